@@ -230,10 +230,11 @@ def without_explained(findings: dict[str, list["Finding"]], comparison: "Compari
 
 def _as_late(t: "Trace") -> bool:
     """Whether the replay comes as late after the target as the measurement, within half a row."""
-    from taccorl.alignment.checks.first_order import fit_first_order
+    from taccorl.alignment.checks.first_order import far_delay, fit_first_order
 
     period_s = (t.time_s[-1] - t.time_s[0]) / (len(t.time_s) - 1)
-    measured, replayed = (fit_first_order(t.target, q, period_s).delay_s for q in (t.measured, t.replayed))
+    rows = [(t.target, q, period_s) for q in (t.measured, t.replayed)]
+    measured, replayed = ((far_delay(*of) or fit_first_order(*of)).delay_s for of in rows)
     return measured - replayed < 0.5 * period_s
 
 
@@ -246,7 +247,7 @@ def of_recordings(
     for name in dict.fromkeys([*findings, *late]):
         open_ = [f for f in late.get(name, []) if not (_waits(f) and f.feature in judged)]
         unjudged = {f.feature for f in open_ if _waits(f)}
-        before = [f for f in findings.get(name, []) if _waits(f) and f.feature not in judged]
+        before = [f for f in findings.get(name, []) if _waits(f) and (f.feature not in judged or f.severity != "note")]
         stays = [f for f in before if f.check == "late_answer" or f.feature in unjudged or name not in comparison.clock]
         open_ = [*stays, *open_]
         if open_ or name in late:
@@ -261,10 +262,10 @@ def _waits(f: "Finding") -> bool:
     return f.check == "late_answer" or (f.check == "not_judged" and f.topic == CLOCK)
 
 
-def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]:
+def far_off(comparison: "Comparison", fitted: Collection[str] = (), late: Collection[str] = ()) -> list[str]:
     """Lines to print, one for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the
     measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation,
-    test). ``fitted``: signals whose gains are only the start of a fit."""
+    test). ``fitted``: signals whose gains are only the start of a fit. ``late``: those that answer far too late."""
     import numpy as np
 
     lines: dict[str, str] = {}
@@ -276,19 +277,17 @@ def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]
         # A drive that takes no position has the replay in place of a target.
         has_target = not any(np.array_equal(t.target, t.replayed, equal_nan=True) for t in traces)
         if s.nrmse > FAR_OFF or (has_target and s.rmse > AS_FAR_AS_TARGET * of_target > 0):
-            of = (
-                f", {s.rmse / of_target:.0%} of what the target by itself is off"
-                if has_target and of_target > 0
-                else ""
-            )
+            share = s.rmse / of_target if has_target and of_target > 0 else 0.0
+            of = f", {share:.0%} of what the target by itself is off" * bool(share)
             off = np.concatenate([t.measured - t.replayed for t in traces])
             mean = float(np.nanmean(off))
             is_constant = mean * mean > MOSTLY_CONSTANT * s.rmse**2
-            if s.signal in fitted and not is_constant:
-                lines[s.signal] = (
-                    f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion, with the gains of the file, which "
-                    "are only a start (gains: fitted); diagnose --until=noise_floor writes those that the recordings determine"
-                )
+            why = "which answers late (late_answer above): correct its times, or state the delay, before anything else"
+            if s.signal not in late:
+                why = "with the gains of the file, which are only a start (gains: fitted); diagnose --until=noise_floor writes "
+                why += "those that the recordings determine"
+            if s.signal in late or (s.signal in fitted and not is_constant):
+                lines[s.signal] = f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion, {why}"
                 continue
             constant = (
                 f"Most of it is a constant: measured positions stand {mean:+.3g} {traces[0].unit} from the replay. Give the "

@@ -171,11 +171,15 @@ def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(("rows_late", "left"), [(3, 0), (0, 1)])
-def test_a_late_answer_is_not_said_where_the_replay_is_as_late(rows_late: int, left: int) -> None:
-    """The measurement comes 3 rows after its target; so does the replay, or it comes with it. Noise of 0.1 mrad."""
+@pytest.mark.parametrize("both_late", [0, 250])
+def test_a_late_answer_is_not_said_where_the_replay_is_as_late(rows_late: int, left: int, both_late: int) -> None:
+    """The measurement comes 3 rows after its target; so does the replay, or it comes with it. Noise of 0.1 mrad.
+    Both 250 rows later: the twin has the delay."""
     at, rng = np.arange(1200), np.random.default_rng(0)
     target = 0.3 * np.sin(2 * np.pi * (at / 200) ** 1.5 / 3)
-    measured, replayed = (np.interp(at - late, at, target) + 1e-4 * rng.normal(size=1200) for late in (3, rows_late))
+    measured, replayed = (
+        np.interp(at - late - both_late, at, target) + 1e-4 * rng.normal(size=1200) for late in (3, rows_late)
+    )
     made = trace(measured - replayed, measured, target=target, recording="a.csv")
     late, other = Finding("late_answer", "note", made.signal, "late"), Finding("jitter", "warning", "", "rows")
     found = without_explained({"a.csv": [late, other], "b.csv": [late]}, comparison(made))

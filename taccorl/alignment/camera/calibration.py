@@ -176,10 +176,8 @@ def calibrate_camera(
         known: at least ``FEWEST_POINTS`` points for a start by PnP; without them the fit starts at the twin's mount. Points in
             held-out frames are used for validation only.
 
-    Raises:
-        TaccorlError: there is no such camera, there are too few frames or points, the pictures are of another stream, or no arm
-            is in view.
-    """
+    Raises TaccorlError: there is no such camera, there are too few frames or points, the pictures are of another stream, or
+    no arm is in view."""
     if len(frames.joints) < FEWEST_FRAMES:
         raise TaccorlError(
             f"{frames.name}: {len(frames.joints)} frames; a calibration needs at least {FEWEST_FRAMES}, with the arms in "
@@ -229,9 +227,7 @@ def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.n
         joints: (F, 14) [rad, m] of the frames that ``KnownPoint.frame`` counts.
         known: at least ``FEWEST_POINTS`` points; their pixels include the black bars.
 
-    Raises:
-        TaccorlError: there are too few points, or no pose explains them.
-    """
+    Raises TaccorlError: there are too few points, or no pose explains them."""
     if len(known) < FEWEST_POINTS:
         raise TaccorlError(
             f"camera {view.camera.name}: {len(known)} known points in frames of the fit; give at least {FEWEST_POINTS}, on "

@@ -53,9 +53,8 @@ def camera_latency(
     Args:
         joints: (T, 14) rad, m, as reported at the same times.
 
-    Raises:
-        TaccorlError: the pictures cover less than 3 s, times are not even, or the number of rows differs from that of pictures.
-    """
+    Raises TaccorlError: the pictures cover less than 3 s, times are not even, or the number of rows differs from that of
+    pictures."""
     time_s = np.asarray(time_s, float)
     if len(time_s) < 3 or time_s[-1] - time_s[0] < _FEWEST_S:
         raise TaccorlError(

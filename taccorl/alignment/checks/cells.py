@@ -39,10 +39,7 @@ def check_cells(
 ) -> dict[str, list[Finding]]:
     """Check the recordings of a sensor of cells. Returns recording → findings. A finding about all fit recordings together, and
     one about all recordings, is stored at the first of them.
-
-    Args:
-        fit_names: names of the fit recordings.
-    """
+    ``fit_names``: names of the fit recordings."""
     found = {m.name: [*m.findings, *_of_recording(config, m), *place_findings(config, m)] for m in measurements}
     fit, every = [m for m in measurements if m.name in fit_names], CellSet(config, measurements)
     if not fit:
@@ -109,10 +106,7 @@ def _of_recording(config: CellsConfig, m: CellMeasurement) -> Iterator[Finding]:
 @check("wrong_sign", "error")
 def _together(s: CellSet, exchanged: set[int]) -> Iterator[Finding]:
     """What all fit recordings together lack.
-
-    Args:
-        exchanged: cells whose columns are exchanged; the sign of their gain is not judged.
-    """
+    ``exchanged``: cells whose columns are exchanged; the sign of their gain is not judged."""
     config, rated, unit = s.config, s.config.load.rated, s.config.load.unit
     load = np.concatenate([m.target for m in s.recordings])
     inside = np.concatenate([within_ends(config, m) for m in s.recordings])

@@ -16,7 +16,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from taccorl.alignment.checks.first_order import Shift, delay_between, fit_first_order, left_by_change, pure_shift
+from taccorl.alignment.checks.first_order import (
+    Shift,
+    delay_between,
+    far_delay,
+    fit_first_order,
+    left_by_change,
+    pure_shift,
+)
 from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import check, find
@@ -31,6 +38,8 @@ from taccorl.errors import TaccorlError
 
 CLOCK = "clock"
 """Topic of findings that the clock of a joint could not be judged, or was judged by the onsets of steps."""
+FAR = "late"
+"""Topic of late answers beyond ``DELAY_S``."""
 SHIFTED = "shifted_from_twin"
 """Check whose findings state that a measurement leads the twin's replay, or comes after it."""
 UNDECIDED = "clock_or_effect"
@@ -116,6 +125,14 @@ def check_clock_of(t: Trial) -> Iterator[Finding]:
                 yield _exchange(name, -lag.lag_s, m)
             else:
                 yield _lead(name, -lag.lag_s, m, "its movement correlates best with a later command")
+        elif far := far_delay(even.target[:, j], measured, even.period_s):
+            text = (
+                f"{name} answers its target {far.delay_s:.2f} s late ({far.delay_s / row_s:.0f} rows, then a lag of "
+                f"{far.time_constant_s * 1e3:.0f} ms): positions are stamped or paired late, commands early, or a driver "
+                "queues commands; positions cannot tell which. Gains, inertia and units come after it: compare the clocks, and "
+                f"{_earlier_positions(m)}. Only if the clocks agree is it a delay (effects command_delay, sensor_delay)"
+            )
+            yield find("late_answer", name, text, severity="warning", topic=FAR)
         elif not fit.rms < max(FITTING * t.floor[name], FITTING_ROWS * fit.row_rms):
             why = f"it shows in steps; {_steps_wanted(m, name, t.floor[name])}"
             yield not_judged(name, f"an offset of one row ({row_s * 1e3:.1f} ms)", why, CLOCK)
@@ -131,6 +148,25 @@ def check_clock_of(t: Trial) -> Iterator[Finding]:
             yield find("late_answer", name, text)
     if not judged:
         yield not_judged("", "clock of command and measurement", "no joint moves enough to tell")
+
+
+@check("late_recording", "error")
+def check_late_recordings(recordings: Sequence[Measurement], found: dict[str, list[Finding]]) -> None:
+    """Turn far delays of signals that answer at once in at least as many other recordings into errors: a robot's own delay is in
+    all of them. Changes ``found``, name of a recording → its findings."""
+    far = {(m.name, f.feature): f for m in recordings for f in found[m.name] if f.topic == FAR}
+    for signal in {feature for _, feature in far}:
+        late = [m for m in recordings if (m.name, signal) in far]
+        sound = [m for m in recordings if signal in m.signals and m not in late and m.column(signal) in Trial(m).moving]
+        if len(late) > len(sound) or not sound:
+            continue
+        for m in late:
+            old = far[m.name, signal]
+            text = (
+                f"{old.text.partition(': positions')[0]}, and not in {len(sound)} other recordings ({sound[0].name} …): the "
+                f"clock of this one is off, or columns are shifted. {_earlier_positions(m).capitalize()}, or leave this one out"
+            )
+            found[m.name] = [find("late_recording", signal, text) if f is old else f for f in found[m.name]]
 
 
 def _until_stopped(m: Measurement, j: int) -> np.ndarray:
@@ -228,12 +264,18 @@ def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s
     return noise_of_rows(target) > ROUGHER * noise_of_rows(measured)
 
 
+def _earlier_positions(m: Measurement) -> str:
+    """Text: the correction for positions that are late."""
+    where = (
+        "shift the position columns against time, or log both by one clock",
+        "correct `latency_s` of the state's channel",
+    )
+    return write(m, where[0], f"{where[1]} in the recording spec")
+
+
 def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> str:
     """Text: the correction for positions that are ``lead_s`` [s] ahead of their targets.
-
-    Args:
-        whole: the joint's own lag is not in ``lead_s``. Otherwise it hides a part of the offset, and rows are rounded up.
-    """
+    ``whole``: the joint's own lag is not in ``lead_s``. Otherwise it hides a part of the offset, and rows are rounded up."""
     rows = max(1, round(lead_s / m.period_s)) if whole else math.ceil(lead_s / m.period_s)
     if is_table(m):
         return f"Write `target_rows_late: {rows}`{'' if whole else ' (or more)'} into the columns file"
@@ -370,10 +412,7 @@ def _with_common_delay(
 ) -> list[Finding]:
     """``findings``, of which those that say that a joint comes late have one topic and name the common delay if all late joints
     agree within half a row or ``SURE`` standard deviations.
-
-    Args:
-        late: late joint → delay and its standard deviation [s].
-    """
+    ``late``: late joint → delay and its standard deviation [s]."""
     delays_s = np.array([delay_s for delay_s, _ in late.values()])
     allowed = np.array([max(0.5 * period_s, SURE * sd_s) for _, sd_s in late.values()])
     if len(late) < 2 or (np.abs(delays_s - np.median(delays_s)) > allowed).any():
@@ -416,10 +455,7 @@ def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -
 def _rival(measured: np.ndarray, replay: np.ndarray, plain: Shift, rivals: Mapping[str, np.ndarray]) -> str:
     """Name of the effect with which the replay comes as near to the measurement as by a shift alone; empty if none does. No other
     number is adjusted: with another K_d and inertia, too, velocity feedforward and a lead are alike.
-
-    Args:
-        rivals: name of an effect → the replay (T,) with a little of it.
-    """
+    ``rivals``: name of an effect → the replay (T,) with a little of it."""
     left = {name: left_by_change(measured, replay, changed) for name, changed in rivals.items()}
     best = min(left, key=lambda name: left[name], default="")
     return best if best and plain.rms >= BETTER * left[best] else ""

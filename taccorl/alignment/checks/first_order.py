@@ -9,6 +9,7 @@ lag does not describe the joint (friction, backlash, …), ``rms`` is large and 
 Letters in shapes: T rows.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from taccorl.data.joint_checks import find_lag
 from taccorl.errors import TaccorlError
 
 COMMAND_HZ = 150.0
@@ -28,8 +30,10 @@ LEAST_ROWS = 20
 """Least number of measured rows for a fit."""
 MOST_ROWS = 5000
 """If there are more rows, an even selection of so many is used for the start of the fit."""
-DELAY_ROWS, DELAY_S = 8.0, 0.15
-"""Range of delays that are searched: from so many rows too early to so many seconds late."""
+DELAY_ROWS, DELAY_S, FAR_S = 8.0, 0.15, 2.0
+"""Range of delays that are searched: from so many rows too early to so many seconds late; and by ``far_delay``."""
+FAR_LEAVES = 0.3
+"""A delay beyond ``DELAY_S`` must leave less than this share of what the best lag and delay within it leave. A choice."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +73,7 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
         measured: (T,) positions at row k [rad, m]; rows with NaN are left out.
         period_s: time between two rows [s].
 
-    Raises:
-        TaccorlError: there are too few rows.
-    """
+    Raises TaccorlError: there are too few rows."""
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
 
@@ -93,6 +95,22 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     return FirstOrder(**of_delay, time_constant_s=math.exp(best.x[0]), gain=gain)
 
 
+def far_delay(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder | None:
+    """The fit with a delay between ``DELAY_S`` and ``FAR_S``, if it leaves much less than ``fit_first_order``; else None.
+    Play and dry friction delay slow motion alike, but take their size off both ends of its range; such a delay is left out."""
+    start = find_lag(target[:, None], measured[:, None], max(1, round(1 / period_s)), (0.0, FAR_S))
+    rows = max(0, round((start.lag_s - 0.1) / period_s))
+    if rows == 0 or len(target) - rows < 2 * DELAY_S / period_s + LEAST_ROWS:
+        return None
+    fit = fit_first_order(target[:-rows], measured[rows:], period_s)
+    fit = dataclasses.replace(fit, delay_s=fit.delay_s + rows * period_s)
+    lost = np.ptp(target) - np.nanmax(measured) + np.nanmin(measured)
+    real = fit.delay_s - 4.0 * fit.delay_sd_s > DELAY_S and lost < float(
+        np.sqrt(np.nanmean(np.square(target - measured)))
+    )
+    return fit if real and fit.rms < FAR_LEAVES * fit_first_order(target, measured, period_s).rms else None
+
+
 def delay_between(
     target: np.ndarray, measured: np.ndarray, other: np.ndarray, period_s: float, changed: Sequence[np.ndarray] = ()
 ) -> Shift:
@@ -105,9 +123,7 @@ def delay_between(
         period_s: time between two rows [s].
         changed: responses (T,) like ``other`` with another inertia, damping …, which may be the reason of the difference.
 
-    Raises:
-        TaccorlError: there are too few rows.
-    """
+    Raises TaccorlError: there are too few rows."""
     fits = [fit_first_order(target, values, period_s) for values in (measured, other)]
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
@@ -135,9 +151,7 @@ def pure_shift(measured: np.ndarray, other: np.ndarray, period_s: float) -> Shif
             an end.
         period_s: time between two rows [s].
 
-    Raises:
-        TaccorlError: there are too few rows.
-    """
+    Raises TaccorlError: there are too few rows."""
     rows, ends = np.arange(len(other)), math.ceil(max(DELAY_ROWS, 2 * DELAY_S / period_s))
     inner = rows[ends:-ends]
     inner = inner[np.isfinite(measured[inner])]

@@ -81,9 +81,11 @@ def check_values(t: Trial) -> Iterator[Finding]:
     if any(f.check == "resampled" for f in m.findings) and (end - first) * m.period_s <= LONGEST_GAP_S:
         return
     names = [m.signals[j] for j in np.flatnonzero(compared & ~known[first:end].all(axis=0))]
+    damaged = any(f.check == "damaged" for f in m.findings)
+    again = "The file is damaged: copy it again" if damaged else "Record again with less load on the logger"
     text = (
         f"{listed(names)}: nothing was measured in {place(m, first, end)}, {len(holes)} such holes: no row "
-        f"there can be compared. Record again with less load on the logger, or {without(m, first)}"
+        f"there can be compared. {again}, or {without(m, first)}"
     )
     yield find("lost_samples", names[0], text, (first, end))
 
@@ -94,7 +96,7 @@ def check_length(t: Trial) -> Iterator[Finding]:
     """Motion, from the first change of a command to the last, that is too short for a fit."""
     changed = np.flatnonzero(np.any(np.diff(t.m.target, axis=0) != 0, axis=1))
     seconds = float(t.m.time_s[changed[-1] + 1] - t.m.time_s[changed[0]]) if len(changed) else 0.0
-    if seconds < SHORT_S and t.moves.any():
+    if 0.0 <= seconds < SHORT_S and t.moves.any():  # negative: time_backwards
         text = (
             f"{seconds:.2f} s of motion in {t.m.num_rows} rows: three parameters of a joint want 10 s that sweep it "
             "from slow to fast"

@@ -171,10 +171,7 @@ def _line(m: Measurement, name: str, factor: str = "…") -> str:
 @check("reversed_effort", "error")
 def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) -> list[Finding]:
     """Finding on an effort with the wrong sign: by its law, which no mass changes, or where no law shows the sign by inertia.
-
-    Args:
-        left: share that the effort with the opposite sign leaves of what it leaves as it is.
-    """
+    ``left``: share that the effort with the opposite sign leaves of what it leaves as it is."""
     sign = 0 if fit is None else fit.sign
     if sign > 0 or (sign == 0 and left >= math.sqrt(1.0 - INERTIA_SURE**2)):
         return []

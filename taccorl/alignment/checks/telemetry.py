@@ -101,6 +101,8 @@ def check_measurements(
     moved = {name for m in measurements for name, far in zip(m.signals, Trial(m).moves, strict=True) if far}
     for m in measurements[:1]:
         found[m.name] += [no_motion(m, name) for name in joints if name not in moved]
+    clock.check_late_recordings(measurements, found)
+    found = {m.name: accepted(found[m.name], accept) for m in measurements}
     sound = [m for m in measurements if not any(f.severity == "error" for f in found[m.name])]
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
     for a, b in itertools.combinations(sound, 2):
@@ -120,7 +122,7 @@ def check_measurements(
     for m in measurements:  # one motion has one delay: what a repeat does not show is chance
         first = m.repeat_of or m.name
         always = set.intersection(*(late[x.name] for x in measurements if (x.repeat_of or x.name) == first))
-        found[m.name] = [f for f in found[m.name] if f.check != "late_answer" or f.feature in always]
+        found[m.name] = [f for f in found[m.name] if f.check != "late_answer" or f.topic or f.feature in always]
     return found
 
 
@@ -203,10 +205,7 @@ def one_cause(found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measu
 
     If a signal is reversed, or exchanged with its target, in most of the recordings that have an error of it, the others are
     checked again with that corrected. Those that pass have the same cause; findings that it explains are removed.
-
-    Args:
-        found: name of a recording → its findings.
-    """
+    ``found``: name of a recording → its findings."""
     result = {name: list(findings) for name, findings in found.items()}
     wrong = {f.feature for own in result.values() for f in own if f.check in CORRECTED and f.severity == "error"}
     for signal in sorted(wrong):

@@ -26,12 +26,15 @@ def check_time(t: Trial) -> Iterator[Finding]:
     m = t.m
     steps = np.diff(m.time_s)
     if not np.isfinite(m.time_s).all() or (steps <= 0).any():
-        row = int(np.argmax(~(steps > 0)))
-        text = (
-            f"time goes from {m.time_s[row]:.6f} to {m.time_s[row + 1]:.6f} s at row {row + 1}, "
-            f"{int((~(steps > 0)).sum())} such rows: sort the table by time, leave repeated rows out, or log the "
-            "driver's own stamps"
-        )
+        bad = ~(steps > 0)
+        row = int(np.argmax(bad))
+        how = f"goes from {m.time_s[row]:.6f} to {m.time_s[row + 1]:.6f} s"
+        ways = "sort the table by time, leave repeated rows out, or log the driver's own stamps"
+        if (steps[bad] == 0).all():
+            how, ways = f"stands still at {m.time_s[row]:.6f} s", "leave repeated rows out, or log stamps of their own"
+        elif bad.all():
+            how, ways = f"{how}, backwards as all through,", "sort the table by time"
+        text = f"time {how} at row {row + 1}, {int(bad.sum())} such rows: {ways}"
         yield find("time_backwards", "time", text, (row, row + 2))
         return
     if m.num_rows > 1 and not RATE_HZ[0] <= m.rate_hz <= RATE_HZ[1]:

@@ -114,10 +114,8 @@ def identify_controller(
         start: gains at which the search starts, besides the twin's.
         bounds: ``kp``, ``kd``, ``torque_ff`` → (low, high) [N·m/rad, N·m·s/rad, N·m].
 
-    Raises:
-        TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a parameter is
-            unknown.
-    """
+    Raises TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a
+    parameter is unknown."""
     if not motions_fit:
         raise TaccorlError(f"{model.signal}: no recording to fit; give at least one sweep of this joint")
     for motion in (*motions_fit, *validation):

@@ -27,10 +27,7 @@ class GainSearch:
     coordinates the valley of the loss is straight: positions determine the ratios, and hardly K_p. Values beyond the bounds are
     clipped. Gains are those in force in the first recording; the other recordings' gains are in proportion, if they were
     commanded so.
-
-    Args:
-        bounds: ``kp``, ``kd``, ``torque_ff`` → low, high.
-    """
+    ``bounds``: ``kp``, ``kd``, ``torque_ff`` → low, high."""
 
     def __init__(
         self,
@@ -188,10 +185,7 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray, correlated: float) ->
 
 def correlation_time(parts: Sequence[np.ndarray]) -> float:
     """Number of rows after which residuals are independent, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the largest over ``parts``.
-
-    Args:
-        parts: residuals (R,) of one recording and channel each.
-    """
+    ``parts``: residuals (R,) of one recording and channel each."""
     longest = 1.0
     for part in parts:
         centred = part - part.mean()

@@ -166,9 +166,7 @@ class JointModel:
         Args:
             each_step: give the response after each physics step, not only at the rows.
 
-        Raises:
-            TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects.
-        """
+        Raises TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects."""
         prepared = [self._prepared(case) for case in cases]
         return [self._simulated(motion, prepared, each_step) for motion in motions]
 

@@ -40,19 +40,14 @@ def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | Non
     Args:
         machine: machine whose other joints are coupled with this one; None for a single axis.
 
-    Raises:
-        TaccorlError: there is no such signal, its targets have gaps, nothing was measured at the start, the recording is too
-            short, or its time is uneven.
-    """
+    Raises TaccorlError: there is no such signal, its targets have gaps, nothing was measured at the start, the recording is
+    too short, or its time is uneven."""
     return motion_of(measurement, signal, None if machine is None else joint_of(machine, signal))
 
 
 def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -> JointMotion:
     """Data of one joint from a recording, as ``joint_motion``, for a given ``RigidJoint``.
-
-    Args:
-        joint: None for a single axis that nothing is known about: targets are then positions.
-    """
+    ``joint``: None for a single axis that nothing is known about: targets are then positions."""
     m, j = measurement, measurement.column(signal)
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:

@@ -164,10 +164,7 @@ class RigidJoint(ABC):
 
     def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
         """(T,) torque [N·m] because other joints move the masses that ``bodies`` add, beyond ``rigid``.
-
-        Args:
-            bodies: as for ``rigid``.
-        """
+        ``bodies``: as for ``rigid``."""
         return 0.0
 
     def surroundings(self, m: Measurement) -> Surroundings:
@@ -206,9 +203,7 @@ class RigidJoint(ABC):
         Returns:
             Reported positions (T,) [rad] and efforts (T,) [N·m].
 
-        Raises:
-            TaccorlError: the machine has no model in MuJoCo.
-        """
+        Raises TaccorlError: the machine has no model in MuJoCo."""
         unknown = [effect.name for effect in effects if effect.drive() is None]
         raise TaccorlError(
             f"{self.signal}: effects on a single axis are computed in the one-joint model, which does not have "

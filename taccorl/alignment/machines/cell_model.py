@@ -46,9 +46,7 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
     Args:
         effects: effects besides the config's; one of the same name replaces the config's.
 
-    Raises:
-        TaccorlError: an effect is given twice.
-    """
+    Raises TaccorlError: an effect is given twice."""
     names = {effect.name for effect in effects}
     acting = present([*(e for e in config.effects if e.name not in names), *effects])
     if config.reading.below_rest:

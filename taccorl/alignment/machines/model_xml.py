@@ -84,10 +84,8 @@ def read_model(path: Path) -> tuple[Element, bytes]:
     Returns:
         Its root, and its bytes.
 
-    Raises:
-        TaccorlError: it cannot be read, is not XML, is too large or nested too deeply, or two joints or links have one name; the
-            message names file and line.
-    """
+    Raises TaccorlError: it cannot be read, is not XML, is too large or nested too deeply, or two joints or links have one
+    name; the message names file and line."""
     root, content = _parsed(path)
     if root.tag == "robot":
         _refuse_long_chains(root)

@@ -27,9 +27,7 @@ def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
         model: MJCF or URDF file.
         out: path of the robot file, which is not written here; the text names the model relative to it.
 
-    Raises:
-        TaccorlError: the model cannot be used (``load_robot_model``).
-    """
+    Raises TaccorlError: the model cannot be used (``load_robot_model``)."""
     robot = load_robot_model(model)
     relative = Path(os.path.relpath(Path(model).resolve(), Path(out).resolve().parent)).as_posix()
     lines = [_HEADER.format(model=Path(model).name, name=Path(out).name).rstrip()]

@@ -101,10 +101,8 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     Args:
         gravity_compensation: share of the weight that the controller compensates.
 
-    Raises:
-        TaccorlError: the file cannot be read; a moving link has no inertia, or one that requires a mesh; there is a closed
-            chain, a joint without a name, or no joint.
-    """
+    Raises TaccorlError: the file cannot be read; a moving link has no inertia, or one that requires a mesh; there is a
+    closed chain, a joint without a name, or no joint."""
     path = Path(path)
     spec, root, remarks, mimics = _spec(path)
     spec.memory = -1  # of contacts, which are not computed

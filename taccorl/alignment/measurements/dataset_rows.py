@@ -43,10 +43,8 @@ def read_dataset(root: Path, columns: TableSpec | None = None, *, is_all: bool =
         columns: names and units of the columns of a dataset that states none. A dataset that states its units is read by those.
         is_all: nothing else is read, so that ``columns`` can be meant for this dataset only.
 
-    Raises:
-        TaccorlError: it is not a dataset, its numbers have no units, it does not state its action_time, it lacks a column, or it
-            states its units and ``columns`` would too.
-    """
+    Raises TaccorlError: it is not a dataset, its numbers have no units, it does not state its action_time, it lacks a
+    column, or it states its units and ``columns`` would too."""
     dataset = Dataset(root)
     try:
         names, units = signal_names(dataset.spec), signal_units(dataset.spec)
@@ -116,9 +114,7 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
         root: folder of the dataset.
         k: index of the episode.
 
-    Raises:
-        TaccorlError: there are too few rows, or the dataset does not state its action_time.
-    """
+    Raises TaccorlError: there are too few rows, or the dataset does not state its action_time."""
     episode.spec.require_action_time(episode.name)
     state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)
     first = 1 if episode.spec.action_time == "next_row" else 0

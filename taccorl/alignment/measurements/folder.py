@@ -178,9 +178,7 @@ def read_measurements(
             ``columns`` is then a path.
         fit_needed: False if nothing is fitted: no recording need be for the fit.
 
-    Raises:
-        TaccorlError: there is nothing to read, a name is unknown, or a motion and its repeat have different uses.
-    """
+    Raises TaccorlError: there is nothing to read, a name is unknown, or a motion and its repeat have different uses."""
     path = Path(path)
     folder = path if path.is_dir() else path.parent
     index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))

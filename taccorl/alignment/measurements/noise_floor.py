@@ -119,9 +119,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
     Returns:
         Signal → its floor; signals that were never recorded (effort, velocity) are left out.
 
-    Raises:
-        TaccorlError: there is no measurement, signals differ, or a repeat has other commands.
-    """
+    Raises TaccorlError: there is no measurement, signals differ, or a repeat has other commands."""
     measurements = list(measurements)
     if not measurements:
         raise TaccorlError("noise floor: no measurement")
@@ -182,10 +180,7 @@ def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
 def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
     """(K,) noise of each column by the residue method, in the unit of the values; NaN if all channels are too short. The median
     over blocks is used, because contact changes in few of them. Blocks with NaN are not used.
-
-    Args:
-        channels: several (values (T, K), rate [Hz]), with the same K columns.
-    """
+    ``channels``: several (values (T, K), rate [Hz]), with the same K columns."""
     found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
     if not found:
         return np.full(channels[0][0].shape[1], np.nan)

@@ -60,9 +60,7 @@ def indenter(
         rpy_rad: fixed-axis roll, pitch, yaw [rad]; (0, π/2, 0) lays a rod across the pads.
         frame: tcp: fixed relative to the hand; world: fixed to the bench.
 
-    Raises:
-        TaccorlError: the shape is unknown, or a size is not above 0.
-    """
+    Raises TaccorlError: the shape is unknown, or a size is not above 0."""
     if shape not in ("sphere", "rod"):
         raise TaccorlError(f"indenter: no shape {shape!r}; {nearest(shape, ('sphere', 'rod'))}")
     if not (0 < radius_m < math.inf and 0 < length_m < math.inf):

@@ -42,9 +42,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
         same_share: largest difference of the aligned commands, as a share of the motion; larger for loads, which are measured
             and not commanded.
 
-    Raises:
-        TaccorlError: the signals or the commands differ.
-    """
+    Raises TaccorlError: the signals or the commands differ."""
     if first.signals != second.signals:
         raise TaccorlError(
             f"{second.name} and {first.name} have different signals, so that one cannot repeat the other"

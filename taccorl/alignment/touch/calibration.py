@@ -139,10 +139,7 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
 
 def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray], threshold_count: float) -> TouchMatch:
     """Compare measured with simulated counts; a taxel is active above ``threshold_count`` (λ_noise).
-
-    Args:
-        simulated: counts (T, P, R, C) for each of ``motions``.
-    """
+    ``simulated``: counts (T, P, R, C) for each of ``motions``."""
     both = [(m.measured.astype(np.float32), s.astype(np.float32)) for m, s in zip(motions, simulated, strict=True)]
     masks = [(a > threshold_count, b > threshold_count) for a, b in both]
     ever = [a.any(axis=0) | b.any(axis=0) for a, b in masks]

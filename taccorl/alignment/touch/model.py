@@ -31,9 +31,7 @@ class TouchModel:
     Args:
         config: configuration of the twin, whose effects always act; those of ``simulate`` act in addition.
 
-    Raises:
-        TaccorlError: the sensor is not FlexiTac.
-    """
+    Raises TaccorlError: the sensor is not FlexiTac."""
 
     def __init__(self, config: TwinConfig) -> None:
         if not isinstance(config.sensor, FlexiTacConfig):
@@ -58,9 +56,7 @@ class TouchModel:
             effects: effects besides the twin's own.
             start_s: start of the recording [s], if the motion lacks its first frames; by default the first frame.
 
-        Raises:
-            TaccorlError: an effect is given twice for a pad, or an effect requires whole pads and the motion is cut.
-        """
+        Raises TaccorlError: an effect is given twice for a pad, or an effect requires whole pads and the motion is cut."""
         acting = present([*self._own, *effects])
         depth, rate = motion.depth(_offsets(acting, motion.pads))
         shape = depth.shape[2:]

@@ -81,11 +81,8 @@ class TouchMotion:
 
     def depth(self, offsets_m: tuple[tuple[float, float, float], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
         """Depth δ [m] and depth rate δ̇ [m/s], each (T, P, R, C) float32, 0 without contact.
-
-        Args:
-            offsets_m: displacement (x, y, z) of each of the P pads' taxels from the nominal position, in the pad's own frame [m];
-                empty: none.
-        """
+        ``offsets_m``: displacement (x, y, z) of each of the P pads' taxels from the nominal position, in the pad's own frame
+        [m]; empty: none."""
         if not any(any(offset) for offset in offsets_m):
             offsets_m = ()
         if offsets_m not in self._known:
@@ -169,9 +166,8 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
     Args:
         config: configuration of the twin, for the robot's mounts and the sensor's scan.
 
-    Raises:
-        TaccorlError: there are no frames of the pads, openings or joints were not measured, or the object never came near a pad.
-    """
+    Raises TaccorlError: there are no frames of the pads, openings or joints were not measured, or the object never came near
+    a pad."""
     if measurement.touch is None:
         raise TaccorlError(
             f"{measurement.name}: the recording has no frames of the pads; record them, or remove this recording"

@@ -44,9 +44,6 @@ def fitted(camera: str) -> CameraFit:
     return calibrate_camera(made(camera)[1], twin(), camera)
 
 
-# the whole ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
 def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
     truth, fit = made(camera)[0], fitted(camera)
@@ -135,9 +132,6 @@ def test_known_points_start_it_from_far_away():
     assert fit.known_after_px < 3  # found to 1 px each way
 
 
-# its parts ------------------------------------------------------------------------------------------------------------
-
-
 def test_pnp_finds_a_camera_exactly_from_exact_points():
     rng = np.random.default_rng(0)
     truth, joints = drawn.random_offset(rng, 0.5, 0.1), drawn.random_poses(rng, 4)
@@ -179,9 +173,6 @@ def test_an_encoder_bias_of_the_twin_is_taken_off_before_its_arms_are_drawn():
         shifted[1] -= 0.05
         plain.place(shifted)
         np.testing.assert_allclose(biased.data.xpos, plain.data.xpos, atol=1e-9)
-
-
-# bad input ------------------------------------------------------------------------------------------------------------
 
 
 def test_too_few_frames_and_frames_that_do_not_fit_are_named():

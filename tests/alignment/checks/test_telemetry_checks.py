@@ -20,6 +20,7 @@ from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.data.episode import ChannelTiming
+from taccorl.data.finding import Finding
 from taccorl.diagnosis.problems.axis_problem import axis_motion, simulated
 from taccorl.errors import TaccorlError
 from taccorl.sim.bench import Bench
@@ -70,9 +71,6 @@ def floors(m: Measurement) -> dict[str, float]:
     return {name: f.value for name, f in noise_floor([m]).items()}
 
 
-# clean data ------------------------------------------------------------------------------------------------------------
-
-
 # The first six have every choice of joints with every resolution.
 @pytest.mark.parametrize("seed", [pytest.param(k, marks=[pytest.mark.slow] * (k >= 6)) for k in range(12)])
 def test_clean_sweeps_stay_clean(seed):
@@ -103,9 +101,6 @@ def test_steps_and_holds_are_clean_too():
     target = steps(3, 0.1, rows=1400)
     m = measured(target, answer(target), np.random.default_rng(0), 2e-4)
     assert found(m) == {}
-
-
-# clocks ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rows", [1, 2, 5])
@@ -148,6 +143,39 @@ def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_canno
         pair = dataclasses.replace(late, name="a"), dataclasses.replace(repeat, name="b", repeat_of="a")
         every = [f.feature for own in check_measurements(pair).values() for f in own if f.check == "late_answer"]
         assert len(every) == said * len(set(every))
+
+
+@pytest.mark.parametrize("late_s", [0.2, 0.5, 1.5])
+@pytest.mark.parametrize("friction_nm", [0.0, 1.0])
+def test_positions_far_too_late_are_told_in_all_recordings_or_in_the_one(late_s: float, friction_nm: float):
+    sound = [sweep(k, joints=[4], friction_nm=friction_nm, name=name) for k, name in enumerate("abc")]
+    late = [dataclasses.replace(shifted(m, -round(late_s * RATE_HZ)), name=m.name) for m in sound]
+
+    def told(recordings: list[Measurement]) -> dict[str, list[tuple[str, str]]]:
+        every = check_measurements(recordings)
+        of = {n: [f for f in own if f.check.startswith("late") and f.severity != "note"] for n, own in every.items()}
+        for f in (f for own in of.values() for f in own):
+            assert f.feature == "left_joint5" and f"{late_s:.1f}" in f.text and "latency_s" in f.text
+        return {n: [(f.check, f.severity) for f in own] for n, own in of.items()}
+
+    assert told(sound) == {"a": [], "b": [], "c": []}
+    assert told(late) == {n: [("late_answer", "warning")] for n in "abc"}
+    assert told([*sound[:2], late[2]]) == {"a": [], "b": [], "c": [("late_recording", "error")]}
+
+
+@pytest.mark.parametrize("play_rad", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize("lag_s", [0.1, 0.5])
+def test_play_and_slow_joints_are_no_clock(play_rad: float, lag_s: float):
+    """Triangles of ± 0.2 rad at 0.1 rad/s: play of 0.1 rad alone comes 0.05 / 0.1 = 0.5 s late, as a clock does."""
+    at = np.arange(4800) / RATE_HZ
+    target = np.tile(HOME, (4800, 1))
+    target[:, 4] += 0.2 - np.abs(at % 8.0 - 4.0) / 10.0
+    keep, held = math.exp(-1 / RATE_HZ / lag_s), HOME.copy()
+    true = lfilter([1 - keep], [1, -keep], target, axis=0, zi=keep * target[:1])[0]
+    for row in true:
+        row[:] = held = np.clip(held, row - play_rad / 2, row + play_rad / 2)
+    every = check_measurement(measured(target[1:], true[:-1], np.random.default_rng(0), 2e-4))
+    assert {f.severity for f in every} <= {"note"}
 
 
 def test_a_step_from_rest_shows_one_row_under_any_friction():
@@ -256,9 +284,6 @@ def gripper_on_a_part(opens: bool, rows_early: int = 0) -> Measurement:
 def test_a_gripper_that_a_part_stops_is_no_fault_of_the_clock_and_one_that_is_early_is(opens: bool):
     assert not [f for f in check_measurement(gripper_on_a_part(opens)) if f.severity == "error"]
     assert found(gripper_on_a_part(opens, rows_early=2))["measured_before_command"] == ["left_gripper"]
-
-
-# against the twin ------------------------------------------------------------------------------------------------------
 
 
 def test_one_row_off_the_twin_is_found_even_when_its_gains_are_wrong(clean):
@@ -416,9 +441,6 @@ def test_velocity_in_rpm_is_named(clean):
     assert "velocity_unit" not in found(dataclasses.replace(clean, velocity=slope))
     rpm = dataclasses.replace(clean, velocity=slope * 60 / (2 * math.pi))
     assert "rpm?" in text_of(rpm, "velocity_unit")
-
-
-# channels --------------------------------------------------------------------------------------------------------------
 
 
 def test_the_range_of_a_command_is_said_however_small():
@@ -688,9 +710,6 @@ def test_too_short(clean):
     assert found(sweep(0, seconds=2.0))["short"] == [""]
 
 
-# start and time --------------------------------------------------------------------------------------------------------
-
-
 def test_not_at_rest_at_the_start(clean):
     m = some(clean, slice(900, None))
     m = dataclasses.replace(m, time_s=m.time_s - m.time_s[0])
@@ -704,6 +723,10 @@ def test_time_that_runs_backwards_stops_everything_else(clean):
     m = dataclasses.replace(clean, time_s=time_s)
     assert found(m) == {"time_backwards": ["time"]}
     assert "at row 500" in text_of(m, "time_backwards")
+    time_s[500] = time_s[499] = 2.495
+    twice = text_of(dataclasses.replace(clean, time_s=time_s), "time_backwards")
+    assert "stands still at 2.495" in twice and "goes from" not in twice and "1 such" in twice
+    assert found(dataclasses.replace(clean, time_s=-clean.time_s)) == {"time_backwards": ["time"]}  # not short, too
 
 
 def test_time_in_milliseconds(clean):
@@ -730,7 +753,9 @@ def test_jitter_of_row_times(clean, jitter_s, caught):
 def test_holes_and_nan_are_errors_with_their_place(clean):
     m = with_column(clean, "left_joint5", np.where(np.arange(clean.num_rows) // 50 == 12, np.nan, clean.measured[:, 4]))
     hole = next(f for f in check_measurement(m) if f.check == "lost_samples")
-    assert (hole.feature, hole.rows) == ("left_joint5", (600, 650))
+    assert (hole.feature, hole.rows) == ("left_joint5", (600, 650)) and "load on the logger" in hole.text
+    cut = text_of(dataclasses.replace(m, findings=(Finding("damaged", "warning", "file", "x"),)), "lost_samples")
+    assert "copy it again" in cut and "load on the logger" not in cut
     bad = with_column(clean, "left_joint5", np.full(clean.num_rows, np.nan), "target")
     assert found(bad)["not_finite"] == ["left_joint5"]
 

@@ -156,9 +156,6 @@ def test_nothing_to_read_is_an_error_with_a_way_out(tmp_path):
         read_measurements(tmp_path)
 
 
-# split -----------------------------------------------------------------------------------------------------------------
-
-
 def test_split_is_deterministic_and_complete():
     found = [split(made(*"abcdefg"), validation_every=2) for _ in range(2)]
     assert found[0].record() == found[1].record()
@@ -196,9 +193,6 @@ def test_repeats_in_a_circle():
         motions(made("a", "b", a="b", b="a"))
     with pytest.raises(TaccorlError, match=r"two measurements.*'a'"):
         split(made("a", "a"))
-
-
-# measurement -----------------------------------------------------------------------------------------------------------
 
 
 def test_shapes_and_units_are_checked():

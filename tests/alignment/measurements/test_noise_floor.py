@@ -157,9 +157,6 @@ def test_touch_floor_of_every_taxel():
     np.testing.assert_allclose(floor[768:], 1 / math.sqrt(12))
 
 
-# repeats ---------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("parts", [0.0, 0.25, 0.5])
 def test_repeats_that_began_at_another_time_are_laid_over_each_other(parts):
     # The same motion 0.3 s and ``parts`` of a row later; sampled from the closed form, so the shift is exact.
@@ -203,9 +200,6 @@ def test_a_cut_repeat_still_counts(motion):
         second, **{k: getattr(second, k)[100:1500] for k in ("time_s", "target", "measured", "velocity", "effort")}
     )
     assert overlay(first, short).shift_s == pytest.approx(0.0, abs=1e-6)
-
-
-# quantisation ----------------------------------------------------------------------------------------------------------
 
 
 def test_step_of_readings_is_found_and_noise_has_none():

@@ -277,9 +277,6 @@ def test_odd_metadata_is_an_error(moved):
         read_recording(source, spec)
 
 
-# the same as a table and as a dataset ----------------------------------------------------------------------------------
-
-
 def write_tables(m: Measurement, folder: Path) -> list[Path]:
     columns = {"t": m.time_s}
     for j, name in enumerate(m.signals):

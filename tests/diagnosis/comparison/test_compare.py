@@ -26,9 +26,6 @@ def measured() -> Measurements:
     return sweeps(friction(FRICTION_NM))
 
 
-# residuals ---------------------------------------------------------------------------------------------------------------
-
-
 def test_twin_with_the_hidden_effect_is_at_the_floor_and_without_it_off_by_friction_over_stiffness(measured):
     nominal, true = compare(TwinConfig(), measured), compare(friction(FRICTION_NM), measured)
     for use in ("fit", "validation"):
@@ -120,9 +117,6 @@ def test_a_measurement_that_leads_its_replay_by_two_rows_is_an_error_of_the_cloc
     found = compare(TwinConfig(), Measurements((early,))).clock[m.name]
     assert [(f.check, f.severity) for f in found] == [("shifted_from_twin", "error")]
     assert compare(TwinConfig(), Measurements((m,))).clock[m.name] == ()
-
-
-# scores ------------------------------------------------------------------------------------------------------------------
 
 
 def test_score_is_the_arithmetic_written_out():
