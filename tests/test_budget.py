@@ -6,9 +6,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_734,
+    "taccorl/alignment": 15_718,
     "taccorl/cli": 5_098,
-    "taccorl/data": 8_826,
+    "taccorl/data": 8_824,
     "taccorl/diagnosis": 11_309,
     "taccorl/episodes": 5_482,
     "taccorl/evaluation": 1_868,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_780,
-    "tests": 61_208,
+    "tests": 61_211,
     "pipelines": 6_298,
 }
 MOST_LINES_OF_A_FILE = 500

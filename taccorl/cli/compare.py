@@ -89,8 +89,7 @@ def run(config: CompareConfig) -> int:
         return 1
     first, last = comparisons[0], comparisons[-1]
     show(how_far(*comparisons), where(first, ()), cell_numbers(last), not_compared(first))
-    late = {f.feature for own in beside.findings.values() for f in own if f.check == "late_answer" and f.topic}
-    off = far_off(last, twins[-1].fitted_gains, late)
+    off = far_off(last, twins[-1].fitted_gains, beside.findings)
     show(Section(text=[origin_words(first.origins), *off]), *_write(config, comparisons, beside.findings, twins))
     return 0
 

@@ -72,7 +72,7 @@ def run(config: DiagnoseConfig) -> int:
     parts = [part for part in selected if part not in off or "other_gains" in config.accept]  # else an effect stands in
     way = "--accept=other_gains diagnoses it with the stated ones"
     refused = [f"{part}: not diagnosed: {off[part]}. {way}" for part in selected if part not in parts]
-    show(Section(text=[*far_off(beside.comparison, machine.fitted_gains), *refused]))
+    show(Section(text=[*far_off(beside.comparison, machine.fitted_gains, beside.findings), *refused]))
     if not parts:
         return 1
     found = _diagnosed(config, machine, parts, measurements)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -262,13 +262,14 @@ def _waits(f: "Finding") -> bool:
     return f.check == "late_answer" or (f.check == "not_judged" and f.topic == CLOCK)
 
 
-def far_off(comparison: "Comparison", fitted: Collection[str] = (), late: Collection[str] = ()) -> list[str]:
+def far_off(comparison: "Comparison", fitted: Collection[str], findings: Mapping[str, list["Finding"]]) -> list[str]:
     """Lines to print, one for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the
     measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation,
-    test). ``fitted``: signals whose gains are only the start of a fit. ``late``: those that answer far too late."""
+    test). ``fitted``: signals whose gains are only the start of a fit. ``findings``: name of a recording → its findings."""
     import numpy as np
 
     lines: dict[str, str] = {}
+    late = {f.feature for own in findings.values() for f in own if f.check == "late_answer" and f.topic}
     for s in comparison.scores():
         if s.kind != "position" or s.ratio < FEWEST_FLOORS:
             continue

@@ -63,10 +63,8 @@ def check_timing(t: ChannelTiming, episode: Episode) -> Iterator[Finding]:
             found.append(("gaps", f"{text}USB load"))
         if t.age_median_s > OLD_SAMPLES_PERIODS / promised_hz:
             text = f"rows show samples {t.age_median_s * 1000:.0f} ms old (median), {t.age_max_s * 1000:.0f} ms at "
-            text += (
-                f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`"
-            )
-            found.append(("old_samples", text))
+            text += f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind"
+            found.append(("old_samples", f"{text}, set `latency_s` or `clock`"))
     for name, number, what in (  # counted over the whole recording, which may hold many episodes
         ("duplicates", t.duplicates, "samples of the recording repeat a stamp; the first of each was kept"),
         ("out_of_order", t.out_of_order, "samples of the recording were out of order; sorted by stamp"),

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from made_rows import of_signal
 
-from taccorl.alignment.checks.clock import check_clock
+from taccorl.alignment.checks.clock import FAR, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
+from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements
@@ -254,18 +255,21 @@ def test_millivolts_and_gains_per_degree_are_suspected_and_hidden_friction_is_no
     old: str, new: str, expected: bool, tmp_path: Path
 ) -> None:
     made = robot(tmp_path, f"law: pwm, {FILES['pwm'].replace(old, new)}")
-    lines = far_off(RobotMachine(made, "robot").compare(Measurements((recording("pwm", "sweep", 1.5, 1),))))
+    lines = far_off(RobotMachine(made, "robot").compare(Measurements((recording("pwm", "sweep", 1.5, 1),))), (), {})
     assert len(lines) == expected and all("swing" in line and "supply_v" in line for line in lines), lines
 
 
 def test_a_zero_that_only_one_of_two_columns_has_is_named_with_its_size(tmp_path: Path) -> None:
     made = RobotMachine(robot(tmp_path, FILES["impedance"]), "robot")
     m = recording("impedance", "sweep", 1.5, 1)
-    (line,) = far_off(made.compare(Measurements((dataclasses.replace(m, measured=m.measured + 0.26),))))
+    moved = made.compare(Measurements((dataclasses.replace(m, measured=m.measured + 0.26),)))
+    (line,) = far_off(moved, (), {})
     assert "swing" in line and "`zero:`" in line
-    assert float(line.split(" rad from the replay")[0].split()[-1]) == pytest.approx(
-        0.26, abs=0.01
-    )  # less the first swing
+    moved_rad = float(line.split(" rad from the replay")[0].split()[-1])
+    assert moved_rad == pytest.approx(0.26, abs=0.01)  # less the first swing
+    late = find("late_answer", "swing", "swing answers its target 0.51 s late", severity="warning", topic=FAR)
+    (line,) = far_off(moved, (), {m.name: [late]})
+    assert "correct its times" in line and "`zero:`" not in line
 
 
 @pytest.mark.slow
