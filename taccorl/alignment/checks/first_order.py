@@ -96,8 +96,8 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
 
 
 def far_delay(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder | None:
-    """The fit with a delay between ``DELAY_S`` and ``FAR_S``, if it leaves much less than ``fit_first_order``; else None.
-    Play and dry friction delay slow motion alike, but take their size off both ends of its range; such a delay is left out."""
+    """The fit of ``measured`` (T,) to ``target`` (T,) with a delay from ``DELAY_S`` to ``FAR_S`` if it leaves much less than
+    ``fit_first_order``, else None. Play and dry friction delay slow motion, but take their size off both ends of its range."""
     start = find_lag(target[:, None], measured[:, None], max(1, round(1 / period_s)), (0.0, FAR_S))
     rows = max(0, round((start.lag_s - 0.1) / period_s))
     if rows == 0 or len(target) - rows < 2 * DELAY_S / period_s + LEAST_ROWS:
