@@ -237,10 +237,9 @@ def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, An
     rest: list[str] = []
     for name, hint in hints.items():
         typed = [option for option in options if option.startswith(f"--{name}=")]
-        if typing.get_origin(hint) is list and len(typed) > 1 and any(f"--{name}=[" in option for option in typed):
-            raise TaccorlError(
-                f"{typed[0]} and {typed[1]}: give --{name}=[…] once, or repeat --{name}= without brackets"
-            )
+        listed = any(option.startswith(f"--{name}=[") and option.endswith("]") for option in typed)
+        if typing.get_origin(hint) is list and len(typed) > 1 and listed:
+            raise TaccorlError(f"{typed[0]} and {typed[1]}: give --{name}=[…] once, or repeat it without brackets")
     for option in options:
         name, _, value = option.removeprefix("--").partition("=")
         hint = hints.get(name)

@@ -231,9 +231,9 @@ OTHER_WORDS = [
     [
         ("pad", 10, "spec_version rows columns wire.rows wire.columns wire.transpose adc_bits baseline.rule scheme"),
         pytest.param(
-            "dataset", 42, "spec_version action_time dtype shape names sensor history", marks=pytest.mark.slow
+            "dataset", 43, "spec_version action_time dtype shape names sensor history", marks=pytest.mark.slow
         ),
-        pytest.param("recording", 36, "spec_version dataset by from channels align", marks=pytest.mark.slow),
+        pytest.param("recording", 35, "spec_version dataset by from channels align", marks=pytest.mark.slow),
     ],
 )
 def test_digest_changes_with_every_leaf(tmp_path, name, num_changed, relations):
