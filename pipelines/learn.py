@@ -160,7 +160,7 @@ def _gpus(most: int) -> list[str]:
 
 
 def _check(config: LearnConfig) -> None:
-    """Check the options before work that takes hours. Raises SystemExit: an option that a later step would refuse."""
+    """Check the options before hours of work begin. Raises SystemExit: a later step would refuse an option."""
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)

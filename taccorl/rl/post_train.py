@@ -345,7 +345,7 @@ def _progress_until(path: Path, iteration: int) -> str:
 
 
 def _logger(settings: PostTrainSettings) -> Callable[[dict[str, Any]], None]:
-    """Return what logs a row of ``progress.jsonl`` to Weights & Biases if --wandb.enable=true; a resumed run continues there."""
+    """Return a function that logs a row of ``progress.jsonl`` to Weights & Biases, if asked for; a resumed run continues."""
     asked, out = settings.wandb, settings.out
     if not asked.enable:
         return lambda row: None

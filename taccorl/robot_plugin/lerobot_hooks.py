@@ -166,7 +166,7 @@ def install() -> bool:
     _replace(queue, "_check_and_resolve_delays", lambda _: lambda self, _, before: self.last_index - before)
     _replace(rtc, "_normalize_prev_actions_length", lambda _: lambda actions, target_steps: actions[:target_steps])
     _replace(tracker, "max", lambda _: lambda self: max([*self._values][1:][-20:] or self._values, default=0.0))
-    _replace(getattr(rtc, "RTCInferenceEngine", None), "_rtc_loop", _after_the_loop)
+    _replace(getattr(rtc, "RTCInferenceEngine", None), "_rtc_loop", _at_lower_priority)
     for names, field in ((_DATASETS, "newest"), (_POLICIES, "window")):
         for module in names:
             _replace(sys.modules.get(module), "log_visualization_data", _with_pads)
@@ -253,7 +253,7 @@ def _from_now(name: str) -> Callable[[Any], Callable]:
     return lambda _: lambda self: q if (q := getattr(self, name)) is None else q[max(0, self.last_index - 1) :].clone()
 
 
-def _after_the_loop(theirs: Callable) -> Callable:
+def _at_lower_priority(theirs: Callable) -> Callable:
     def predict(self: Any) -> None:
         if sys.platform == "linux":  # where a thread has a niceness of its own
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
@@ -263,7 +263,7 @@ def _after_the_loop(theirs: Callable) -> Callable:
 
 
 def _regained(theirs: Callable) -> Callable:
-    """Sleep for less where the last sleep was too long: LeRobot counts each period from the end of the last sleep."""
+    """Shorten a sleep by how much the last one was too long: LeRobot's periods begin at its end, and would all be longer."""
     late_s = 0.0
 
     def sleep(seconds: float) -> None:

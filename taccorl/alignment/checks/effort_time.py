@@ -35,9 +35,9 @@ CLIPPED = 0.98
 SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
 SIGN_SURE, MOST_SHARE = 0.5, 4.0
-"""A fit of the drive's law tells sign and size of its gain if its residual is at most this share of the RMS effort, and r at most
-4. The effort of a well damped drive is a small difference of large terms, which r of 32 or 34 imitated beside any gain; wrong
-models gave up to 1.5. Choices."""
+"""Sign and size of the gain are believed if a fit of the drive's law leaves at most this share of the RMS effort, and r is at
+most 4. The effort of a well damped drive is a small difference of large terms: fits with r above 30 left as little with wrong
+gains; with wrong models r was 1.5 at most. Both are choices."""
 MOST_EARLY, EARLY = 10, 0.5
 """Most rows by which efforts are tried as recorded too early; and largest residual of the law at a shift, as a share of that
 without a shift, for which the shift is reported. Choices."""

@@ -46,7 +46,7 @@ def arriving(p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: f
             store(commands, n, now)
     for lane in range(LANES):
         if numbers[_DELAY, lane] > 0.0:
-            # MuJoCo reads its history before it stores: one step at least.
+            # MuJoCo reads its delay buffer before it writes the new value: the shortest delay is one physics step.
             late = max(numbers[_DELAY, lane] / step_s, 0.0 if numbers[_MIDPOINT, lane] > 0.0 else 1.0)
             whole = math.floor(late)
             own = commands[:, lane].copy()

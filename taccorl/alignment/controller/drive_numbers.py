@@ -10,7 +10,7 @@ from taccorl.sim.effects.effect import JOINT_SLOTS, ArmEffect
 FAMILIES = (command, drive, encoder, friction, gear, load)
 """Modules of the effects that the model has."""
 POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
-"""Codes for the quantity that a command states (``Drive.command``)."""
+"""Values of ``Drive.command``: which quantity of the joint commands set, its position, velocity or torque."""
 
 
 class _Own(NamedTuple):
@@ -29,7 +29,7 @@ class _Own(NamedTuple):
     rotor_inertia: float = 0.0
     """Share of ``inertia`` on the motor's side of the gear [kg·m²]."""
     gravity_sin: float = 0.0
-    """S [N·m] in the weight's torque S sin q + C cos q, which the motor must hold."""
+    """S [N·m] of the motor torque S sin q + C cos q that holds the link's weight at joint position q."""
     gravity_cos: float = 0.0
     """C [N·m] in the same torque."""
     compensation_sin: float = 0.0

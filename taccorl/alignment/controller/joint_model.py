@@ -76,7 +76,7 @@ class Numbers(NamedTuple):
     age_s: float = 0.0
     """Additional age of the measured position when the drive's torque acts."""
     facts: Mapping[str, float] | None = None
-    """Field of ``drive_numbers.Drive`` → value to use instead of the joint's."""
+    """Overrides: name of a field of ``drive_numbers.Drive`` → value that is used instead of the joint's own."""
 
 
 class _Prepared(NamedTuple):

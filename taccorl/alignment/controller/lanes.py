@@ -129,7 +129,7 @@ def _place(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
 
 
 def row_of(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
-    """Make the LLVM instruction that loads one row: ``values`` are an array (R, LANES) of type ``array``, and the row's index."""
+    """LLVM code that loads a row of an array (R, LANES): ``values``: the array, of Numba type ``array``, and the row."""
     return builder.load(_place(context, builder, array, values), align=8)
 
 

@@ -192,7 +192,7 @@ class _Rows:
         if not rates:
             raise RecordingError(f"{self.cutter.recording.source.name}: fewer than two commands: nothing to replay")
         name, rate_hz = max(rates.items(), key=lambda item: item[1])
-        said = self.spec.channels[name].rate_hz
+        said = self.cutter.nominal_hz(name)
         return said if abs(rate_hz / said - 1) < RATE_TOLERANCE else rate_hz
 
     def _many(self, channel: str) -> bool:

@@ -164,7 +164,7 @@ class Problem(Protocol):
     candidates: dict[str, Candidate]
     """Name of the effect → candidate."""
     at_once: int
-    """Number of cases that ``simulate_all`` computes in about the time of one."""
+    """Number of parameter sets that ``simulate_all`` simulates side by side in about the time of one."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.

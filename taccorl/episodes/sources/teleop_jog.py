@@ -1,4 +1,4 @@
-"""Cartesian jogging of the twin's two hands: keys → steps of one hand → joint targets.
+"""Cartesian jogging of the twin's hands: a key moves one hand's goal by a step; inverse kinematics gives joint targets.
 
 A hand moves along the bench's axes (x away from the arms, y left, z up) and turns about its own (x towards its palm's edge,
 y the fingers' closing direction, z the approach). A goal that is out of reach is refused, so that it never runs away from the

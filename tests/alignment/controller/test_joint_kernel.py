@@ -1,4 +1,4 @@
-"""The compiled one-joint model: functions of eight numbers at once, lanes that do not touch each other, sources that change."""
+"""The compiled one-joint model: its vectorised functions, simulations side by side that must not mix, compilation anew."""
 
 import math
 import shutil
