@@ -40,7 +40,6 @@ bench: .venv/.ready  ## measure; writes bench.json and docs/benchmarks.md (ONLY=
 pictures: .venv/.ready  ## draw the pictures of the README and docs/effects.md again
 	$(BIN)/python -m pipelines.task_pictures
 	$(BIN)/python -m pipelines.effects_page
-	$(BIN)/python -m pipelines.mend_picture
 
 notebooks: .venv/.ready  ## run the notebooks and store their outputs (ONLY=2: the second)
 	$(BIN)/python tests/notebooks/stored_outputs.py $(ONLY)

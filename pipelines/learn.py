@@ -219,7 +219,7 @@ def _single(config: LearnConfig, robot: Path) -> list[Path | None]:
     parts = {name: {name: getattr(whole, name)} for name in sections if getattr(whole, name) != getattr(nominal, name)}
     for effect in present(whole.effects):
         parts.setdefault(effect.name, {"effects": []})["effects"].append(effect)
-    files = {config.out / "surrogates" / _named(robot) / f"{name}_of_{robot.stem}.yaml": parts[name] for name in parts}
+    files = {config.out / "surrogates" / named(robot) / f"{name}_of_{robot.stem}.yaml": parts[name] for name in parts}
     for path, part in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         save_twin(dataclasses.replace(nominal, **part), path)
@@ -230,7 +230,7 @@ def _is_folder(twin: str | Path) -> bool:
     return any(Path(twin).glob("*.yaml"))
 
 
-def _named(twin: Path) -> str:
+def named(twin: Path) -> str:
     """Name and digest of a twin file, or of a folder of them."""
     files = sorted(twin.glob("*.yaml")) or [twin]
     digests = "".join(twin_digest(load_twin(file)) for file in files)
@@ -240,7 +240,7 @@ def _named(twin: Path) -> str:
 def mended(config: LearnConfig, robot: Path) -> Path:
     """The twin that commands make of sweeps and presses of the surrogate ``robot``, where it is not there yet. It starts from the
     nominal one, and nothing of ``robot`` but the recordings is read."""
-    folder = config.out / "surrogates" / _named(robot)
+    folder = config.out / "surrogates" / named(robot)
     done, twin = folder / f"mended_{robot.stem}.yaml", folder / "sweeps" / TWIN
     if done.exists():
         return done
@@ -270,10 +270,10 @@ def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tupl
         some = dataclasses.replace(config, episodes=[each], workers=workers)
         with ThreadPoolExecutor(config.workers) as pool:
             parts = [made for made, _ in pool.map(lambda file: demonstrations(some, task, file), files)]
-        both = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{_named(made_in)}"
+        both = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{named(made_in)}"
         step(merge.run, MergeConfig(sim=parts, out=both, store=store, pictures="cache", resolution=RESOLUTION))
         return both, store
-    name, whole = ("", TwinConfig()) if made_in is None else (f"_{_named(made_in)}", load_twin(made_in))
+    name, whole = ("", TwinConfig()) if made_in is None else (f"_{named(made_in)}", load_twin(made_in))
     twin = folder / f"twin_of_{config.physics_steps}_steps{name}.yaml"
     dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps{name}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -342,8 +342,8 @@ def _scored(
     """Score the trained policy, if that is not done yet, on ``gpu`` or the CPU. Returns the folder of the results."""
     (task, pictures), (difficulty, executed, hidden, robot) = scene, cell
     length = "" if config.episode_length is None else f"_{config.episode_length}_steps"
-    about = about | {"scored_in": _named(robot) if robot else "", "steps": training.steps}
-    length += f"_in_{_named(robot)}" if robot else ""
+    about = about | {"scored_in": named(robot) if robot else "", "steps": training.steps}
+    length += f"_in_{named(robot)}" if robot else ""
     out = training.folder / f"score_{config.scored}_{difficulty}_{executed}_{pictures}_{hidden}{length}"
     if not out.exists():
         asked = EvaluateConfig(

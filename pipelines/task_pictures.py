@@ -1,5 +1,5 @@
 """``make pictures``: the tasks as the cameras see them (docs/task_*.png), and their rows in docs/twin.md; an insertion
-beside what the pads read (docs/insertion.gif). All simulated."""
+beside what the pads read (docs/insertion.gif); a joint's twin before and after (docs/mended_twin.png). All simulated."""
 
 import re
 from pathlib import Path
@@ -8,11 +8,17 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw
 
+from taccorl.diagnosis.comparison.compare import compare
+from taccorl.diagnosis.machines.piper import PiperTwin
+from taccorl.diagnosis.problems.joints import diagnose_joint
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.expert import ExpertSource
+from taccorl.report.figures import joint_response
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.surrogate.cases import draw_case
+from taccorl.surrogate.recordings import recordings
 from taccorl.tasks.experts import tasks_with_expert
 from taccorl.views.colors import PAD_COLORS, heat
 from taccorl.views.contact_sheet import font
@@ -78,6 +84,16 @@ def insertion(sim: Simulation, states: np.ndarray, counts: np.ndarray) -> list[I
     return frames
 
 
+def mended_twin() -> None:
+    """Draw the case of ``make demo`` and notebook 3, a surrogate robot with dry friction: the twin before and after."""
+    case = draw_case(["coulomb_friction"], seed=3, signal="left_joint4", strength=12.0, gains_known=True)
+    measurements = recordings(case, "chirp")
+    found = PiperTwin(case.twin).mended([diagnose_joint(case.twin, case.signal, measurements)])[0].config
+    both = (compare(twin, measurements, name="twin").traces for twin in (case.twin, found))
+    shown = [next(t for t in traces if (t.recording, t.kind) == ("held_triangle", "position")) for traces in both]
+    joint_response(*shown).savefig(OUT / "mended_twin.png", dpi=80)
+
+
 def main() -> None:
     """One strip a task: ``VIEWS`` at four moments. One task's episode as a GIF."""
     for task in tasks_with_expert():
@@ -99,6 +115,7 @@ def main() -> None:
             first.save(OUT / "insertion.gif", save_all=True, append_images=rest, duration=times, loop=0, optimize=True)
         sim.close()
     PAGE.write_text(with_rows(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    mended_twin()
 
 
 if __name__ == "__main__":

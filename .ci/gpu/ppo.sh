@@ -27,11 +27,11 @@ from pipelines.learn import LearnConfig, demonstrations, parsed
 demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), 'assembly_1', Path('$robot'))" --task=assembly_1 --episodes="$demonstrations" \
   --scored_in=["$robot"] --out=/dev/shm/anchor --workers="$threads" >/dev/shm/made_anchor.log 2>&1
 since "anchor made: $?"
-improve() { # NUMBER TWIN ANCHOR
+improve() { # NUMBER TWIN STAGE
   out=/dev/shm/learn_ppo/assembly_1/policy_$2_$3 twin=() first=$(($1 % gpus * quarter))
   local cores=$first-$((first + quarter - 1))
   if [ "$2" = mended ]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
-  if [ "$3" = anchored ]; then
+  if [ "$3" = ppo_anchored ]; then
     anchor=(--anchor.dataset="$(echo /dev/shm/anchor/assembly_1/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store)
   else
     anchor=(--anchor.weight=0)
@@ -43,17 +43,29 @@ improve() { # NUMBER TWIN ANCHOR
     --save_freq=5 --keep_checkpoints=1 --rerun=false "${twin[@]}" "${anchor[@]}" "${options[@]}" --out="$out" >"$out.log" 2>&1
   since "$2 $3 ended: $?"
   for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
-    score=$out/score_$scored$([ "$scored_of" = "$policies/$2" ] && echo _before)
-    if [ "$3" = plain ] || [ "$scored_of" != "$policies/$2" ]; then
+    stage=$([ "$scored_of" = "$policies/$2" ] && echo start || echo "$3")
+    score=$out/score_${scored}_train_8_clear_nothing_$stage
+    if [ "$3" = ppo ] || [ "$scored_of" != "$policies/$2" ]; then
       OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task=assembly_1 \
         --policy.n_action_steps=8 --episodes="$scored" --seed=60000 --twin="$robot" --batch_size=64 --workers=$(((quarter + 1) / 2)) --failures=0 \
         --out="$score" >"$score.log" 2>&1
       since "$2 $3 scored: $?"
+      python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" <<'P'
+import json, re, sys
+from pathlib import Path
+
+from pipelines.learn import named
+
+learnt, robot, score, stage = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
+of, twin = re.fullmatch(r"train_(\d+)_20_steps_?(.*)", Path(learnt["dataset"]["root"]).name).groups()
+about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin, "scored_in": named(Path(robot)), "steps": learnt["steps"]}
+(Path(score) / "settings.json").write_text(json.dumps(about | {"stage": stage}))
+P
     fi
   done
 }
 for k in 0 1 2 3; do
-  improve $k "$([ $k -lt 2 ] && echo nominal || echo mended)" "$([ $((k % 2)) = 0 ] && echo plain || echo anchored)" &
+  improve $k "$([ $k -lt 2 ] && echo nominal || echo mended)" "$([ $((k % 2)) = 0 ] && echo ppo || echo ppo_anchored)" &
 done
 wait
 touch /dev/shm/done

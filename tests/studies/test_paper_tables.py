@@ -12,8 +12,7 @@ ROW = ABOUT | ONE | {"difficulty": "train", "executed": 8, "first_scene": 70}
 
 
 def test_a_score_becomes_one_row_however_often_it_is_taken(tmp_path):
-    score = tmp_path / "score_96_train_8_clear_nothing"
-    score.mkdir()
+    (score := tmp_path / "score_96_train_8_clear_nothing").mkdir()
     told = {"scores": [ONE], "scenes": {"difficulty": "train", "seed": 70}, "policies": [{"digest": "d"}]}
     for name, text in (("settings", ABOUT), ("evaluation", told)):
         (score / f"{name}.json").write_text(json.dumps(text))
@@ -30,8 +29,10 @@ def test_cells_are_what_was_counted():
     assert gain({"mended": rows[1:]}, "randomised") == "not run"
     six = [[ROW | {"n": 100, "successes": k + 10 * j} for j in range(3)] for k in (0, 30)]
     assert gain({"nominal": six[0], "mended": six[1]}).endswith("; +7 … +53")  # 30 ± 2.776 · √(200 / 3), Welch
-    moved = transfer([row | {"scored_in": "late_cd34"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]])
-    assert {key: list(of) for key, of in moved.items()} == {("late", 9): ["nominal", "mended", "randomised"]}
+    moved = [row | {"scored_in": "late_cd34"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]]
+    assert {key: [*of] for key, of in transfer(moved).items()} == {("late", 9): ["nominal", "mended", "randomised"]}
+    assert transfer(after := [row | {"stage": "ppo"} for row in moved]) == {}
+    assert "| late | after | 0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* | +14; p = 2e-05 |" in page(after)
     assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96* | not run |" in page(rows[:1])
 
 
