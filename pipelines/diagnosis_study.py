@@ -1,8 +1,8 @@
-"""``python -m pipelines.diagnosis_study pack chirp … [--seeds=10] [--workers=2] [--rows=PATH] [--first_seed=60000]``
+"""``python -m pipelines.diagnosis_study pack chirp … [--seeds=10] [--workers=2] [--rows=PATH] [--first_seed=100000]``
 
 Is the search for missing effects right? On surrogate robots. Rows go to docs/diagnosis_study.jsonl as they are finished; what is
 there is not run again (a case that failed is, with ``--again``). ``--page`` writes docs/diagnosis.md from the rows and runs
-nothing. Thresholds were chosen on seeds 300 to 999 and 15000 to 59999; seeds from 60000 on are for the page only.
+nothing. Thresholds were chosen on seeds 300 to 999 and 15000 to 99999; seeds from 100000 on are for the page only.
 """
 
 import json
@@ -29,7 +29,7 @@ from taccorl.surrogate.hidden import OUTSIDE, REGISTERED  # noqa: E402
 from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # noqa: E402
 
 ROWS = Path("docs/diagnosis_study.jsonl")
-FIRST_SEED = 60000
+FIRST_SEED = 100000
 PAIRS = (
     ("coulomb_friction", "command_delay"),
     ("coulomb_friction", "gravity_mismatch"),

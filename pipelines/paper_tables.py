@@ -178,8 +178,8 @@ assembly_1, cameras and touch, learnt in a twin, scored in the surrogate. Gains 
 
 ### After PPO in the twin of the demonstrations
 
-A policy of each twin, post-trained there (11 … 15 iterations, 1100 s), without and with an anchor on 50 demonstrations of the
-surrogate; scored in the surrogate, scenes from seed 60000.
+A policy of each twin, post-trained there, without and with an anchor on 50 demonstrations of the surrogate, in which all are
+scored ([settings](training.md#post-training-ppo-in-the-twin)).
 
 {_table("surrogate | PPO | in: nominal | in: mended | mended − nominal", sorted(table_4, key=lambda row: row[0]))}
 
@@ -239,9 +239,9 @@ def _counts(rows: Rows) -> tuple[int, int]:
 
 def draw(rows: Rows, path: Path) -> None:
     """A picture: completed in each surrogate, with the most demonstrations; intervals of the scenes; a dot for each training."""
-    figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-    table = {f"{robot}: {ROBOTS[robot]}": of for (robot, _), of in reversed(transfer(rows).items())}
-    table |= {f"{robot}, after PPO in the twin": of for (robot, _), of in transfer(rows, "ppo").items()}
+    figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    table = {f"{robot}:\n{ROBOTS[robot]}": of for (robot, _), of in reversed(transfer(rows).items())}
+    table |= {f"{robot},\nafter PPO in the twin": of for (robot, _), of in transfer(rows, "ppo").items()}
     shown = [twin for twin in TWINS if any(twin in of for of in table.values())]
     for k, twin in enumerate(shown):
         off = 0.8 * ((k + 0.5) / len(shown) - 0.5)

@@ -90,8 +90,10 @@ def mended_twin() -> None:
     measurements = recordings(case, "chirp")
     found = PiperTwin(case.twin).mended([diagnose_joint(case.twin, case.signal, measurements)])[0].config
     both = (compare(twin, measurements, name="twin").traces for twin in (case.twin, found))
-    shown = [next(t for t in traces if (t.recording, t.kind) == ("held_triangle", "position")) for traces in both]
-    joint_response(*shown).savefig(OUT / "mended_twin.png", dpi=80)
+    before, after = (
+        next(t for t in traces if (t.recording, t.kind) == ("held_triangle", "position")) for traces in both
+    )
+    joint_response(before, after).savefig(OUT / "mended_twin.png", dpi=80)
 
 
 def main() -> None:
