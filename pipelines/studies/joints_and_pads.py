@@ -6,6 +6,7 @@ hidden in it. Rows of any number of machines and sessions add up in one file; ``
 """
 
 import dataclasses
+import math
 import time
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -286,7 +287,10 @@ def inside(row: dict[str, Any], *, hidden_only: bool = False) -> list[bool]:
         hidden_only: numbers of the hidden effects, and not those that are always fitted.
     """
     own = tuple(f"{name}." for name in row["hidden"])
-    held = {name: low <= true <= high for name, (_, low, high, true) in row["numbers"].items()}
+    held = {}
+    for name, (value, low, high, true) in row["numbers"].items():
+        turns = round((value - true) / math.tau) if name.endswith(".phase_rad") else 0
+        held[name] = low <= true + turns * math.tau <= high
     return [held[name] for name in held if not hidden_only or name.startswith(own)]
 
 

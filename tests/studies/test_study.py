@@ -128,6 +128,8 @@ def test_intervals_hold_the_truth_or_do_not():
     r = row(("backlash",), ("backlash",), numbers=numbers)
     assert inside(r) == [True, False]
     assert inside(r, hidden_only=True) == [False]
+    turned = row(("cogging",), ("cogging",), numbers={"cogging.phase_rad": [-5.41, -5.64, -5.19, 1.03]})
+    assert inside(turned) == [True]  # 1.03 − 2 π = −5.25
 
 
 def test_a_failed_case_is_material_so_that_it_counts():

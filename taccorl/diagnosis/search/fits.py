@@ -20,6 +20,7 @@ from taccorl.diagnosis.search.fit import (
     fit,
     inverse_of,
     moved_by,
+    out_of_dents,
     over_own_scale,
     rms,
     stacked,
@@ -42,9 +43,6 @@ SURELY_FULL, NEAR_BEST = 2, 1.3
 times the least error. The factor is that of ``SearchConfig.floor``."""
 STUCK = 1.001
 """Factor on the error of a model: a fit that contains the model and leaves more than that has stopped in a worse place."""
-BESIDE = (0.9, 0.97, 1.03, 1.1)
-"""The newest effect of a model above the floor is fitted again from its fitted values times these factors: the error is not
-smooth in a limit or in dry friction, so that the solver stops early."""
 PAST_ROW = 0.02
 """Share of a row by which a fit of a delay begins beyond a whole row."""
 NEARLY = 0.1
@@ -315,12 +313,10 @@ class Fits:
         if self.at_floor(model) or model.polished or not self.added(model):
             return model
         self.progress(f"refitting {' and '.join(model.names)} from beside their values")
-        fits = [fit(self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE)]
-        newest = self.problem.candidates[model.names[-1]]
-        own = [f.name for f in newest.frees if f.log and model.fit.values[f.name] > 0.0]
-        beside = [model.fit.values | {n: model.fit.values[n] * by} for n in own for by in BESIDE]
-        fits.append(self.fitted(model.names, [fits[0].values, *beside]))
-        found = self._keep(min(fits, key=lambda f: f.error), full=True)
+        wide = fit(self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE)
+        fits = [wide, self.fitted(model.names, [wide.values])]
+        found = out_of_dents(self.problem, min((model.fit, *fits), key=lambda f: f.error), self.fit_to, STEPS)
+        found = self._keep(found, full=True)
         found.polished = True
         return found
 
@@ -328,7 +324,7 @@ class Fits:
         """Fit of the same hypothesis until it converges, with derivatives fine enough for its intervals. Numbers that go on
         moving while χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
         self.progress("last refit, with finer derivatives")
-        fine = self._fine(model)
+        fine = self._fine(out_of_dents(self.problem, model, self.fit_to, STEPS))
         if fine.trouble:
             further = self._fine(fine)
             fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows

@@ -5,7 +5,7 @@ import pytest
 from made_problem import MadeProblem, Ripple, Square, record
 
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
-from taccorl.diagnosis.search.fit import FAR, FINE, fit, over_own_scale, residuals, rms
+from taccorl.diagnosis.search.fit import FAR, FINE, fit, out_of_dents, over_own_scale, residuals, rms
 from taccorl.diagnosis.search.problem import Free, free
 from taccorl.diagnosis.search.screen import alike, probe
 
@@ -62,6 +62,25 @@ def test_where_a_response_jumps_an_interval_is_as_wide_as_over_its_own_range():
     assert steps[0] == pytest.approx(0.005, rel=0.4)
     smooth = fit(Offset(), recording, (), {}, step=FINE)
     assert over_own_scale(Offset(), smooth, recording)[0].covariance() == pytest.approx(smooth.covariance(), rel=1e-6)
+
+
+class Dented(MadeProblem):
+    """A strength s acts as s + 0.02 sin(s / 0.004): its slope is negative in places."""
+
+    def simulate(self, base, effects, recording):
+        acts = [Ripple(strength=one.strength + 0.02 * np.sin(one.strength / 0.004)) for one in effects]
+        return super().simulate(base, acts, recording)
+
+
+@pytest.mark.parametrize("start", [1.5, 1.8, 2.5])
+def test_a_fit_goes_on_from_a_dent_that_it_stopped_in(start):
+    recording, begun = [record(0, Ripple(strength=2.0))], {"ripple.strength": start}
+    stopped = fit(Dented(Ripple), recording, ("ripple",), begun, step=FINE)
+    found = out_of_dents(Dented(Ripple), stopped, recording, 30, FINE)
+    assert stopped.error > 1.5 and abs(stopped.values["ripple.strength"] - 2.0) > 0.2
+    assert found.error < 1.0 and abs(found.values["ripple.strength"] - 2.0) < 0.05
+    smooth = fit(MadeProblem(Ripple), recording, ("ripple",), begun)
+    assert out_of_dents(MadeProblem(Ripple), smooth, recording, 30) is smooth
 
 
 def test_a_number_at_its_bound_is_said_to_be_there():
