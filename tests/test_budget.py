@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_718,
     "taccorl/cli": 5_097,
     "taccorl/data": 8_824,
-    "taccorl/diagnosis": 11_309,
+    "taccorl/diagnosis": 11_308,
     "taccorl/episodes": 5_482,
     "taccorl/evaluation": 1_868,
     "taccorl/lerobot_plugin": 343,

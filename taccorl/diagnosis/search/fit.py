@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -36,16 +36,13 @@ ENTRIES_LEFT_OVER = 4
 """Number of independent entries as which that rest counts for intervals, however many rows it has: unlike noise it does not
 average out. On 27 simulated joints with one effect fitted and another one missing, intervals of the fitted strength held the
 truth in 23 cases; in 17 without this, in 18 with 36 entries, in 24 with 1."""
-OUTLYING = 10.0
-"""Residual [floors] from which a robust fit (``loss="cauchy"``) discounts a row."""
 _OPEN = 1e-14
 """Directions that move the residuals, squared, so little of the strongest one count as this: open."""
 _AT_BOUND = 1e-3
 """Share of a parameter's range from its end that counts as being there."""
 
 
-ASIDE = tuple(side * step for side in (-1.0, 1.0) for step in (0.01, 0.03, 0.1, 0.3))
-"""Steps of ``out_of_dents`` in a coordinate."""
+_ASIDE = tuple(side * step for side in (-1.0, 1.0) for step in (0.01, 0.03, 0.1, 0.3))
 _DENTS, _DEEPER = 4, 0.998
 """``out_of_dents`` goes on at most ``_DENTS`` times, each time to at most ``_DEEPER`` times the error."""
 DECADES = 100.0
@@ -259,11 +256,8 @@ def residuals(
 def stacked(
     problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
 ) -> np.ndarray:
-    """(n,) residuals of all recordings [floors], one after another, without entries that were not measured.
-
-    Args:
-        base: always fitted numbers: name → value.
-    """
+    """(n,) residuals of all recordings [floors], one after another, without entries that were not measured. ``base``: always
+    fitted numbers."""
     return stacked_all(problem, [(base, effects)], recordings)[0]
 
 
@@ -302,7 +296,6 @@ def fit(
     start: Mapping[str, float],
     most: int = 40,
     step: float = COARSE,
-    loss: Literal["linear", "cauchy"] = "linear",
     prior: Sequence[tuple[float, float]] = (),
 ) -> Fit:
     """Fit all numbers of a hypothesis together, but for those that are held.
@@ -312,8 +305,6 @@ def fit(
         start: start values; numbers that are left out start at their defaults.
         most: most steps of the solver.
         step: step of its finite differences.
-        loss: ``cauchy`` counts a residual r as log(1 + (r / ``OUTLYING``)²), so that stretches that a number moves by jumps (a
-            pendulum that sticks one swing earlier) do not hold back the others. For a start of a ``linear`` fit.
         prior: mean and standard deviation of each coordinate, whose squared distance is added to the squared residuals; none: no
             prior. It is not part of the result's residuals and derivatives.
     """
@@ -378,8 +369,6 @@ def fit(
         ftol=1e-5,
         xtol=1e-6,
         gtol=1e-9,
-        loss=loss,
-        f_scale=OUTLYING,
     )
     ended = np.clip(found.x + shift, low, high)
     values, effects = at(ended)
@@ -398,21 +387,18 @@ def fit(
 
 
 def out_of_dents(problem: Problem, model: Fit, recordings: Sequence[Recording], most: int, step: float = COARSE) -> Fit:
-    """``model``, or fits from the best of points beside it, as long as they leave less. Where a link bounces in its play, sticks or
-    is limited, the error has dents in which the solver stops, a fifth of the play away from the truth. One number of an effect is
-    moved by ``ASIDE`` at a time; the others stay.
+    """``model``, or fits (``fit``) from the best of points beside it, as long as they leave less.
 
-    Args:
-        recordings: those of ``model``.
-        most: most steps of the solver in each fit.
-        step: step of its finite differences.
-    """
+    Where a link bounces in its play, sticks or is limited, the error has dents in which the solver stops, a fifth of the play off
+    the truth. One coordinate at a time is moved by ``_ASIDE``, the others stay. ``recordings``: those of ``model``."""
     own = model.frees if any("." in f.name for f in model.frees) else ()
     candidates = chosen(problem, model.names)
     for _ in range(_DENTS if own else 0):
         beside = []
         for f in own:
-            to = np.clip(f.coordinate(model.values[f.name]) + np.array(ASIDE), f.coordinate(f.low), f.coordinate(f.high))
+            to = np.clip(
+                f.coordinate(model.values[f.name]) + np.array(_ASIDE), f.coordinate(f.low), f.coordinate(f.high)
+            )
             beside += [model.values | {f.name: f.value(c)} for c in to]
         cases = [(v, problem.prepare(v, [c.make(v) for c in candidates], recordings)) for v in beside]
         errors = np.mean(np.square(stacked_all(problem, cases, recordings)), axis=1)
@@ -432,11 +418,5 @@ def best_fit(
     starts: Sequence[Mapping[str, float]],
     most: int = 40,
 ) -> Fit:
-    """The best of several fits with different start values, by its squared residuals.
-
-    Args:
-        names: effects of the hypothesis.
-        starts: start values of each fit.
-        most: most steps of the solver in each.
-    """
+    """The fit (``fit``) that leaves least, of one from each of ``starts``."""
     return min((fit(problem, recordings, names, start, most) for start in starts), key=lambda f: f.error)

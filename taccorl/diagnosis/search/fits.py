@@ -13,7 +13,6 @@ import numpy as np
 from taccorl.diagnosis.search.evidence import Blocks, above_floor, bic_gain, block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import (
     FINE,
-    OUTLYING,
     WIDE,
     Fit,
     best_fit,
@@ -41,6 +40,8 @@ model without one of its effects. On the studies the true one was among the firs
 SURELY_FULL, NEAR_BEST = 2, 1.3
 """After a few steps these are fitted fully: the first 2 of the screening, the 2 with the least error, and all with at most 1.3
 times the least error. The factor is that of ``SearchConfig.floor``."""
+FAR_OFF = 10.0
+"""RMS residual [floors] from which on the first fits, too, leave dents (``out_of_dents``): a swing that sticks earlier."""
 STUCK = 1.001
 """Factor on the error of a model: a fit that contains the model and leaves more than that has stopped in a worse place."""
 PAST_ROW = 0.02
@@ -233,9 +234,9 @@ class Fits:
             there = self.models.get(key | {n})
             self.progress(f"first refit with {n}, {k} of {len(names)}")
             short[n] = there.fit if there is not None and there.full else self._short(parent.fit, n, starts[n][0])
-        if short and min(f.error for f in short.values()) > OUTLYING:
-            self.progress("refitting without what is far off")
-            short |= {n: self._rough(short[n]) for n in names[:4]}
+        if short and min(f.error for f in short.values()) > FAR_OFF:
+            self.progress("refitting from beside what is far off")
+            short |= {n: out_of_dents(self.problem, short[n], self.fit_to, FIRST_STEPS) for n in names[:4]}
         most_removed = parent.fit.error**2 - min((f.error for f in short.values()), default=0.0) ** 2
         for n in [n for n in names if short[n].trouble]:  # along a ridge of several numbers a few steps do not go far
             if parent.fit.error**2 - short[n].error ** 2 > 0.5 * most_removed > 0.0:
@@ -267,15 +268,6 @@ class Fits:
             whole = int(model.values[delay] / row_s)
             more += [model.values | self.given | {delay: (k + PAST_ROW) * row_s} for k in (whole, whole + 1)]
         return min((model, *(self.fitted((*parent.names, name), [one], steps) for one in more)), key=lambda m: m.error)
-
-    def _rough(self, model: Fit) -> Fit:
-        """``model``, or the best robust fit from where the numbers began if that leaves less: stretches that answer by jumps,
-        such as a swing that sticks earlier, hold a linear fit beside the truth."""
-        found = [model]
-        for start in self.problem.candidates[model.names[-1]].starts[:3]:
-            begun = self.given | start
-            found.append(fit(self.problem, self.fit_to, model.names, begun, 2 * FIRST_STEPS, loss="cauchy"))
-        return min(found, key=lambda m: m.error)
 
     def _full(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
         """``parent`` with one effect more; never worse than ``parent``, which it contains."""
@@ -314,9 +306,8 @@ class Fits:
             return model
         self.progress(f"refitting {' and '.join(model.names)} from beside their values")
         wide = fit(self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE)
-        fits = [wide, self.fitted(model.names, [wide.values])]
-        found = out_of_dents(self.problem, min((model.fit, *fits), key=lambda f: f.error), self.fit_to, STEPS)
-        found = self._keep(found, full=True)
+        least = min((model.fit, wide, self.fitted(model.names, [wide.values])), key=lambda f: f.error)
+        found = self._keep(out_of_dents(self.problem, least, self.fit_to, STEPS), full=True)
         found.polished = True
         return found
 

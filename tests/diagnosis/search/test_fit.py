@@ -177,23 +177,3 @@ def test_strengths_that_cannot_change_sign_are_searched_on_a_logarithmic_scale()
     assert both.value(both.coordinate(-2.5)) == pytest.approx(-2.5)
     assert one.value(one.coordinate(1e9)) == pytest.approx(one.high)
     assert one.value(9e9) == one.high
-
-
-class Sticking(MadeProblem):
-    """A tenth of the rows is off by 100 (1 + (gain − 1)²) floors while the gain is below 2.8: a minimum near 1. The gain is 3."""
-
-    def simulate(self, base, effects, recording):
-        values = super().simulate(base, effects, recording)
-        if base["gain"] < 2.8:
-            stuck = len(values) // 10
-            values[:stuck] = recording.measured[:stuck] + 100.0 * recording.floor * (1.0 + (base["gain"] - 1.0) ** 2)
-        return values
-
-
-def test_rows_that_answer_by_a_jump_hold_a_linear_fit_back_and_not_a_robust_one():
-    start = {"gain": 0.5, "offset": 0.0}
-    held = fit(Sticking(), [record(0)], (), start)
-    rough = fit(Sticking(), [record(0)], (), start, loss="cauchy")
-    assert 0.5 < held.values["gain"] < 2.0
-    assert rough.values["gain"] == pytest.approx(3.0, abs=0.1)
-    assert fit(Sticking(), [record(0)], (), rough.values).error == pytest.approx(1.0, abs=0.1)
