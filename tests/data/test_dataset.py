@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from by_lerobot import write_with_lerobot
 
 from taccorl.data.dataset import Dataset, dataset_spec_from_json, dataset_spec_to_json, episode_record
 from taccorl.data.episode import ChannelTiming, Episode
@@ -45,50 +46,21 @@ def state(episode: int, row: int) -> np.ndarray:
     return np.array([episode, row, 0.1 * row], np.float32)
 
 
-def write_with_lerobot(root: Path, encoder: dict[str, Any]) -> None:
-    from taccorl.data.lerobot_format import quiet_lerobot
-
-    with quiet_lerobot():
-        from lerobot.configs import RGBEncoderConfig
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        video = {"dtype": "video", "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
-        dataset = LeRobotDataset.create(
-            repo_id="local/made",
-            root=root,
-            fps=30,
-            robot_type="toy",
-            features={
-                "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
-                "observation.tactile": {"dtype": "int16", "shape": (1536,), "names": None},
-                "observation.grip": {"dtype": "float32", "shape": (1,), "names": None},
-                "observation.matrix": {"dtype": "float32", "shape": (2, 2), "names": None},
-                "observation.note": {"dtype": "string", "shape": (1,), "names": None},
-                "next.done": {"dtype": "bool", "shape": (1,), "names": None},
-                FRONT: video,
-                WRIST: video,
-            },
-            streaming_encoding=True,
-            encoder_queue_maxsize=64,
-            rgb_encoder=RGBEncoderConfig(**encoder),
-        )
-        for episode, length in enumerate(LENGTHS):
-            for row in range(length):
-                dataset.add_frame(
-                    {
-                        "observation.state": state(episode, row),
-                        "observation.tactile": tactile(episode, row),
-                        "observation.grip": np.array([row], np.float32),
-                        "observation.matrix": np.full((2, 2), row, np.float32),
-                        "observation.note": "hello",
-                        "next.done": np.array([row == length - 1]),
-                        FRONT: np.full((64, 64, 3), grey(FRONT, row), np.uint8),
-                        WRIST: np.full((64, 64, 3), grey(WRIST, row), np.uint8),
-                        "task": TASKS[episode],
-                    }
-                )
-            dataset.save_episode()
-        dataset.finalize()
+def rows_of(episode: int) -> list[dict[str, Any]]:
+    return [
+        {
+            "observation.state": state(episode, row),
+            "observation.tactile": tactile(episode, row),
+            "observation.grip": np.array([row], np.float32),
+            "observation.matrix": np.full((2, 2), row, np.float32),
+            "observation.note": "hello",
+            "next.done": np.array([row == LENGTHS[episode] - 1]),
+            FRONT: np.full((64, 64, 3), grey(FRONT, row), np.uint8),
+            WRIST: np.full((64, 64, 3), grey(WRIST, row), np.uint8),
+            "task": TASKS[episode],
+        }
+        for row in range(LENGTHS[episode])
+    ]
 
 
 @pytest.fixture(scope="session")
@@ -97,7 +69,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("made_by_lerobot")
     roots = {name: folder / name.replace(" ", "_") for name in ENCODERS}
     for name, root in roots.items():
-        write_with_lerobot(root, ENCODERS[name])
+        options = {"robot_type": "toy", "streaming_encoding": True, "encoder_queue_maxsize": 64}
+        names = {"observation.state": ["a", "b", "c"]}
+        write_with_lerobot(root, map(rows_of, range(3)), encoder=ENCODERS[name], names=names, **options)
     return roots
 
 

@@ -14,6 +14,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from by_lerobot import write_with_lerobot
 from small_arm import messages, write_mcap, write_spec
 
 from taccorl.cli.main import main
@@ -26,16 +27,11 @@ from taccorl.errors import RecordingError
 
 ROWS, FPS, EPISODES = 12, 30, 3
 SHAPE = (64, 96, 3)
-VECTOR = {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
-FEATURES = {
-    "observation.state": VECTOR,
-    "action": VECTOR,
-    "count": {"dtype": "int64", "shape": (1,), "names": None},
-    "observation.images.top": {"dtype": "video", "shape": SHAPE, "names": ["height", "width", "channels"]},
-}
+JOINTS = ["pan.pos", "lift.pos"]
+FEATURES = ("observation.state", "action", "count", "observation.images.top")
 
 
-def row(features: dict[str, Any], time_s: float, k: int) -> dict[str, Any]:
+def row(features: tuple[str, ...], time_s: float, k: int) -> dict[str, Any]:
     values = {
         "observation.state": np.array([np.sin(time_s), np.cos(time_s)], np.float32),
         "action": np.array([np.sin(time_s + 0.1), np.cos(time_s + 0.1)], np.float32),
@@ -50,23 +46,16 @@ def row(features: dict[str, Any], time_s: float, k: int) -> dict[str, Any]:
 
 
 def build(
-    root: Path, features: dict[str, Any] = FEATURES, tasks: tuple[str, ...] = ("put", "open"), fps: int = FPS
+    root: Path, features: tuple[str, ...] = FEATURES, tasks: tuple[str, ...] = ("put", "open"), fps: int = FPS
 ) -> Path:
-    """Written by LeRobot itself."""
-    with quiet_lerobot():
-        from lerobot.configs import RGBEncoderConfig
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        dataset = LeRobotDataset.create(
-            f"local/{root.name}", fps=fps, root=root, robot_type="arm", features=features,
-            rgb_encoder=RGBEncoderConfig(vcodec="h264", g=2, crf=30),
-        )  # fmt: skip
-        for e in range(EPISODES):
-            for k in range(ROWS + e):
-                dataset.add_frame(row(features, e + k / fps, k) | {"task": tasks[e % len(tasks)]})
-            dataset.save_episode()
-        dataset.finalize()
-    return root
+    written = [
+        [row(features, e + k / fps, k) | {"task": tasks[e % len(tasks)]} for k in range(ROWS + e)]
+        for e in range(EPISODES)
+    ]
+    return write_with_lerobot(
+        root, written, fps=fps, robot_type="arm", names=dict.fromkeys(("observation.state", "action"), JOINTS),
+        images=STILL, encoder={"vcodec": "h264", "g": 2, "crf": 30},
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -92,15 +81,9 @@ def edit_dataset(command: str) -> None:
 
 # ---- good datasets ----
 
-MORE = {
-    "grid": {"dtype": "float32", "shape": (2, 3), "names": None},
-    "done": {"dtype": "bool", "shape": (1,), "names": None},
-    "note": {"dtype": "string", "shape": (1,), "names": None},
-}
-
-
-MOTION = {key: FEATURES[key] for key in ("observation.state", "action")}
-STILL = {"observation.images.still": FEATURES["observation.images.top"] | {"dtype": "image"}}
+MORE = ("grid", "done", "note")
+MOTION = ("observation.state", "action")
+STILL = ("observation.images.still",)
 
 
 @pytest.mark.parametrize(
@@ -108,13 +91,13 @@ STILL = {"observation.images.still": FEATURES["observation.images.top"] | {"dtyp
     [
         (FEATURES, 30, ("put", "open")),
         (FEATURES, 25, ("put",)),
-        (FEATURES | STILL, 20, ("put", "open", "close")),
+        (FEATURES + STILL, 20, ("put", "open", "close")),
         (MOTION, 50, ("put", "open")),
-        (MOTION | MORE, 15, ("put", "open")),
-        (MOTION | STILL, 10, ("put", "open")),
+        (MOTION + MORE, 15, ("put", "open")),
+        (MOTION + STILL, 10, ("put", "open")),
     ],
 )
-def test_a_dataset_of_lerobot_is_good(tmp_path: Path, features: dict, fps: int, tasks: tuple) -> None:
+def test_a_dataset_of_lerobot_is_good(tmp_path: Path, features: tuple, fps: int, tasks: tuple) -> None:
     root = build(tmp_path / "d", features, tasks, fps)
     assert findings(root) == {}
     assert read_as_lerobot(root, [0, ROWS, 3 * ROWS + 2]) == []

@@ -1,16 +1,15 @@
 """Touch of other people's LeRobot datasets, of any shape and type: read, checked, drafted and ingested, never skipped."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from by_lerobot import write_with_lerobot
 
 from taccorl.cli.main import main
 from taccorl.data.checks import check_episode
 from taccorl.data.dataset import Dataset
-from taccorl.data.lerobot_format import quiet_lerobot
 
 ROWS, FPS = 90, 30
 KINDS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -27,21 +26,12 @@ def touch(dtype: str, shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
 
 
 def build(root: Path, values: dict[str, np.ndarray]) -> Path:
-    """Written by LeRobot itself."""
-    vector = {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
-    features: dict[str, Any] = {"observation.state": vector, "action": vector}
-    features |= {key: {"dtype": str(v.dtype), "shape": v.shape[1:], "names": None} for key, v in values.items()}
-    with quiet_lerobot():
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        dataset = LeRobotDataset.create(f"local/{root.name}", fps=FPS, root=root, robot_type="arm", features=features)
-        for k in range(ROWS):
-            state = np.array([np.sin(k / 30), np.cos(k / 30)], np.float32)
-            row = {"observation.state": state, "action": state * 0.9, **{key: v[k] for key, v in values.items()}}
-            dataset.add_frame(row | {"task": "press"})
-        dataset.save_episode()
-        dataset.finalize()
-    return root
+    phase = np.arange(ROWS) / 30
+    state = np.stack([np.sin(phase), np.cos(phase)], axis=1).astype(np.float32)
+    columns = {"observation.state": state, "action": np.float32(0.9) * state, **values}
+    rows = [{key: column[k] for key, column in columns.items()} | {"task": "press"} for k in range(ROWS)]
+    joints = {key: ["pan.pos", "lift.pos"] for key in ("observation.state", "action")}
+    return write_with_lerobot(root, [rows], fps=FPS, robot_type="arm", names=joints)
 
 
 @pytest.mark.parametrize("key", KINDS)

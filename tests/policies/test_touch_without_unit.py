@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from by_lerobot import write_with_lerobot
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
@@ -49,26 +50,18 @@ HISTORY, STRIDE = 3, 2
 
 
 def write(root: Path, joints: int, pictures: str | None, touch: Touch, rows: tuple[int, ...] = (9, 7)) -> Path:
-    names = [f"joint_{k}.pos" for k in range(joints)]
-    features: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": (joints,), "names": names} for key in ("observation.state", "action")
-    }
-    if pictures:
-        names = ["height", "width", "channels"]
-        features["observation.images.top"] = {"dtype": pictures, "shape": (48, 64, 3), "names": names}
-    features |= {key: {"dtype": dtype, "shape": shape, "names": None} for key, (dtype, shape) in touch.items()}
-    dataset = LeRobotDataset.create("local/other", 30, features, root=root, use_videos=pictures == "video")
-    rng = np.random.default_rng(0)
-    for num_rows in rows:
-        for _ in range(num_rows):
-            frame: dict[str, Any] = {key: (300 + 40 * rng.normal(size=s)).astype(t) for key, (t, s) in touch.items()}
-            frame |= {key: rng.normal(size=joints).astype(np.float32) for key in ("observation.state", "action")}
-            if pictures:
-                frame["observation.images.top"] = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
-            dataset.add_frame({**frame, "task": "press the button"})
-        dataset.save_episode()
-    dataset.finalize()
-    return root
+    rng, motion = np.random.default_rng(0), ("observation.state", "action")
+
+    def row() -> dict[str, Any]:
+        made: dict[str, Any] = {key: rng.normal(size=joints).astype(np.float32) for key in motion}
+        made |= {key: (300 + 40 * rng.normal(size=shape)).astype(dtype) for key, (dtype, shape) in touch.items()}
+        if pictures:
+            made["observation.images.top"] = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        return made | {"task": "press the button"}
+
+    names = {key: [f"joint_{k}.pos" for k in range(joints)] for key in motion}
+    images = ["observation.images.top"] if pictures == "image" else []
+    return write_with_lerobot(root, [[row() for _ in range(n)] for n in rows], names=names, images=images)
 
 
 def train(root: Path, out: Path, *words: str) -> Path:

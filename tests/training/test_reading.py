@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from by_lerobot import write_with_lerobot
 from lerobot.datasets import dataset_reader, factory, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
@@ -65,15 +66,10 @@ def test_every_row_is_lerobots_to_the_bit_and_the_type(root, monkeypatch, episod
 def test_features_of_several_dimensions_are_read_alike(tmp_path, monkeypatch, dtype):
     """As LeRobot's writer stores the touch of other robots: lists in lists."""
     shapes = {"observation.tactile.grid": (4, 3), "observation.tactile.pads": (2, 4, 3)}
-    features: dict = {key: {"dtype": dtype, "shape": shape, "names": None} for key, shape in shapes.items()}
-    features["action"] = {"dtype": "float32", "shape": (2,), "names": None}
-    writer, rng = LeRobotDataset.create("local/grids", 30, features, root=tmp_path / "grids"), np.random.default_rng(0)
-    for rows in (6, 5):
-        for _ in range(rows):
-            touch = {key: (50 * rng.normal(size=shape)).astype(dtype) for key, shape in shapes.items()}
-            writer.add_frame({**touch, "action": np.zeros(2, np.float32), "task": "x"})
-        writer.save_episode()
-    writer.finalize()
+    rng = np.random.default_rng(0)
+    rows = [{key: (50 * rng.normal(size=shape)).astype(dtype) for key, shape in shapes.items()} for _ in range(11)]
+    rows = [row | {"action": np.zeros(2, np.float32), "task": "x"} for row in rows]
+    write_with_lerobot(tmp_path / "grids", [rows[:6], rows[6:]])
     for episodes in (None, [1]):
         windows = {key: [-2 / 30, 0.0] for key in shapes}
         settings: dict = {"episodes": episodes, "delta_timestamps": windows}

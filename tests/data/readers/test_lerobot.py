@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from by_lerobot import write_with_lerobot
 
 from taccorl.data.cutting import Cutter
 from taccorl.data.dataset import Dataset, dataset_spec_to_json, episode_record
@@ -84,43 +85,19 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Somebody's dataset at 10 rows a second: texts, flags, a shaped array, pictures in the parquet file."""
-    from taccorl.data.lerobot_format import quiet_lerobot
-
-    root = tmp_path_factory.mktemp("theirs") / "dataset"
-    with quiet_lerobot():
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        dataset = LeRobotDataset.create(
-            repo_id="local/theirs",
-            root=root,
-            fps=10,
-            use_videos=False,
-            features={
-                "observation.state": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]},
-                "observation.tactile.left": {"dtype": "float32", "shape": (12, 32), "names": None},
-                "observation.images.top": {
-                    "dtype": "image",
-                    "shape": (16, 16, 3),
-                    "names": ["height", "width", "channels"],
-                },
-                "next.done": {"dtype": "bool", "shape": (1,), "names": None},
-                "note": {"dtype": "string", "shape": (1,), "names": None},
-            },
-        )
-        for row in range(6):
-            dataset.add_frame(
-                {
-                    "observation.state": np.array([row, -row], np.float32),
-                    "observation.tactile.left": np.arange(384, dtype=np.float32).reshape(12, 32) + row,
-                    "observation.images.top": np.full((16, 16, 3), row, np.uint8),
-                    "next.done": np.array([row == 5]),
-                    "note": f"row {row}",
-                    "task": "look",
-                }
-            )
-        dataset.save_episode()
-        dataset.finalize()
-    return root
+    rows = [
+        {
+            "observation.state": np.array([row, -row], np.float32),
+            "observation.tactile.left": np.arange(384, dtype=np.float32).reshape(12, 32) + row,
+            "observation.images.top": np.full((16, 16, 3), row, np.uint8),
+            "next.done": np.array([row == 5]),
+            "note": f"row {row}",
+            "task": "look",
+        }
+        for row in range(6)
+    ]
+    root, pictures = tmp_path_factory.mktemp("theirs") / "dataset", ["observation.images.top"]
+    return write_with_lerobot(root, [rows], fps=10, images=pictures, names={"observation.state": ["a", "b"]})
 
 
 def reader_of(root: Path, index: int = 0, spec: str | None = None) -> Any:
