@@ -16,13 +16,14 @@ def test_one_bad_entry_of_a_folder_does_not_hide_the_others(tmp_path: Path, caps
     (tmp_path / "v21/meta/info.json").write_text('{"codebase_version": "v2.1"}')
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "zero.mcap").touch()
-    assert main(["ingest", "inspect", str(tmp_path)]) == 1
+    assert main(["ingest", "inspect", str(tmp_path / "missing.mcap"), str(tmp_path)]) == 1
     printed = capsys.readouterr().out
+    assert "missing.mcap: no such file" in printed
     assert "piper_flexitac_mcap" in printed
     assert f"{tmp_path}: not read: notes.txt (no recording)" in printed
     assert f"{tmp_path}: not read: v21 (is a LeRobot v2.1 dataset" in printed
     assert f"{tmp_path / 'zero.mcap'}: is empty (0 bytes)" in printed
-    assert printed.count("zero.mcap") == 1
+    assert printed.count("zero.mcap: ") == 1
 
 
 def test_times_that_the_reader_made_up_are_not_shown_as_measured(

@@ -170,15 +170,6 @@ def test_drafts_are_no_spec_before_their_todos_are_replaced(tmp_path: Path) -> N
         load_recording_spec(tmp_path / "mine.yaml")
 
 
-def test_neither_file_of_the_pair_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = one_arm(tmp_path / "a.mcap", duration_s=0.5)
-    (tmp_path / "mine_dataset.yaml").write_text("my work")
-    assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 2
-    assert "mine_dataset.yaml exists" in capsys.readouterr().err
-    assert (tmp_path / "mine_dataset.yaml").read_text() == "my work"
-    assert not (tmp_path / "mine.yaml").exists()
-
-
 def _bag(path: Path, topics: dict[str, str]) -> Path:
     """JSON topics of these types, three messages each."""
     with path.open("wb") as file:

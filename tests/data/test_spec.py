@@ -77,6 +77,7 @@ DATASET = {
         "observation.tactile_window": {**PADS, "shape": [48], "sensor": "pad.yaml", "history": 4, "optional": True},
     },
 }
+PAD_CHANNEL = {"field": "data", "clock": "log", "latency_s": 0.01, "rate_hz": 100.0, "max_age_s": 0.04}
 RECORDING = {
     "spec_version": 1,
     "dataset": "dataset.yaml",
@@ -98,22 +99,8 @@ RECORDING = {
         },
         "command": {"topic": "/command", "field": "position", "rate_hz": 200.0, "drop_zero_stamp": True},
         "front": {"topic": "/camera", "rate_hz": 30.0, "max_age_s": 0.08, "channel_order": "rgb"},
-        "pad_a": {
-            "topic": "/pad_a",
-            "field": "data",
-            "clock": "log",
-            "latency_s": 0.01,
-            "rate_hz": 100.0,
-            "max_age_s": 0.04,
-        },
-        "pad_b": {
-            "topic": "/pad_b",
-            "field": "data",
-            "clock": "log",
-            "latency_s": 0.01,
-            "rate_hz": 100.0,
-            "max_age_s": 0.04,
-        },
+        "pad_a": {"topic": "/pad_a", **PAD_CHANNEL},
+        "pad_b": {"topic": "/pad_b", **PAD_CHANNEL},
     },
     "features": {
         "observation.state": {"channels": ["state"], "align": "asof"},
@@ -209,21 +196,8 @@ def test_digest_ignores_comments_layout_and_the_order_of_keys(tmp_path):
 
 
 OTHER_WORDS = [
-    "hdf5",
-    "log",
-    "header",
-    "h264",
-    "libsvtav1",
-    "hold",
-    "asof",
-    "bgr",
-    "int16",
-    "uint16",
-    "topic",
-    "/other",
-    "other",
-    "unknown",
-]
+    "hdf5", "log", "header", "h264", "libsvtav1", "hold", "asof", "bgr", "int16", "uint16", "topic", "/other", "other", "unknown",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """ROS 2 SQLite bags: written here by rosbags, and then damaged; other people's are in test_bags."""
 
+import contextlib
 import hashlib
 import shutil
 import sqlite3
@@ -192,22 +193,19 @@ def test_random_damage_ends_as_messages_and_damages_or_as_an_error_in_plain_word
         (b"", r"is empty \(0 bytes\)"),
         (b"no bag" * 50, "is not an SQLite file"),
         (b"SQLite format 3\0", "is not an SQLite"),
+        (None, r"x\.db3: cannot be opened"),
+        ("CREATE TABLE songs (title TEXT)", r"an.*SQLite file, but.*ROS 2 bag:.*tables.*songs"),
     ],
 )
-def test_what_is_no_bag_is_said_in_plain_words(tmp_path: Path, content: bytes, words: str) -> None:
+def test_what_is_no_bag_is_said_in_plain_words(tmp_path: Path, content: bytes | str | None, words: str) -> None:
     path = tmp_path / "x.db3"
-    path.write_bytes(content)
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        with contextlib.closing(sqlite3.connect(path)) as other:
+            other.execute(content)
     with pytest.raises(RecordingError, match=words):
-        list(reader_of(path).messages(None))
-
-
-def test_another_sqlite_file_is_named_as_such(tmp_path: Path) -> None:
-    path = tmp_path / "x.db3"
-    with sqlite3.connect(path) as other:
-        other.execute("CREATE TABLE songs (title TEXT)")
-    other.close()
-    with pytest.raises(RecordingError, match=r"an.*SQLite file, but.*ROS 2 bag:.*tables.*songs"):
-        list(reader_of(path).messages(None))
+        list(readers.get("db3")(Source(path, (path,))).messages(None))
 
 
 def forget_definitions(path: Path) -> None:
@@ -289,21 +287,8 @@ def test_files_of_a_split_bag_are_one_recording_in_the_order_of_metadata_yaml(tm
     bag = tmp_path / "split"
     bag.mkdir()
     for number in (0, 1):
-        part = write_bag(tmp_path / f"part_{number}", num=3 + number)
-        shutil.copyfile(db3_of(part), bag / f"split_{number}.db3")
-    names = "".join(f"\n    - split_{number}.db3" for number in (1, 0))
-    (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:{names}\n")
-    assert frames(list(reader_of(bag).messages({"/pad"}))) == [0, 2, 0, 2]
-    ((_, source),) = find_sources(bag)
-    assert [p.name for p in source.files] == ["split_1.db3", "split_0.db3"]
+        shutil.copyfile(db3_of(write_bag(tmp_path / f"part_{number}", num=3 + number)), bag / f"split_{number}.db3")
+    names = "[split_1.db3, split_0.db3]"
+    (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {{relative_file_paths: {names}}}\n")
     found = list(reader_of(bag).messages({"/joints"}))
     assert [round((m.log_ns - LATE_NS - START_NS) / 5e6) for m in found] == [0, 1, 2, 3, 0, 1, 2]
-
-
-def test_a_source_may_be_named_directly(bag: Path) -> None:
-    path = db3_of(bag)
-    reader = readers.get("db3")(Source(path, (path,)))
-    assert set(reader.topics()) == {"/joints", "/pad"}
-    missing = readers.get("db3")(Source(bag / "no.db3", (bag / "no.db3",)))
-    with pytest.raises(RecordingError, match=r"no\.db3: cannot be opened"):
-        missing.topics()
