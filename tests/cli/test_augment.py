@@ -162,8 +162,6 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
         ((*WORDS, "--episodes=3"), "new is occupied: it holds augmented v4"),
         ((*WORDS, "--stratify=true"), "new is occupied: it holds augmented v4"),
         ((*WORDS, "--out=other"), "other.augment_report.html: already exists and is not a report"),
-        ((*WORDS, "--engine.workers=two"), "engine.workers"),
-        ((*WORDS, "--egnine.workers=2"), "did you mean 'engine.workers'?"),
     ],
 )
 def test_what_cannot_work_is_named_before_any_attempt(

@@ -178,12 +178,6 @@ def test_what_is_not_there_is_said(words: list[str], message: str, made: Path, s
     ("change", "message"),
     [
         ({"arm": "right"}, "01_press.mcap: the object never comes within 1 mm of the pads of the right arm"),
-        pytest.param({"radius_m": 0.0098}, "01_press.mcap: the object never comes within 1 mm", marks=pytest.mark.slow),
-        pytest.param(
-            {"radius_m": 0.0108},
-            "01_press.mcap: the object comes near the pads of the left arm and never touches",
-            marks=pytest.mark.slow,  # in the fast set: test_pads of diagnosis
-        ),
         ({"shape": "cube"}, "'cube' is not one of 'sphere', 'rod'"),
     ],
 )

@@ -185,6 +185,7 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
         (("excite", "left_joint2", "--num=0"), "--num=0"),
         (("excite", "left_joint2", "--floor_rad=nan"), "--floor_rad=nan"),
         (("surrogate", "--secret=1", "--strength=0"), "--strength=0"),
+        (("check", "full", "--spec=piper_flexitac_mcpa"), "did you mean 'piper_flexitac_mcap'"),
         (("ingest", "inspect", "nope"), "taccorl ingest inspect: nope"),
         (("lineage", "explain", "nope"), "taccorl lineage explain: "),
     ],

@@ -134,7 +134,6 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_writte
         (("--real=surrogate", "--sim=twin", "--out=mine"), "mine is occupied: it is a folder of 1 entries without"),
         (("--sim=twin", "--out=both"), "both is occupied: it holds cotraining v3"),
         (("--real=blind", "--sim=twin", "--out=x"), "twin has observation.images.front, but blind does not: ingest"),
-        (("--rael=surrogate", "--out=x"), "did you mean 'real'?"),
     ],
 )
 def test_what_cannot_work_is_named_and_nothing_is_left(

@@ -164,6 +164,7 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("--name=a", "--paths=[a,b]", "--paths=c"), ("--paths=[a,b] and --paths=c", "once, or repeat")),
         (("x", "--name=a", "--joints=six"), ("--joints=six", "whole number")),
         (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
+        (("x", "--name=a", "--reach_m=half"), ("--reach_m=half", "expected a number")),
         (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "true or false")),
         (("x", "--name=a", "--quick=1"), ("quick", "'1'", "true or false", "--quick=true")),
         (("x", "--name=a", "--reach_m=[1"), ("[1",)),
@@ -251,19 +252,6 @@ def test_every_field_of_every_verb_survives_the_way_through(tmp_path: Path) -> N
     assert isinstance(source, ExpertSource) and source.hands.speed == 1.2
     words[-1:] = ["--engine.type=slurm", "--engine.partition=gpu", "--engine.time=01:00:00"]
     assert parse(IngestConfig, words, positional="paths").engine == SlurmEngine(partition="gpu", time="01:00:00")
-
-
-@pytest.mark.parametrize(
-    ("words", "facts"),
-    [
-        (["--episodes=many"], ("--episodes=many", "whole number")),
-        (["--randomization=half"], ("--randomization=half", "expected a number")),
-    ],
-)
-def test_a_word_in_place_of_a_number_names_option_and_value(words: list[str], facts: tuple[str, ...]) -> None:
-    with pytest.raises(TaccorlError) as raised:
-        parse(CollectConfig, ["--task=bench", *words])
-    assert all(fact in str(raised.value) for fact in facts) and "parse" not in str(raised.value)
 
 
 def test_the_command_of_a_configuration_gives_the_configuration() -> None:

@@ -346,17 +346,6 @@ def test_an_episode_before_a_channel_began_is_a_loss_not_a_silence(tmp_path: Pat
     assert found.losses[0].end_s == pytest.approx(1.9, abs=0.02)
 
 
-def test_a_channel_that_starts_late_or_ends_early_is_named(tmp_path: Path) -> None:
-    made = Made(tmp_path / "late.mcap", duration_s=4.0, gap=[(LEFT, 0.0, 1.0), (FRONT, 3.0, 9.0)])
-    found = cut(made.path)
-    [episode] = found.episodes
-    assert (episode.start_ns - START_UNIX_NS) * 1e-9 == pytest.approx(1.02, abs=0.03)
-    assert [loss.reason for loss in found.losses] == ["left_wrist begins late", "front ends early"]
-    late, early = found.losses
-    assert (late.start_s, late.end_s) == (pytest.approx(0.1, abs=0.01), pytest.approx(1.02, abs=0.03))
-    assert (early.start_s, early.end_s) == (pytest.approx(2.98, abs=0.04), pytest.approx(3.9, abs=0.01))
-
-
 def test_a_held_command_that_ends_early_costs_nothing(tmp_path: Path) -> None:
     topics = list(COMMAND_TOPICS.values())
     made = Made(tmp_path / "quiet.mcap", gap=[(topic, 1.5, 9.0) for topic in topics])
