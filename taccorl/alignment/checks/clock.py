@@ -89,15 +89,10 @@ USUAL_TAU_S = 0.12
 least step · period / τ."""
 
 
-def check_clock(m: Measurement, floor: Mapping[str, float]) -> list[Finding]:
-    """Findings about the clock of one measurement. ``floor``: signal → noise floor of positions [rad, m]."""
-    return list(check_clock_of(Trial(m, known_floor=floor)))
-
-
 @check("measured_before_command", "error")
 @check(EXCHANGED_COLUMNS, "error", explains=FOLLOWS_FROM)
 @check("late_answer", "note", needs="clock")
-def check_clock_of(t: Trial) -> Iterator[Finding]:
+def check_clock(t: Trial) -> Iterator[Finding]:
     """Leads, late answers, exchanged columns, and signals that could not be judged."""
     m, even = t.m, t.even
     stepped = _early_steps(t)

@@ -8,6 +8,7 @@ import scipy.io
 
 from taccorl.alignment.checks.clock import check_clock
 from taccorl.alignment.checks.telemetry import check_measurement
+from taccorl.alignment.checks.trial import Trial
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 
@@ -45,5 +46,5 @@ def test_real_positions_one_millisecond_early_are_found_or_said_to_be_unknowable
     floor = {"drive": noise_floor([emps])["drive"].value}
     columns = {"time_s": emps.time_s[:-5], "target": emps.target[:-5], "measured": emps.measured[5:]}
     early = Measurement(name="early", signals=("drive",), units=("m",), **columns)
-    assert {f.check for f in check_clock(early, floor)} <= {"measured_before_command", "not_judged"}
+    assert {f.check for f in check_clock(Trial(early, known_floor=floor))} <= {"measured_before_command", "not_judged"}
     assert np.isfinite(early.measured).all()

@@ -15,6 +15,7 @@ from taccorl.alignment.checks.first_order import fit_first_order, left_by_change
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import check_measurement, check_measurements, check_names
+from taccorl.alignment.checks.trial import Trial
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.measurement import Measurement
@@ -191,7 +192,7 @@ def test_a_step_from_rest_shows_one_row_under_any_friction():
 
 def test_where_nothing_can_be_known_it_says_so():
     m = shifted(sweep(2, friction_nm=3.0, joints=[4, 5]), 1)
-    findings = check_clock(m, floors(m))
+    findings = list(check_clock(Trial(m, known_floor=floors(m))))
     assert [(f.check, f.feature) for f in findings] == [("not_judged", "left_joint5"), ("not_judged", "left_joint6")]
     for f in findings:
         # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.

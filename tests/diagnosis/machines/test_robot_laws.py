@@ -16,6 +16,7 @@ from taccorl.alignment.checks.clock import FAR, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.checks.trial import Trial
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
@@ -238,7 +239,7 @@ def test_exchanged_columns_of_target_and_position_are_told_from_early_stamps(law
     ways_out = ("swing.q the column that swing.q_target has", "target_rows_late")
     for one, expected in ((m, ()), (exchanged, ways_out[:1]), (early, ways_out[1:])):
         one = dataclasses.replace(one, source=Path("sweep.csv"))
-        said = [f.text for f in check_clock(one, {"swing": NOISE_RAD}) if f.severity == "error"]
+        said = [f.text for f in check_clock(Trial(one, known_floor={"swing": NOISE_RAD})) if f.severity == "error"]
         assert len(said) == len(expected) and all(word in text for word, text in zip(expected, said, strict=True)), said
 
 
