@@ -1,6 +1,7 @@
 """Origin of data: stated, kept through every step, derived only for data written before there was a domain, never made real."""
 
 import json
+import shutil
 from pathlib import Path
 
 import h5py
@@ -30,6 +31,14 @@ def job(path: Path, store: Path, domain: str | None, spec: str = SPEC) -> Job:
     loaded = load_recording_spec(spec)
     [(_, source)] = find_sources(path, reader=loaded.reader)
     return Job(source, loaded, spec, store, dry_run=True, domain=domain)  # pyright: ignore
+
+
+@pytest.fixture
+def hdf5(tmp_path: Path) -> Path:
+    """A stand-in that states domain and origin."""
+    path = tmp_path / "episode_0.hdf5"
+    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
+    return path
 
 
 # ---- the value ----
@@ -90,32 +99,26 @@ def test_a_simulator_s_columns_go_with_no_real_domain() -> None:
 # ---- a stand-in never becomes real ----
 
 
-def test_a_stand_in_cannot_be_ingested_as_real(recordings: Path, tmp_path: Path) -> None:
+def test_a_stand_in_cannot_be_ingested_as_real(recordings: Path, hdf5: Path, tmp_path: Path) -> None:
     [first, *_] = sorted(recordings.glob("*.mcap"))
     for domain in ("real", "twin"):
         entry = ingest_one(job(first, tmp_path, domain))
         assert entry["outcome"] == "refused"
         assert domain in entry["reason"] and "surrogate: stand-in recording" in entry["reason"]
-    hdf5 = tmp_path / "episode_0.hdf5"
-    write_cobot_magic_hdf5(hdf5, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
     assert ingest_one(job(hdf5, tmp_path, "real", "cobot_magic_hdf5"))["outcome"] == "refused"
 
 
-def test_a_stand_in_with_an_edited_label_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "episode_0.hdf5"
-    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
-    with h5py.File(path, "a") as file:
+def test_a_stand_in_with_an_edited_label_is_refused(hdf5: Path, tmp_path: Path) -> None:
+    with h5py.File(hdf5, "a") as file:
         assert file.attrs["domain"] == "surrogate"
         file.attrs["domain"] = "real"
-    entry = ingest_one(job(path, tmp_path, None, "cobot_magic_hdf5"))
+    entry = ingest_one(job(hdf5, tmp_path, None, "cobot_magic_hdf5"))
     assert entry["outcome"] == "refused" and "contradicts the data" in entry["reason"]
 
 
-def test_a_recording_that_states_two_domains_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "episode_0.hdf5"
-    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
+def test_a_recording_that_states_two_domains_is_refused(hdf5: Path, tmp_path: Path) -> None:
     spec = load_recording_spec("cobot_magic_hdf5")
-    recording = load_recording(find_sources(path, reader=spec.reader)[0][1], spec, tmp_path)
+    recording = load_recording(find_sources(hdf5, reader=spec.reader)[0][1], spec, tmp_path)
     recording.reader.metadata = {"joined": {"domain": "real"}, **recording.reader.metadata}
     with pytest.raises(TaccorlError, match=r"episode_0.*real, surrogate"):
         _ = recording.origin
@@ -132,8 +135,6 @@ def test_a_dataset_of_a_stand_in_keeps_its_domain_through_another_ingest(dataset
 
 
 def test_an_edited_record_of_a_dataset_is_refused_with_its_file(dataset: Path, tmp_path: Path) -> None:
-    import shutil
-
     edited = tmp_path / "edited"
     shutil.copytree(dataset, edited)
     path = edited / "meta/taccorl/episodes.json"
@@ -153,13 +154,11 @@ def test_a_folder_of_stand_ins_cannot_be_stated_real_for_compare(recordings: Pat
 # ---- what is a robot's ----
 
 
-def test_a_recording_that_states_nothing_is_real_only_if_its_user_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "episode_0.hdf5"
-    write_cobot_magic_hdf5(path, StandInConfig(duration_s=3.0, camera_size=(96, 128)))
-    with h5py.File(path, "a") as file:  # as a robot's recorder leaves it
+def test_a_recording_that_states_nothing_is_real_only_if_its_user_says_so(hdf5: Path, tmp_path: Path) -> None:
+    with h5py.File(hdf5, "a") as file:  # as a robot's recorder leaves it
         del file.attrs["domain"], file.attrs["origin"]
     spec = load_recording_spec("cobot_magic_hdf5")
-    recording = load_recording(find_sources(path, reader=spec.reader)[0][1], spec, tmp_path)
+    recording = load_recording(find_sources(hdf5, reader=spec.reader)[0][1], spec, tmp_path)
     assert Cutter(recording).cut().episodes[0].origin == Origin()
     assert Cutter(recording, "real").cut().episodes[0].origin == Origin("real")
 
@@ -180,8 +179,6 @@ def test_a_table_s_user_states_its_domain_in_the_columns_file_or_for_the_folder(
 def test_check_says_that_a_domain_was_derived(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import shutil
-
     old = tmp_path / "old"
     shutil.copytree(dataset, old)
     path = old / "meta/taccorl/episodes.json"

@@ -105,26 +105,20 @@ IMU = (
     (["linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z"], ["m/s2"] * 3, [0, 0, 9.81]),
 )
 ACCEL = make("geometry_msgs/msg/Accel", linear=vector(4, 5, 6), angular=vector(7, 8, 9))
+QUATERNION = (list("wxyz"), ["wxyz"] * 4, [0.5, 0.1, 0.2, 0.3])
+GEOMETRY = {
+    "Vector3": ("vector", vector(1, 2, 3), [(list(XYZ), [""] * 3, [1, 2, 3])]),
+    "Point": ("point", vector(1, 2, 3, kind="Point"), [(list(XYZ), ["m"] * 3, [1, 2, 3])]),
+    "Quaternion": ("quaternion", quaternion(0.5, 0.1, 0.2, 0.3), [QUATERNION]),
+    "Pose": ("pose", pose(), POSE),
+    "Twist": ("twist", twist(), TWIST),
+    "Wrench": ("wrench", wrench(), FORCE),
+    "Accel": ("accel", ACCEL, [(TWIST[0][0], ["m/s2"] * 3, [4, 5, 6]), (TWIST[1][0], ["rad/s2"] * 3, [7, 8, 9])]),
+}
+"""Kind → its field in the stamped kind, a message, and its names, units and values."""
 MESSAGES = [
-    (vector(1, 2, 3), [(list(XYZ), [""] * 3, [1, 2, 3])]),
-    (stamped("Vector3", "vector", vector(1, 2, 3)), [(list(XYZ), [""] * 3, [1, 2, 3])]),
-    (vector(1, 2, 3, kind="Point"), [(list(XYZ), ["m"] * 3, [1, 2, 3])]),
-    (stamped("Point", "point", vector(1, 2, 3, kind="Point")), [(list(XYZ), ["m"] * 3, [1, 2, 3])]),
-    (quaternion(0.5, 0.1, 0.2, 0.3), [(list("wxyz"), ["wxyz"] * 4, [0.5, 0.1, 0.2, 0.3])]),
-    (
-        stamped("Quaternion", "quaternion", quaternion(0.5, 0.1, 0.2, 0.3)),
-        [(list("wxyz"), ["wxyz"] * 4, [0.5, 0.1, 0.2, 0.3])],
-    ),
-    (pose(), POSE),
-    (stamped("Pose", "pose", pose()), POSE),
-    (twist(), TWIST),
-    (stamped("Twist", "twist", twist()), TWIST),
-    (wrench(), FORCE),
-    (stamped("Wrench", "wrench", wrench()), FORCE),
-    (
-        stamped("Accel", "accel", ACCEL),
-        [(TWIST[0][0], ["m/s2"] * 3, [4, 5, 6]), (TWIST[1][0], ["rad/s2"] * 3, [7, 8, 9])],
-    ),
+    *((message, groups) for _, message, groups in GEOMETRY.values()),
+    *((stamped(kind, field, message), groups) for kind, (field, message, groups) in GEOMETRY.items()),
     (imu(), IMU),
     (odometry(), (*POSE, *TWIST)),
 ]
