@@ -40,7 +40,7 @@ def found_in_recordings(found: Mapping[str, Sequence[Finding]]) -> list[Section]
     lines = []
     for same in (of for severity in SEVERITIES for key, of in several.items() if key[0] == severity):
         name, f = same[0]
-        more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
+        more = f" (and {further} more)" if (further := len(dict(same)) - 1) else ""
         others = [other for _, other in same if other.feature != f.feature]
         lines.append(Cell(f"  {f.severity:8s}{name}{more}: {f.check}: {f.text}{_also(others)}", f.severity))
     return [*sections, Section(text=lines)]
