@@ -45,8 +45,7 @@ def test_options_read_from_source_are_those_of_the_config(verb: str) -> None:
 def test_the_script_is_made_without_any_library() -> None:
     heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml', 'taccorl.cli.collect'}"
     code = f"import sys; from taccorl.cli.main import main; main(['completion', 'bash']); print({heavy} & set(sys.modules))"
-    done = fresh_python("-c", code)
-    assert done.stdout.splitlines()[-1] == "set()"
+    assert fresh_python("-c", code).stdout.splitlines()[-1] == "set()"
 
 
 @pytest.mark.parametrize("shell", LAST_WORD)

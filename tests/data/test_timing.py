@@ -79,10 +79,7 @@ OPTIONS = {"max_age_s": 0.04, "history": 5, "rate_hz": 100.0}
 def shown(grid: np.ndarray, times: np.ndarray, values: np.ndarray, align: str) -> list[tuple[float, ...] | None]:
     """What every row shows, None where it is stale."""
     m = match(grid, times, align, **OPTIONS)  # pyright: ignore[reportArgumentType]
-    rows: list[tuple[float, ...] | None] = []
-    for k in range(len(grid)):
-        rows.append(tuple(values[m.index[k]]) if m.fresh[k] else None)
-    return rows
+    return [tuple(values[m.index[k]]) if m.fresh[k] else None for k in range(len(grid))]
 
 
 @pytest.mark.parametrize("align", ["hold", "asof", "window"])

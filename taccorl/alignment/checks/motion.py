@@ -8,6 +8,7 @@ import numpy as np
 from taccorl.alignment.checks.range_end import stood_at_stop
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, without, write
+from taccorl.alignment.checks.wiring import in_other_unit
 from taccorl.alignment.controller.joint_motion import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
@@ -142,6 +143,8 @@ def check_motion(t: Trial) -> Iterator[Finding]:
         name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
         known = measured[np.isfinite(measured)]
         if len(known) and np.ptp(known) < DEAD_SHARE * np.ptp(target):
+            if in_other_unit(t, int(j)):
+                continue  # check_wiring says so
             still = "the same number all the time" if np.ptp(known) == 0 else f"within {np.ptp(known):.2g} {m.units[j]}"
             text = (
                 f"{name} stays {still} while its command moves by {np.ptp(target):.3g} {m.units[j]} over "

@@ -19,7 +19,7 @@ import numpy as np
 from taccorl.alignment.checks.held_commands import Dropped, find_dropped
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor, repeat_pairs
+from taccorl.alignment.measurements.noise_floor import BURST_POWER, BURST_SHARE, SignalFloor, noise_floor, repeat_pairs
 from taccorl.alignment.measurements.repeats import overlay
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
@@ -28,8 +28,6 @@ DISAGREE = 3.0
 """Ratio of the floor from repeats to the floor from rest, residue or rounding above which they disagree."""
 BLOCK_S = 0.5
 """Length of a block in which the difference of two repeats is measured [s]."""
-BURST_POWER, BURST_SHARE = 0.8, 0.25
-"""A difference is intermittent if the first share of its square lies in less than the second share of the time."""
 MOST_TIMES = 5
 """Most times that a text lists."""
 

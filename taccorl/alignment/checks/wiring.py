@@ -28,6 +28,9 @@ ALIKE = 0.02
 """Least difference of correlations for choosing between two joints."""
 GAIN = (0.2, 5.0)
 """Gain above which neither controller nor physics can explain the motion."""
+SAME_FACTOR = 1.5
+"""A joint that hardly moves is in another unit if it follows its command and its gain is a known factor, within so many times of
+it either way: a lag other than ``USUAL_LAG_S`` changes gains. A choice."""
 BEYOND = {"rad": 0.5, "m": 0.05}
 """Distance beyond the robot's limits above which a position is impossible."""
 SMOOTH_S = 0.03
@@ -77,6 +80,7 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
     out_of_range = {f.feature for f in beyond}
     lagged = _lagged(even.target, even.period_s)
     follows, gains = _follows(even, lagged, commanded)
+    follows[gains < 0.05] = np.nan
     swapped: dict[str, str] = {}
     for j in commanded:
         own, name = follows[j, j], m.signals[j]
@@ -99,9 +103,17 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             yield find("reversed", name, text)
     yield from _swaps(m, swapped)
     for j in t.moving:
-        if m.signals[j] not in {*out_of_range, *swapped} and follows[j, j] > FOLLOWS_NOT:
+        if m.signals[j] not in {*out_of_range, *swapped} and (follows[j, j] > FOLLOWS_NOT or in_other_unit(t, j)):
             yield from _gain(m, even, lagged, j)
             yield from _velocity_unit(m, even, j)
+
+
+def in_other_unit(t: Trial, j: int) -> bool:
+    """Whether a joint that hardly moves follows its command all the same, by the factor between two units."""
+    one = t.even.only([t.m.signals[j]])
+    follows, gain = (float(found[0, 0]) for found in _follows(one, _lagged(one.target, one.period_s), [0]))
+    near = (1 / SAME_FACTOR < gain / f < SAME_FACTOR for f in KNOWN_FACTORS)
+    return j in t.moving and follows > FOLLOWS and any(near)
 
 
 def _lagged(target: np.ndarray, period_s: float) -> np.ndarray:
@@ -123,7 +135,7 @@ def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> tuple[
     for i in range(len(m.signals)):
         for j in commanded:
             gains[i, j] = span[i] / np.ptp(lagged[:, j])
-            if gains[i, j] < 0.05 or v_measured[:, i].std() == 0 or v_command[:, j].std() == 0:
+            if v_measured[:, i].std() == 0 or v_command[:, j].std() == 0:
                 continue
             found[i, j] = np.corrcoef(v_measured[:, i], v_command[:, j])[0, 1]
     return found, gains
@@ -168,7 +180,8 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> Iterator[Finding]:
 def _unit_way_out(m: Measurement, *columns: str) -> str:
     """Line to write where a number is in another unit."""
     file = f"Write the `unit:` of {' and '.join(columns)} in a columns file"
-    return write(m, file, "State `scale` of the channel in the recording spec")
+    where = write(m, file, "State `scale` of the channel in the recording spec")
+    return f"{where}; if other recordings are right, convert this one"
 
 
 @check("unit", "error")

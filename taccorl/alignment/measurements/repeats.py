@@ -90,15 +90,6 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
     )
 
 
-def repeats(first: Measurement, second: Measurement) -> bool:
-    """True if both recordings have the same commands, after alignment in time."""
-    try:
-        overlay(first, second)
-    except TaccorlError:
-        return False
-    return True
-
-
 def _lag(a: np.ndarray, b: np.ndarray) -> int:
     """Whole rows by which ``b`` (T, J) lies later than ``a``: highest correlation of their steps."""
     da, db = np.diff(a, axis=0), np.diff(b, axis=0)

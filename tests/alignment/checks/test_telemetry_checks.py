@@ -100,8 +100,7 @@ def test_progress_names_each_recording_with_its_place_and_the_check(clean):
 
 def test_steps_and_holds_are_clean_too():
     target = steps(3, 0.1, rows=1400)
-    m = measured(target, answer(target), np.random.default_rng(0), 2e-4)
-    assert found(m) == {}
+    assert found(measured(target, answer(target), np.random.default_rng(0), 2e-4)) == {}
 
 
 @pytest.mark.parametrize("rows", [1, 2, 5])
@@ -424,17 +423,19 @@ def test_a_column_that_is_wrong_is_named(clean, check: str, name: str, words: st
     j = clean.column(name)
     q, target = wrong(clean.measured[:, j], clean.target[:, j])
     m = with_column(with_column(clean, name, q), name, target, "target")
-    assert found(m)[check] == [name] and words in text_of(m, check)
+    assert found(m)[check] == [name] and words in text_of(m, check) and not {"unit", "dead_channel"} <= found(m).keys()
 
 
-def test_degrees_near_zero_are_seen_by_the_gain():
+@pytest.mark.parametrize(("field", "times"), [("measured", "59.5"), ("target", "0.0181")])
+def test_degrees_near_zero_are_seen_by_the_gain(field: str, times: str):
     # ±0.5° about zero lies within the joint's limits even when it is read as radians.
     m = sweep(0, joints=[0])
     target = HOME + (m.target - HOME) * 0.15
     small = measured(target, answer(target), np.random.default_rng(0), 1e-5)
-    wrong = with_column(small, "left_joint1", np.degrees(small.measured[:, 0]))
-    assert found(wrong)["unit"] == ["left_joint1"]
-    assert "goes 59.5 times" in text_of(wrong, "unit")  # 57.3, and a lag of 88 ms where 100 were assumed
+    wrong = with_column(small, "left_joint1", np.degrees(getattr(small, field)[:, 0]), field)
+    assert found(wrong)["unit"] == ["left_joint1"] and "dead_channel" not in found(wrong)
+    # 57.3 or 1 / 57.3, times 1.04 for a lag of 88 ms where 100 were assumed
+    assert f"goes {times} times" in text_of(wrong, "unit")
 
 
 def test_velocity_in_rpm_is_named(clean):
@@ -544,8 +545,7 @@ def test_a_joint_that_sticks_is_a_warning_and_a_driver_that_repeats_old_values_a
     assert "dry friction" in by["sticking_joint"].text
     values = stuck(clean, 0.0).measured[:, 1].copy()
     values[600:700] = values[600]
-    again = with_column(stuck(clean, 0.0), "left_joint2", values)
-    assert found(again)["frozen_channel"] == ["left_joint2"]
+    assert found(with_column(stuck(clean, 0.0), "left_joint2", values))["frozen_channel"] == ["left_joint2"]
 
 
 def sticking_servo(hz: float, friction_nm: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -700,8 +700,7 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
 def test_a_sweep_that_never_moves_the_joint():
     m = sweep(0, joints=[4])
     assert found(m, joints=["left_joint4", "left_joint5"])["no_motion"] == ["left_joint4"]
-    still = dataclasses.replace(m, target=np.tile(HOME, (m.num_rows, 1)))
-    assert "record a sweep" in text_of(still, "no_motion")
+    assert "record a sweep" in text_of(dataclasses.replace(m, target=np.tile(HOME, (m.num_rows, 1))), "no_motion")
     with pytest.raises(TaccorlError, match="did you mean 'left_joint5'"):
         check_measurement(m, joints=["left_joint_5"])
 
@@ -731,8 +730,7 @@ def test_time_that_runs_backwards_stops_everything_else(clean):
 
 
 def test_time_in_milliseconds(clean):
-    m = dataclasses.replace(clean, time_s=clean.time_s * 1e3)
-    assert found(m) == {"time_unit": ["time"]}
+    assert found(dataclasses.replace(clean, time_s=clean.time_s * 1e3)) == {"time_unit": ["time"]}
 
 
 def test_dropped_rows_are_counted_and_placed(clean):
@@ -747,8 +745,7 @@ def test_dropped_rows_are_counted_and_placed(clean):
 @pytest.mark.parametrize(("jitter_s", "caught"), [(1e-5, False), (2e-3, True)])
 def test_jitter_of_row_times(clean, jitter_s, caught):
     time_s = clean.time_s + jitter_s * np.random.default_rng(0).uniform(-0.5, 0.5, clean.num_rows)
-    m = dataclasses.replace(clean, time_s=time_s - time_s[0])
-    assert ("jitter" in found(m)) is caught
+    assert ("jitter" in found(dataclasses.replace(clean, time_s=time_s - time_s[0]))) is caught
 
 
 def test_holes_and_nan_are_errors_with_their_place(clean):

@@ -72,15 +72,13 @@ def test_three_lost_rows_are_a_gap_and_no_line():
         "3 rows lost in 1 gaps" in even.findings[0].text and "3 of them without a measurement" in even.findings[0].text
     )
     assert {f.check for f in check_measurement(even) if f.severity == "error"} == set()
-    motion = joint_motion(even, None, "left_joint5")
-    assert np.isnan(motion.measured).sum() == 3
+    assert np.isnan(joint_motion(even, None, "left_joint5").measured).sum() == 3
 
 
 def test_a_command_that_changes_now_and_then_is_held_across_a_gap():
     rows = np.delete(np.arange(1200), [400, 401, 402])
     m = table(rows / RATE_HZ, rows)
-    steps = np.where(rows < 403, 0.0, 0.2)
-    even = even_rows(dataclasses.replace(m, target=steps[:, None]))
+    even = even_rows(dataclasses.replace(m, target=np.where(rows < 403, 0.0, 0.2)[:, None]))
     np.testing.assert_array_equal(even.target[:, 0], np.where(np.arange(1200) < 403, 0.0, 0.2))
 
 
