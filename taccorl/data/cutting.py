@@ -161,17 +161,15 @@ class Cutter(TimedRecording):
                 end(time_ns, {"success": True, "failure": False}.get(word))
             start = None
         if start is not None:
-            last = max(int(c.time_ns[-1]) for c in self.clocks.values())
-            end(last, None, "the recording ends within the episode")
+            end(max(int(c.time_ns[-1]) for c in self.clocks.values()), None, "the recording ends within the episode")
         return found
 
     def _from_metadata(self, _: Cut) -> list[_Interval]:
         """MCAP metadata records ``episode_<id>`` with ``start`` and ``end`` (log time, ns), ``instruction``, ``success``."""
         metadata, found = self.recording.reader.metadata, []
         if self.set_backs:
-            by_s = self.set_backs[0].by_s
-            text = f"the clock was set back by {by_s:.3f} s in mid-recording: which times the metadata records of its "
-            raise RecordingError(f"{text}episodes state is unknown; use `episodes: {{by: whole_file}}`")
+            text = f"the clock was set back by {self.set_backs[0].by_s:.3f} s in mid-recording: which times the metadata records"
+            raise RecordingError(f"{text} of its episodes state is unknown; use `episodes: {{by: whole_file}}`")
         for name, record in sorted(metadata.items(), key=lambda item: item[1].get("start", "")):
             if not name.startswith("episode_"):
                 continue
@@ -326,9 +324,14 @@ class Cutter(TimedRecording):
                     yield from check_sample_jumps(name, samples, time_s, names, units, 1 / self.fps)
 
     def nominal_hz(self, channel: str) -> float:
-        """Rate of ``channel`` [Hz] that the file's metadata state (``rate_hz <topic>``), or else the spec."""
+        """Rate of ``channel`` [Hz] in the metadata (``rate_hz <topic>``), else of the spec. Raises RecordingError: malformed."""
         spec, records = self.spec.channels[channel], self.recording.reader.metadata.values()
-        return float(next((r[key] for r in records if (key := RATE_OF + spec.topic) in r), spec.rate_hz))
+        said = next((r[key] for r in records if (key := RATE_OF + spec.topic) in r), spec.rate_hz)
+        with contextlib.suppress(ValueError):
+            if 0.0 < (rate_hz := float(said)) < float("inf"):
+                return rate_hz
+        text = f"{self.recording.source.name}: metadata {RATE_OF + spec.topic!r} is {said!r}, no rate in Hz above 0: "
+        raise RecordingError(f"{text}correct it, or leave it out, and the spec's {spec.rate_hz:g} Hz is used")
 
     def _timing(self, channel: str, key: str, age_s: np.ndarray, grid_ns: np.ndarray) -> ChannelTiming:
         clock = self.clocks[channel]

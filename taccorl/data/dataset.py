@@ -288,8 +288,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 def write_info(root: Path, info: Mapping[str, Any]) -> None:
     """Write ``meta/info.json`` as LeRobot formats it."""
-    text = json.dumps(info, indent=4, ensure_ascii=False)
-    (root / "meta" / "info.json").write_text(text, encoding="utf-8")
+    (root / "meta" / "info.json").write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
 def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:

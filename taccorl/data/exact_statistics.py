@@ -37,8 +37,7 @@ def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
         x.sort(axis=1, kind="stable")  # of 16 bits by radix: 100 times as fast as np.quantile
         parts.append(np.concatenate([x[:, [0, -1]].T, [mean, std], x[:, rows].T]).astype(np.float64))
     names = ["min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES)]
-    stats = dict(zip(names, np.concatenate(parts, axis=1), strict=True))
-    return stats | {"count": np.array([num])}
+    return dict(zip(names, np.concatenate(parts, axis=1), strict=True)) | {"count": np.array([num])}
 
 
 def statistics_of_rows(values: np.ndarray, shape: Sequence[int]) -> dict[str, np.ndarray]:

@@ -154,8 +154,7 @@ def _write_rows(path: Path, sources: list[_Source]) -> None:
             for k in range(file.num_row_groups):
                 table = _plus(file.read_row_group(k), "index", part.first_row)
                 table = _plus(table, "episode_index", part.first_episode)
-                tasks = pa.array(part.task_numbers[table["task_index"].to_numpy()])
-                table = set_column(table, "task_index", tasks)
+                table = set_column(table, "task_index", pa.array(part.task_numbers[table["task_index"].to_numpy()]))
                 writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
                 writer.write_table(table.select(writer.schema.names))
     if writer is not None:

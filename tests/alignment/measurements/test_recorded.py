@@ -64,8 +64,7 @@ def write(moved: Moved, path: Path, config: StandInConfig, **label: str) -> Path
 def moved(tmp_path_factory) -> Moved:
     sim = Simulation(Bench())
     sim.reset([0])
-    spec = row_spec(sim, pictures=False)
-    recorder = EpisodeRecorder(sim, spec, np.random.default_rng(0), dense=True)
+    recorder = EpisodeRecorder(sim, row_spec(sim, pictures=False), np.random.default_rng(0), dense=True)
     home = sim.targets[0].copy()
     for k in range(round(SECONDS * 30)):
         fade = min(1.0, max(0.0, min(k - 8, 76 - k) / 20))  # at rest at the end: a recording goes on as it ended
@@ -91,8 +90,7 @@ def driven(moved) -> Moved:
 @pytest.fixture(scope="module")
 def recorded(moved) -> Measurement:
     label = {"repeat_of": "earlier.mcap", "kp": '{"left_joint5": 40}', "payload_kg": '{"left": 0.5}'}
-    path = write(moved, moved.folder / "bench.mcap", NO_LOSS, **label)
-    return read_measurements(path).fit[0]
+    return read_measurements(write(moved, moved.folder / "bench.mcap", NO_LOSS, **label)).fit[0]
 
 
 def truth_rows(m: Measurement, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -269,11 +267,21 @@ def test_a_channel_that_ends_early_and_a_file_cut_by_a_crash_are_named(moved, ga
     assert named in {f.check for f in read_measurements(path).fit[0].findings}
 
 
-def test_odd_metadata_is_an_error(moved):
-    path = write(moved, moved.folder / "odd.mcap", NO_LOSS, kp="40")
+RATE = "rate_hz /joint_states_ctrl_left"
+
+
+@pytest.mark.parametrize(
+    ("label", "named"),
+    [
+        ({"kp": "40"}, r'metadata kp.*40.*\{"left_joint5": 40.0\}'),
+        *(({RATE: text}, rf"odd\.mcap: metadata '{RATE}' is '{text}'.* Hz") for text in ("200 Hz", "0", "nan")),
+    ],
+)
+def test_odd_metadata_is_an_error(moved, label: dict[str, str], named: str):
+    path = write(moved, moved.folder / "odd.mcap", NO_LOSS, **label)
     spec = load_recording_spec("piper_flexitac_mcap")
     ((_, source),) = find_sources(path, reader="mcap")
-    with pytest.raises(RecordingError, match=r'metadata kp.*40.*\{"left_joint5": 40.0\}'):
+    with pytest.raises(RecordingError, match=named):
         read_recording(source, spec)
 
 
