@@ -262,8 +262,11 @@ def test_what_is_in_the_way_is_refused_before_the_first_attempt(collected, tmp_p
         produce(CollectPlan(task="assembly_1"), out, store)
     with pytest.raises(InTheWayError, match=r"notes.txt is occupied: it is a file without"):
         produce(CollectPlan(task="assembly_1"), out / "notes.txt", store)
-    with pytest.raises(TaccorlError, match="holds files already"):
-        collect_recordings(CollectPlan(task="assembly_1"), out / "notes.txt")
+    (out / "assembly_1_007.part").touch()  # a killed run leaves it
+    for path, why in ((out / "notes.txt", "already;"), (out, r"already, assembly_1_007\.part .* may be deleted;")):
+        with pytest.raises(TaccorlError, match=f"holds files {why}"):
+            collect_recordings(CollectPlan(task="assembly_1"), path)
+    (out / "assembly_1_007.part").unlink()
     assert (out / "notes.txt").read_text() == "keep me"
     assert list(out.iterdir()) == [out / "notes.txt"]
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from taccorl.data.finding import listed
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Attempt, Entry, Source, act
@@ -116,7 +117,9 @@ def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print)
     their paths. Failures, if they are kept, get numbers of the same sequence, but do not count. Raises TaccorlError: ``out`` is
     not empty, or three of four attempts of an expert fail."""
     if not is_free(out):
-        raise TaccorlError(f"{out} holds files already; nothing was changed: give another folder")
+        parts = listed(sorted(path.name for path in out.glob("*.part")))
+        stopped = f", {parts} of a run that was stopped: unfinished, it may be deleted" if parts else ""
+        raise TaccorlError(f"{out} holds files already{stopped}; nothing was changed: give another folder")
     sim = plan.make()
     spec = row_spec(sim, pictures=False, executed=True)
     origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's

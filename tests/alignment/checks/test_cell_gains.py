@@ -55,8 +55,7 @@ def array(**changes) -> list[CellMeasurement]:
 
 def found(measurements: list[CellMeasurement], shared: bool = True) -> dict[str, list[Finding]]:
     """Recording → findings; recordings without one are left out."""
-    every = check_cells(config(shared), measurements, ["a", "b"])
-    return {name: own for name, own in every.items() if own}
+    return {name: own for name, own in check_cells(config(shared), measurements, ["a", "b"]).items() if own}
 
 
 def split(m: list[CellMeasurement]) -> Measurements:
@@ -159,8 +158,7 @@ def test_a_recording_with_its_load_in_another_unit_is_named_with_the_factor(fact
 
 
 def test_of_two_recordings_both_are_named():
-    recordings = [presses("a"), presses("val", load_factor=1e-3)]
-    found = check_cells(config(), recordings, ["a"])
+    found = check_cells(config(), [presses("a"), presses("val", load_factor=1e-3)], ["a"])
     texts = [f.text for f in found["val"] if f.check == "other_gain"]
     assert len(texts) == 1 and "one of val and a" in texts[0]
     assert not any(f.check == "other_gain" for f in found["a"])
@@ -229,8 +227,7 @@ def test_cells_with_exchanged_columns_are_named_with_their_lines(others):
     order = [others.get(k, k) for k in range(K)]
     for crosstalk in (0.0, 0.15):
         recordings = loaded_apart(3, crosstalk, order)
-        exchanged = exchanged_cells(CellSet(config(shared=False), recordings))
-        assert {e.cell: e.load_of for e in exchanged} == others
+        assert {e.cell: e.load_of for e in exchanged_cells(CellSet(config(shared=False), recordings))} == others
         own = [f for findings in found(recordings, shared=False).values() for f in findings]
         assert [(f.check, f.severity) for f in own] == [("exchanged_cells", "error")]
         assert all(f"`{config().names[k]}:`" in own[0].text for k in others)

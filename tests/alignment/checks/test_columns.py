@@ -94,8 +94,7 @@ def test_a_joint_that_is_turned_in_all_columns_is_named_where_its_weight_shows_i
     right = recordings(machine)
     turned = [changed(m, COLUMNS, [0, 1, 2], [1.0, 1.0, -1.0]) for m in right]
     assert errors(machine, turned) == {("wrong_sign", "sign of elbow")}
-    silent = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in turned]
-    assert errors(machine, silent) == set()
+    assert errors(machine, [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in turned]) == set()
     assert errors(machine, [changed(m, COLUMNS, [0, 1, 2], [-1.0, 1.0, 1.0]) for m in right]) == set()
 
 

@@ -357,8 +357,7 @@ class Director:
         """What this hand holds in its subtask ``k``, and the other one in what is coordinated with it."""
         coordination = self.spec.coordination(arm, k)
         places = coordination.eef_subtask_constraint_tuple if coordination else ((arm, k),)
-        held = [self.spec.subtask_configs[a][j].held_object for a, j in places]
-        return [body for body in held if body is not None]
+        return [body for body in [self.spec.subtask_configs[a][j].held_object for a, j in places] if body is not None]
 
     def _source_and_delta(
         self, arm: str, k: int, subtask: SubtaskSpec, coordination: ConstraintSpec | None, scene: SeenPoses

@@ -56,8 +56,7 @@ class GateKeeper:
 
     def watch(self) -> Watch:
         """``Watch`` for the next control step."""
-        num_steps = self.sim.config.physics.steps_per_control_step
-        return Watch(range(_EVERY, num_steps + 1, _EVERY), self._look)
+        return Watch(range(_EVERY, self.sim.config.physics.steps_per_control_step + 1, _EVERY), self._look)
 
     def _look(self, _: int) -> None:
         for pair in self.sim.task.mating:

@@ -34,8 +34,7 @@ def tcp_from_part(source: Source, arm: str, part: str) -> np.ndarray | None:
 
 def is_same(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two poses (4, 4) differ by less than ``SAME_M`` and ``SAME_RAD``."""
-    turn = one[:3, :3].T @ other[:3, :3]
-    angle_rad = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+    angle_rad = np.arccos(np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1))
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < SAME_M and angle_rad < SAME_RAD)
 
 
