@@ -83,6 +83,7 @@ def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
 
 @check("low_rate", "warning")
 @check("out_of_order", "warning")
+@check("duplicates", "note")
 def _channels(m: Measurement) -> Iterator[Finding]:
     for t in m.timing:
         if t.nominal_hz and t.rate_hz < RATE_SHARE * t.nominal_hz:
@@ -91,6 +92,9 @@ def _channels(m: Measurement) -> Iterator[Finding]:
                 "lost; correct the driver"
             )
             yield find("low_rate", t.channel, text)
+        if t.duplicates:
+            text = f"{t.duplicates} samples of {t.channel} repeat the stamp of another; the first of each was kept"
+            yield find("duplicates", t.channel, text, topic="stamps")
         if t.out_of_order:
             text = (
                 f"{t.out_of_order} samples of {t.channel} were stamped before the one ahead of them (sorted now): "

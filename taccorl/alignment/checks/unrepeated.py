@@ -86,8 +86,7 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
             for s in moved
         }
         if moved and not any(np.isfinite(pair.difference).any() for own in differences.values() for pair in own):
-            why = "no recording repeats another (repeat_of). Record one motion twice"
-            yield name, not_judged("", what, why)
+            yield name, not_judged("", what, "no recording repeats another (repeat_of). Record one motion twice")
         for signal, own in differences.items():
             dropped = find_dropped(group, group[0].column(signal))
             certain = dropped is not None and dropped.certain

@@ -232,9 +232,7 @@ class Measurement:
         """The measurement resampled to an even ``rate_hz`` by linear interpolation, which keeps the mean time of every command
         and position. Raises TaccorlError: there are less than two rows, or time does not increase."""
         if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
-            raise TaccorlError(
-                f"{self.name}: its time does not increase, so that it cannot be resampled to {rate_hz:g} Hz"
-            )
+            raise TaccorlError(f"{self.name}: its time does not increase: it cannot be resampled to {rate_hz:g} Hz")
         steps = int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1
         time_s = self.time_s[0] + np.arange(steps) / rate_hz
         columns = {

@@ -41,8 +41,7 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
     narrow, spans = _joint_channels(source, spec)
     with opened(source, narrow) as recording:
         found: list[Finding] = []
-        cutter = _cutter(recording, found)
-        rows = _Rows(cutter, spans)
+        rows = _Rows(_cutter(recording, found), spans)
         found += [Finding("damaged", "warning", "file", f"{d}; copy it again") for d in recording.damage if d.lost]
         return rows.measurement(_Notes.of(recording, spec), (*found, *rows.cut_short()))
 
@@ -252,8 +251,7 @@ class _Rows:
     def measurement(self, notes: _Notes, findings: tuple[Finding, ...]) -> Measurement:
         """All of it."""
         names = signal_names(self.spec.target)
-        shape = (len(self.grid_ns), len(names))
-        extra = {kind: np.full(shape, np.nan) for kind in _EXTRA}
+        extra = {kind: np.full((len(self.grid_ns), len(names)), np.nan) for kind in _EXTRA}
         for channel, span in self.spans.items():
             extra[span.kind][:, span.first : span.first + span.size] = self._on_grid(channel, held=False)
         raw = [self._values(c) for c in self.states]
