@@ -94,14 +94,12 @@ def _side(image: np.ndarray, axis: int, k: int) -> np.ndarray:
 def _beside(step: np.ndarray, axis: int) -> np.ndarray:
     """The larger of the steps before and after each along an axis; none beyond the ends."""
     wide = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in (0, 1)])
-    size = step.shape[axis]
-    return np.maximum(*(np.take(wide, range(k, k + size), axis=axis) for k in (0, 2)))
+    return np.maximum(*(np.take(wide, range(k, k + step.shape[axis]), axis=axis) for k in (0, 2)))
 
 
 def _unproject(pixels: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
     x = (pixels[:, 0] - intrinsics.cx_px) / intrinsics.fx_px * depth_m
-    y = -(pixels[:, 1] - intrinsics.cy_px) / intrinsics.fy_px * depth_m
-    return np.stack([x, y, -depth_m], axis=1)
+    return np.stack([x, -(pixels[:, 1] - intrinsics.cy_px) / intrinsics.fy_px * depth_m, -depth_m], axis=1)
 
 
 class PictureEdges:

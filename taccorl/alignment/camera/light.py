@@ -95,8 +95,7 @@ def _joined(pairs: list[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray) -> t
 
 def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
     """Gain and gamma from grey values of the twin and of the pictures."""
-    edges = np.linspace(0, 255, _BINS + 1)
-    bin_of = np.digitize(x, edges)
+    bin_of = np.digitize(x, np.linspace(0, 255, _BINS + 1))
     rows = []
     for k in np.unique(bin_of):
         mine = bin_of == k

@@ -168,8 +168,7 @@ def _replay_error(robot: Robot, m: Measurement, name: str) -> float:
 def _noise(m: Measurement, name: str) -> float:
     j = m.column(name)
     q = m.measured[np.isfinite(m.measured[:, j]), j]
-    off = np.nanstd(m.measured[:, j] - m.target[:, j])
-    return max(noise_of_rows(q), float(m.quantum[j]), INEXACT * float(off))
+    return max(noise_of_rows(q), float(m.quantum[j]), INEXACT * float(np.nanstd(m.measured[:, j] - m.target[:, j])))
 
 
 def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:

@@ -162,8 +162,7 @@ def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str
         known = np.square([x for x in own if x is not None] or [(1.0, 1.0)]).sum(axis=0)
         return math.sqrt(known[0] / max(known[1], 1e-300))
 
-    other = dataclasses.replace(law, effort_after_target=not law.effort_after_target)
-    as_is = min(left(0), left(0, other))
+    as_is = min(left(0), left(0, dataclasses.replace(law, effort_after_target=not law.effort_after_target)))
     best = min(range(MOST_EARLY + 1), key=left)
     if best == 0 or left(best) > min(EARLY * as_is, SIGN_SURE):
         return ""

@@ -83,8 +83,7 @@ class Dropped:
     def certain(self) -> bool:
         """True if pulses of the right sign clearly outnumber those of the opposite sign and do not gather at one place between
         the turns of the target, so that commands were dropped. Play and sticking hold a joint once after each turn."""
-        enough = self.found >= LEAST_EVENTS + MIRRORED * self.mirrored
-        return enough and _uniform(np.array(self.ranks)) >= BY_CHANCE
+        return self.found >= LEAST_EVENTS + MIRRORED * self.mirrored and _uniform(np.array(self.ranks)) >= BY_CHANCE
 
     @property
     def rate(self) -> float:
@@ -215,8 +214,7 @@ def _fitted(
     """((T,) measured − G target, (L,) impulse response of G per row); G is fitted to what was applied."""
     u = applied - target[0]
     seen = np.isfinite(measured)
-    length = round(RESPONSE_S / period_s)
-    impulse = np.zeros(length + LEAD_ROWS)
+    impulse = np.zeros(round(RESPONSE_S / period_s) + LEAD_ROWS)
     impulse[LEAD_ROWS] = 1.0  # a delay of part of a row spreads it to both sides
 
     def answer(x: np.ndarray, drive: np.ndarray) -> np.ndarray:
@@ -264,8 +262,7 @@ def _filtered(whiten: np.ndarray, left: np.ndarray) -> np.ndarray:
 
 def _local_sigma(e: np.ndarray, window: int) -> np.ndarray:
     """(T,) standard deviation of e: robust, of the whole and of the neighbourhood, whichever is larger."""
-    count = max(1, len(e) // window)
-    edges = np.linspace(0, len(e), count + 1).astype(int)
+    edges = np.linspace(0, len(e), max(1, len(e) // window) + 1).astype(int)
     whole = 1.4826 * float(np.median(np.abs(e[e != 0]))) if (e != 0).any() else 1.0
     levels = [1.4826 * float(np.median(np.abs(e[a:b]))) for a, b in itertools.pairwise(edges)]
     middles = 0.5 * (edges[:-1] + edges[1:])

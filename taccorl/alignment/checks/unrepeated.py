@@ -125,14 +125,18 @@ def _unrepeated(
     quiet = max((by[k] for k in ("rest", "residue", "quantisation") if k in by), default=floor.value)
     squares = np.concatenate([np.empty(0), *(pair.difference**2 for pair in pairs)])
     repeats = float(np.sqrt(np.nanmean(squares) / 2)) if np.isfinite(squares).any() else 0.0
-    if repeats <= DISAGREE * quiet:
+    odd = dict(next((e.left_out for e in floor.estimates if e.method == "repeats"), ()))
+    if repeats <= DISAGREE * quiet and not odd:
         return
     blocks = sorted((block for pair in pairs for block in pair.blocks()), reverse=True)
     power = np.cumsum([block.rms**2 for block in blocks])
     count = int(np.searchsorted(power, BURST_POWER * power[-1])) + 1 if len(power) and power[-1] > 0 else 0
     share = count / len(blocks) if count else 1.0
     bursts = [block for block in blocks[:count] if block.rms > DISAGREE * quiet]
-    if share < BURST_SHARE and bursts:
+    if odd:
+        each = (f"{p.second} from {p.first} {odd[p.second]:.0f} times" for p in pairs if p.second in odd)
+        how = f"{', '.join(each)} as much as the other repeats, so that the noise floor is {floor.words()}"
+    elif share < BURST_SHARE and bursts:
         some = ", ".join(f"{b.begin_s:.2f} to {b.end_s:.2f} s" for b in bursts[:MOST_TIMES])
         how = (
             f"in bursts: {share:.0%} of the time holds {BURST_POWER:.0%} of it ({bursts[0].first} against {bursts[0].second}: "
@@ -152,4 +156,4 @@ def _unrepeated(
         f"{signal} does not repeat: two recordings of one motion differ by {repeats * 1e3:.3g} {unit}, {repeats / quiet:.1f} "
         f"times the noise of {quiet * 1e3:.3g} {unit} at rest and between rows, {how}; {cause}"
     )
-    yield bursts[0].second if bursts else pairs[0].first, find("does_not_repeat", signal, text)
+    yield next(iter(odd), bursts[0].second if bursts else pairs[0].first), find("does_not_repeat", signal, text)

@@ -149,8 +149,7 @@ def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
         return None
     best = max(follows[i, j] for i in free)
     alike = [i for i in free if follows[i, j] > best - ALIKE]
-    twin = [i for i in alike if m.signals[i] == other_arm(m.signals[j])]
-    return (twin or alike)[0]
+    return ([i for i in alike if m.signals[i] == other_arm(m.signals[j])] or alike)[0]
 
 
 @check("swapped_arms", "error")

@@ -141,8 +141,7 @@ def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray
 
 def _smooth(m: Measurement, signal: str, deriv: int) -> np.ndarray:
     """(T,) measured position, or a time derivative of it, of the quadratic over ``SMOOTH_S``."""
-    q = m.measured[:, m.column(signal)].astype(float)
-    return savgol_filter(q, _window(m), 2, deriv=deriv, delta=m.period_s)
+    return savgol_filter(m.measured[:, m.column(signal)].astype(float), _window(m), 2, deriv=deriv, delta=m.period_s)
 
 
 def _window(m: Measurement) -> int:

@@ -47,8 +47,7 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
         effects: effects besides the config's; one of the same name replaces the config's.
 
     Raises TaccorlError: an effect is given twice."""
-    names = {effect.name for effect in effects}
-    acting = present([*(e for e in config.effects if e.name not in names), *effects])
+    acting = present([*(e for e in config.effects if e.name not in {effect.name for effect in effects}), *effects])
     if config.reading.below_rest:
         acting = [dataclasses.replace(e, below_rest=True) if isinstance(e, CreepingEffect) else e for e in acting]
     load, shape = np.maximum(loads(m), 0.0), (1, m.num_places) if m.place.size else config.shape

@@ -211,8 +211,7 @@ class RobotJoint(RigidJoint):
         rows = np.arange(len(coupling)) * m.num_rows / len(coupling)
         coupling = coupling - np.interp(rows, np.arange(m.num_rows), m.known_load(self.signal))
         positions = None if along is None else along.positions
-        j = m.column(self.signal)
-        on, added = (values[:, j] if values.size else None for values in (m.enabled, m.torque_ff))
+        on, added = (values[:, m.column(self.signal)] if values.size else None for values in (m.enabled, m.torque_ff))
         drive = {"supply": self._config.supply(self.signal, m), "on": on, "torque_ff_nm": added}
         return Surroundings(coupling_nm=coupling, carrying_nm=carrying, pose=pose, positions=positions, **drive)
 
@@ -255,8 +254,7 @@ class RobotJoint(RigidJoint):
             for name in ("measured", "velocity", "effort", *m.extra_columns)
         }
         model = self._robot.rigid.model
-        rest = [model.qpos0[model.joint(name).qposadr[0]] for name in names]
-        arrays["target"] = np.tile(rest, (m.num_rows, 1))
+        arrays["target"] = np.tile([model.qpos0[model.joint(name).qposadr[0]] for name in names], (m.num_rows, 1))
         quantum = np.zeros(len(names))
         for j, name in enumerate(names):
             if name in m.signals:

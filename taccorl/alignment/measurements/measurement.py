@@ -233,8 +233,7 @@ class Measurement:
         and position. Raises TaccorlError: there are less than two rows, or time does not increase."""
         if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
             raise TaccorlError(f"{self.name}: its time does not increase: it cannot be resampled to {rate_hz:g} Hz")
-        steps = int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1
-        time_s = self.time_s[0] + np.arange(steps) / rate_hz
+        time_s = self.time_s[0] + np.arange(int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1) / rate_hz
         columns = {
             name: np.column_stack([np.interp(time_s, self.time_s, c) for c in getattr(self, name).T])
             for name in ("target", "measured", "velocity", "effort", *self.extra_columns)

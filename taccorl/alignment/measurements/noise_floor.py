@@ -7,7 +7,8 @@
     quantisation  q / √12, q the encoder's step
 
 Repeats are used if there are any, because they contain the robot's own variation. If few blocks hold most of their
-difference (bursts), their median is used, so that the floor does not contain the bursts. Without repeats the more certain one of
+difference (bursts), their median is used, so that the floor does not contain the bursts. A repeat that differs ``ODD`` times as
+much as the others (a late clock, another load) is left out. Without repeats the more certain one of
 rest and residue is used (the other one if it is clearly larger), which is a lower bound, or cycles if they differ by more. The
 floor is never below the quantisation, and never 0 (``NUMBER``, ``EXACT``). All estimates are reported.
 
@@ -58,6 +59,8 @@ MOVING = 1e-3
 BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
 """Repeats differ in bursts if less than ``BURST_SHARE`` of the blocks hold ``BURST_POWER`` of the squared difference, and the
 RMS of all is ``BURST_RATIO`` times that of the typical block."""
+ODD = 5.0
+"""A repeat is left out if the RMS of its typical block is more than this many times the others' median. A choice."""
 NUMBER = 2.0**-24
 """Last bit of a 32-bit number of size 1: no floor is smaller than this rounding."""
 EXACT = 1e-3
@@ -77,6 +80,8 @@ class Estimate:
     without_bursts: bool = False
     """True if a few short blocks of time hold most of the difference between two repeats of a motion, so that ``value`` was
     computed from the median block instead of from all blocks."""
+    left_out: tuple[tuple[str, float], ...] = ()
+    """Repeats that were left out: name of the recording, its difference over that of the others."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,7 @@ class SignalFloor:
         a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
         bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
         bursts = ", bursts left out" if self.used.without_bursts else ""
+        bursts += "".join(f", without {name}" for name, _ in self.used.left_out)
         return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
 
 
@@ -184,8 +190,7 @@ def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
     found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
     if not found:
         return np.full(channels[0][0].shape[1], np.nan)
-    squares = np.concatenate([b.mean_squares for b in found])
-    own = [column[np.isfinite(column)] for column in squares.T]
+    own = [column[np.isfinite(column)] for column in np.concatenate([b.mean_squares for b in found]).T]
     return np.sqrt([float(_median(c, found[0].freedom)) if len(c) else np.nan for c in own])
 
 
@@ -220,13 +225,15 @@ class _Blocks:
     """Rows in a block."""
     freedom: float
     """Degrees of freedom of a block of white noise."""
+    name: str = ""
+    """Name of the recording that repeats another."""
 
 
 def _repeat_blocks(first: Measurement, second: Measurement, kind: Kind) -> _Blocks:
     laid = overlay(first, second)
     rows = _block_rows(first.rate_hz)
     squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
-    return _Blocks(_without_beginning(squares), rows, float(rows))
+    return _Blocks(_without_beginning(squares), rows, float(rows), second.name)
 
 
 def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -243,8 +250,7 @@ def _without_beginning(squares: np.ndarray) -> np.ndarray:
         return squares
     measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
     usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
-    still_off = np.logical_and.accumulate(squares > usual, axis=0)
-    return np.where(still_off, np.nan, squares)
+    return np.where(np.logical_and.accumulate(squares > usual, axis=0), np.nan, squares)
 
 
 def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -329,14 +335,16 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
     blocks = [b for b in blocks if len(b.mean_squares)]
     if not blocks:
         return [None] * num_signals
-    squares = np.concatenate([b.mean_squares for b in blocks])
     rows, freedom = min(b.rows for b in blocks), min(b.freedom for b in blocks)
     found: list[Estimate | None] = []
-    for column in squares.T:
-        own = column[np.isfinite(column)]
-        if len(own) == 0:
+    for j in range(num_signals):
+        parts = [(b.name, own[np.isfinite(own)]) for b in blocks for own in (b.mean_squares[:, j],)]
+        parts = [part for part in parts if len(part[1])]
+        if not parts:
             found.append(None)
             continue
+        odd = _odd({name: float(np.median(own)) for name, own in parts}) if method == "repeats" else {}
+        own = np.concatenate([own for name, own in parts if name not in odd])
         # Repeats in the mean (unless positions differ in bursts): what happens once belongs to it, and the noise of an effort
         # grows with the motion. The others in the median: a stretch that
         # still creeps, or a kink that the smooth cuts, is not noise.
@@ -346,7 +354,17 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
         square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
         spread = _log_spread(own, freedom, robust=robust)
         value = math.sqrt(square)
-        found.append(Estimate(method, value, value / spread, value * spread, len(own) * rows, bursts))
+        found.append(Estimate(method, value, value / spread, value * spread, len(own) * rows, bursts, (*odd.items(),)))
+    return found
+
+
+def _odd(squares: dict[str, float]) -> dict[str, float]:
+    """Repeats that differ over ``ODD`` times as much as the others: name → ratio. ``squares``: name → typical difference²."""
+    found = {}
+    for name, own in squares.items():
+        others = float(np.median([square for other, square in squares.items() if other != name] or [math.inf]))
+        if own > ODD**2 * others > 0.0:
+            found[name] = math.sqrt(own / others)
     return found
 
 

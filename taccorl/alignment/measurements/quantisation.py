@@ -33,5 +33,4 @@ def find_quantum(values: np.ndarray) -> float:
     quantum = float(near.sum() / np.round(near / quantum).sum())
     counts = np.round(steps / quantum)
     quantum = float(steps.sum() / counts.sum())
-    off = np.abs(steps / quantum - counts)
-    return quantum if (off < SAME * np.maximum(1.0, counts * 1e-3)).all() else 0.0
+    return quantum if (np.abs(steps / quantum - counts) < SAME * np.maximum(1.0, counts * 1e-3)).all() else 0.0

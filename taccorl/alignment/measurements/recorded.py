@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -156,23 +157,18 @@ class _Notes:
         if spec.episodes.by == "markers":
             texts = [t.removeprefix("start:") for t in texts if t.startswith("start:")]
         told = next((t.strip() for t in texts if t.strip()), written.get("instruction", spec.instruction.text or ""))
-        numbers: dict[str, dict[str, float]] = {}
-        for key in ("kp", "kd", "gain_scale", "payload_kg"):
+
+        def stated(key: str, value: Callable[[Any], Any], example: str) -> dict[str, Any]:
             try:
-                numbers[key] = {str(k): float(v) for k, v in json.loads(written.get(key, "{}")).items()}
+                return {str(k): value(v) for k, v in json.loads(written.get(key, "{}")).items()}
             except (ValueError, TypeError, AttributeError) as error:
-                raise RecordingError(
-                    f"{recording.source.name}: metadata {key} is {written[key]!r}; expected a value such as "
-                    '{"left_joint5": 40.0}'
-                ) from error
-        try:
-            stated = json.loads(written.get("payload_position_m", "{}")).items()
-            places = {str(arm): (float(x), float(y), float(z)) for arm, (x, y, z) in stated}
-        except (ValueError, TypeError, AttributeError) as error:
-            raise RecordingError(
-                f"{recording.source.name}: metadata payload_position_m is {written['payload_position_m']!r}; expected "
-                'a value such as {"left": [0, 0, 0.168]}'
-            ) from error
+                text = f"metadata {key} is {written[key]!r}; expected a value such as {example}"
+                raise RecordingError(f"{recording.source.name}: {text}") from error
+
+        one = '{"left_joint5": 40.0}'
+        numbers = {key: stated(key, float, one) for key in ("kp", "kd", "gain_scale", "payload_kg")}
+        three = '{"left": [0, 0, 0.168]}'
+        places = stated("payload_position_m", lambda v: (*np.reshape(v, 3).astype(float).tolist(),), three)
         return cls(recording.origin, told, written.get("repeat_of") or None, numbers, places)
 
 
@@ -214,8 +210,7 @@ class _Rows:
         stamps = self._time_ns(moves)
         half = self.period_ns // 2
         # Median distance from the nearest tick: stamps jitter about the instant at which the driver meant to send.
-        off = int(np.median((stamps - stamps[0] + half) % self.period_ns - half))
-        first = int(stamps[0]) + off
+        first = int(stamps[0]) + int(np.median((stamps - stamps[0] + half) % self.period_ns - half))
         first += max(0, -(-(start - first) // self.period_ns)) * self.period_ns
         if end - first < 2 * self.period_ns:
             raise RecordingError(

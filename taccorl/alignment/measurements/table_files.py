@@ -115,8 +115,7 @@ def _encoding(path: Path, spec: FileForm | None) -> str:
     mark the one under ``encoding:`` of the columns file; without both UTF-8."""
     with path.open("rb") as file:
         start = file.read(3)
-    marked = (name for mark, name in MARKS.items() if start.startswith(mark))
-    return next(marked, spec.encoding if spec else "utf-8")
+    return next((name for mark, name in MARKS.items() if start.startswith(mark)), spec.encoding if spec else "utf-8")
 
 
 def _stated(path: Path, encoding: str) -> list[tuple[str, str]]:

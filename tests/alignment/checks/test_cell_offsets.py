@@ -27,8 +27,7 @@ def unclipped(below_rest: bool = True) -> CellsConfig:
 
 
 def offsets(recordings: list[CellMeasurement], below_rest: bool = False) -> list[Finding]:
-    found = check_cells(unclipped(below_rest), recordings, ["a", "b"])
-    return [f for own in found.values() for f in own]
+    return [f for own in check_cells(unclipped(below_rest), recordings, ["a", "b"]).values() for f in own]
 
 
 def creeping(share: float):
@@ -54,8 +53,7 @@ def test_an_offset_that_differs_between_recordings_is_named_with_its_size_and_a_
     assert size == pytest.approx(24, abs=1) and floors == pytest.approx(24, rel=0.2)  # the noise is 1 count
     (single,) = offsets(changed(-12.0 * (np.arange(K) == 7)))
     assert "1 of 20 cells" in single.text and config().names[7] in single.text and " by -1" in single.text
-    warm = [dataclasses.replace(m, temperature_c=np.full(len(m.time_s), 20.0)) for m in changed(24.0)]
-    assert offsets(warm) == []
+    assert offsets([dataclasses.replace(m, temperature_c=np.full(len(m.time_s), 20.0)) for m in changed(24.0)]) == []
     remarks = CellsMachine(config()).diagnose("array", split(changed(24.0))).diagnosis.remarks
     assert any("20 of 20 cells" in text for text in remarks)
 

@@ -112,6 +112,19 @@ def test_backlash_that_holds_a_joint_once_between_turns_is_not_called_dropped_co
     assert dropped is not None and dropped.found >= 6 + 4 * dropped.mirrored and not dropped.certain
 
 
+def test_a_repeat_that_differs_far_more_than_the_others_is_left_out_of_the_floor_and_named():
+    """10 rows late, or a drift of 12 floors: its RMS is 12 / √2, over √2 of two recordings' noise: 6 times the others'."""
+    made = [recording("a", 1), recording("b", 2, repeat_of="a"), recording("c", 3, repeat_of="a")]
+    at, drift = made[1].measured, 12 * NOISE_RAD * np.sin(np.arange(2400) / 50)[:, None]
+    for measured in (np.roll(at, 10, axis=0), at + drift):
+        every = [*made, dataclasses.replace(made[1], name="odd", measured=measured)]
+        floor = noise_floor(every)["left_joint5"].used
+        assert [name for name, _ in floor.left_out] == ["odd"] and floor.value == noise_floor(made)["left_joint5"].value
+        (text,) = (f.text for name, f in check_repeatability(every) if (name, f.check) == ("odd", "does_not_repeat"))
+        assert f"odd from a {floor.left_out[0][1]:.0f} times" in text and "without odd" in text
+    assert floor.left_out[0][1] == pytest.approx(6.0, rel=0.25)  # with the noise: √(6² + 1)
+
+
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
     m = recording("a", 3, drop=0.05, longest=4)
     dropped = find_dropped([m], 0)

@@ -41,8 +41,7 @@ def urdf(folder: Path, *parts: str) -> Path:
 
 
 def line_of(path: Path, words: str, which: int = 0) -> int:
-    lines = [k for k, line in enumerate(path.read_text().splitlines(), 1) if words in line]
-    return lines[which]
+    return [k for k, line in enumerate(path.read_text().splitlines(), 1) if words in line][which]
 
 
 def test_two_joints_of_one_name_are_named_with_their_links_and_lines(tmp_path: Path):

@@ -78,8 +78,7 @@ def test_repeats_see_what_the_robot_does_not_repeat(motion):
     alone = noise_floor([once("a")])["left_joint2"].value
     pairs = [noise_floor([once("a"), dataclasses.replace(once("b"), repeat_of="a")])["left_joint2"] for _ in range(12)]
     # ⟨(A sin(x + φ₁) − A sin(x + φ₂))²⟩ / 2 over phases is A² / 2 = 1 mrad², plus the noise.
-    rms = math.sqrt(np.mean([f.value**2 for f in pairs]))
-    assert rms == pytest.approx(math.sqrt(1e-6 + NOISE**2), rel=0.35)
+    assert math.sqrt(np.mean([f.value**2 for f in pairs])) == pytest.approx(math.sqrt(1e-6 + NOISE**2), rel=0.35)
     assert alone < 0.5e-3
 
 
@@ -325,5 +324,4 @@ def test_what_is_no_three_equal_cycles_is_none(motion):
     held = cycling()
     held.target[500:1900] = held.target[500]
     assert cycles(held) is None
-    loaded = dataclasses.replace(cycling(), load=np.linspace(0.0, 1.0, 2400)[:, None])
-    assert cycles(loaded) is None
+    assert cycles(dataclasses.replace(cycling(), load=np.linspace(0.0, 1.0, 2400)[:, None])) is None

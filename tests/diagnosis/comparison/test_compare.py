@@ -63,8 +63,7 @@ def test_gripper_or_contact_takes_the_whole_twin():
     target = target.copy()
     target[300:, 6] -= 0.02
     gripping = recorded(TwinConfig(), target, 6)
-    ways = [r.way for r in replay_all(TwinConfig(), [free, gripping], lambda *_: None)]
-    assert ways == ["joint", "twin"]
+    assert [r.way for r in replay_all(TwinConfig(), [free, gripping], lambda *_: None)] == ["joint", "twin"]
     assert moving(gripping) == [SIGNAL, "left_gripper"]
     found = compare(TwinConfig(), Measurements((gripping,)))
     assert [s for s, kind in found.signals if kind == "position"] == [SIGNAL, "left_gripper"]

@@ -65,8 +65,7 @@ def test_regimes_of_a_group_exclude_each_other_and_shares_add_up():
         assert sum(c.n for c in own) == len(position)
     motion = motions_of([trace(noise, position)])[0]
     for group in {r.group for r in REGIMES}:
-        together = sum(r.rows(motion).astype(int) for r in REGIMES if r.group == group)
-        assert together.max() <= 1
+        assert sum(r.rows(motion).astype(int) for r in REGIMES if r.group == group).max() <= 1
 
 
 def test_high_load_and_contact_are_read_off_torque_and_pads():
@@ -141,8 +140,7 @@ def test_several_recordings_are_one_curve_and_a_still_joint_has_none():
     _, position = swing(seconds=10.0)
     two = comparison(trace(1e-3 * position, position), trace(1e-3 * position, position, recording="other"))
     found = {c.variable: c for c in curves(two, "left_joint5")}
-    slope = np.polyfit(found["position"].at, found["position"].middle, 1)[0]
-    assert slope == pytest.approx(1e-3, rel=1e-6)
+    assert np.polyfit(found["position"].at, found["position"].middle, 1)[0] == pytest.approx(1e-3, rel=1e-6)
     still = np.full(2000, 0.3)
     assert [c.variable for c in curves(comparison(trace(1e-3 * still, still)), "left_joint5")] == ["time"]
 

@@ -45,8 +45,7 @@ def test_fit_and_validation_that_disagree_are_remarked_in_either_way():
         (remark,) = [r for r in regime_errors([large, small]).remarks if r.startswith(ALL)]
         assert f"{uses[0]} recordings end at 1.47" in remark or f"{uses[0]} recordings at 1.47" in remark
         assert "0.92" in remark
-    alike = [trace(one, POSITION, recording=use, use=use) for use in ("fit", "validation")]
-    assert regime_errors(alike).remarks == ()
+    assert regime_errors([trace(one, POSITION, recording=use, use=use) for use in ("fit", "validation")]).remarks == ()
 
 
 def test_ranges_that_validation_does_not_cover_are_remarked():

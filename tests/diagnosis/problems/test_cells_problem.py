@@ -155,8 +155,7 @@ def test_the_noise_floor_is_that_of_reading_and_load_together():
     load = np.interp(np.arange(4000) / RATE_HZ, [0, 5, 15, 25, 40], [0, 0, 15, 15, 0])
     reading = 20.0 * load + 10 + rng.normal(0, 2.0, 4000)
     m = press(load + rng.normal(0, 0.05, 4000), reading)
-    floor = reading_floor(config(), [m])
-    assert floor[0] == pytest.approx(np.hypot(2.0, 20.0 * 0.05), rel=0.08)
+    assert reading_floor(config(), [m])[0] == pytest.approx(np.hypot(2.0, 20.0 * 0.05), rel=0.08)
 
 
 def test_recordings_of_a_second_have_a_noise_floor_too():

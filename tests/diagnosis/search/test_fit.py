@@ -122,8 +122,7 @@ def test_blocks_are_means_of_half_a_second():
 
 def test_standard_score_is_mean_over_its_error():
     # mean 2, deviation √(((1−2)² + 0 + (3−2)²) / 2) = 1, error 1/√3
-    even = np.full(3, 1 / 3)
-    assert standard_score(Blocks(np.array([1.0, 2.0, 3.0]), even)) == pytest.approx(2 * np.sqrt(3))
+    assert standard_score(Blocks(np.array([1.0, 2.0, 3.0]), np.full(3, 1 / 3))) == pytest.approx(2 * np.sqrt(3))
     assert standard_score(Blocks(np.array([5.0]), np.ones(1))) == 0.0
     assert standard_score(Blocks(np.zeros(4), np.full(4, 0.25))) == 0.0
 

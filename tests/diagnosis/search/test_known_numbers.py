@@ -19,8 +19,7 @@ from taccorl.errors import TaccorlError
 def found(*candidates: str, **changed: Any) -> Diagnosis:
     problem = AxisProblem(dataclasses.replace(AXIS, **changed), recorded_slide())
     without = [n for n in problem.candidates if n not in (*candidates, *problem.present)]
-    one = SearchConfig(max_effects=1)
-    return solve("drive", problem, problem.fit, problem.validation, (), one, without).diagnosis
+    return solve("drive", problem, problem.fit, problem.validation, (), SearchConfig(max_effects=1), without).diagnosis
 
 
 def test_a_known_mass_stays_and_the_rest_is_found_beside_it():
@@ -39,8 +38,7 @@ def test_a_wrong_known_mass_is_named_with_the_mass_that_the_recordings_have():
     assert d.after.values["inertia"] == 80.0
     (remark,) = d.remarks
     assert "inertia 80 kg" in remark and "`known`" in remark
-    freed = float(remark.split("with inertia ")[1].split(" ")[0])
-    assert freed == pytest.approx(MASS_KG, rel=0.01)
+    assert float(remark.split("with inertia ")[1].split(" ")[0]) == pytest.approx(MASS_KG, rel=0.01)
 
 
 @pytest.mark.parametrize(("stated", "names", "num"), [(2.0, ("hidden",), 1), (3.0, (), 0)])
@@ -57,8 +55,7 @@ def test_an_effect_that_only_makes_up_for_a_wrong_known_number_is_named(
     if num:
         assert d.after.values["hidden.strength"] == pytest.approx(1.0, abs=0.02)
         assert "gain 2 " in d.remarks[0] and "in place of hidden" in d.remarks[0]
-        freed = float(d.remarks[0].split("; gain ")[1].split(" ")[0])
-        assert freed == pytest.approx(3.0, abs=0.02)
+        assert float(d.remarks[0].split("; gain ")[1].split(" ")[0]) == pytest.approx(3.0, abs=0.02)
 
 
 def test_an_effect_that_is_known_to_be_absent_is_not_added_and_its_absence_is_doubted():
@@ -66,8 +63,7 @@ def test_an_effect_that_is_known_to_be_absent_is_not_added_and_its_absence_is_do
     assert d.names == ()
     (remark,) = d.remarks
     assert "coulomb_friction is marked as known to be absent" in remark
-    force = float(remark.split("coulomb_friction.torque_nm ")[1].split(" ")[0])
-    assert force == pytest.approx(FRICTION_N, rel=0.05)
+    assert float(remark.split("coulomb_friction.torque_nm ")[1].split(" ")[0]) == pytest.approx(FRICTION_N, rel=0.05)
 
 
 @pytest.mark.parametrize(
