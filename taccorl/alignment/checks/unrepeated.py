@@ -129,6 +129,7 @@ def _unrepeated(
     if repeats <= DISAGREE * quiet and not odd:
         return
     blocks = sorted((block for pair in pairs for block in pair.blocks()), reverse=True)
+    worst = blocks[0] if blocks else pairs[0]
     power = np.cumsum([block.rms**2 for block in blocks])
     count = int(np.searchsorted(power, BURST_POWER * power[-1])) + 1 if len(power) and power[-1] > 0 else 0
     share = count / len(blocks) if count else 1.0
@@ -144,8 +145,8 @@ def _unrepeated(
         )
     else:
         how = (
-            f"all the time ({share:.0%} of it holds {BURST_POWER:.0%}). The noise floor contains it, so a missing effect below "
-            "that is not found"
+            f"all the time ({share:.0%} of it holds {BURST_POWER:.0%}), most {worst.second} from {worst.first}. The noise floor "
+            "contains it, so a missing effect below that is not found; if one of the two is wrong, remove that `repeat_of`"
         )
     cause = (
         "dropped commands explain it (see dropped_commands)"
@@ -156,4 +157,4 @@ def _unrepeated(
         f"{signal} does not repeat: two recordings of one motion differ by {repeats * 1e3:.3g} {unit}, {repeats / quiet:.1f} "
         f"times the noise of {quiet * 1e3:.3g} {unit} at rest and between rows, {how}; {cause}"
     )
-    yield next(iter(odd), bursts[0].second if bursts else pairs[0].first), find("does_not_repeat", signal, text)
+    yield next(iter(odd), worst.second), find("does_not_repeat", signal, text)

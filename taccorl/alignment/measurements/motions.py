@@ -113,8 +113,7 @@ def chirp(
     time_s = _time(seconds)
     hz = low_hz + (high_hz - low_hz) * time_s / seconds
     angle = 2 * np.pi * (low_hz * time_s + (high_hz - low_hz) * time_s**2 / (2 * seconds))
-    height = np.minimum(amplitude_rad, speed / (2 * np.pi * hz))
-    return height * np.sin(angle) * _fade(time_s, seconds)
+    return np.minimum(amplitude_rad, speed / (2 * np.pi * hz)) * np.sin(angle) * _fade(time_s, seconds)
 
 
 def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray:
