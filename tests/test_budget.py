@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_713,
+    "taccorl/alignment": 15_718,
     "taccorl/cli": 5_097,
     "taccorl/data": 8_824,
     "taccorl/diagnosis": 11_308,
@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_780,
-    "tests": 60_874,
-    "pipelines": 6_289,
+    "tests": 60_869,
+    "pipelines": 6_293,
 }
 MOST_LINES_OF_A_FILE = 500
 
