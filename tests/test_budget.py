@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_780,
-    "tests": 60_869,
+    "tests": 60_871,
     "pipelines": 6_293,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -92,7 +92,7 @@ def _channels(m: Measurement) -> Iterator[Finding]:
                 "lost; correct the driver"
             )
             yield find("low_rate", t.channel, text)
-        if t.duplicates:
+        if t.duplicates > (1.0 - RATE_SHARE) * t.rate_hz * (m.time_s[-1] - m.time_s[0]):  # a few are usual
             text = f"{t.duplicates} samples of {t.channel} repeat the stamp of another; the first of each was kept"
             yield find("duplicates", t.channel, text, topic="stamps")
         if t.out_of_order:

@@ -760,10 +760,12 @@ def test_holes_and_nan_are_errors_with_their_place(clean):
 
 def test_channels_of_a_recording_speak_for_themselves(clean):
     base = ChannelTiming("left_command", "action", "line", 100.0, 0, 0.01, 0.0, 0.0, nominal_hz=200.0)
-    state = dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3, duplicates=7)
+    often = round(0.3 * 200.0 * (clean.time_s[-1] - clean.time_s[0]))
+    state = dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3, duplicates=often)
     m = dataclasses.replace(clean, timing=(base, state))
     assert found(m) == {"low_rate": ["left_command"], "out_of_order": ["left_state"], "duplicates": ["left_state"]}
-    assert text_of(m, "duplicates").startswith("7 samples of left_state repeat")
+    assert text_of(m, "duplicates").startswith(f"{often} samples of left_state repeat")
+    assert found(dataclasses.replace(clean, timing=(dataclasses.replace(state, out_of_order=0, duplicates=9),))) == {}
     apart = dataclasses.replace(base, rate_hz=200.0, age_median_s=0.002)
     assert found(dataclasses.replace(clean, timing=(apart,))) == {"jitter": ["left_command"]}
     assert found(dataclasses.replace(clean, time_error_s=0.005)) == {"row_times": ["time"]}
