@@ -30,7 +30,7 @@ from taccorl.cli.collect import CollectConfig
 from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
-from taccorl.episodes.sources.mimicgen.coverage import Share
+from taccorl.evaluation.statistics import told_rate, wilson_interval
 from taccorl.sim.twin_file import save_twin
 
 RECORDING_SPEC = "piper_flexitac_mcap"
@@ -125,15 +125,19 @@ def write(rows: list[dict], config: CotrainConfig, training: Training, out: Path
     found: dict[str, list[bool]] = {}
     for row in rows:
         found.setdefault(row["where"], []).append(row["success"])
-    shares = {where: Share(successes=sum(each), attempts=len(each)) for where, each in found.items()}
+    counts = {where: (sum(each), len(each)) for where, each in found.items()}
+    scores = {
+        where: {"successes": k, "attempts": n, "rate": k / n, "interval_95": wilson_interval(k, n)}
+        for where, (k, n) in counts.items()
+    }
     of_twin = config.augmented + (config.sources if config.cache == "none" else 0)
     data = f"{config.real} episodes of a surrogate ({ORIGIN}); {of_twin} of the twin"
-    told = {"data": data, "steps": training.steps, "scores": {w: s.record() for w, s in shares.items()}}
+    told = {"data": data, "steps": training.steps, "scores": scores}
     text = json.dumps(told | {"outcomes": rows}, indent=1, ensure_ascii=False)
     (out / "outcomes.json").write_text(text + "\n", encoding="utf-8")
     lines = [f"{config.task}, {training.steps} steps on {data}. Nothing here is of a robot.", ""]
     lines += ["| scored in | successes, 95 % after Wilson |", "|---|---|"]
-    lines += [f"| {where} | {share} |" for where, share in shares.items()]
+    lines += [f"| {where} | {told_rate(*count)} |" for where, count in counts.items()]
     (out / "outcomes.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print("\n" + "\n".join(lines))
 

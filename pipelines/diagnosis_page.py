@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from pipelines.studies.figures import confusion_matrix, detection_curves, half_detected
 from pipelines.studies.joints_and_pads import (
@@ -20,6 +19,7 @@ from pipelines.studies.joints_and_pads import (
     named,
     silently_wrong,
 )
+from pipelines.studies.robots import share
 from taccorl.data.origin import Origin
 
 PAGE = Path("docs/diagnosis.md")
@@ -47,14 +47,6 @@ know the gains. Half of the cases use efforts, half have a loop sampled at 0.5 t
 Intervals are 95 % (Wilson).
 
 """
-
-
-def share(count: int, n: int) -> str:
-    """``87 % (34 of 39; 73 … 94)``"""
-    if n == 0:
-        return "not measured yet"
-    ends = binomtest(count, n).proportion_ci(method="wilson")
-    return f"{count / n:.0%} ({count} of {n}; {100 * ends.low:.0f} … {100 * ends.high:.0f})"
 
 
 def write_page(rows: list[dict]) -> None:

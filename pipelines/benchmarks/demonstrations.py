@@ -16,6 +16,7 @@ from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
 from taccorl.episodes.sources.mimicgen.spec import NoiseSpec, SplitNoiseSpec, load_mimic_spec, with_options
+from taccorl.evaluation.statistics import wilson_interval
 from taccorl.lineage.store import Store
 from taccorl.sim.twin import TwinConfig
 from taccorl.tasks.experts import tasks_with_expert
@@ -113,18 +114,19 @@ def mimicgen_cells(task: str) -> Iterator[Row]:
         if place is twin:
             yield Row(
                 name=f"yield over that of replayed poses (its 0 counts as 1), {words}",
-                value=held.share.successes / max(replay.share.successes, 1), unit="×", goal="≥ 3", n=num_attempts,
+                value=held.successes / max(replay.successes, 1), unit="×", goal="≥ 3", n=num_attempts,
                 spread=0.0,
             )  # fmt: skip
 
 
 def _yield_row(name: str, score: Any, goal: str) -> Row:
     """Value and 95 % interval (Wilson) of a yield."""
-    low, high = score.share.interval
+    n = len(score.outcomes)
+    low, high = wilson_interval(score.successes, n)
     failures = ", ".join(f"{count} {what}" for what, count in score.failures.items()) or "no failures"
     return Row(
         name=f"{name} (95 %: {100 * low:.0f} … {100 * high:.0f}); {failures}",
-        value=100 * score.share.rate, unit="%", goal=goal, n=score.share.attempts, spread=50 * (high - low),
+        value=100 * score.successes / n, unit="%", goal=goal, n=n, spread=50 * (high - low),
     )  # fmt: skip
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taccorl.episodes.sources.mimicgen.attempt import Attempts, Generated
-from taccorl.episodes.sources.mimicgen.coverage import Share
 from taccorl.episodes.sources.mimicgen.source import Source, SourcePool
 from taccorl.episodes.sources.mimicgen.spec import MimicSpec
 from taccorl.episodes.sources.mimicgen.stored import state_digest
@@ -32,8 +31,8 @@ class Score:
     """Number of kept attempts whose stored actions end in another state, or without reaching the goal, in a new simulation."""
 
     @property
-    def share(self) -> Share:
-        return Share(successes=self.outcomes.count("success"), attempts=len(self.outcomes))
+    def successes(self) -> int:
+        return self.outcomes.count("success")
 
     @property
     def failures(self) -> dict[str, int]:

@@ -14,7 +14,7 @@ VERBS = {
     "twin": {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
         "task": "`task new NAME` writes a working task of your own, which collect, augment and evaluate then know",
-        "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
+        "augment": "a few demonstrations from the twin → many new ones (MimicGen)",
         "correct": "the expert takes over where a policy fails → dataset of its corrections (DAgger)",
         "execute": "stored actions (augment --rows=actions) → LeRobot dataset, or frames for training without any video",
         "evaluate": "success rate of a policy in the twin, its interval, failures; comparison of two policies on the same scenes",

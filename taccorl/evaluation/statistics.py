@@ -12,12 +12,12 @@ from scipy.stats import binomtest
 
 from taccorl.errors import TaccorlError
 
-CONFIDENCE = 0.95
-"""Probability of all intervals."""
+Z = NormalDist().inv_cdf(0.975)
+"""Standard normal quantile of all intervals, which are of 95 %."""
 
 
-def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Wilson's score interval of a share, without continuity correction: (low, high) in 0 … 1.
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of a share, without continuity correction: (low, high) in 0 … 1.
 
     (p + z²/2n ± z √(p q / n + z²/4n²)) / (1 + z²/n), with p = successes / n and q = 1 − p. (0, 1) if n is 0. Raises
     TaccorlError: not 0 ≤ successes ≤ n."""
@@ -25,11 +25,17 @@ def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> t
         raise TaccorlError(f"Wilson's interval: {successes} successes of {n} episodes")
     if n == 0:
         return 0.0, 1.0
-    z, p = _z(confidence), successes / n
+    z, p = Z, successes / n
     middle, scale = p + z**2 / (2 * n), 1 + z**2 / n
     half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     # At p = 0 and p = 1 one end is exact; rounding would leave 1e-17 there.
     return (middle - half) / scale if successes else 0.0, (middle + half) / scale if successes < n else 1.0
+
+
+def told_rate(successes: int, n: int) -> str:
+    """Success rate with Wilson's interval as text: ``8 of 10: 80 % (95 %: 49 … 94)``, without percentages if n is 0."""
+    low, high = (100 * end for end in wilson_interval(successes, n))
+    return f"{successes} of {n}: " + (f"{100 * successes / n:.0f} % (95 %: {low:.0f} … {high:.0f})" if n else "–")
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
@@ -43,10 +49,8 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     return float(binomtest(only_first, disagree, 0.5).pvalue) if disagree else 1.0
 
 
-def paired_difference_interval(
-    both: int, only_first: int, only_second: int, neither: int, confidence: float = CONFIDENCE
-) -> tuple[float, float]:
-    """Interval (low, high) of p₁ − p₂ from paired outcomes, in −1 … 1: Newcombe's method 10 (Statist. Med. 17, 2635–2650, 1998).
+def paired_difference_interval(both: int, only_first: int, only_second: int, neither: int) -> tuple[float, float]:
+    """95 % interval (low, high) of p₁ − p₂ from paired outcomes: Newcombe's method 10 (Statist. Med. 17, 2635–2650, 1998).
 
     Args:
         both, neither: number of scenes on which both policies succeed, and on which none does.
@@ -64,7 +68,7 @@ def paired_difference_interval(
     if min(a, b, c, d) < 0 or n == 0:
         raise TaccorlError(f"paired difference: counts {a}, {b}, {c}, {d}; give numbers ≥ 0, one of them > 0")
     p1, p2 = (a + b) / n, (a + c) / n
-    (l1, u1), (l2, u2) = wilson_interval(a + b, n, confidence), wilson_interval(a + c, n, confidence)
+    (l1, u1), (l2, u2) = wilson_interval(a + b, n), wilson_interval(a + c, n)
     margins = (a + b) * (c + d) * (a + c) * (b + d)
     numerator = a * d - b * c
     if numerator > 0:
@@ -140,7 +144,3 @@ class PairedComparison:
             f"of {self.n} scenes {self.both} both, {self.only_first} only the first, {self.only_second} only the second, "
             f"{self.neither} neither; McNemar's exact test p = {self.p_value:.3g}"
         )
-
-
-def _z(confidence: float) -> float:
-    return NormalDist().inv_cdf(0.5 + confidence / 2)

@@ -4,17 +4,21 @@ import json
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import yaml
 
+from taccorl.cli.augment import view_commands
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
+from taccorl.episodes.plan import Made
 from taccorl.episodes.sources.mimicgen import augment as module
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, attempt_episode
 from taccorl.episodes.sources.mimicgen.spec import mimic_spec_path
+from taccorl.lineage.stage import Artefact
 
 WORDS = ("--task=assembly_2", "--episodes=1", "--images=false", "--out=new", "--store=store")
 
@@ -29,38 +33,23 @@ def place(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def report(folder: Path, name: str = "new") -> dict[str, Any]:
-    return json.loads((folder / f"{name}.augment_report.json").read_text())
+def report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "new/meta/taccorl/collect_report.json").read_text())
 
 
-def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
+def test_the_result_keeps_yield_causes_and_grips(place: Path) -> None:
     told, dataset = report(place), Dataset(place / "new")
-    assert dataset.num_episodes == told["yield"]["successes"] == 1
-    assert told["data"] == "twin: MuJoCo twin, not a robot"
-    assert len(told["failed"]) == told["yield"]["attempts"] - 1
+    assert dataset.num_episodes == told["episodes"] == told["outcomes"]["success"] == 1
+    assert [entry["attempt"] for entry in told["entries"]] == list(range(told["attempts"]))
+    assert sum(told["outcomes"].values()) == told["attempts"]
     grips = [(g["arm"], g["part"], g["sources"]) for g in told["grips"]["hands"]]
     assert grips == [("left", "cradle", 2), ("right", "plug", 2)] and told["grips"]["few"]
     assert all(1 <= g["different"] <= 2 for g in told["grips"]["hands"])
-    collected = json.loads((place / "new/meta/taccorl/collect_report.json").read_text())
-    assert collected["grips"] == told["grips"]
-    assert told["cost"]["wall_s"] > 0
-    assert told["cost"]["cpu_s_per_success"] > 0
-    by_attempt = {draw["attempt"]: draw for draw in told["draws"]}
-    simulation = dataset.episode(0).provenance["simulation"]
-    assert isinstance(simulation, dict)
-    made = simulation["mimicgen"]
-    for name, value in made["draw"].items():  # reckoned from the seeds; there as the simulation drew it
-        assert by_attempt[made["attempt"]][name] == value
     card = (place / "new/README.md").read_text()
-    assert "**Data: twin: MuJoCo twin, not a robot**" in card and f"{told['yield']['attempts']} attempt" in card
-    page = (place / "new.augment_report.html").read_text()
-    assert "Yield: 1 of " in page
-    assert "data:image/png;base64," in page
+    assert "**Data: twin: MuJoCo twin, not a robot**" in card and f"{told['attempts']} attempt" in card
 
 
-def test_the_same_command_again_makes_nothing_anew_and_says_so_of_its_cost(
-    collected: Path, place: Path, said: Any
-) -> None:
+def test_the_same_command_again_makes_nothing_anew(collected: Path, place: Path, said: Any) -> None:
     attempts = sorted((place / "store" / "mimicgen").iterdir())
     code, text = said("augment", f"--source={collected}", *WORDS)
     assert code == 0
@@ -70,8 +59,20 @@ def test_the_same_command_again_makes_nothing_anew_and_says_so_of_its_cost(
     )
     assert "next:    taccorl view new --episode=0" in text
     assert sorted((place / "store" / "mimicgen").iterdir()) == attempts
-    assert report(place)["cost"]["cpu_s_per_success"] is None
-    assert report(place)["cost"]["process_s_per_success"] > 0
+
+
+def test_of_each_cause_the_first_attempt_with_actions_can_be_viewed() -> None:
+    """The attempt's physics is shown, also where the second execution failed; it is the artefact if the store lost it."""
+    ended = [("dropped", 0), ("success", 9), ("force", 7), ("dropped", 5), ("force", 8), ("hung", 0), ("gate", 4)]
+    entries = [{"attempt": k, "outcome": o, "rows": rows, "reason": f"why {k}"} for k, (o, rows) in enumerate(ended)]
+    produced = SimpleNamespace(made=[Made(Artefact(Path(f"made {e['attempt']}"), ""), e) for e in entries])
+    store = SimpleNamespace(find=lambda _, k, __: None if k == 6 else Artefact(Path(f"store/{k}"), ""))
+    plan = SimpleNamespace(steps=[SimpleNamespace(stage="")], config=lambda k: k, inputs=lambda k: [])
+    assert view_commands(cast(Any, plan), cast(Any, produced), cast(Any, store)) == [
+        "view:    taccorl view store/3  (dropped: why 3)",
+        "view:    taccorl view store/2  (force: why 2)",
+        "view:    taccorl view 'made 6'  (gate: why 6)",
+    ]
 
 
 @pytest.mark.slow
@@ -160,8 +161,6 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
         ((*WORDS[:3], "--out=mine", "--store=store"), "mine is occupied: it is a folder of 1 entries without"),
         ((*WORDS, "--seed=1"), "which differs in attempts (source, seed, number"),
         ((*WORDS, "--episodes=3"), "new is occupied: it holds augmented v4"),
-        ((*WORDS, "--stratify=true"), "new is occupied: it holds augmented v4"),
-        ((*WORDS, "--out=other"), "other.augment_report.html: already exists and is not a report"),
     ],
 )
 def test_what_cannot_work_is_named_before_any_attempt(
@@ -170,7 +169,6 @@ def test_what_cannot_work_is_named_before_any_attempt(
     monkeypatch.setattr(AugmentPlan, "run", lambda *_: pytest.fail("an attempt was made"))
     (place / "mine").mkdir(exist_ok=True)
     (place / "mine" / "work.txt").write_text("x")
-    (place / "other.augment_report.html").write_text("my own page")
     options = {word.partition("=")[0]: word for word in (f"--source={collected}", *words)}  # the last one counts
     code, text = said("augment", *options.values())
     assert code == 2

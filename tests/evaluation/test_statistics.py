@@ -6,7 +6,13 @@ import math
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.evaluation.statistics import PairedComparison, mcnemar_exact, paired_difference_interval, wilson_interval
+from taccorl.evaluation.statistics import (
+    PairedComparison,
+    mcnemar_exact,
+    paired_difference_interval,
+    told_rate,
+    wilson_interval,
+)
 
 Z2 = 3.841459  # z², z = 1.959964
 
@@ -15,6 +21,7 @@ def test_wilson_of_eight_in_ten() -> None:
     # Middle (0.8 + 3.841459 / 20) / 1.3841459 = 0.9920730 / 1.3841459 = 0.7167402.
     # Half 1.959964 · √(0.8 · 0.2 / 10 + 3.841459 / 400) / 1.3841459 = 1.959964 · √0.02560365 / 1.3841459 = 0.2265776.
     assert wilson_interval(8, 10) == pytest.approx((0.7167402 - 0.2265776, 0.7167402 + 0.2265776), abs=1e-6)
+    assert (told_rate(8, 10), told_rate(0, 0)) == ("8 of 10: 80 % (95 %: 49 … 94)", "0 of 0: –")
 
 
 def test_wilson_at_the_ends_is_exact_there() -> None:

@@ -4,21 +4,23 @@ import os
 import shutil
 import signal
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
 from taccorl.episodes.attempt import read_json
+from taccorl.episodes.plan import Made
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.mimicgen import augment as module
-from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, attempt_episode
-from taccorl.episodes.sources.mimicgen.coverage import numbers, read_attempts
+from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, Rounds, attempt_episode
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec, with_options
 from taccorl.errors import InTheWayError, TaccorlError
 from taccorl.lineage.engines import LocalEngine, RayEngine
 from taccorl.lineage.processes import Failed
+from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
@@ -144,14 +146,10 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     crashed = done.report["entries"][0]
     assert crashed["reason"] == "the worker process was killed by SIGSEGV while it had this item"
     assert crashed["scene_seed"] == some.scene_seed(0)
-    found = read_attempts(some, done.made, store)
     said = "has no actions to show; its outcome is crashed: the worker process"
     with pytest.raises(TaccorlError, match=said):
-        attempt_episode(found[0].folder)
+        attempt_episode(done.made[0].artefact.path)
     assert produce(plan(episodes=1), tmp_path / "new", store, quiet).report == done.report
-    told = numbers(some, found, None)
-    assert told["failures"] == {"crashed": 1}
-    assert told["failed"][0]["command"] is None
 
 
 @pytest.mark.slow
@@ -162,6 +160,28 @@ def test_an_attempt_that_hung_is_counted_with_the_limit(plan, tmp_path):
     report = produce(some, tmp_path / "new", store, quiet).report
     assert report["outcomes"] == {"hung": 1, "success": 1}
     assert report["entries"][0]["reason"] == "no end after 600 s; the worker process was killed"
+
+
+def test_rounds_are_the_same_in_whatever_order_attempts_end(plan):
+    """Every third succeeds, and a round has as many attempts as successes are missing: 6, 4, 2, 2, 1, 1."""
+    ends, found = [], []
+    for seed in range(2):
+        rounds, rng, made = Rounds(plan(episodes=6)), np.random.default_rng(seed), []
+        todo = list(rounds.first())
+        while todo:
+            k = todo.pop(rng.integers(len(todo)))
+            made.append(k)
+            outcome = {"attempt": k, "outcome": "success" if k % 3 == 0 else "dropped"}
+            todo += rounds.after(k, Made(Artefact(Path(), ""), outcome))
+        found.append(sorted(made))
+        ends.append(made)
+    assert found[0] == found[1] == list(range(16)) and ends[0] != ends[1]
+
+
+def test_a_stratified_dataset_of_before_is_not_taken_for_this_plans(plan):
+    told = {"episodes": 2, "entries": [{"attempt": 0}, {"attempt": 3}]}
+    assert plan().items_of(told) == [0, 3]
+    assert plan().items_of(told | {"stratify": {"passed_over": 2}}) is None
 
 
 def test_what_hardly_ever_succeeds_is_stopped(plan, tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ from taccorl.data.dataset import Dataset
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.mimicgen.attempt import Attempts
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, attempt_episode
-from taccorl.episodes.sources.mimicgen.coverage import read_attempts
 from taccorl.episodes.sources.mimicgen.director import Ahead, ArmTarget
 from taccorl.episodes.sources.mimicgen.disturbance import Disturbance, Exact, drifted
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
@@ -201,7 +200,9 @@ def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     merged = dataclasses.replace(episode, arrays={k: v for k, v in episode.arrays.items() if k != "sim.executed"})
     with pytest.raises(DatasetError, match=r"sim\.executed, are not stored: taccorl merge"):
         merged.executed()
-    again = attempt_episode(read_attempts(plan, made, store)[-1].folder)
+    again = attempt_episode(
+        store.find(plan.steps[0].stage, plan.config(made[-1].entry["attempt"]), plan.inputs(0)).path
+    )
     for key in ("action", "sim.executed", "sim.state"):
         np.testing.assert_array_equal(again.arrays[key], episode.arrays[key])
     said = r"disturbed .*datagen_config/disturbance.* Give the dataset from which it was made"

@@ -5,7 +5,6 @@ success, with touch and pictures, are an artefact of their own, which ``rows: ac
 """
 
 import dataclasses
-import functools
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,16 +23,13 @@ from taccorl.episodes.sources.mimicgen.grips import grips_report
 from taccorl.episodes.sources.mimicgen.source import SourcePool
 from taccorl.episodes.sources.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.episodes.sources.mimicgen.stored import META, Demonstration, execute, write_stored
-from taccorl.episodes.sources.mimicgen.stratify import ResetSpace, first_attempts, next_round
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.manifest import DATASET_MANIFEST, read_manifest
 from taccorl.lineage.processes import Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.robots import ROBOT
-from taccorl.sim.randomize import Row, draw
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ
 
 # Attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end.
@@ -58,9 +54,6 @@ class AugmentPlan(Plan):
     """Dataset of the sources (``Store.dataset``)."""
     episodes: int = 200
     """Number of successful episodes to generate, in the plan's twin, which may differ from that of the sources."""
-    stratify: bool = False
-    """True: choose attempts in boxes of the reset space with few episodes (``stratify.py``). It changes which attempts are made,
-    not their results."""
     rows: Rows = "dataset"
     """Kind of output: a LeRobot dataset, or seeds and actions (``stored.py``). The attempts are the same."""
 
@@ -71,26 +64,9 @@ class AugmentPlan(Plan):
         super().__post_init__()
         if self.rows not in get_args(Rows):
             raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
-        if self.stratify and not self.space.rows:
-            raise TaccorlError(f"--stratify=true: a reset of {self.task} draws nothing: there are no boxes to fill")
-
-    @functools.cached_property
-    def space(self) -> ResetSpace:
-        """Reset space of the task; without any row if ``randomization`` is 0."""
-        return ResetSpace(self._drawn_rows if self.randomization > 0 else (), self.randomization)
-
-    @functools.cached_property
-    def _drawn_rows(self) -> tuple[Row, ...]:
-        return tuple(tasks.get(self.task)(self.difficulty).rows)
 
     def scene_seed(self, k: int) -> int:
         return attempt_seeds(self.seed, self.task, k)[0]
-
-    def draw(self, k: int) -> dict[str, np.ndarray]:
-        """Values that the reset of attempt ``k`` draws at random (poses of parts and others): name of the row → (components,) in
-        the row's unit. Nothing is simulated.
-        """
-        return draw(self._drawn_rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
 
     @property
     def dataset(self) -> Stage:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -155,8 +131,7 @@ class AugmentPlan(Plan):
 
     def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
         own = super().dataset_config(entries) | {"spec": self.spec.digest}
-        own |= {} if entries is None else {"attempts": len(entries)}
-        return own | ({"stratify": True} if self.stratify else {})
+        return own | ({} if entries is None else {"attempts": len(entries)})
 
     def report_at(self, out: Path) -> dict[str, Any] | None:
         if self.rows == "dataset":
@@ -164,18 +139,11 @@ class AugmentPlan(Plan):
         return read_json(out / META)["report"] if (out / META).is_file() else None
 
     def items_of(self, report: dict[str, Any]) -> Any:
-        return super().items_of(report) if ("stratify" in report) == self.stratify else None
+        return None if "stratify" in report else super().items_of(report)  # an earlier taccorl passed over attempts
 
     def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
         report = super().report(entries)
         report["entries"] = [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries]
-        if self.stratify:
-            first = entries[: first_attempts(self.episodes)]
-            report["stratify"] = {
-                "first_attempts": len(first),
-                "first_successes": successes(first),
-                "passed_over": entries[-1]["attempt"] + 1 - len(entries),
-            }
         return report | {"grips": grips_report(self.opened().actor.pool.sources)}
 
     def write(self, report: dict[str, Any], kept: list[Path], folder: Path) -> bool:
@@ -200,16 +168,10 @@ class Rounds:
         """Attempts of the next round, ascending; none if there are enough successes."""
         plan, entries = self._plan, [made.entry for made in self._before]
         missing = plan.episodes - successes(entries)
-        numbers = list[int]()
-        if missing > 0 and plan.stratify:
-            done = [(entry["attempt"], entry["outcome"] == "success") for entry in entries]
-            numbers = next_round(plan.space, lambda k: plan.space.boxes(plan.draw(k)), plan.episodes, done)
-        elif missing > 0:
-            # Never fewer than are missing, so none of them is in vain but for the few at the end.
-            num = min(max(missing, min(_ROUND, plan.episodes // 10)), _HUNDRED)
-            numbers = list(range(len(entries), len(entries) + num))
-        self._round = dict.fromkeys(numbers)
-        return numbers
+        # Never fewer than are missing, so none of them is in vain but for the few at the end.
+        num = min(max(missing, min(_ROUND, plan.episodes // 10)), _HUNDRED) if missing > 0 else 0
+        self._round = dict.fromkeys(range(len(entries), len(entries) + num))
+        return list(self._round)
 
     def after(self, item: int, made: Made) -> list[int]:
         """The next round when the present one has ended. Raises TaccorlError: hardly any attempt succeeds."""
