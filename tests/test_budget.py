@@ -23,8 +23,8 @@ MOST_LINES = {
     "taccorl/surrogate": 3_769,
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
-    "taccorl/views": 2_780,
-    "tests": 60_599,
+    "taccorl/views": 2_682,
+    "tests": 60_579,
     "pipelines": 6_292,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -1,6 +1,6 @@
-"""Dataset card: ``README.md`` beside ``meta/``, in the form that the Hugging Face Hub shows, with pictures in ``.card/``.
+"""Dataset card: ``README.md`` beside ``meta/``, in the form that the Hugging Face Hub shows, with a picture in ``.card/``.
 
-It states facts from the dataset's own files: origin, features with units, size, coverage, checks. Missing facts, such as a
+It states facts from the dataset's own files: origin, features with units, size, checks. Missing facts, such as a
 licence, are not filled in. The card belongs to no digest, and its owner may edit it.
 """
 
@@ -13,28 +13,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, Dataset
 from taccorl.data.finding import listed
 from taccorl.data.origin import Domain, Origin
-from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.data.spec import FeatureSpec
 from taccorl.errors import printable
 from taccorl.lineage.manifest import CARD
 from taccorl.report.markdown import markdown
 from taccorl.report.section import Cell, Section
-from taccorl.views.colors import ARM_COLORS, heat
-from taccorl.views.contact_sheet import INK, PAPER, SOFT, draw_sheet, font
-from taccorl.views.groups import element_names
+from taccorl.views.contact_sheet import draw_sheet
 
-PICTURES = ".card"
-EPISODE_PICTURE, COVERAGE_PICTURE = f"{PICTURES}/episode_0.jpg", f"{PICTURES}/coverage.png"
+PICTURE = ".card/episode_0.jpg"
 SHEET_WIDTH_PX = 1200
-"""Largest width of the card's pictures [pixels]."""
-LABEL_PX, BARS_PX, MAP_PX, ROW_PX, GAP_PX = 150, 380, 104, 24, 20
-LIGHT_BAR = (191, 205, 224)
+"""Largest width of the card's picture [pixels]."""
 DOMAIN_TAGS: dict[Domain | None, str] = {"real": "real", "surrogate": "surrogate", "twin": "simulated"}
 """Domain → tag of the card."""
 MOST_INSTRUCTIONS = 8
@@ -44,16 +38,18 @@ MOST_INSTRUCTIONS = 8
 def write_card(root: Path) -> Path | None:
     """Write the card of the dataset at ``root``; returns its path, or None if there is a README.md, which is not changed.
     Raises DatasetError: it is not a complete LeRobot dataset. Raises OSError: the folder cannot be written."""
-    path, temp = root / CARD, root / PICTURES / CARD
+    path, picture = root / CARD, root / PICTURE
+    temp = picture.with_name(CARD)
     if os.path.lexists(path):
         temp.unlink(missing_ok=True)  # of a run that died
         return None
     dataset = Dataset(root)
-    pictures = dict(_pictures(dataset))
-    text = card_text(dataset, list(pictures))
-    (root / PICTURES).mkdir(exist_ok=True)
-    for name, image in pictures.items():
-        image.save(root / name, optimize=True, quality=85)
+    text, sheet = card_text(dataset), draw_sheet(dataset.episode(0))[0]
+    if sheet.width > SHEET_WIDTH_PX:
+        size = SHEET_WIDTH_PX, round(sheet.height * SHEET_WIDTH_PX / sheet.width)
+        sheet = sheet.resize(size, Image.Resampling.LANCZOS)
+    picture.parent.mkdir(exist_ok=True)
+    sheet.save(picture, optimize=True, quality=85)
     try:
         temp.write_text(text, encoding="utf-8")
         os.link(temp, path)  # unlike a rename, never over a file that came meanwhile
@@ -64,25 +60,20 @@ def write_card(root: Path) -> Path | None:
     return path
 
 
-def card_text(dataset: Dataset, pictures: list[str]) -> str:
-    """Return the card as Markdown with YAML front matter; ``pictures`` are the paths of its pictures relative to the dataset."""
+def card_text(dataset: Dataset) -> str:
+    """Return the card as Markdown with YAML front matter."""
     origins = Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
     front = yaml.safe_dump(_front_matter(dataset, origins), sort_keys=False, allow_unicode=True)
     said = "; ".join(str(origin) for origin in origins)
+    shown = f"![Episode 0: pictures and pads at six instants, grippers and touch over time]({PICTURE})"
     body = markdown(
         Section(text=[f"Data: {said}"], style="data"),
-        Section(text=_summary(dataset), notes=[f"![{_ALT[name]}]({name})" for name in pictures]),
+        Section(text=_summary(dataset), notes=[shown]),
         _features(dataset),
         _origin(dataset, origins),
         Section(title="Checks", text=_checks(dataset)),
     )
     return f"---\n{front}---\n\n# {printable(dataset.root.resolve().name)}\n\n{body}\n\n## Use\n\n{_use(dataset)}\n"
-
-
-_ALT = {
-    EPISODE_PICTURE: "Episode 0: pictures and pads at six instants, grippers and touch over time",
-    COVERAGE_PICTURE: "Coverage: ranges of the joints within their limits, counts of every taxel",
-}
 
 
 def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
@@ -241,92 +232,3 @@ def _quoted(dataset: Dataset) -> str:
 def _read(dataset: Dataset, name: str, default: Any) -> Any:
     path = dataset.root / PROVENANCE / name
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else default
-
-
-def _pictures(dataset: Dataset) -> Iterator[tuple[str, Image.Image]]:
-    """Path relative to the dataset's folder → picture."""
-    sheet, _ = draw_sheet(dataset.episode(0))
-    if sheet.width > SHEET_WIDTH_PX:
-        sheet = sheet.resize(
-            (SHEET_WIDTH_PX, round(sheet.height * SHEET_WIDTH_PX / sheet.width)), Image.Resampling.LANCZOS
-        )
-    yield EPISODE_PICTURE, sheet
-    path = dataset.root / "meta" / "stats.json"
-    if path.is_file() and (image := draw_coverage(dataset.spec, json.loads(path.read_text(encoding="utf-8")))):
-        yield COVERAGE_PICTURE, image
-
-
-def draw_coverage(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) -> Image.Image | None:
-    """Draw the ranges of the state within its limits, and the 99 % quantile of every taxel's counts; None if the dataset has
-    neither. ``stats``: content of LeRobot's ``meta/stats.json``, over all rows."""
-    ranges, maps = state_ranges(spec, stats), pad_maps(spec, stats)
-    if not ranges and not maps:
-        return None
-    bars_width, map_width = (LABEL_PX + BARS_PX + GAP_PX) * bool(ranges), len(maps) * (MAP_PX + GAP_PX)
-    height = 2 * GAP_PX + 2 * ROW_PX + max(len(ranges) * ROW_PX, 3 * MAP_PX * bool(maps))
-    image = Image.new("RGB", (GAP_PX + bars_width + map_width, height), PAPER)
-    draw = ImageDraw.Draw(image)
-    if ranges:
-        _draw_ranges(draw, ranges)
-    if maps:
-        _draw_maps(image, draw, maps, GAP_PX + bars_width)
-    return image
-
-
-def _draw_ranges(draw: ImageDraw.ImageDraw, ranges: dict[str, tuple[float, ...]]) -> None:
-    """A bar for every element: its limits, minimum to maximum, and 98 % of all rows."""
-    left, top = GAP_PX + LABEL_PX, GAP_PX + ROW_PX
-    draw.text((left, GAP_PX), "state within its limits: min to max; 98 % of rows (blue)", INK, font(14))
-    for row, (title, (low, q01, q99, high)) in enumerate(ranges.items()):
-        y = top + row * ROW_PX
-        draw.text((left - 8, y + ROW_PX / 2), title, INK, font(14), anchor="rm")
-        draw.rectangle((left, y + 5, left + BARS_PX, y + ROW_PX - 5), outline=SOFT)
-        for begin, end, color in ((low, high, LIGHT_BAR), (q01, q99, ARM_COLORS["left"])):
-            x0, x1 = (left + BARS_PX * float(np.clip(share, 0, 100)) / 100 for share in (begin, end))
-            draw.rectangle((x0, y + 5, max(x1, x0 + 1), y + ROW_PX - 5), fill=color)
-    for share in (0, 50, 100):
-        y = top + len(ranges) * ROW_PX
-        draw.text((left + BARS_PX * share / 100, y + 2), f"{share} %", SOFT, font(13), anchor="mt")
-
-
-def _draw_maps(image: Image.Image, draw: ImageDraw.ImageDraw, maps: dict[str, np.ndarray], left: int) -> None:
-    """Every pad, in one scale of colours."""
-    top_count = max(1.0, *(float(values.max()) for values in maps.values()))
-    text = f"touch: counts that 99 % of rows do not exceed, 0 to {top_count:.0f}"
-    draw.text((left, GAP_PX), text, INK, font(14))
-    for k, (name, values) in enumerate(maps.items()):
-        x = left + k * (MAP_PX + GAP_PX)
-        size = (MAP_PX, round(MAP_PX * values.shape[0] / values.shape[1]))
-        if size[1] > 3 * MAP_PX:
-            size = (round(3 * MAP_PX * values.shape[1] / values.shape[0]), 3 * MAP_PX)
-        picture = Image.fromarray(heat(np.clip(values, 0, None) / top_count)).resize(size, Image.Resampling.NEAREST)
-        image.paste(picture, (x, GAP_PX + 2 * ROW_PX))
-        draw.text((x + size[0] / 2, GAP_PX + 2 * ROW_PX - 5), name, SOFT, font(13), anchor="ms")
-
-
-def state_ranges(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) -> dict[str, tuple[float, ...]]:
-    """Element of the state with finite limits → minimum, 1 % and 99 % quantile, maximum, in % of the range between its limits."""
-    key = "observation.state"
-    feature, found = spec.features.get(key), stats.get(key, {})
-    if feature is None or not {"min", "q01", "q99", "max"} <= set(found):
-        return {}
-    titles = [f"{name} [{unit}]" for name, unit in zip(element_names(feature), feature.units, strict=True)]
-    ranges = {}
-    for i, (title, (low, high)) in enumerate(zip(titles, feature.limits, strict=True)):
-        if np.isfinite([low, high]).all() and high > low:
-            ranges[title] = tuple(100 * (found[name][i] - low) / (high - low) for name in ("min", "q01", "q99", "max"))
-    return ranges
-
-
-def pad_maps(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) -> dict[str, np.ndarray]:
-    """Pad → (rows, columns) 99 % quantile of its counts, from the newest reading of each row."""
-    maps: dict[str, np.ndarray] = {}
-    for key in sorted(spec.keys("tactile"), key=lambda k: spec.features[k].history):
-        feature, sensor = spec.features[key], spec.sensors[key]
-        if "q99" not in stats.get(key, {}):
-            continue
-        counts = np.array(stats[key]["q99"], dtype=float)
-        counts = counts.reshape(feature.history, len(feature.pads), sensor.rows, sensor.columns)[-1]
-        for pad, values in zip(feature.pads, counts, strict=True):
-            maps.setdefault(pad, values)
-    return maps

@@ -1,6 +1,5 @@
 """The card states what the dataset's files state, is no part of the dataset, and never takes the place of a user's README.md."""
 
-import dataclasses
 import json
 import re
 import shutil
@@ -17,9 +16,7 @@ from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.lineage.manifest import read_manifest, verify
 from taccorl.lineage.store import Store
-from taccorl.views.card import card_text, pad_maps, state_ranges, write_card
-
-from .made_episode import TOUCH, bimanual_spec
+from taccorl.views.card import card_text, write_card
 
 
 @pytest.fixture
@@ -41,7 +38,7 @@ def test_ingest_writes_a_card_that_the_hub_can_read(dataset: Path):
     assert card.data.configs == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
     assert card.data.license is None, "nobody stated one"
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", card.text)
-    assert pictures == [".card/episode_0.jpg", ".card/coverage.png"]
+    assert pictures == [".card/episode_0.jpg"]
     for name in pictures:
         with Image.open(dataset / name) as image:
             assert np.asarray(image).std() > 20
@@ -107,26 +104,9 @@ def test_what_the_card_says_to_type_loads_the_dataset(copy: Path, monkeypatch: p
 
 
 def test_the_card_of_data_without_pictures_proposes_no_policy_that_refuses_them(copy: Path):
-    assert "--policy.type=act" in card_text(Dataset(copy), [])
+    assert "--policy.type=act" in card_text(Dataset(copy))
     for path in (copy / "meta/info.json", copy / "meta/taccorl/dataset_spec.json"):
         own = json.loads(path.read_text())
         own["features"] = {key: f for key, f in own["features"].items() if "images" not in key}
         path.write_text(json.dumps(own))
-    assert "lerobot-train" not in card_text(Dataset(copy), [])
-
-
-def test_ranges_are_shares_of_the_limits_and_pads_show_the_newest_reading():
-    spec = bimanual_spec()
-    limits = spec.features["observation.state"].limits  # left_joint_2: 0 … 3.14 rad
-    assert limits[1].tolist() == [0.0, 3.14]
-    state = {name: [3.14 * share] * 14 for name, share in (("min", 0.1), ("q01", 0.2), ("q99", 0.5), ("max", 0.6))}
-    counts = np.arange(4 * 32 * 12, dtype=float)
-    stats = {"observation.state": state, TOUCH: {"q99": counts.tolist()}}
-    np.testing.assert_allclose(state_ranges(spec, stats)["left_joint_2 [rad]"], [10, 20, 50, 60])
-    maps = pad_maps(spec, stats)
-    assert list(maps) == ["left_a", "left_b", "right_a", "right_b"]
-    np.testing.assert_array_equal(maps["right_a"], counts.reshape(4, 32, 12)[2])
-    window = dataclasses.replace(spec.features[TOUCH], history=2, shape=(3072,))
-    with_window = dataclasses.replace(spec, features=spec.features | {TOUCH: window})
-    both = {TOUCH: {"q99": [*(-counts), *counts]}}
-    np.testing.assert_array_equal(pad_maps(with_window, both)["right_a"], counts.reshape(4, 32, 12)[2])
+    assert "lerobot-train" not in card_text(Dataset(copy))
