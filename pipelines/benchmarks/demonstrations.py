@@ -15,7 +15,7 @@ from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
-from taccorl.episodes.sources.mimicgen.spec import NoiseSpec, SplitNoiseSpec, load_mimic_spec, with_options
+from taccorl.episodes.sources.mimicgen.spec import NoiseSpec, load_mimic_spec, with_options
 from taccorl.evaluation.statistics import wilson_interval
 from taccorl.lineage.store import Store
 from taccorl.sim.twin import TwinConfig
@@ -100,7 +100,7 @@ def mimicgen_cells(task: str) -> Iterator[Row]:
         value=plain.broken + plain.outcomes.count("not reproduced"), unit="episodes", goal="≤ 0", n=len(plain.duration_s),
         spread=0.0,
     )  # fmt: skip
-    noise = SplitNoiseSpec(transport=NoiseSpec(position_m=0.0025, rotation_rad=math.radians(1.4)))
+    noise = NoiseSpec(position_m=0.0025, rotation_rad=math.radians(1.4))
     cells = (
         ("MimicGen's noise of 2.5 mm and 1.4° a step in transport", with_options(ours, noise=noise), twin, "≥ 70", ""),
         ("stiffness halved", ours, stiffened(twin, 0.5), "≥ 75", "≤ 30"),

@@ -20,7 +20,6 @@ from taccorl.episodes.sources.mimicgen.source import SourcePool
 from taccorl.episodes.sources.mimicgen.spec import (
     GatesSpec,
     NoiseSpec,
-    SplitNoiseSpec,
     check_task,
     load_mimic_spec,
     mimic_spec_path,
@@ -92,7 +91,7 @@ def directed(spec, *, felt: bool, moved_m: float = 0.0) -> tuple[Director, dict[
 
 @pytest.mark.parametrize("scheme", ["replay", "none"])
 def test_hands_are_taken_over_at_the_contact_row_and_left_alone_until_then(scheme):
-    spec = mimic_spec(scheme, noise=SplitNoiseSpec(transport=NoiseSpec(position_m=0.002)))
+    spec = mimic_spec(scheme, noise=NoiseSpec(position_m=0.002))
     _, replayed = directed(spec, felt=False, moved_m=0.05)
     director, goals = directed(spec, felt=True, moved_m=0.05)
     hands = director.contact_hands
@@ -272,10 +271,6 @@ def test_every_task_is_finished_by_its_expert(task, tmp_path: Path):
     [
         ("contact_mode: closed_loop_exprt", r"'closed_loop_exprt' is not one of .*did you mean 'closed_loop_expert'"),
         ("contact_mode: closed_loop_expert, retarget: eef_command", r"retarget: eef_command sends poses as commanded"),
-        (
-            "contact_mode: closed_loop_expert, noise: {contact: {position_m: 0.001}}",
-            r"noise → contact: has no effect with closed_loop_expert",
-        ),
     ],
 )
 def test_a_mode_that_is_not_there_or_contradicts_is_named_with_its_place(options, said, tmp_path):

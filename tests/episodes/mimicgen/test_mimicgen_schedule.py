@@ -48,13 +48,6 @@ def test_a_latter_subtask_begins_when_the_former_has_ended():
     assert table(Schedule(SIGNALS, [sequence]), LENGTHS) == expected
 
 
-def test_a_latter_subtask_with_a_time_difference_waits_with_so_many_steps_left():
-    sequence = after(INSERT, HOLD, sequential_min_time_diff=1)
-    # Two of its three steps are done before; one is left when the former ends after five steps.
-    expected = ["0.0 0.0", "0.1 0.1", "1.0 0.2", "1.1 1.0", "- 1.1", "1.2 -"]
-    assert table(Schedule(SIGNALS, [sequence]), LENGTHS) == expected
-
-
 def test_a_trajectory_is_asked_for_when_its_subtask_begins_and_not_before():
     schedule = Schedule(SIGNALS, [after(("right", 0), HOLD)])
     assert schedule.to_plan() == ["left", "right"]

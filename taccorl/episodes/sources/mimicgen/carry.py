@@ -1,4 +1,4 @@
-"""Retargeting of a motion to a new scene: transforms of objects and held objects, bridges, and choice of the nearest source.
+"""Retargeting of a motion to a new scene: transforms of objects and held objects, bridges, and choice of a near source.
 
 Pure functions of (4, 4) poses ``a_from_b``.
 """
@@ -9,9 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from taccorl.episodes.sources.mimicgen.spec import BridgeSpec, SelectionSpec
 from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, minimum_jerk, rotvec, turn
 
+NEAREST = 3
+"""Number of nearest sources from which one is drawn."""
+_M_PER_RAD = 0.2  # in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1
+_BRIDGE_MPS, _BRIDGE_RADPS = 0.25, 1.5  # peak speeds
 _ROUNDING = 1e-6
 
 
@@ -48,23 +51,6 @@ def object_delta(new: np.ndarray, source: np.ndarray, num_turns: int = 1) -> np.
     return look_alike(new, source, num_turns) @ inverse(source)
 
 
-def translation(delta: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """The translation (4, 4) by which ``delta`` (4, 4) moves the object at ``source`` (4, 4), without its rotation."""
-    shift = np.eye(4)
-    shift[:3, 3] = (delta @ source)[:3, 3] - source[:3, 3]
-    return shift
-
-
-def shaken(delta: np.ndarray, about: np.ndarray, shift_m: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
-    """``delta`` (4, 4) followed by a rotation vector ``turn_rad`` (3,) about the position to which it moves the pose ``about``
-    (4, 4), and by a translation ``shift_m`` (3,), in world coordinates; returns (4, 4).
-    """
-    centre = (delta @ about)[:3, 3]
-    extra = turn(turn_rad)
-    extra[:3, 3] = centre - extra[:3, :3] @ centre + shift_m
-    return extra @ delta
-
-
 def in_hand_correction(
     tcp_src: np.ndarray, held_src: np.ndarray, tcp_new: np.ndarray, held_new: np.ndarray, num_turns: int = 1
 ) -> np.ndarray:
@@ -77,18 +63,18 @@ def in_hand_correction(
     return in_hand_src @ inverse(look_alike(in_hand_new, in_hand_src, num_turns))
 
 
-def bridge(start: np.ndarray, end: np.ndarray, limits: BridgeSpec, hz: float) -> list[np.ndarray]:
-    """Poses (4, 4), one per control step, after ``start`` (4, 4) up to ``end`` (4, 4), straight, minimum jerk, within the peak
-    speeds ``limits``; none if the two are the same. ``hz`` is the rate of control steps.
+def bridge(start: np.ndarray, end: np.ndarray, hz: float) -> list[np.ndarray]:
+    """Poses (4, 4), one per control step, after ``start`` (4, 4) up to ``end`` (4, 4), straight, minimum jerk, at most 0.25 m/s
+    and 1.5 rad/s; none if the two are the same. ``hz`` is the rate of control steps.
     """
     off = distance(start, end)
-    duration_s = PEAK_OF_MEAN * max(off.position_m / limits.speed_mps, off.rotation_rad / limits.turn_radps)
+    duration_s = PEAK_OF_MEAN * max(off.position_m / _BRIDGE_MPS, off.rotation_rad / _BRIDGE_RADPS)
     num = math.ceil(duration_s * hz - _ROUNDING)
     return [between(start, end, minimum_jerk(k / num)) for k in range(1, num + 1)]
 
 
-def one_of_nearest(distances: Sequence[Distance], how: SelectionSpec, rng: np.random.Generator) -> int:
-    """Index of one of the ``nn_k`` nearest sources, drawn uniformly; ``distances`` has one entry for each source."""
-    size = [how.pos_weight * d.position_m + how.rot_weight * d.rotation_rad for d in distances]
-    nearest = np.argsort(size, kind="stable")[: how.nn_k]
+def one_of_nearest(distances: Sequence[Distance], rng: np.random.Generator) -> int:
+    """Index of one of the ``NEAREST`` nearest sources, drawn uniformly; ``distances`` has one entry for each source."""
+    size = [d.position_m + _M_PER_RAD * d.rotation_rad for d in distances]
+    nearest = np.argsort(size, kind="stable")[:NEAREST]
     return int(nearest[rng.integers(len(nearest))])

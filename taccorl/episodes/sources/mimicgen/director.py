@@ -19,8 +19,6 @@ from taccorl.episodes.sources.mimicgen.carry import (
     look_alike,
     object_delta,
     one_of_nearest,
-    shaken,
-    translation,
 )
 from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, Cue, Place, Schedule
 from taccorl.episodes.sources.mimicgen.source import ArmTrack, Segment, SourcePool, contact_row
@@ -31,6 +29,7 @@ from taccorl.tasks.experts.se3 import minimum_jerk, turn
 _SETTLED_M, _SETTLED_RAD = 0.0004, 0.004  # a hand that moves less in a control step is at rest
 _ARRIVED_M, _ARRIVED_RAD = 0.0005, 0.005  # a hand that is no further from its goal is there
 _REACH_M = 0.4  # of a joint to the hand: how far noise of the joints moves it
+_JOINT_RADPS = 2.5  # peak speed of any joint in motions that are blended in joint space
 _HANDED_OVER_STEPS = 2  # of a path: one in which another takes over, one when it has finished
 
 
@@ -184,7 +183,8 @@ class Director:
             arm: _Hand(ArmTarget(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False))
             for arm in self.spec.signals
         }
-        self._chosen: dict[str, int] = {}
+        self._source: int | None = None
+        """Index of the source that the attempt repeats; None: not chosen yet."""
         self._shared: dict[int, tuple[int, np.ndarray]] = {}
         """Coordination → index of the source and Δ that both arms use."""
         self._offsets: dict[Place, int] = {}
@@ -270,9 +270,8 @@ class Director:
         return False
 
     def _shaken(self, arm_target: ArmTarget) -> ArmTarget:
-        noise = self.spec.datagen_config.noise
-        std = noise.contact if arm_target.contact else noise.transport
-        if not arm_target.noisy or (std.position_m == 0 and std.rotation_rad == 0):
+        std = self.spec.datagen_config.noise
+        if arm_target.contact or not arm_target.noisy or (std.position_m == 0 and std.rotation_rad == 0):
             return arm_target
         draw = self._noise_rng.normal(size=6)
         if arm_target.joints_rad is not None:
@@ -308,7 +307,7 @@ class Director:
         else:
             before = track.goal[segment.start - 1] if segment.start else track.tcp[0]
             first = delta @ before @ choice.correction
-            goals = bridge(hand.last.goal, first, self.spec.datagen_config.bridge, self.hz)
+            goals = bridge(hand.last.goal, first, self.hz)
             path.bridge = [ArmTarget(goal=goal, opening_m=hand.last.opening_m) for goal in goals]
         if self.contact_hands is not None and path.contact < segment.end:
             num_together = self._hand_over(path, coordination)
@@ -368,23 +367,10 @@ class Director:
             return i, self._object_delta(i, arm, k, subtask.object_ref, scene)
         key = self.spec.task_constraint_configs.index(coordination)
         if key not in self._shared:
-            i = self._choose(arm, k, scene)
-            self._shared[key] = i, self._coordinated_delta(i, arm, k, subtask, coordination, scene)
+            i, body = self._choose(arm, k, scene), subtask.object_ref
+            moved = body if coordination.coordination_scheme == "transform" else None
+            self._shared[key] = i, self._object_delta(i, arm, k, moved, scene)
         return self._shared[key]
-
-    def _coordinated_delta(
-        self, i: int, arm: str, k: int, subtask: SubtaskSpec, coordination: ConstraintSpec, scene: SeenPoses
-    ) -> np.ndarray:
-        row = self.pool.segment(i, arm, k, self._offsets).start
-        about = self.pool.sources[i].objects[subtask.object_ref][row] if subtask.object_ref else np.eye(4)
-        delta = np.eye(4)
-        if coordination.coordination_scheme != "replay":
-            delta = self._object_delta(i, arm, k, subtask.object_ref, scene)
-        if coordination.coordination_scheme == "translate":
-            delta = translation(delta, about)
-        draw = self._rng.uniform(-1, 1, size=6)
-        shift_m = draw[:3] * coordination.coordination_scheme_pos_noise_scale
-        return shaken(delta, about, shift_m, draw[3:] * coordination.coordination_scheme_rot_noise_scale)
 
     def _object_delta(self, i: int, arm: str, k: int, body: str | None, scene: SeenPoses) -> np.ndarray:
         if body is None:
@@ -406,7 +392,7 @@ class Director:
         share = np.array([minimum_jerk(x) for x in np.linspace(0, 1, len(joints))])[:, None]
         joints = joints + (1 - share) * (now - joints[0]) + share * (end - joints[-1])
         fastest = np.abs(np.diff(joints, axis=0)).max(initial=0.0) * self.hz
-        slower = max(1.0, fastest / self.spec.datagen_config.bridge.joint_speed_radps)
+        slower = max(1.0, fastest / _JOINT_RADPS)
         at = np.linspace(0, len(joints) - 1, math.ceil(len(joints) * slower))
         resampled = np.stack([np.interp(at, np.arange(len(joints)), column) for column in joints.T], axis=1)
         return segment.start + np.round(at).astype(int), resampled
@@ -414,33 +400,19 @@ class Director:
     # selection --------------------------------------------------------------------------------------------------------
 
     def _choose(self, arm: str, k: int, scene: SeenPoses) -> int:
-        generation = self.spec.datagen_config
-        if not generation.generation_select_src_per_subtask:
-            if arm in self._chosen:
-                return self._chosen[arm]
-            if self._chosen and not generation.generation_select_src_per_arm:
-                self._chosen[arm] = next(iter(self._chosen.values()))
-                return self._chosen[arm]
-        self._chosen[arm] = self._select(arm, k, scene)
-        return self._chosen[arm]
-
-    def _select(self, arm: str, k: int, scene: SeenPoses) -> int:
-        subtask = self.spec.subtask_configs[arm][k]
-        strategy, how = subtask.selection_strategy, subtask.selection_strategy_kwargs
-        if strategy == "random" or subtask.object_ref is None:
-            return int(self._rng.integers(len(self.pool)))
-        of = self._object_distance if strategy == "nearest_neighbor_object" else self._hand_distance
-        distances = [of(i, arm, k, subtask.object_ref, scene) for i in range(len(self.pool))]
-        return one_of_nearest(distances, how, self._rng)
+        """One source for the whole attempt, by the strategy of the subtask that begins first."""
+        if self._source is None:
+            subtask = self.spec.subtask_configs[arm][k]
+            if subtask.selection_strategy == "random" or (body := subtask.object_ref) is None:
+                self._source = int(self._rng.integers(len(self.pool)))
+            else:
+                distances = [self._object_distance(i, arm, k, body, scene) for i in range(len(self.pool))]
+                self._source = one_of_nearest(distances, self._rng)
+        return self._source
 
     def _object_distance(self, i: int, arm: str, k: int, body: str, scene: SeenPoses) -> Distance:
         then = self.pool.sources[i].objects[body][self.pool.segment(i, arm, k, self._offsets).start]
         return distance(look_alike(scene.body(body), then, self._num_turns(body)), then)
-
-    def _hand_distance(self, i: int, arm: str, k: int, body: str, scene: SeenPoses) -> Distance:
-        row = self.pool.segment(i, arm, k, self._offsets).start
-        first = self._object_delta(i, arm, k, body, scene) @ self.pool.sources[i].arms[arm].goal[row]
-        return distance(scene.tcp(arm), first)
 
     def _num_turns(self, body: str) -> int:
         return self.spec.symmetry.get(body, 1)

@@ -22,15 +22,9 @@ class ConstraintSpec:
     eef_subtask_constraint_tuple: tuple[Place, Place]
     """Two of (arm, index of its subtask from 0); for a sequence the former first."""
     constraint_type: Literal["sequential", "coordination"]
-    sequential_min_time_diff: int = -1
-    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
-    coordination_scheme: Literal["replay", "transform", "translate"] = "replay"
-    """Transform Δ that both arms use, with the same source. replay: none; transform: that of the object; translate: the object's
-    translation only. The object is that of the subtask that begins first."""
-    coordination_scheme_pos_noise_scale: float = 0.0
-    """Half width [m] of a uniform random shift of Δ, per axis, so that the hands meet at another place."""
-    coordination_scheme_rot_noise_scale: float = 0.0
-    """Half width [rad] of a uniform random rotation vector of Δ about the object, per axis."""
+    coordination_scheme: Literal["replay", "transform"] = "replay"
+    """Transform Δ that both arms use, with the same source. replay: none; transform: that of the object of the subtask that
+    begins first."""
     coordination_synchronize_start: bool = False
     """True: both begin together, at the later of their first rows in the source. False: only their ends run together."""
 
@@ -144,12 +138,7 @@ class Schedule:
         """Why the arm's present subtask may not begin; empty if it may."""
         state = self._arms[arm]
         for c in self.constraints:
-            if (
-                c.latter == (arm, state.subtask)
-                and not c.coordinated
-                and c.sequential_min_time_diff < 0
-                and not self._ended(c.former)
-            ):
+            if c.latter == (arm, state.subtask) and not c.coordinated and not self._ended(c.former):
                 return f"waits to begin {state.name!r} until {c.former[0]} has ended {self._name(c.former)!r}"
         c = self._coordination(arm)
         if c and c.coordination_synchronize_start and not self._at(other := self._other(c, arm)):
@@ -163,10 +152,6 @@ class Schedule:
             return ""
         if state.num_steps is None:
             return self._kept_from_beginning(arm) or f"has no trajectory of {state.name!r}"
-        for c in self.constraints:
-            waits = c.latter == (arm, state.subtask) and not c.coordinated and not self._ended(c.former)
-            if waits and state.step >= state.num_steps - max(c.sequential_min_time_diff, 0):
-                return f"waits in {state.name!r} until {c.former[0]} has ended {self._name(c.former)!r}"
         if self._is_together(arm):
             c = self._coordination(arm)
             assert c is not None

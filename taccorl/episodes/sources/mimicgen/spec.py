@@ -22,19 +22,7 @@ UNTIL_THE_END = "until the end"
 """Name of a last subtask without a signal."""
 Retarget = Literal["held_object", "eef", "eef_command"]
 ContactMode = Literal["replay", "closed_loop_expert"]
-Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_distance"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SelectionSpec:
-    """Parameters with which a strategy chooses among sources: number of nearest ones, weights of position and rotation."""
-
-    nn_k: int = 3
-    """Number of nearest sources from which one is drawn uniformly."""
-    pos_weight: float = 1.0
-    """Weight of one metre in the distance of poses."""
-    rot_weight: float = 0.2
-    """Weight of one radian in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1."""
+Strategy = Literal["random", "nearest_neighbor_object"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +41,8 @@ class SubtaskSpec:
     """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
     last subtask."""
     selection_strategy: Strategy = "random"
-    """How the source is chosen: at random, or by the nearest pose of the object or of the hand."""
-    selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
+    """How the source is chosen: at random, or among those with the nearest pose of the object. The subtask that begins first
+    chooses for the whole attempt."""
 
     @property
     def name(self) -> str:
@@ -63,34 +51,12 @@ class SubtaskSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BridgeSpec:
-    """Motion from the hand's present pose to the start of a segment: minimum jerk, limited by these peak speeds."""
-
-    speed_mps: float = 0.25
-    """Peak speed of the hand [m/s]."""
-    turn_radps: float = 1.5
-    """Peak rate of the hand's rotation [rad/s]."""
-    joint_speed_radps: float = 2.5
-    """Peak speed of any joint, for motions in joint space."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class NoiseSpec:
-    """Standard deviation of white noise on the hand's goal, per axis, each step. MimicGen's default is 2.5 mm and 1.4°."""
+    """Standard deviation of white noise on the hand's goal in free motion and while gripping, up to ``contact_lead_steps`` before
+    the held object first touches its mate; per axis, each step. MimicGen's default is 2.5 mm and 1.4°."""
 
     position_m: float = 0.0
     rotation_rad: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplitNoiseSpec:
-    """Noise on the hand's goals in transport and in contact."""
-
-    transport: NoiseSpec = field(default_factory=NoiseSpec)
-    """Noise in free motion and while gripping."""
-    contact: NoiseSpec = field(default_factory=NoiseSpec)
-    """Noise from ``contact_lead_steps`` before the held object first touches its mate in the source. Not used with
-    closed_loop_expert, which has its own tremor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,12 +72,8 @@ class DisturbanceSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class GenerationSpec:
-    """Settings for all subtasks: choice of sources, transfer of the motion, motion in contact, waiting, noise."""
+    """Settings for all subtasks: transfer of the motion, motion in contact, waiting, noise."""
 
-    generation_select_src_per_subtask: bool = False
-    """True: choose a source for each subtask; False: one source for the whole attempt."""
-    generation_select_src_per_arm: bool = False
-    """True: each arm chooses its own source; coordinated subtasks always share one."""
     retarget: Retarget = "held_object"
     """Object whose path is kept. held_object: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ
     · T_src. Both transfer the target poses of the hand, and correct the steady-state offset that the arm has in this twin.
@@ -121,7 +83,6 @@ class GenerationSpec:
     source's motion, without feedback. closed_loop_expert: the task's scripted expert, which detects a block, backs off and aims
     again, with a human-like aiming error and tremor. These are in ``sim.executed``, the target that was sent; ``action`` is the
     target without them. The mode is stored in the provenance, with the expert's corrections."""
-    bridge: BridgeSpec = field(default_factory=BridgeSpec)
     num_settle_steps_before_gripper: int = 12
     """Largest number of steps, without noise, for which an arm waits until it is at rest before its gripper opens or closes; the
     other arm of a coordinated subtask waits, too."""
@@ -131,7 +92,7 @@ class GenerationSpec:
     transport decays."""
     contact_lead_steps: int = 15
     """Number of control steps before the held object touches its mate from which the motion counts as contact."""
-    noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
+    noise: NoiseSpec = field(default_factory=NoiseSpec)
     disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)
 
     @property
@@ -249,7 +210,6 @@ def _subtask_rules(key: str, subtask: SubtaskSpec, *, last: bool) -> Rules:
     yield unnamed, f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
     text = f"[{low}, {high}]: an arm's last subtask ends where the source ends"
     yield last and (low, high) != (0, 0), ends, text
-    yield subtask.selection_strategy_kwargs.nn_k < 1, f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
     needs = subtask.selection_strategy != "random" and subtask.object_ref is None
     yield needs, f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
 
@@ -268,11 +228,8 @@ def _number_rules(spec: MimicSpec) -> Rules:
     generation = spec.datagen_config
     for name, value in _numbers(spec.gates, "gates/"):
         yield not value > 0, name, f"{value:g}: nothing would pass; give a number > 0"
-    for i, constraint in enumerate(spec.task_constraint_configs):
-        for name, value in _numbers(constraint, f"task_constraint_configs/{i}/"):
-            yield name.endswith("noise_scale") and value < 0, name, f"{value:g}: give a half width ≥ 0"
     for name, value in _numbers(generation):
-        positive = name.startswith("bridge/") or name.endswith("time_s")
+        positive = name.endswith("time_s")
         text = f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
         yield not value >= 0 or (positive and value == 0), f"datagen_config/{name}", text
     disturbance = generation.disturbance
@@ -285,8 +242,6 @@ def _closed_loop_rules(generation: GenerationSpec) -> Rules:
     closed = generation.contact_mode == "closed_loop_expert"
     text = "eef_command sends poses as commanded, closed_loop_expert says where the hands are to be; take "
     yield closed and generation.retarget == "eef_command", "datagen_config/retarget", f"{text}held_object or eef"
-    text = "has no effect with closed_loop_expert, whose hands tremble by themselves; leave it out"
-    yield closed and generation.noise.contact != NoiseSpec(), "datagen_config/noise/contact", text
 
 
 def check_task(spec: MimicSpec, task: Task) -> None:
