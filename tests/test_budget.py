@@ -10,7 +10,7 @@ MOST_LINES = {
     "taccorl/cli": 5_091,
     "taccorl/data": 8_824,
     "taccorl/diagnosis": 11_308,
-    "taccorl/episodes": 4_982,
+    "taccorl/episodes": 4_979,
     "taccorl/evaluation": 1_868,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_207,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_682,
-    "tests": 60_535,
+    "tests": 60_529,
     "pipelines": 6_292,
 }
 MOST_LINES_OF_A_FILE = 500

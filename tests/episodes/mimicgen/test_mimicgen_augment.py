@@ -178,12 +178,6 @@ def test_rounds_are_the_same_in_whatever_order_attempts_end(plan):
     assert found[0] == found[1] == list(range(16)) and ends[0] != ends[1]
 
 
-def test_a_stratified_dataset_of_before_is_not_taken_for_this_plans(plan):
-    told = {"episodes": 2, "entries": [{"attempt": 0}, {"attempt": 3}]}
-    assert plan().items_of(told) == [0, 3]
-    assert plan().items_of(told | {"stratify": {"passed_over": 2}}) is None
-
-
 def test_what_hardly_ever_succeeds_is_stopped(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_HUNDRED", 4)
     monkeypatch.setattr("taccorl.episodes.sources.mimicgen.attempt.Attempts.run", lambda self, k: 1 / 0)

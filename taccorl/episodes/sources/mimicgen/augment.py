@@ -138,9 +138,6 @@ class AugmentPlan(Plan):
             return super().report_at(out)
         return read_json(out / META)["report"] if (out / META).is_file() else None
 
-    def items_of(self, report: dict[str, Any]) -> Any:
-        return None if "stratify" in report else super().items_of(report)  # an earlier taccorl passed over attempts
-
     def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
         report = super().report(entries)
         report["entries"] = [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries]
