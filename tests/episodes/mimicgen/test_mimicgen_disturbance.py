@@ -198,7 +198,7 @@ def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     (measured,) = read_dataset(tmp_path / "new")  # what is compared with the twin is what was sent
     np.testing.assert_array_equal(measured.target, episode.arrays["sim.executed"][:-1])
     merged = dataclasses.replace(episode, arrays={k: v for k, v in episode.arrays.items() if k != "sim.executed"})
-    with pytest.raises(DatasetError, match=r"sim\.executed, are not stored: taccorl merge"):
+    with pytest.raises(DatasetError, match=r"\(sim\.executed\) are not stored: merge omits them"):
         merged.executed()
     again = attempt_episode(
         store.find(plan.steps[0].stage, plan.config(made[-1].entry["attempt"]), plan.inputs(0)).path
