@@ -114,19 +114,19 @@ def mimicgen_cells(task: str) -> Iterator[Row]:
         if place is twin:
             yield Row(
                 name=f"yield over that of replayed poses (its 0 counts as 1), {words}",
-                value=held.successes / max(replay.successes, 1), unit="×", goal="≥ 3", n=num_attempts,
-                spread=0.0,
+                value=held.outcomes.count("success") / max(replay.outcomes.count("success"), 1),
+                unit="×", goal="≥ 3", n=num_attempts, spread=0.0,
             )  # fmt: skip
 
 
 def _yield_row(name: str, score: Any, goal: str) -> Row:
     """Value and 95 % interval (Wilson) of a yield."""
-    n = len(score.outcomes)
-    low, high = wilson_interval(score.successes, n)
+    done, n = score.outcomes.count("success"), len(score.outcomes)
+    low, high = wilson_interval(done, n)
     failures = ", ".join(f"{count} {what}" for what, count in score.failures.items()) or "no failures"
     return Row(
         name=f"{name} (95 %: {100 * low:.0f} … {100 * high:.0f}); {failures}",
-        value=100 * score.successes / n, unit="%", goal=goal, n=n, spread=50 * (high - low),
+        value=100 * done / n, unit="%", goal=goal, n=n, spread=50 * (high - low),
     )  # fmt: skip
 
 

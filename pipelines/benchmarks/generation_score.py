@@ -31,10 +31,6 @@ class Score:
     """Number of kept attempts whose stored actions end in another state, or without reaching the goal, in a new simulation."""
 
     @property
-    def successes(self) -> int:
-        return self.outcomes.count("success")
-
-    @property
     def failures(self) -> dict[str, int]:
         """Failure category → number of attempts, the most frequent first."""
         return dict(Counter(o for o in self.outcomes if o != "success").most_common())
