@@ -308,9 +308,8 @@ def check_against_twin(
         rivals: function that returns, by the names of effects, the twin's positions (T,) of a signal with a little of an effect
             that takes lag off. A lead that one of them explains as well as a shift is only a warning.
     """
-    findings = []
+    findings, period_s = [], m.period_s
     late: dict[str, tuple[float, float]] = {}
-    period_s = m.period_s
     for j in Trial(m).moving:
         name = m.signals[j]
         rows = m.target[:, j], m.measured[:, j], reported[:, j]
@@ -327,8 +326,9 @@ def check_against_twin(
             shift = plain
         elif _is_late(shift, period_s) and not _is_late(delay_between(*rows, period_s, changed(name)), period_s):
             shift = dataclasses.replace(plain, row_rms=0.0)  # other numbers explain it without a delay
-        if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
-            why = f"look for the missing effect first, which leaves {shift.rms / floor[name]:.0f} noise floors"
+        contrary = _leads(shift, period_s) and _is_late(plain, period_s)  # so friction looks beside a longer lag
+        if contrary or shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
+            why = f"look for the missing effect first, which leaves {plain.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
             findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
         elif _leads(shift, period_s):
