@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_718,
+    "taccorl/alignment": 15_716,
     "taccorl/cli": 5_091,
     "taccorl/data": 8_824,
     "taccorl/diagnosis": 11_308,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_682,
-    "tests": 60_528,
+    "tests": 60_546,
     "pipelines": 6_288,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -145,9 +145,7 @@ def checked(
     from taccorl.cli.progress import LINE_EVERY_S, Steps
     from taccorl.report.terminal import show
 
-    rows, seconds = (
-        sum(values) for values in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True)
-    )
+    rows, seconds = (sum(each) for each in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True))
     if rows > MANY_ROWS:
         print(
             f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take minutes; 10 s of each motion are enough",
@@ -156,8 +154,10 @@ def checked(
     steps = Steps(every_s=0.0 if rows > MANY_ROWS else LINE_EVERY_S)
     found: dict[str, list[Finding]] = {}
     if machine.of_joints:
-        limits = machine.effort_limits
-        found = check_measurements(measurements.all, accept=accept, limits=limits, progress=steps)
+        found = check_measurements(measurements.all, accept=accept, limits=machine.effort_limits, progress=steps)
+        for m in measurements.all:  # a target that is sent between two rows acts before the row that shows it
+            often = {name for name, hz in machine.command_rates.items() if hz * m.period_s > 1.0}
+            found[m.name] = [f for f in found[m.name] if f.check != "measured_before_command" or f.feature not in often]
     uneven = [f for own in found.values() for f in own if f.feature == "time" and f.severity == "error"]
     timed = not uneven and all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}

@@ -68,12 +68,14 @@ def test_rows_that_all_stand_twice_are_named_and_not_compared(bench: Path, tmp_p
     assert code == 1 and "time_backwards" in text and "not compared" in text
 
 
-def write_smooth(path: Path, seed: int) -> None:
-    """The mass without friction under a target that moves on at 0.1 ms, logged at 250 Hz."""
+def write_smooth(path: Path, seed: int, *, steps: bool = False) -> None:
+    """The mass without friction under a target that moves on at 0.1 ms, or steps 0.2 ms after a row, logged at 250 Hz."""
     dt_s = 1.0 / (RATE_HZ * PARTS)
     time_s = np.arange(4 * RATE_HZ * PARTS) * dt_s
     fade = np.clip(np.minimum(time_s - 0.3, 3.7 - time_s) / 0.4, 0, 1)
     target = 0.1 * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * 0.6 * (time_s - 0.3))
+    if steps:
+        target = 0.1 * ((time_s - 0.2002) // 0.6 % 2 == 0)
     at = speed = 0.0
     rng = np.random.default_rng(seed)
     lines = ["t,slide.q,slide.q_target"]
@@ -98,6 +100,10 @@ def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_i
     assert code == 0 and "shifted_from_twin" not in text, text
     # noise of 2e-5 m; held, half a row of 4 ms at 0.38 m/s is 7e-4 m
     assert error(tmp_path / "b", "fit", "position") < 4e-5
+    write_smooth(tmp_path / "bench" / "steps.csv", 3, steps=True)
+    code, text = said("compare", tmp_path / "bench", f"--twin={tmp_path / 'drive.yaml'}")
+    assert code == 0 and "measured_before_command" not in text, text
+    assert "measured_before_command" in said("compare", tmp_path / "bench", f"--twin={tmp_path / 'held.yaml'}")[1]
 
 
 @pytest.mark.slow

@@ -59,18 +59,19 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
         raise TaccorlError(
             f"{second.name} does not repeat {first.name}: only one of them commands a torque_ff; correct repeat_of"
         )
-    rate_hz = first.rate_hz
-    a, b = first.resampled(rate_hz), second.resampled(rate_hz)
+    a, b = (m.resampled(rate_hz := first.rate_hz) for m in (first, second))
     scale = np.maximum(np.ptp(a.target, axis=0), 1e-9)
     lag = _lag(a.target / scale, b.target / scale)
     share, lag = _refine(a.target, b.target, lag)
     rows, start = _common(a.num_rows, b.num_rows, lag)
     target = _shifted(b.target, start, share, len(rows)) - a.target[rows]
-    moving = _moving(a.target[rows], round(AFTER_S * rate_hz))
-    whole = _moving(a.target, 0).sum()
+    moving, whole = _moving(a.target[rows], round(AFTER_S * rate_hz)), _moving(a.target, 0).sum()
     rms = float(np.sqrt(np.mean(target[moving] ** 2))) if moving.any() else 0.0
     motion = float(np.sqrt(np.mean(np.var(a.target, axis=0))))
-    if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > max(same_share * motion, SAME_QUANTA):
+    speed = rate_hz * np.linalg.norm(np.diff(a.target, axis=0)) / np.sqrt(a.target.size)
+    jitter_s = max(np.median(np.abs(np.diff(m.time_s) - m.period_s)) for m in (first, second))  # that of their stamps
+    alike = max(same_share * motion, SAME_QUANTA, 2.0 * jitter_s * speed)
+    if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > alike:
         raise TaccorlError(
             f"{second.name} does not repeat {first.name}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
             f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice"
@@ -84,10 +85,8 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
             ("effort", a.effort, b.effort),
         )
     }
-    zero_s = first.time_s[0] - second.time_s[0]
-    return Overlay(
-        (lag + share) / rate_hz - zero_s, difference, a.time_s[rows][moving], 1.0 + float((weights**2).sum())
-    )
+    shift_s = (lag + share) / rate_hz - first.time_s[0] + second.time_s[0]
+    return Overlay(shift_s, difference, a.time_s[rows][moving], 1.0 + float((weights**2).sum()))
 
 
 def _lag(a: np.ndarray, b: np.ndarray) -> int:
@@ -101,8 +100,7 @@ def _lag(a: np.ndarray, b: np.ndarray) -> int:
 
 
 def _refine(a: np.ndarray, b: np.ndarray, lag: int) -> tuple[float, int]:
-    """(share of a row in [0, 1), whole rows): lowest point of a parabola through the squared differences of
-    commands."""
+    """(share of a row in [0, 1), whole rows): lowest point of a parabola through the squared differences of commands."""
     costs = []
     for k in (lag - 1, lag, lag + 1):
         rows, start = _common(len(a), len(b), k)

@@ -92,9 +92,8 @@ class Axis(Machine):
         name = self.config.name
         for m in measurements.fit:
             self._check_signal(m)
-            if np.nanmax(m.measured[:, m.column(name)]) - np.nanmin(m.measured[:, m.column(name)]) > least_motion(
-                m, name
-            ):
+            q = m.measured[:, m.column(name)]
+            if np.nanmax(q) - np.nanmin(q) > least_motion(m, name):
                 return (name,)
         least = max(least_motion(m, name) for m in measurements.fit)
         raise TaccorlError(f"no fit recording moves {name} by more than {least:.2g} {self.config.unit}; record motions")
@@ -161,6 +160,10 @@ class Axis(Machine):
     @property
     def effort_limits(self) -> Mapping[str, float]:
         return {} if self.config.effort_limit is None else {self.config.name: self.config.effort_limit}
+
+    @property
+    def command_rates(self) -> Mapping[str, float]:
+        return {self.config.name: self.config.command_hz or 0.0}
 
     def drive(self, part: str) -> Drive:
         c = self.config

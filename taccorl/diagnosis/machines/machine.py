@@ -232,18 +232,12 @@ class Machine(ABC):
 
     @abstractmethod
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
-        """Names of the parts that the fit recordings excite, so that they can be diagnosed.
-
-        Raises:
-            TaccorlError: there are none; the message states what to record.
-        """
+        """Names of the parts that the fit recordings excite, so that they can be diagnosed. Raises TaccorlError: there are none;
+        the message states what to record."""
 
     def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
-        """Select those of ``parts`` that ``--joints`` and ``--pads`` name; all if neither is given.
-
-        Raises:
-            TaccorlError: a name is not among them.
-        """
+        """Those of ``parts`` that ``--joints`` and ``--pads`` name; all if neither is given. Raises TaccorlError: a name is not
+        among them."""
         if pads:
             raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; remove --pads")
         known = [*self.units] or parts
@@ -309,18 +303,18 @@ class Machine(ABC):
 
     @property
     def effort_limits(self) -> Mapping[str, float]:
-        """Part of the machine (joint or axis) → limit of its motor's effort in the machine's file [N·m; N if it slides]. Parts
-        without a stated limit are left out."""
+        """Joint or axis → limit of its motor's effort in the machine's file [N·m; N if it slides], where one is stated."""
+        return {}
+
+    @property
+    def command_rates(self) -> Mapping[str, float]:
+        """Joint or axis → rate at which it receives targets [Hz], where the machine's file states one."""
         return {}
 
     # motions ---------------------------------------------------------------------------------------------------------
 
     def drive(self, part: str) -> Drive:
-        """Limits of one part's motion.
-
-        Raises:
-            TaccorlError: motions of this kind of machine are not planned, or it has no such part.
-        """
+        """Limits of one part's motion. Raises TaccorlError: the machine has no motions, or no such part."""
         raise TaccorlError(f"{self.name}: no command plans motions for it; its parts are no joints or axes")
 
     def answer(self, part: str, m: Measurement) -> JointResponse:

@@ -445,9 +445,12 @@ class RobotMachine(Machine):
         stated = {name: joint.effort_limit for name, joint in self.robot.config.joints.items()}
         return {name: limit for name, limit in stated.items() if limit is not None}
 
+    @property
+    def command_rates(self) -> Mapping[str, float]:
+        return {name: joint.command_hz or 0.0 for name, joint in self.robot.config.joints.items()}
+
     def drive(self, part: str) -> Drive:
-        joint = self.robot.joint(part)
-        c = self.robot.config.joints[part]
+        joint, c = self.robot.joint(part), self.robot.config.joints[part]
         return Drive(joint.unit, joint.known.limits, c.effort_limit, c.target_kind, c.law != "pwm")
 
     def answer(self, part: str, m: Measurement) -> JointResponse:
