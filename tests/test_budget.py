@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_716,
     "taccorl/cli": 5_091,
     "taccorl/data": 8_824,
-    "taccorl/diagnosis": 11_308,
+    "taccorl/diagnosis": 11_305,
     "taccorl/episodes": 4_979,
     "taccorl/evaluation": 1_868,
     "taccorl/lerobot_plugin": 343,

@@ -442,8 +442,7 @@ class RobotMachine(Machine):
 
     @property
     def effort_limits(self) -> Mapping[str, float]:
-        stated = {name: joint.effort_limit for name, joint in self.robot.config.joints.items()}
-        return {name: limit for name, limit in stated.items() if limit is not None}
+        return {name: j.effort_limit for name, j in self.robot.config.joints.items() if j.effort_limit is not None}
 
     @property
     def command_rates(self) -> Mapping[str, float]:
@@ -490,13 +489,11 @@ class RobotMachine(Machine):
                 low, high = a.intervals["speed_delay_s"]
                 sure = low > half_s or high < half_s
                 new.append(make_effect("speed_delay", delay_s=(float(a.base["speed_delay_s"]) - half_s) * sure))
-            names = {e.name for e in new}
-            kept = [e for e in config.effects if e.name not in names]
+            kept = [e for e in config.effects if e.name not in {n.name for n in new}]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]
             robot = robot.with_joint(a.part, dataclasses.replace(config, **numbers, effects=effects_))
-        name, why = robot.mass_twice()
-        if name:
-            raise TaccorlError(why)
+        if (twice := robot.mass_twice())[0]:
+            raise TaccorlError(twice[1])
         return dataclasses.replace(self, robot=robot)
 
     def _whole(self, m: Measurement) -> Measurement:
