@@ -159,5 +159,5 @@ def test_what_does_not_succeed_here_is_dropped_and_counted_and_a_bit_that_differ
     spoilt = shutil.copytree(made / "actions", tmp_path / "spoilt")
     (spoilt / ACTIONS).chmod(0o644)
     np.save(spoilt / ACTIONS, actions)
-    with pytest.raises(DatasetError, match="its files are damaged"):
+    with pytest.raises(DatasetError, match="its files were changed"):
         stored_sources([spoilt], store)
