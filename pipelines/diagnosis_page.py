@@ -32,7 +32,7 @@ HEAD = f"""# Is the search for missing effects right?
 
 **Every case is a surrogate robot, simulated**, written apart from the twin (finer steps, dynamics of its own, bristle friction,
 noise, quantisation, jitter, disturbances). Known effects are hidden in one joint or the pads of one arm; the search (ba5ba3f2)
-does not know the gains. Half of the cases use efforts, half have a loop sampled at 0.5 to 4 kHz. These seeds chose nothing.
+does not know the gains. Half of the cases use efforts, half a loop sampled at 0.5 to 4 kHz. No threshold was chosen on them.
 
 | word | meaning |
 |---|---|

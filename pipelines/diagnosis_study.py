@@ -1,8 +1,8 @@
 """``python -m pipelines.diagnosis_study pack chirp … [--seeds=10] [--workers=2] [--rows=PATH] [--first_seed=100000]``
 
 Is the search for missing effects right? On surrogate robots. Rows go to docs/diagnosis_study.jsonl as they are finished; what is
-there is not run again (a case that failed is, with ``--again``). ``--page`` writes docs/diagnosis.md from the rows and runs
-nothing. Thresholds were chosen on seeds 300 to 999 and 15000 to 99999; seeds from 100000 on are for the page only.
+there is not run again (a case that failed is, with ``--again``). ``--page`` writes docs/diagnosis.md and runs nothing. Thresholds
+were chosen on seeds 300 to 999 and 15000 to 99999. Rows from 100000 on led to ``out_of_dents``: the next page takes other seeds.
 """
 
 import json

@@ -33,7 +33,7 @@ TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
 _SEEDS = "--seeds=[1000,2000,3000]"
 _FOUR = "[nominal,configs/randomised,mended,surrogate]"
 _EACH = f"--sensors=[touch,cameras] {_SEEDS}"
-STAGES = {"start": "before", "ppo": "after", "ppo_anchored": "after, with an anchor"}
+STAGES = {"start": "before", "ppo": "after", "ppo_anchored": "after, with an anchor"}  # PPO: field of a row → text
 _LONG, _SHORT = (f"--train_options=[--steps={n},--save_freq={n}]" for n in (5400, 2500))
 PARTS = {
     "imitation": [

@@ -68,7 +68,7 @@ def run(config: AugmentConfig) -> int:
 
 
 def view_commands(plan: "AugmentPlan", produced: "Produced", store: "Store") -> list[str]:
-    """Of each cause of failure the command that shows its first attempt with actions, as lines."""
+    """Lines, one for each cause of failure: the command that opens the first attempt that failed so and has actions."""
     first = {each.entry["outcome"]: each for each in reversed(produced.made) if each.entry["rows"] and not each.success}
     lines = []
     for outcome, each in sorted(first.items()):

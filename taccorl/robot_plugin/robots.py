@@ -136,7 +136,7 @@ class TouchRobot(Robot):
                 self.guard.forget()
 
     def instruct(self, text: str) -> None:
-        """Record ``text``, the task of LeRobot's command, as instruction. Raises TaccorlError: --robot.instruction differs."""
+        """Record ``text``, the task given to LeRobot, as the instruction. Raises TaccorlError: --robot.instruction is another."""
         own = self.config.instruction
         if own and text and own != text:
             raise TaccorlError(f"--robot.instruction={own}: the command's task is {text!r}: remove --robot.instruction")

@@ -61,7 +61,7 @@ def write_card(root: Path) -> Path | None:
 
 
 def card_text(dataset: Dataset) -> str:
-    """Return the card as Markdown with YAML front matter."""
+    """Text of the dataset card: Markdown, below the YAML front matter that the Hugging Face Hub reads."""
     origins = Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
     front = yaml.safe_dump(_front_matter(dataset, origins), sort_keys=False, allow_unicode=True)
     said = "; ".join(str(origin) for origin in origins)

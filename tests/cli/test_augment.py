@@ -62,7 +62,7 @@ def test_the_same_command_again_makes_nothing_anew(collected: Path, place: Path,
 
 
 def test_of_each_cause_the_first_attempt_with_actions_can_be_viewed() -> None:
-    """The attempt's physics is shown, also where the second execution failed; it is the artefact if the store lost it."""
+    """A failed attempt is opened by its stored physics, which a failed second execution has too; without it by its result."""
     ended = [("dropped", 0), ("success", 9), ("force", 7), ("dropped", 5), ("force", 8), ("hung", 0), ("gate", 4)]
     entries = [{"attempt": k, "outcome": o, "rows": rows, "reason": f"why {k}"} for k, (o, rows) in enumerate(ended)]
     produced = SimpleNamespace(made=[Made(Artefact(Path(f"made {e['attempt']}"), ""), e) for e in entries])

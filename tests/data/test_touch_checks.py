@@ -44,7 +44,7 @@ def pad(episode: Episode, name: str) -> touch_checks.Pad:
 
 
 def touched(episode: Episode, change: Change) -> Episode:
-    """The episode with its counts above baseline changed."""
+    """``episode`` after ``change`` has altered its counts above baseline, (T, pads, rows, columns), in place."""
     _, _, touch = copies(episode)
     change(touch)
     return with_arrays(episode, touch=flat(touch))

@@ -109,7 +109,7 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
 
 
 def in_other_unit(t: Trial, j: int) -> bool:
-    """Whether a joint that hardly moves follows its command all the same, by the factor between two units."""
+    """Whether joint ``j`` follows its command with a gain near a known ratio of two units, as of rad to degrees: 1 / 57.3."""
     one = t.even.only([t.m.signals[j]])
     follows, gain = (float(found[0, 0]) for found in _follows(one, _lagged(one.target, one.period_s), [0]))
     near = (1 / SAME_FACTOR < gain / f < SAME_FACTOR for f in KNOWN_FACTORS)

@@ -308,7 +308,7 @@ class Machine(ABC):
 
     @property
     def command_rates(self) -> Mapping[str, float]:
-        """Joint or axis → rate at which it receives targets [Hz], where the machine's file states one."""
+        """Joint or axis → rate at which its drive receives targets [Hz]; 0, or left out, if the machine's file states none."""
         return {}
 
     # motions ---------------------------------------------------------------------------------------------------------

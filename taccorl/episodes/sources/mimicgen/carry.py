@@ -12,7 +12,7 @@ import numpy as np
 from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, minimum_jerk, rotvec, turn
 
 NEAREST = 3
-"""Number of nearest sources from which one is drawn."""
+"""Number of source demonstrations, those whose object lies nearest to that of the new scene, from which one is drawn."""
 _M_PER_RAD = 0.2  # in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1
 _BRIDGE_MPS, _BRIDGE_RADPS = 0.25, 1.5  # peak speeds
 _ROUNDING = 1e-6

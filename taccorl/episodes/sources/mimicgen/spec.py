@@ -41,8 +41,8 @@ class SubtaskSpec:
     """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
     last subtask."""
     selection_strategy: Strategy = "random"
-    """How the source is chosen: at random, or among those with the nearest pose of the object. The subtask that begins first
-    chooses for the whole attempt."""
+    """How an attempt's source demonstration is chosen: at random, or from those whose object lies nearest to that of the new
+    scene (``carry.NEAREST``). The subtask that begins first decides for the whole attempt."""
 
     @property
     def name(self) -> str:
