@@ -7,6 +7,7 @@ so for every combination, with a training on each GPU. All of it is simulated: n
 outputs/learn; a stopped run goes on where it was. It wants a GPU and 16 cores for half an hour (docs/learning.md). ``--small``
 shows the chain on a CPU in minutes and learns nothing.
 
+``--sources=[10,0]``: demonstrations that MimicGen makes of ten, and the expert's own: how many different grips a policy needs.
 ``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: learnt in the nominal twin, in the one that commands mend
 (surrogate ── diagnose --until=noise_floor), and in the surrogate, scored in it; ``--singly``: also in each effect alone.
 """
@@ -26,20 +27,23 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
 from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, parsed, step
-from taccorl.cli import collect, diagnose, merge, surrogate
+from taccorl.cli import augment, collect, diagnose, execute, merge, surrogate
+from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.diagnose import DiagnoseConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
+from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.merge import MergeConfig
-from taccorl.cli.parse import command
+from taccorl.cli.parse import command, shared_fields
 from taccorl.cli.surrogate import SurrogateConfig
 from taccorl.episodes.sources.expert import ExpertSource
+from taccorl.episodes.sources.mimicgen.spec import mimic_spec_path
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
@@ -71,6 +75,9 @@ class LearnConfig:
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
     """Spread of the grips, pulses, errors of the expert: --hands.grasp_m=0.004 …"""
+    sources: list[int] = field(default_factory=lambda: [0])
+    """Demonstrations of the expert of which MimicGen (taccorl augment, execute), with pushes and the expert in contact, makes
+    the others; 0: all are the expert's own."""
     twins: list[str] = field(default_factory=lambda: ["nominal"])
     """Twins of the demonstrations: nominal; mended, which taccorl diagnose makes of sweeps and presses of each twin of
     --scored_in; surrogate, those; a folder of twin files that share the demonstrations, such as configs/randomised."""
@@ -112,8 +119,6 @@ class LearnConfig:
     each, and slowed it; on the CPU one makes 0.15 (configs/learn/small.yaml, pictures included)."""
     episode_length: int | None = None
     """Control steps after which a scored episode is cut off; the task's own limit if not given."""
-    gpus: int = 0
-    """Most GPUs to use, each with a training; 0: all."""
     out: Path = Path("outputs/learn")
     """Folder of everything: the demonstrations are shared by all runs there, a policy's folder is named after its settings."""
 
@@ -135,12 +140,12 @@ def main(words: list[str]) -> list[Learned]:
     _check(config)  # before hours of demonstrations
     scored = _twins(config)
     gpus: queue.Queue[str] = queue.Queue()
-    for gpu in (names := _gpus(config.gpus)):
+    for gpu in (names := _gpus()):
         gpus.put(gpu)
     with ThreadPoolExecutor(2 * len(names)) as pool:  # one policy learns on a GPU while another is scored
         runs = []
-        for (twin, robots), task in itertools.product(scored.items(), config.task):
-            made = demonstrations(config, task, twin)
+        for (twin, robots), task, sources in itertools.product(scored.items(), config.task, config.sources):
+            made = demonstrations(config, task, twin, sources)
             each = itertools.product(config.seeds, config.episodes, config.pictures, config.sensors)
             runs += [pool.submit(_learned, config, task, made, settings, robots, gpus) for settings in each]
         learned = [run.result() for run in runs]
@@ -150,13 +155,13 @@ def main(words: list[str]) -> list[Learned]:
     return learned
 
 
-def _gpus(most: int) -> list[str]:
+def _gpus() -> list[str]:
     """Numbers of the GPUs to use, those that CUDA_VISIBLE_DEVICES allows; ``["0"]`` without one."""
     names = list(filter(None, os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")))
     if not names and shutil.which("nvidia-smi"):
         shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False).stdout
         names = [str(number) for number, _ in enumerate(shown.splitlines())]
-    return names[: most or None] or ["0"]
+    return names or ["0"]
 
 
 def _check(config: LearnConfig) -> None:
@@ -166,7 +171,7 @@ def _check(config: LearnConfig) -> None:
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
     ones = ("executed", "episodes", "rows_per_picture", "workers", "scored")
     ones += ("batch_size", "physics_steps", "episode_length")
-    for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
+    for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "sources": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
         numbers = value if isinstance(value, list) else [least if value is None else value]
@@ -261,25 +266,26 @@ def mended(config: LearnConfig, robot: Path) -> Path:
     return done.with_suffix(".unfinished").rename(done)
 
 
-def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tuple[Path, Path]:
-    """Collect the demonstrations of a task in a twin, if they are not there. Returns the dataset's folder and the store."""
-    folder, store = config.out / task, config.out / "store"
+def demonstrations(config: LearnConfig, task: str, made_in: Path | None, sources: int = 0) -> tuple[Path, Path]:
+    """Make the demonstrations of a task in a twin, if they are not there: the expert's own, or MimicGen's of ``sources`` of them.
+    Returns the dataset's folder and the store."""
+    folder, store, end = config.out / task, config.out / "store", f"_mimicgen_{sources}" if sources else ""
     if made_in is not None and _is_folder(made_in):
         files = sorted(made_in.glob("*.yaml"))
         each, workers = (math.ceil(whole / len(files)) for whole in (max(config.episodes), config.workers))
         some = dataclasses.replace(config, episodes=[each], workers=workers)
         with ThreadPoolExecutor(config.workers) as pool:
-            parts = [made for made, _ in pool.map(lambda file: demonstrations(some, task, file), files)]
-        both = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{named(made_in)}"
-        step(merge.run, MergeConfig(sim=parts, out=both, store=store, pictures="cache", resolution=RESOLUTION))
-        return both, store
+            parts = [made for made, _ in pool.map(lambda file: demonstrations(some, task, file, sources), files)]
+        both = f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{named(made_in)}{end}"
+        step(merge.run, MergeConfig(sim=parts, out=folder / both, store=store, pictures="cache", resolution=RESOLUTION))
+        return folder / both, store
     name, whole = ("", TwinConfig()) if made_in is None else (f"_{named(made_in)}", load_twin(made_in))
     twin = folder / f"twin_of_{config.physics_steps}_steps{name}.yaml"
-    dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps{name}"
+    dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps{name}{end}"
     folder.mkdir(parents=True, exist_ok=True)
     physics = dataclasses.replace(whole.physics, steps_per_control_step=config.physics_steps)
     save_twin(dataclasses.replace(whole, physics=physics), twin)
-    made = CollectConfig(
+    own = CollectConfig(
         task=task,
         source=ExpertSource(hands=config.hands),
         episodes=max(config.episodes),
@@ -294,7 +300,26 @@ def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tupl
         engine=LocalEngine(workers=config.workers),
     )
     try:
-        step(collect.run, made)
+        if not sources:
+            step(collect.run, own)
+        else:  # of the expert without pulses, as MimicGen disturbs the arms itself
+            few, many, spec = (dataset.with_name(f"{dataset.name}_{n}") for n in ("sources", "actions", "spec.yaml"))
+            pushed = {"contact_mode": "closed_loop_expert", "disturbance": {"joint_rad": config.hands.pulse_rad}}
+            cut = yaml.safe_load(mimic_spec_path(task).read_text(encoding="utf-8"))
+            spec.write_text(yaml.safe_dump(cut | {"datagen_config": pushed}), encoding="utf-8")
+            plain = ExpertSource(hands=dataclasses.replace(config.hands, pulse_rad=0.0))
+            bare = {
+                "images": False,
+                "pictures": "video",
+                "resolution": None,
+                "rows_per_picture": 1,
+                "part_poses": False,
+            }
+            step(collect.run, dataclasses.replace(own, source=plain, episodes=sources, out=few, **bare))
+            moved: dict[str, Any] = {"source": few, "spec": str(spec), "rows": "actions", "images": False, "out": many}
+            step(augment.run, AugmentConfig(**shared_fields(own, AugmentConfig) | moved))
+            done: dict[str, Any] = {"source": [many]}
+            step(execute.run, ExecuteConfig(**shared_fields(own, ExecuteConfig) | done))
     except DatasetError as error:
         raise SystemExit(f"{error}\nother demonstrations need another --out") from error
     return dataset, store
@@ -318,7 +343,9 @@ def _learned(
     if "observation.is_sim" in (dataset / "meta" / "info.json").read_text(encoding="utf-8"):
         words.append("--policy.sim_weight=1")  # merged of several twins: no row is real
     training = Training(config.train, dataset, [*words, *config.train_options], config.out / task)
-    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed, "twin": dataset.name.partition("_steps_")[2]}
+    twin, _, sources = dataset.name.partition("_steps")[2].partition("_mimicgen_")
+    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed, "twin": twin[1:]}
+    about |= {"sources": int(sources)} if sources else {}
     gpu = gpus.get()
     try:
         if words := training.command():
@@ -390,7 +417,8 @@ def _row(score: Path) -> str:
     (one,), scenes = told["scores"], told["scenes"]
     low, high = (100 * end for end in one["interval_95"])
     executed, hidden = score.name.split("_")[3], ", ".join(scenes["hidden"]) or "–"
-    cells = [scenes["tasks"][0], *(about[k] for k in ("sensors", "demonstrations", "seed"))]
+    made = f"{about['demonstrations']}{' of {sources} sources'.format(**about) if 'sources' in about else ''}"
+    cells = [scenes["tasks"][0], about["sensors"], made, about["seed"]]
     cells += [scenes["pictures"], scenes["difficulty"], executed, hidden, f"{one['successes']} of {one['n']}"]
     took = one["median_success_s"]
     cells += [f"{100 * one['rate']:.1f} % ({low:.1f} … {high:.1f})", "–" if took is None else f"{took:.1f} s"]

@@ -25,7 +25,9 @@ from taccorl.errors import nearest
 from taccorl.evaluation.statistics import wilson_interval
 from taccorl.sim.task import CLEARANCES_M
 
-ROWS, PAGE, PICTURE = (Path("docs") / name for name in ("results.jsonl", "results.md", "transfer.png"))
+ROWS, PAGE, PICTURE, GRIPS = (
+    Path("docs") / name for name in ("results.jsonl", "results.md", "transfer.png", "grips.png")
+)
 TWINS = ("nominal", "randomised", "mended", "surrogate")
 ROBOTS = {"late": "commands 30 ms late", "sticky": "friction, 60 % of weight held", "heavy": "no weight held"}
 SENSORS = {"touch": "cameras and touch", "cameras": "cameras alone"}
@@ -33,6 +35,8 @@ TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
 _SEEDS = "--seeds=[1000,2000,3000]"
 _FOUR = "[nominal,configs/randomised,mended,surrogate]"
 _EACH = f"--sensors=[touch,cameras] {_SEEDS}"
+PLAIN = {"pictures": "clear", "difficulty": "train", "executed": 8, "twin": "", "scored_in": ""}
+DEMONSTRATIONS = (100, 300, 1000, 3500)
 STAGES = {"start": "before", "ppo": "after", "ppo_anchored": "after, with an anchor"}  # PPO: field of a row → text
 _LONG, _SHORT = (f"--train_options=[--steps={n},--save_freq={n}]" for n in (5400, 2500))
 PARTS = {
@@ -44,6 +48,7 @@ PARTS = {
         f"--task={t} --pictures=randomised --difficulty=[train,hard] --executed=[8,16] --episodes=2000 {_SHORT} {_EACH}"
         for t in ("assembly_1", "test_tube")
     ],
+    "grips": [f"--sensors=[touch,cameras] --sources=[10,20,0] --episodes=[100,300,1000] {_SHORT} {_SEEDS}"],
     "transfer": [
         f"--scored_in=[configs/surrogates/{r}.yaml] --twins={_FOUR} --episodes=1200 {_SHORT} {_SEEDS}" for r in ROBOTS
     ],
@@ -62,7 +67,7 @@ class PaperTablesConfig:
     """Parts to run, and scores to take."""
 
     only: list[str] = field(default_factory=list)
-    """Parts to run: imitation, randomised, transfer."""
+    """Parts to run: imitation, randomised, grips, transfer."""
     page: bool = False
     """Run nothing."""
     take: list[Path] = field(default_factory=list)
@@ -89,7 +94,8 @@ def main(words: list[str]) -> None:
     rows = read(ROWS)
     PAGE.write_text(page(rows), encoding="utf-8")
     draw(rows, PICTURE)
-    print(f"{ROWS}: {len(rows)} rows; {PAGE}, {PICTURE}")
+    draw_grips(rows, GRIPS)
+    print(f"{ROWS}: {len(rows)} rows; {PAGE}, {PICTURE}, {GRIPS}")
 
 
 def read(path: Path) -> Rows:
@@ -137,18 +143,23 @@ def share(rows: Rows) -> str:
 def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
-    plain = {"pictures": "clear", "difficulty": "train", "executed": 8, "twin": "", "scored_in": ""}
-    learnt = _grouped([row for row in seen if plain.items() <= row.items()], "task", "sensors")
+    own = _grouped([row for row in seen if PLAIN.items() <= row.items() and "sources" not in row], "task", "sensors")
     pictures = [row for row in seen if row["pictures"] == "randomised"]
     cells = _grouped(pictures, "task", "difficulty", "executed", "sensors")
-    table_1, table_2, table_3, table_4 = [], [], [], []
+    table_1, table_2, table_3, table_4, table_5 = [], [], [], [], []
     for k, task in enumerate(TASKS):
         for sensors, text in SENSORS.items():
             paper = "; ".join(f"{stage[k]} %" for stage in PAPER[sensors].values())
-            table_1.append((task, text, paper, share(_most(learnt[task, sensors])), "not run"))
+            learnt, after = (
+                _most([row for row in own[task, sensors] if row.get("stage") == stage]) for stage in (None, "ppo")
+            )
+            of = f"; of {after[0]['demonstrations']} demonstrations" if after else ""
+            table_1.append((task, text, paper, share(learnt), share(after) + of))
     for task, clear, executed in sorted({cell[:3] for cell in cells} | {("test_tube", "train", 8)}):
         here = (share(_most(cells[task, clear, executed, sensors])) for sensors in SENSORS)
         table_2.append((task, f"{1e3 * CLEARANCES_M[clear]:g} mm, {executed}", *here))
+    for key, of in grips(seen).items():
+        table_5.append((*key, *(share(of.get(n, [])) for n in DEMONSTRATIONS)))
     for key, of in transfer(seen).items():
         table_3.append((", ".join(map(str, key)), *(share(of.get(t, [])) for t in TWINS), gain(of), gain(of, TWINS[1])))
     for stage, text in STAGES.items():
@@ -167,6 +178,15 @@ their number, each training (`*`: one). 0.5 mm of clearance, 8 actions executed 
 ## Randomised pictures
 
 {_table(f"task | clearance, executed | {' | '.join(SENSORS.values())}", table_2)}
+
+## How many demonstrations, of how many grips
+
+![completed by demonstrations]({GRIPS.name})
+
+assembly_1, clear pictures, scored in the nominal twin. Of 10 or 20 demonstrations, each with a grip of its own, MimicGen made the
+others, with pushes, and with the expert in contact.
+
+{_table(f"policy | grips | {' | '.join(map(str, DEMONSTRATIONS))} demonstrations", table_5)}
 
 ## Does the mended twin make better policies?
 
@@ -217,6 +237,16 @@ def transfer(rows: Rows, stage: str = "") -> dict[tuple[str, int], dict[str, Row
     return {key: of for key, of in found.items() if key[0] in ROBOTS and {"nominal", "mended"} <= of.keys()}
 
 
+def grips(rows: Rows) -> dict[tuple[str, str], dict[int, Rows]]:
+    """(sensors, grips), in words → demonstrations → rows; assembly_1 in the nominal twin."""
+    found: dict[tuple[str, str], dict[int, Rows]] = defaultdict(lambda: defaultdict(list))
+    for row in sorted(rows, key=lambda row: (row["sensors"] != "touch", -row.get("sources", 3500), row["seed"])):
+        if (PLAIN | {"task": "assembly_1"}).items() <= row.items() and "stage" not in row:
+            of = f"{row['sources']} grips" if "sources" in row else "each its own grip"
+            found[SENSORS[row["sensors"]], of][row["demonstrations"]].append(row)
+    return found
+
+
 def gain(of: dict[str, Rows], over: str = "nominal") -> str:
     """Points of mended ``over`` another; Fisher's p, as if scenes of one training were independent; Welch's 95 % interval of
     three or more trainings."""
@@ -258,6 +288,21 @@ def draw(rows: Rows, path: Path) -> None:
     axis.set(ylabel="completed [%]", ylim=(0, 100), xlim=(-0.5, len(table) - 0.5))
     axis.set_title("assembly_1, scored in surrogate robots (simulated); whiskers: 95 % of the scenes", fontsize=9)
     figure.legend(loc="outside lower center", ncols=len(shown), fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def draw_grips(rows: Rows, path: Path) -> None:
+    """A picture: completed by number of demonstrations; intervals of the scenes."""
+    figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    for key, of in grips(rows).items():
+        counts = list(map(_counts, (of[n] for n in sorted(of))))
+        height, ends = 100 * np.divide(*np.transpose(counts)), 100 * np.transpose([wilson_interval(*c) for c in counts])
+        axis.errorbar(sorted(of), height, abs(ends - height), marker="o", capsize=4, label=", ".join(key))
+    axis.set(xscale="log", ylim=(0, 100), xlabel="demonstrations", ylabel="completed [%]")
+    axis.set_xticks(DEMONSTRATIONS, map(str, DEMONSTRATIONS), minor=False)
+    axis.set_title("assembly_1, simulated; whiskers: 95 % of the scenes", fontsize=9)
+    axis.legend(fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -1,4 +1,4 @@
-# bash .ci/gpu/next.sh SECOND, in every call after the one that began transfer.sh: waits until SECOND of the machine's clock or the
+# bash .ci/gpu/next.sh SECOND, in every call after the one that began learn.sh or ppo.sh: waits until SECOND of the machine's clock or the
 # end of the job; into $OUT come scores, logs, and the weights of one more policy (bfloat16, zstd, in parts).
 [ -e /dev/shm/t0 ] || { echo "another machine: nothing of the job is here"; exit 1; }
 . /dev/shm/env.sh

@@ -3,10 +3,8 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import mean
 
 from pipelines.benchmarks.rows import Row, against_reference, benchmark
-from pipelines.studies.cells import ASKED, FIRST_SEED, run_cells
 from pipelines.studies.joints_and_pads import Job, run, run_touch
 from taccorl.diagnosis.machines.machine import diagnose_parts
 from taccorl.diagnosis.machines.piper import PiperTwin
@@ -18,8 +16,8 @@ from taccorl.surrogate.recordings import robot_recordings
 HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
 
 HIDDEN_IN_PADS = ("taxel_saturation", "taxel_creep", "taxel_gain_spread", "pad_shift", "taxel_crosstalk")
-ARMS, CELLS_EACH, CLEAN_CELLS, ROBOTS = (410, 420), 5, 20, 6
-"""Seeds of whole arms; sensors of cells with each effect, and without; robots."""
+ARMS = (410, 420)
+"""Seeds of whole arms."""
 STICKY = Path("configs/surrogates/sticky.yaml")
 """Effects that whole arms hide."""
 
@@ -55,40 +53,4 @@ def diagnosis() -> Iterator[Row]:
         "one arm's pads, four fit and two validation recordings, 13 candidates, surrogate",
         [float(run_touch(job)["cpu_s"]) for job in pads],
         goal="≤ 3.3e6",
-    )
-
-
-@benchmark("cells")
-def cells() -> Iterator[Row]:
-    """Sensors of cells with one of eight hidden effects, and clean ones; all simulated (``python -m pipelines.cells_study``)."""
-    run_cells("", FIRST_SEED - 1)
-    rows = [run_cells(name, FIRST_SEED + k) for name in ASKED for k in range(CELLS_EACH)]
-    seen = [r for r in rows if r.material]
-    clean = [run_cells("", FIRST_SEED + 100 + k) for k in range(CLEAN_CELLS)]
-    shares = {
-        "hidden effect of a force cell: exact": (seen, 0.85),
-        "nothing hidden in a force cell: silent": (clean, 0.98),
-    }
-    for what, (own, goal) in shares.items():
-        yield Row.of([float(r.exact) for r in own], by=mean, name=f"{what}, simulated", unit="1", goal=f"≥ {goal}")
-    yield against_reference(
-        "one force cell, six recordings at 100 Hz, 10 candidates, simulated",
-        [r.cpu_s for r in rows],
-        goal="≤ 1,500,000",
-    )
-
-
-@benchmark("robots")
-def robots() -> Iterator[Row]:
-    """One joint of robots that are not the PiPER, by their robot files; the whole study is ``pipelines.studies.robots``."""
-    from pipelines.studies import robots as robot_study
-
-    rows = [robot_study.run(job) for job in robot_study.jobs()[:ROBOTS]]
-    hidden = [r for r in rows if r["hidden"] and r["fitted"] >= robot_study.MATERIAL_FLOORS]
-    right = [float(robot_study.is_exact(r)) for r in hidden]
-    name = "share of hidden effects found exactly, of the study's first, simulated robots"
-    yield Row.of(right, by=mean, name=name, unit="1", goal="≥ 0.8")
-    costs = [float(r["cpu_s"]) for r in rows]
-    yield against_reference(
-        "one joint, commanded gains, five recordings of 8 to 9 s at 200 Hz, simulated robots", costs
     )

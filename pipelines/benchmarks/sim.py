@@ -1,6 +1,5 @@
 """Figures of the twin: physics, touch, pictures, gripping. ``make bench ONLY=twin_speed`` and the others."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from statistics import median
@@ -18,7 +17,7 @@ from taccorl.sim.rendering import Renderer
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
-from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 NUM_SIMS = 128
@@ -190,18 +189,3 @@ def tiled_pictures() -> Iterator[Row]:
         unit="images/s (wall)",
         goal="" if software else "≥ 10000",
     )
-
-
-@benchmark("physics_step")
-def physics_step() -> Iterator[Row]:
-    """Benchmark of the physics step; penetration is measured in ``make bench ONLY=experts``."""
-    for steps in (20, 40):
-        config = TwinConfig()
-        config.physics = dataclasses.replace(config.physics, steps_per_control_step=steps)
-        sim = Simulation(tasks.get("assembly_1")(), config, num_sims=NUM_SIMS)
-        sim.reset(np.arange(NUM_SIMS))
-        goal = sim.targets.copy()
-        rates = [NUM_SIMS / t for t in _cpu_s(lambda sim=sim, goal=goal: sim.step(goal))]
-        yield Row.of(
-            rates, name=f"control steps, hands empty, step {1e3 / CONTROL_HZ / steps:.2f} ms", unit="env steps/CPU-s"
-        )

@@ -27,17 +27,13 @@ TINY: dict[str, dict[str, Any]] = {  # module → its constants
         "EXPERT_EPISODES": 1, "PENETRATION_EPISODES": 1, "MIMICGEN_ATTEMPTS": 2, "MIMICGEN_SOURCES": 1,
         "COST_ATTEMPTS": 2, "COST_SOURCES": 1, "tasks_with_expert": lambda: ("assembly_2",),
     },
-    "diagnosis": {
-        "HIDDEN": ("coulomb_friction",), "HIDDEN_IN_PADS": ("taxel_saturation",), "ARMS": (410,), "ARM_JOINTS": 1,
-        "CELLS_EACH": 1, "CLEAN_CELLS": 1, "ROBOTS": 2,
-    },
+    "diagnosis": {"HIDDEN": ("coulomb_friction",), "HIDDEN_IN_PADS": ("taxel_saturation",), "ARMS": (410,)},
     "gpu": {"WORLDS": (2,), "WORLDS_ON_CPU": (2,), "NUM_ENVS": 2, "REPEATS": 1, "ACTIONS": 2},
     "policies": {"REPEATS": 1},
     "recordings": {"RECORDING_S": 4.0, "LONG_RECORDING_S": 5.0, "RIVAL_ROWS": 5, "REPEATS": 1},
     "rl": {"NUM_SIMS": 2, "REPEATS": 1, "_CHUNKS": (1,), "_CPUS": 2},
     "sim": {"NUM_SIMS": 2, "REPEATS": 1},
     "training": {"EPISODE_ROWS": 16, "BATCH": 4, "WORKERS": 1, "EPOCHS": 1, "CACHED_PX": 32, "CACHED_BATCH": 8},
-    "views": {"EPISODE_S": 4.0, "REPEATS": 1},
 }  # fmt: skip
 
 

@@ -17,11 +17,11 @@ from taccorl.sim.twin_file import load_twin
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--episodes=[1,2]"]
-    less, done = learn.main(words)
+    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--episodes=[1,2]", "--sources=[0,2]"]
+    less, done, _, many = learn.main(words)
     dataset = Dataset(done.dataset)
-    assert dataset.num_episodes == 2 and dataset.rows_per_picture == 3
-    assert len(dataset.unstored) == 3  # cameras whose frames are in the cache alone
+    stored = dataset.num_episodes, dataset.rows_per_picture, len(dataset.unstored)
+    assert stored == (2, 3, 3)  # three cameras whose frames are in the cache alone
     made = dataset.episode_facts(0)["provenance"]["simulation"]
     assert made["source"]["hands"]["grasp_m"] == 0.004 and made["source"]["hands"]["pulse_rad"] == 0.02
     config = TactilePI05Config.from_pretrained(done.policy)
@@ -34,27 +34,25 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     rows = [
         row.split(" | ") for row in (tmp_path / "scores.md").read_text().splitlines() if row.startswith("| assembly_2")
     ]
-    assert [(row[2], row[6], row[8]) for row in rows] == [("1", "8", "0 of 2"), ("2", "8", "0 of 2")]
+    made = ("1", "2", "1 of 2 sources", "2 of 2 sources")
+    assert [(row[2], row[6], row[8]) for row in rows] == [(n, "8", "0 of 2") for n in made]
+    assert json.loads((many.scores[0] / "settings.json").read_text())["sources"] == 2
     commands: list[str] = []
     monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))
-    assert learn.main(words) == [less, done]
-    assert commands == ["collect"]  # which finds what it made; no training, no evaluation
+    assert learn.main(words)[:2] == [less, done]
+    assert commands == ["collect", "collect", "augment", "execute"]  # which find what they made; no training
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--tsak=assembly_2"], "tsak"),
         (["--train=configs/learn/smal.yaml"], "no such file"),
         (["--executed=17"], "at most 16, the chunk_size"),
         (["--seeds=[]"], "seeds=.*: at least 0"),
         (["--difficulty=[train,hrd]"], "difficulty=hrd"),
-        (["--task=[assembly_1,assembly1]"], "did you mean 'assembly_1'"),
         (["--hide=[]"], "give one of nothing, touch"),
-        (["--gpus=-1"], "at least 0"),
-        (["--pictures=randomized"], "did you mean 'randomised'"),
-        (["--hide=touch_at_mat"], "did you mean 'touch_at_mate'"),
+        (["--sources=[-1]"], "at least 0"),
         (["--twins=[nominal,mendd]"], "did you mean 'mended'"),
         (["--twins=[mended]"], "of which surrogate"),
         (["--singly=true"], "--singly: of which surrogate"),
@@ -92,4 +90,4 @@ def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_in_each_
 
 def test_only_gpus_that_the_user_allows_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
-    assert learn._gpus(0) == ["2", "3"] and learn._gpus(1) == ["2"]
+    assert learn._gpus() == ["2", "3"]
