@@ -33,8 +33,6 @@ class TouchOptions(RobotConfig):
     """Height and width [pixels] of observed pictures, which are scaled and padded with black; 0: those of the cameras."""
     record: Path | None = None
     """MCAP file of everything that the robot measures and is told; PiPER arms only."""
-    instruction: str = ""
-    """Instruction that is written into that file."""
     dry_run: bool = False
     """Send no command; at the end, print ages and latencies, and whether the loop can be held."""
 

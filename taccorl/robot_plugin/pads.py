@@ -263,8 +263,7 @@ class Pads:
             likeness = {other: float(np.corrcoef(counts, of)[0, 1]) for other, of in stored.items()}
             best = max(likeness, key=lambda n: likeness[n], default="")
             if best and best != name and likeness[best] > SAME_PAD:
-                text = f"pad {name}: on its port is {best}: pads are exchanged; correct the ports. {way_out}"
-                raise TaccorlError(text)
+                raise TaccorlError(f"pad {name}: on its port is {best}: pads are exchanged; correct ports. {way_out}")
             if likeness.get(name, 0.0) <= SAME_PAD:
                 text = f"pad {name}: its resting counts differ from those of before: is it touched, or another pad? {way_out}"
                 raise TaccorlError(text)

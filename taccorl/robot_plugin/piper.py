@@ -37,8 +37,7 @@ class TwoPipers:
             text = "--robot.type=bi_piper_flexitac needs the plug-in: pip install lerobot_robot_wego_piper"
             raise TaccorlError(text) from error
         if config.left_can == config.right_can:
-            text = f"--robot.left_can and --robot.right_can are both {config.left_can}: each arm has its own"
-            raise TaccorlError(text)
+            raise TaccorlError(f"--robot.left_can and --robot.right_can are both {config.left_can}: give each its own")
         ports = {"left": config.left_can, "right": config.right_can}
         self.arms: dict[str, Any] = {
             arm: plugin.PiperFollower(plugin.PiperFollowerConfig(port=port, id=arm)) for arm, port in ports.items()

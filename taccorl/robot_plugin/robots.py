@@ -22,6 +22,7 @@ from taccorl.robot_plugin.config_robots import TouchOptions, TouchRobotConfig
 from taccorl.robot_plugin.lerobot_hooks import TouchFeature, TouchReading
 from taccorl.robot_plugin.mcap_log import McapLog
 from taccorl.robot_plugin.pads import Pads, PadsConfig
+from taccorl.robot_plugin.piper import TwoPipers
 from taccorl.robot_plugin.safety import Guard, Observed, Reaction, Stopped
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
 from taccorl.surrogate.drivers import COMMAND_TOPICS, STATE_TOPICS
@@ -109,7 +110,7 @@ class TouchRobot(Robot):
         self.body.connect()
         try:
             if self.config.record is not None:
-                said = self.config.instruction or getattr(self.body, "instruction", "") or "not stated"
+                said = getattr(self.body, "instruction", "") or "not stated"
                 is_polled = not isinstance(self.body, SurrogateArms)  # states come with the loop, as commands do
                 topics = [*COMMAND_TOPICS.values(), *(STATE_TOPICS.values() if is_polled else ())]
                 rates_hz = dict.fromkeys(topics, self.config.fps)
@@ -136,10 +137,7 @@ class TouchRobot(Robot):
                 self.guard.forget()
 
     def instruct(self, text: str) -> None:
-        """Record ``text``, the task given to LeRobot, as the instruction. Raises TaccorlError: --robot.instruction is another."""
-        own = self.config.instruction
-        if own and text and own != text:
-            raise TaccorlError(f"--robot.instruction={own}: the command's task is {text!r}: remove --robot.instruction")
+        """Record ``text``, the task given to LeRobot, as the instruction."""
         if self._log is not None and text:
             self._log.instruction = text
 
@@ -331,7 +329,5 @@ class BiPiperFlexitac(TouchRobot):
     name = "bi_piper_flexitac"
 
     def _body(self) -> Body:
-        from taccorl.robot_plugin.piper import TwoPipers
-
         assert isinstance(self.config, config_robots.BiPiperFlexitacConfig)
         return TwoPipers(self.config)

@@ -103,13 +103,11 @@ class Guard:
             self._low, self._high = ROBOT.action_low.copy(), ROBOT.action_high.copy()
         for name, ends in config.ranges.items():
             if name not in names or len(ends) != 2 or not ends[0] < ends[1]:
-                text = f"safety.ranges: {name}: {ends}: give [lowest, highest] of one of {', '.join(names)}"
-                raise TaccorlError(text)
+                raise TaccorlError(f"safety.ranges: {name}: {ends}: give [low, high] of one of {', '.join(names)}")
             self._low[names.index(name)], self._high[names.index(name)] = ends
         box = config.workspace_m
         if box and (len(box) != 6 or not all(a < b for a, b in zip(box[::2], box[1::2], strict=True))):
-            text = f"safety.workspace_m={box}: give [x_low, x_high, y_low, y_high, z_low, z_high] [m], or []"
-            raise TaccorlError(text)
+            raise TaccorlError(f"safety.workspace_m={box}: give [x_low, x_high, y_low, y_high, z_low, z_high] m, or []")
         self._box = np.array(box).reshape(3, 2) if box and piper else None
         self._hands = _hands() if self._box is not None else None
         self.stopped = ""

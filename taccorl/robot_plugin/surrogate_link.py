@@ -141,9 +141,6 @@ class SurrogateLink:
             if "seed" in header:  # of hello or reset: the samples so far are of another scene
                 self.states.clear()
                 self.pictures.clear()
-                for frames in self.pads.values():
-                    while not frames.empty():
-                        frames.get_nowait()
             self._replies.put(header)
             return
         self.heard_s = self._clock()
@@ -162,8 +159,9 @@ class SurrogateLink:
             frames = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
             samples = [("pad", stamps_s[0], name, frame) for name, frame in zip(names, frames, strict=True)]
             for _, stamp, name, frame in samples:
-                (frames := self.pads[name]).put((stamp, frame))
-                _ = frames.qsize() > 4096 and frames.get_nowait()  # 40 s: nobody reads them
+                self.pads[name].put((stamp, frame))
+                if self.pads[name].qsize() > 4096:  # 40 s: nobody reads them
+                    self.pads[name].get_nowait()
         for listener in self.listeners:
             for sample in samples:
                 listener(*sample)

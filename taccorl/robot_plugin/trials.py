@@ -237,8 +237,7 @@ def _kept(found: Evaluation, out: Path) -> dict[str, Any]:
     if not out.is_dir() or {path.name for path in out.iterdir()} <= {"trials"}:
         return {}
     if not is_stored(out):
-        text = f"--out={out}: holds files already; nothing was changed: give another folder, or move it away"
-        raise TaccorlError(text)
+        raise TaccorlError(f"--out={out}: holds files already; nothing was changed: give another folder or move it")
     there, here = (json.loads(text) for text in ((out / SUMMARY_FILE).read_text("utf-8"), json.dumps(found.to_json())))
     void = there.get("robot", {}).pop("void", [])
     here["robot"].pop("void")
