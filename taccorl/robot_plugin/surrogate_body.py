@@ -159,16 +159,17 @@ class SurrogateBody:
         """Advance by 10 ms; returns the messages, due in the future. ``behind``: ticks by which the caller is late; pictures
         are then left out. ``lead``: whether the leader moves."""
         states: list[tuple[float, np.ndarray]] = []
-        share = min((self.ticks + 1 - self._since) * self.TICK_S * CONTROL_HZ, 1.0)
-        self._target = self._from + share * (self._goal - self._from)
         now_s = self.ticks * self.TICK_S
         every = round(self._physics * PAD_HZ / JOINT_HZ)
+        passed = self.ticks - self._since + np.arange(every, self._physics + 1, every)[:, None, None] / self._physics
+        line = self._from + np.minimum(passed * self.TICK_S * CONTROL_HZ, 1.0) * (self._goal - self._from)
+        self._target = line[-1, 0]
 
         def see(step: int) -> None:
             states.append((now_s + step * self.sim.config.physics.timestep_s, self._state()))
 
         at = range(every, self._physics + 1, every)
-        self.sim.advance(self._target[None, None], self._physics, watch=Watch(at, see))
+        self.sim.advance(line, every, watch=Watch(at, see))
         self.ticks += 1
         if (self.ticks - self._begin) * CONTROL_HZ // PAD_HZ > self._steps:
             self._steps += 1
