@@ -164,6 +164,9 @@ def install() -> bool:
     # 0.6.1 drops of a chunk what its latency lasts, up to 2 more than was executed meanwhile; guides what is beyond the last
     # chunk's end towards 0; and never forgets the latency of the first chunk, which loads kernels (its pull request 4454).
     _replace(queue, "_check_and_resolve_delays", lambda _: lambda self, _, before: self.last_index - before)
+    _replace(queue, "_replace_actions_queue", _kept_from_now)
+    # A chunk is begun so early that none is executed beyond its first ``n_action_steps``, if it takes as long as the last.
+    _replace(queue, "qsize", lambda theirs: lambda self: theirs(self) - max(0, getattr(self, "executed", 0) - 1))
     _replace(rtc, "_normalize_prev_actions_length", lambda _: lambda actions, target_steps: actions[:target_steps])
     _replace(tracker, "max", lambda _: lambda self: max([*self._values][1:][-20:] or self._values, default=0.0))
     _replace(getattr(rtc, "RTCInferenceEngine", None), "_rtc_loop", _at_lower_priority)
@@ -251,6 +254,15 @@ def _none_past_a_hold(engine: Any, guard: Callable[[], Any]) -> Callable:
 def _from_now(name: str) -> Callable[[Any], Callable]:
     """What is left of a queue, from the action of the newest observation's period on (executed already), as in the next chunk."""
     return lambda _: lambda self: q if (q := getattr(self, name)) is None else q[max(0, self.last_index - 1) :].clone()
+
+
+def _kept_from_now(theirs: Callable) -> Callable:
+    def replace(self: Any, original: torch.Tensor, processed: torch.Tensor, executed: int) -> None:
+        """Keep the action of the newest observation's period (executed, but of the last chunk): the next may begin with it."""
+        theirs(self, original, processed, max(0, executed - 1))
+        self.executed, self.last_index = executed, min(executed, 1)
+
+    return replace
 
 
 def _at_lower_priority(theirs: Callable) -> Callable:
