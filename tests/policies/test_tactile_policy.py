@@ -208,6 +208,8 @@ def test_relative_actions_of_a_chunk_are_relative_to_the_state_that_it_was_predi
     # LeRobot's guidance, up to 10, overshoot with fewer than 10 steps: 0.098 here.
     policy.config.rtc_config, policy.config.num_inference_steps = RTCConfig(), 4
     policy.init_rtc_processor()
+    weights = policy.rtc_processor.get_prefix_weights(3, 5, 6).tolist()
+    assert weights == [1, 1, 1, 0, 0, 0], "of what is executed before the chunk comes; LINEAR: then 2/3, 1/3, 0"
     rows = before({**seen, "observation.state": at_plan.expand(2, 14), "task": ["move"] * 2})
     torch.testing.assert_close(after(planned[-1])[:, 1], sent, atol=1e-5, rtol=0)
     free, guided = (plan(rows, inference_delay=3, prev_chunk_left_over=left) for left in (None, planned[-1][:, 1:6]))

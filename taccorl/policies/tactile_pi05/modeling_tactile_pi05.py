@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.configs import RTCAttentionSchedule as Schedule
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
@@ -140,13 +141,16 @@ class TactilePI05Policy(PI05Policy):
         self._plans_state: Tensor | None = None
 
     def init_rtc_processor(self) -> None:
-        """As LeRobot's, but with a guidance weight of at most the number of denoising steps: with more, one step moves an action
-        beyond the value that it is guided to."""
+        """As LeRobot's, with two changes. The guidance weight is at most the number of denoising steps: with more, one step moves
+        an action beyond the value that it is guided to. And instead of LeRobot's default, LINEAR, guidance ends with the actions
+        that are executed before the chunk arrives (ZEROS): new observations hardly change what is guided by the last chunk."""
         super().init_rtc_processor()
         if self.rtc_processor is not None:
             theirs = self.rtc_processor.rtc_config
             most = min(theirs.max_guidance_weight, float(self.config.num_inference_steps))
-            self.rtc_processor.rtc_config = replace(theirs, max_guidance_weight=most)
+            how = theirs.prefix_attention_schedule
+            how = Schedule.ZEROS if how == Schedule.LINEAR else how
+            self.rtc_processor.rtc_config = replace(theirs, max_guidance_weight=most, prefix_attention_schedule=how)
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
         """Return the co-training loss (see ``mixture``) over ``action_losses``, and values for the log (name → float).

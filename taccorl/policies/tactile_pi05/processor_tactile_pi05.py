@@ -180,29 +180,22 @@ def make_tactile_pi05_pre_post_processors(
             f"--policy.tokenizer={config.tokenizer_name}: has {len(tokenizer.input_tokenizer)} tokens, more than the "
             f"{SIZES[config.backbone].vocabulary} of --policy.backbone={config.backbone}: remove --policy.tokenizer"
         )
-    relative = RelativeActionsProcessorStep(
-        enabled=config.use_relative_actions,
-        exclude_joints=config.relative_exclude_joints,
-        action_names=config.action_feature_names,
-    )
+    names = {"exclude_joints": config.relative_exclude_joints, "action_names": config.action_feature_names}
+    relative = RelativeActionsProcessorStep(enabled=config.use_relative_actions, **names)
     common = make_default_policy_processor_steps(config, dataset_stats)
     before: list[ProcessorStep] = [common.rename_observations, common.add_batch_dim, relative]
-    if config.use_relative_actions:
-        before.append(RawStateStep())
-    if config.knows_hands:
-        before.append(HandPosesStep())
+    before += [RawStateStep()] if config.use_relative_actions else []
+    before += [HandPosesStep()] if config.knows_hands else []
     if config.part_poses or config.pose_loss:
         before.append(PartPosesStep(names=config.require_part_names(), required=config.part_poses))
     before.append(common.normalize)
-    if config.tactile:
-        before.append(_tactile_step(config, dataset_stats))
+    before += [_tactile_step(config, dataset_stats)] if config.tactile else []
     if config.has_discrete_state:
         before.append(Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim))
     before += [tokenizer, common.to_device]
     absolute = AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative)
     after: list[ProcessorStep] = [common.unnormalize, absolute, common.to_cpu]
     if config.use_relative_actions:
-        names = {"exclude_joints": config.relative_exclude_joints, "action_names": config.action_feature_names}
         after = [TakeStateSincePlanStep(), common.unnormalize, absolute, FromPlansStateStep(**names), common.to_cpu]
     return make_policy_processor_pipelines(input_steps=before, output_steps=after)
 
