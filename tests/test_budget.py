@@ -14,7 +14,7 @@ MOST_LINES = {
     "taccorl/evaluation": 1_868,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_207,
-    "taccorl/policies": 3_488,
+    "taccorl/policies": 3_485,
     "taccorl/report": 2_488,
     "taccorl/rl": 2_479,
     "taccorl/robot_plugin": 2_678,
