@@ -220,8 +220,8 @@ def _remembered(theirs: Callable) -> Callable:
 
 
 def _paced(theirs: Callable) -> Callable:
-    """Predict a chunk when ``n_action_steps`` of the last are executed. LeRobot's default (30 left) makes the next
-    chunk at once if chunks have 30 actions or fewer: guided actions then guide the next, and observations have little effect."""
+    """Have the next chunk when ``n_action_steps`` of the last are executed. LeRobot's default (30 left) begins it
+    at once if chunks have 30 actions or fewer: guided actions then guide the next, and observations have little effect."""
 
     def create(config: Any, *, policy: Any, **more: Any) -> Any:
         chunk, taken = (getattr(policy.config, name, None) for name in ("chunk_size", "n_action_steps"))
