@@ -19,7 +19,7 @@ from taccorl.report.diagnosed import diagnosed
 from taccorl.report.evidence_words import last_refit_words, to_record, unit_words
 from taccorl.report.report import Report
 from taccorl.report.section import Section, cell
-from taccorl.report.verdict import Verdict, verdict
+from taccorl.report.verdict import verdict
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.pads import TaxelThreshold
 
@@ -43,10 +43,6 @@ def changed(d: Diagnosis, **fields: Any) -> Diagnosis:
     return dataclasses.replace(d, **fields)
 
 
-def sentences(v: Verdict) -> list[str]:
-    return [v.finding, v.confidence, v.record_next]
-
-
 def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one: Diagnosis):
     number = Identified(name="ripple.strength/kp", value=0.002, low=0.0019, high=0.0021, unit="rad")
     known = Known(
@@ -56,16 +52,13 @@ def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one: Dia
     )
     v = verdict(PART, one, known=known)
     assert (v.kind, v.level) == ("effects", "high")
-    assert (
-        f"{one.errors['fitted']['validation']:.2f}" in v.finding
-        and f"{one.errors['after']['validation']:.2f}" in v.finding
-    )
+    assert all(f"{one.errors[stage]['validation']:.2f}" in v.finding for stage in ("fitted", "after"))
     assert PART in v.finding and "ripple" in v.finding and "0.002 rad (0.0019 … 0.0021)" in v.finding
     assert f"{one.errors['after']['test']:.2f}" in v.confidence
     assert "110" in v.record_next and "152" in v.record_next, "what the recordings leave of K_p"
     pinned = verdict(PART, one, known=dataclasses.replace(known, pinned_by=("recorded effort",)))
     assert "K_p" not in pinned.record_next
-    assert all(s.endswith(".") and "\n" not in s for s in sentences(v))
+    assert all(s.endswith(".") and "\n" not in s for s in (v.finding, v.confidence, v.record_next))
 
 
 def test_errors_fall_from_those_of_the_twin_as_it_was_where_its_refit_is_worse(one: Diagnosis):

@@ -50,9 +50,8 @@ def compare(
             if the object is known.
         progress: function that is called with (recording, number of recordings done, number in all).
 
-    Raises:
-        TaccorlError: the robot lacks a signal, a recording has nothing to compare, or the pads contradict the stated object.
-    """
+    Raises TaccorlError: the robot lacks a signal, a recording has nothing to compare, or the pads contradict the stated
+    object."""
     uses: list[tuple[Use, Measurement]] = [
         (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
     ]
