@@ -90,14 +90,6 @@ def test_friction_is_no_fault_of_the_telemetry(friction_nm):
         assert not any(f.severity != "note" for f in check_measurement(m))
 
 
-def test_progress_names_each_recording_with_its_place_and_the_check(clean):
-    said: list[tuple[str, str]] = []
-    two = [clean, dataclasses.replace(clean, name="again", repeat_of=clean.name)]
-    check_measurements(two, progress=lambda name, text: said.append((name, text)))
-    own = [text for name, text in said if name == "again"]
-    assert len(own) == 3 and all("recording 2 of 2" in text for text in own) and "clock" in own[-1]
-
-
 def test_steps_and_holds_are_clean_too():
     target = steps(3, 0.1, rows=1400)
     assert found(measured(target, answer(target), np.random.default_rng(0), 2e-4)) == {}
