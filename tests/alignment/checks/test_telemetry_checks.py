@@ -103,6 +103,17 @@ def test_positions_one_row_early_are_an_error_at_every_joint(seed, rows):
     assert all(f.severity == "error" for f in check_measurement(m) if f.check == "measured_before_command")
 
 
+@pytest.mark.parametrize(("rows", "hz", "early"), [(1, 1000.0, False), (2, 1000.0, True), (1, 150.0, True)])
+def test_targets_that_are_sent_between_rows_of_200_hz_lead_by_a_row_and_no_more(
+    clean, rows: int, hz: float, early: bool
+):
+    target = steps(4, 0.15)
+    stepped = measured(target, answer(target), np.random.default_rng(0), 2e-4)
+    for m, joints in ((clean, len(ARMS_JOINTS)), (stepped, 1)):
+        errors = found(shifted(m, rows), rates=dict.fromkeys(m.signals, hz))
+        assert len(errors.get("measured_before_command", ())) == joints * early
+
+
 def test_lead_names_joint_time_and_way_out(clean):
     recorded = text_of(shifted(clean, 2), "measured_before_command")
     assert "answers" in recorded and "ms" in recorded

@@ -34,18 +34,6 @@ def test_the_hidden_effect_is_found_with_its_strength_and_the_error_falls_to_the
     assert [name for name, _ in found.steps] == ["", "ripple"]
 
 
-def test_progress_states_the_effects_so_far_and_the_error_that_they_leave():
-    """Before: 1.7 / √2 on noise of 0.1, 12.06 floors; with the ripple, a square of 0.6 is left."""
-    fit, validation, _ = made(Ripple(strength=1.7), Square(strength=-0.6))
-    said: list[str] = []
-    found = diagnose(MadeProblem(Ripple, Square), fit, validation, progress=said.append)
-    rounds = [text for text in said if "first refit with square" in text or "refitting with square" in text]
-    (first,) = (text for text in rounds if "no effect added" in text and "first" in text)
-    before = found.errors["fitted"]["validation"]
-    assert f"{before:.2f}" in first and "of 2" in first
-    assert any("ripple" in text and f"{found.rounds[0].validation_error:.2f}" in text for text in rounds)
-
-
 def test_nothing_is_added_where_nothing_is_missing():
     problem = MadeProblem(Ripple, Bump, Square, Squire, Hidden)
     for seed in range(40):
