@@ -96,13 +96,7 @@ class Alignment:
 _NOT_STORED = ("numbers", "effects", "twin", "overlays")
 
 
-def align_part(
-    part: str,
-    config: TwinConfig,
-    measurements: Measurements,
-    *,
-    fit_kp: bool = False,
-) -> Alignment:
+def align_part(part: str, config: TwinConfig, measurements: Measurements, *, fit_kp: bool = False) -> Alignment:
     """Align one joint (``left_joint5``) or the pads of one arm (``left pads``); why it cannot be done is its ``trouble``.
 
     Args:
@@ -145,10 +139,7 @@ def _align_joint(signal: str, config: TwinConfig, measurements: Measurements, fi
     free += ["kd"] * (not all(m.kd_known for m in motions))
     free += ["kp"] * (fit_kp and not all(m.kp_known for m in motions))
     fit = identify_controller(
-        motions,
-        model,
-        free=free,
-        validation=[joint_motion(m, config, signal) for m in own.validation],
+        motions, model, free=free, validation=[joint_motion(m, config, signal) for m in own.validation]
     )
     judged = [e for e in fit.errors if e.use == "validation"] or list(fit.errors)
     before, after = (

@@ -112,6 +112,7 @@ def verdict(
     doubts: Sequence[str] = (),
     options: Sequence[str] = (),
     repeated: bool = False,
+    floor: str = "",
     short: Mapping[str, Sequence[str]] | None = None,
     worst: RegimeError | None = None,
 ) -> Verdict:
@@ -119,7 +120,8 @@ def verdict(
     were divided into identified and other ones. ``data``: faults of the recordings that must be corrected before an effect can
     be named. ``doubts``: other reasons for less confidence, such as ranges that no validation recording covers. ``options``:
     options of suggested commands, such as ``--twin=twin.yaml``. ``repeated``: a motion of the part was repeated, so that the
-    noise floor includes the variation between repeats. ``short``: fit, validation → variables whose range in the recordings of
+    noise floor includes the variation between repeats. ``floor``: text on a noise floor that is not known, as a single pair of
+    repeats contradicts the noise of rows. ``short``: fit, validation → variables whose range in the recordings of
     the other use its own do not cover, if it is known. ``worst``: recording and regime with the largest error after the fit,
     if they are known."""
     kind, w = _kind(d, data), _Words(part, d, known, data)
@@ -127,12 +129,12 @@ def verdict(
     finding = FOUND[kind].format(w=w, refitted=refitted_words(d))
     if d.changed and kind not in ("data_first", "not_converged"):
         finding = f"{finding} Numbers of the file that change: {'; '.join(changed_words(d))}."
-    reasons = [*_doubts(d, kind, short)]
+    reasons = [*_doubts(d, kind, short, floor)]
     if remarks:
         reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
     # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
-    unsure = kind in UNCERTAIN or bool(d.untested and d.errors[d.baseline]["validation"] <= LITTLE)
-    level: Level = "low" if unsure else "moderate" if reasons or kind == "ties" else "high"
+    unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (floor and kind == "nothing_missing")
+    level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
     first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
     why = [reason.rstrip(".") for reason in (*first, *reasons)]
     more = f"; and {len(why) - _MOST} more" if len(why) > _MOST else ""
@@ -143,7 +145,8 @@ def verdict(
         level=level,
         finding=finding,
         confidence=f"Confidence {level}: {'; '.join(why[:_MOST])}{more}.",
-        record_next=words,
+        record_next=bool(floor) * "The motion of the two recordings that differ a third time, for the noise floor. "
+        + words,
         command=" ".join([command, *options]) if command else "",
         remarks=remarks,
     )
@@ -288,7 +291,9 @@ class _Words:
         return f"validation recordings end at {self.after:.2f}{test}"
 
 
-def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None) -> Iterator[str]:
+def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None, floor: str) -> Iterator[str]:
+    if floor:
+        yield f"the noise floor may be wrong, and every error with it: {floor}"
     after, first = d.errors["after"], d.errors[d.baseline]["validation"]
     fit, validation, test = after["fit"], after["validation"], after.get("test")
     named = kind in ("effects", "ties")

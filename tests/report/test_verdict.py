@@ -21,7 +21,6 @@ from taccorl.report.report import Report
 from taccorl.report.section import Section, cell
 from taccorl.report.verdict import verdict
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.pads import TaxelThreshold
 
 PART = "left_joint5"
 
@@ -174,19 +173,6 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     assert "repeat_of" in v.record_next and "repeat_of" not in again.record_next and again.command == v.command
 
 
-def test_without_a_nearest_effect_and_a_regime_the_press_of_the_first_effect_is_described():
-    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(2)]
-    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:])
-    last = d.rounds[-1]
-    of_cells = tuple(
-        dataclasses.replace(e, name=name, gain=0.0)
-        for e, name in zip(last.evidence, ("taxel_threshold", "taxel_play"), strict=True)
-    )
-    d = changed(d, rounds=(*d.rounds[:-1], dataclasses.replace(last, evidence=of_cells)))
-    v = verdict("array", d, repeated=True)
-    assert "taxel_threshold" in v.record_next and v.record_next.endswith(TaxelThreshold.to_record)
-
-
 def test_one_effect_where_more_is_missing_is_not_called_the_answer():
     recordings = [record(k, Bump(strength=5.0), Ripple(strength=1.0)) for k in range(2)]
     d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:], config=SearchConfig(max_effects=1))
@@ -257,6 +243,12 @@ def test_data_comes_before_any_effect(one: Diagnosis):
     v = verdict(PART, one, data=["a.csv: positions are 5 ms late", "b.csv: the same"])
     assert (v.kind, v.level, v.command) == ("data_first", "low", "")
     assert "5 ms late" in v.finding and "1 more" in v.finding and "ripple" not in v.finding
+
+
+def test_nothing_is_missing_is_not_sure_where_the_noise_floor_is_not_known(one: Diagnosis, nothing: Diagnosis):
+    for d, level in ((one, "moderate"), (nothing, "low")):
+        v = verdict(PART, d, floor="2 mrad; not known")
+        assert v.level == level and "2 mrad; not known" in v.confidence and "a third time" in v.record_next
 
 
 @pytest.mark.parametrize("reason", ["test", "no test", "bound", "doubt", "disagree"])

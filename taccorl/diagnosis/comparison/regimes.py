@@ -14,8 +14,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.folder import Use
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, repeat_pairs
-from taccorl.alignment.measurements.repeats import overlay
+from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, laid_pairs
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import variable_unit
 from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
@@ -128,8 +127,11 @@ def with_regimes(
     motions = motions_of([_trace(r, floor) for side in sides for r in side])
     rows = {m.trace.recording: {name: inside(m) for name, inside in _regimes()} for m in motions}
     noise = {name: 0.0 for name, _ in _regimes()}
-    for first, second in repeat_pairs(measurements):
-        laid, j = overlay(first, second), first.column(floor.signal)
+    odd = {name for name, _ in floor.used.left_out}
+    for first, second, laid in laid_pairs(measurements):
+        if second.name in odd:
+            continue
+        j = first.column(floor.signal)
         at = np.searchsorted(first.time_s, laid.time_s - 1e-9).clip(max=first.num_rows - 1)
         for name, inside in rows[first.name].items():
             own = laid.difference["position"][inside[at], j]
