@@ -10,6 +10,7 @@ from typing import Literal
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
+from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, Status, of_test
 from taccorl.report.evidence_words import (
     effect_class,
@@ -65,6 +66,7 @@ UNCERTAIN: Mapping[Kind, str] = {
     "more": "what is still missing may change what was named",
 }
 """Kind of low confidence → its first reason."""
+SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
     "gains_moved": "Nothing yet: state the commanded gains (kp, kd in measurements.yaml) and check the time stamps.",
@@ -116,14 +118,12 @@ def verdict(
     short: Mapping[str, Sequence[str]] | None = None,
     worst: RegimeError | None = None,
 ) -> Verdict:
-    """Verdict on one part. ``can_tell``: effects that its recordings can show and separate. ``known``: its numbers, if they
-    were divided into identified and other ones. ``data``: faults of the recordings that must be corrected before an effect can
-    be named. ``doubts``: other reasons for less confidence, such as ranges that no validation recording covers. ``options``:
-    options of suggested commands, such as ``--twin=twin.yaml``. ``repeated``: a motion of the part was repeated, so that the
-    noise floor includes the variation between repeats. ``floor``: text on a noise floor that is not known, as a single pair of
-    repeats contradicts the noise of rows. ``short``: fit, validation → variables whose range in the recordings of
-    the other use its own do not cover, if it is known. ``worst``: recording and regime with the largest error after the fit,
-    if they are known."""
+    """Verdict on one part. ``can_tell``: effects that its recordings can show and separate. ``known``: its numbers, if they were
+    divided into identified and other ones. ``data``: faults of the recordings that come before any effect. ``doubts``: other
+    reasons for less confidence. ``options``: of suggested commands, such as ``--twin=twin.yaml``. ``repeated``: the noise floor
+    includes what differs between repeats. ``floor``: text on one that is not known (``SignalFloor.is_unknown``). ``short``: fit,
+    validation → variables whose range in the recordings of the other use its own do not cover, if it is known. ``worst``:
+    recording and regime with the largest error after the fit, if they are known."""
     kind, w = _kind(d, data), _Words(part, d, known, data)
     remarks = (*d.remarks, *doubts[:_MOST])
     finding = FOUND[kind].format(w=w, refitted=refitted_words(d))
@@ -176,6 +176,8 @@ def _change(c: Changed, d: Diagnosis) -> str:
     if c.name == "loop_hz":
         low, high = (1.0 / end if end > 0.0 else math.inf for end in reversed(d.intervals["loop_s"]))
     edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
+    edit += f": multiply efforts by {1 / c.after:.4g}, or correct the torque constant" * (c.name == EFFORT_SCALE)
+    edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))
     return f"{c.name} {c.was} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g}){edit}"
 
 
@@ -236,11 +238,13 @@ class _Words:
     @property
     def off(self) -> str:
         how = {c.effect or c.name: "off" if math.isfinite(c.before) else "not stated" for c in self.d.changed}
-        off = " and ".join(f"{name} of the file is {word}" for name, word in how.items())
+        off = " and ".join(SCALED if n == EFFORT_SCALE else f"{n} of the file is {word}" for n, word in how.items())
         if not self.instead:
             return f"no effect is missing, but {off}: {self.fell}"
-        missing = f"or {' or '.join(self.instead)} is missing instead"
-        return f"{off}, {missing}: {self.fell}, and these recordings do not tell which it is"
+        missing = [name for name in self.instead if name != EFFORT_SCALE]
+        ways = [f"{' or '.join(missing)} is missing instead"] * bool(missing)
+        ways += [SCALED] * (EFFORT_SCALE in self.instead)
+        return f"{off}, or {', or '.join(ways)}: {self.fell}, and these recordings do not tell which it is"
 
     @property
     def instead(self) -> tuple[str, ...]:
@@ -354,6 +358,8 @@ def _record_next(
         how = ": " + " ".join(cls.to_record for cls in classes) if not command and classes else "."
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how}"
         return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
+    if EFFORT_SCALE in w.instead:
+        return "The same motions with a known load (`payload_kg`), whose part of the inertia is known.", ""
     if w.instead:
         own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)
         words = f"A wider motion, or another pose: {own} is the same there, the torque of {_some(w.instead)} is not."

@@ -16,7 +16,7 @@ from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.report.diagnosed import diagnosed
-from taccorl.report.evidence_words import last_refit_words, to_record, unit_words
+from taccorl.report.evidence_words import to_record, unit_words
 from taccorl.report.report import Report
 from taccorl.report.section import Section, cell
 from taccorl.report.verdict import verdict
@@ -343,15 +343,6 @@ def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_ref
     assert verdict(PART, d).command.endswith("--effects=coulomb_friction,load_friction"), "the check of one effect"
     held = verdict(PART, changed(tied, base={}))  # torque_ff is known
     assert held.command.endswith("--effects=coulomb_friction,asymmetric_friction")
-
-
-def test_the_error_of_the_last_round_is_named_where_the_last_refit_changed_it(one: Diagnosis):
-    assert "last round" not in printed(one), "both are printed alike"
-    errors = {**one.errors, "after": {"fit": 1.84, "validation": 1.1845}}
-    d = changed(one, errors=errors, steps=(("", 21.27), ("ripple", 1.2956)))
-    (line,) = [line.strip() for line in printed(d).splitlines() if "last round" in line]
-    assert "1.30" in line and "1.18" in line and line == last_refit_words(d)
-    assert "last round" not in printed(changed(d, steps=(("", 21.27),))), "no round added anything"
 
 
 def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts(one: Diagnosis):

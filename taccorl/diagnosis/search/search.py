@@ -28,7 +28,7 @@ from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_sco
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
 from taccorl.diagnosis.search.identifiable import not_told_from_none
-from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress
+from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress, with_scale
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
@@ -68,9 +68,13 @@ def diagnose(
         progress: function that is called with a text about the present step.
     """
     began = time.process_time()
-    fits = Fits(problem, fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
-    problem.learn(fits.first.values)
-    beam = Beam(fits, [name for name in problem.candidates if name not in without])
+    how = (fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
+    fits = Fits(problem, *how)
+    if not fits.at_floor(fits.base) and (scaled := with_scale(problem)) is not None:
+        by_scale = Fits(scaled, *how)
+        fits = by_scale if by_scale.at_floor(by_scale.base) else fits
+    fits.problem.learn(fits.first.values)
+    beam = Beam(fits, [name for name in fits.problem.candidates if name not in without])
     answer = beam.search()
     answer, removed, remarks = beam.pruned(answer)
     steps = beam.steps(answer)
@@ -97,7 +101,7 @@ def diagnose(
         intervals=model.intervals(),
         rounds=rounds,
         rivals=rivals,
-        twins={n: dict(problem.candidates[n].cls.near_twins) for n in fits.added(model)},
+        twins={n: dict(fits.problem.candidates[n].cls.near_twins) for n in fits.added(model)},
         removed=tuple(removed),
         errors=errors,
         test_without=without_it,
