@@ -291,21 +291,6 @@ def printed(d: Diagnosis) -> str:
     return "\n".join(texts(diagnosed(found(d), verdict(PART, d), ())))
 
 
-def test_the_terminal_names_a_nearest_effect_only_if_it_takes_away_some_of_the_error():
-    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(3)]
-    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
-    last = d.rounds[-1]
-
-    def shown(gain: float) -> str:
-        best = dataclasses.replace(last.evidence[0], gain=gain)
-        rounds = (*d.rounds[:-1], dataclasses.replace(last, evidence=(best, *last.evidence[1:])))
-        return printed(changed(d, rounds=rounds))
-
-    name = f"nearest: {last.evidence[0].name}"
-    assert name in shown(0.08)
-    assert name not in shown(0.004) and "nearest" not in shown(-0.2)
-
-
 def test_the_terminal_prints_no_interval_of_a_number_that_was_not_fitted(one: Diagnosis):
     for interval, words in (({"strength": (0.9, 1.1)}, "(0.9 … 1.1)"), ({}, "(not fitted)")):
         effect = dataclasses.replace(one.effects[0], interval=interval)

@@ -88,11 +88,7 @@ class RegimeErrors:
 
 
 def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
-    """Errors of one signal by recording and regime.
-
-    Args:
-        traces: all recordings of the signal, replayed with the fitted twin.
-    """
+    """Errors of one signal by recording and regime. ``traces``: all recordings of the signal, replayed with the fitted twin."""
     motions, regimes = motions_of(traces), _regimes()
     rows = [_row(m.trace.recording, m.trace.use, name, [m], inside) for m in motions for name, inside in regimes]
     uses: list[Use] = [use for use in USES if any(m.trace.use == use for m in motions)]
@@ -116,12 +112,8 @@ def with_regimes(
 ) -> list[list[Recording]]:
     """``sides`` (fit, validation, test) of a joint or axis, each recording with the rows of its regimes and the noise of
     positions there: by repeats of a motion, and ``EXACT`` of the tracking error, which no equations have more exactly (arms
-    without an effect kept 0.3 % of it in steps). As they are if ``floor`` is that of efforts.
-
-    Args:
-        measurements: those that the recordings were made of, by name.
-        floor: noise floor of the first channel.
-    """
+    without an effect kept 0.3 % of it in steps). As they are if ``floor`` is that of efforts. ``measurements``: those that the
+    recordings were made of, by name. ``floor``: noise floor of the first channel."""
     if floor.kind != "position":
         return [[*side] for side in sides]
     motions = motions_of([_trace(r, floor) for side in sides for r in side])
