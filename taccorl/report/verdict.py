@@ -259,7 +259,7 @@ class _Words:
 
     @property
     def place(self) -> str:
-        """Effects of the file of whose strength the refit beside an added effect leaves less than ``GONE``."""
+        """Effects of the file of whose strength the refit beside an added effect leaves less than ``GONE``, and ``SCALED``."""
         found = []
         for c in self.d.changed if added(self.d) else ():
             cls = effect_class(c.effect) if c.effect else None
@@ -267,7 +267,8 @@ class _Words:
             none = own[0].absent if own else None
             if none is not None and abs(c.after - none) < GONE * abs(c.before - none):
                 found.append(c.effect)
-        return f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
+        place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
+        return place + f", or {SCALED}" * self.d.or_scale
 
     @property
     def sizes(self) -> str:
@@ -324,7 +325,7 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
         yield (
             f"validation recordings keep {validation:.2f} of {first:.2f} noise floors, so little that no effect was looked for"
         )
-    yield from filter(None, (unjudged(d, short), may_be_two(d)))
+    yield from filter(None, ("a wrong torque constant does as well" * d.or_scale, unjudged(d, short), may_be_two(d)))
     if d.one_pose:
         yield (
             f"{_some(tuple(d.one_pose))} found in one pose of the other joints, in which the weight of a tilted base or of a "
@@ -358,7 +359,7 @@ def _record_next(
         how = ": " + " ".join(cls.to_record for cls in classes) if not command and classes else "."
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how}"
         return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
-    if EFFORT_SCALE in w.instead:
+    if EFFORT_SCALE in w.instead or d.or_scale:
         return "The same motions with a known load (`payload_kg`), whose part of the inertia is known.", ""
     if w.instead:
         own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)

@@ -262,13 +262,7 @@ def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one: Diagnosis,
     d = changed(one, errors=one.errors | {"after": errors.get(reason, after)})
     d = changed(d, at_bound=("ripple.strength",)) if reason == "bound" else d
     v = verdict(PART, d, doubts=["velocity: not validated"] if reason == "doubt" else [])
-    said = {
-        "test": "2.34",
-        "no test": "no test recording",
-        "bound": "ripple.strength",
-        "doubt": "velocity",
-        "disagree": "1.47",
-    }
+    said = {"test": "2.34", "no test": "no test rec", "bound": "strength", "doubt": "velocity", "disagree": "1.47"}
     assert v.level == "moderate"
     assert said[reason] in " ".join((v.confidence, *v.remarks))
     assert reason != "doubt" or "1 remark below" in v.confidence

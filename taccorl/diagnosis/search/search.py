@@ -69,14 +69,17 @@ def diagnose(
     """
     began = time.process_time()
     how = (fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
-    fits = Fits(problem, *how)
+    fits, by_scale = Fits(problem, *how), None
     if not fits.at_floor(fits.base) and (scaled := with_scale(problem)) is not None:
-        by_scale = Fits(scaled, *how)
-        fits = by_scale if by_scale.at_floor(by_scale.base) else fits
+        by_scale = own if (own := Fits(scaled, *how)).at_floor(own.base) else None
+    if by_scale is not None and by_scale.base.numbers <= fits.base.numbers:
+        fits, by_scale = by_scale, None
     fits.problem.learn(fits.first.values)
     beam = Beam(fits, [name for name in fits.problem.candidates if name not in without])
-    answer = beam.search()
-    answer, removed, remarks = beam.pruned(answer)
+    answer, removed, remarks = beam.pruned(beam.search())
+    if by_scale is not None and better(by_scale.base, answer, fits.config):
+        fits, by_scale, beam = by_scale, None, Beam(by_scale, beam.names)
+        answer, removed, remarks = beam.pruned(beam.search())
     steps = beam.steps(answer)
     rivals = beam.rivals(answer, steps)
     rounds = beam.rounds(answer, steps, rivals)
@@ -95,6 +98,7 @@ def diagnose(
         changed=changed,
         effects=tuple(_described(fits, model, errors, without_it)),
         offers=tuple(_offers(beam, answer, rivals, test)),
+        or_scale=by_scale is not None and bool(fits.added(answer) and refusal(answer, by_scale.base, fits.config)),
         present=fits.present,
         base=_base(model),
         start=fits.given,

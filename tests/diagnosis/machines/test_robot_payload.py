@@ -126,6 +126,18 @@ def recorded(
     return logged(name, arm.joints, arm.units, again, time_s=time_s, target=target, measured=measured, effort=effort)
 
 
+def test_a_wrong_torque_constant_of_a_joint_that_weight_loads_is_no_mass(tmp_path: Path) -> None:
+    """Efforts times 1.3. With gains that nobody knows a payload makes up for it, by more numbers."""
+    arm = TWO._replace(true=TWO.known, delay_s=0.0)
+    one, again = (recorded(n, 1, 0.3, 2.5, k, of, arm) for k, n, of in ((1, "a", None), (11, "b", "a")))
+    other = recorded("c", 1, 0.25, 2.2, 21, None, arm)
+    fit, validation = ([dataclasses.replace(m, effort=1.3 * m.effort) for m in of] for of in ((one, again), (other,)))
+    way = {"search": SearchConfig(max_effects=1), "without": WITHOUT, "gains": "fitted"}
+    found = machine(tmp_path).diagnose("elbow", Measurements(tuple(fit), tuple(validation)), **way).diagnosis
+    assert found.names == () and found.base["effort_scale"] == pytest.approx(1.3, rel=0.01)
+    assert [c.name for c in found.changed] == ["effort_scale"]
+
+
 @pytest.mark.slow
 def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(tmp_path: Path) -> None:
     """0.35 kg at 0.4 m from the yaw axis is half of its known inertia: without it the delay is wrong, and efforts fit only with a

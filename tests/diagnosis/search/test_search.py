@@ -8,9 +8,11 @@ import pytest
 from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, drive, record
 
 from taccorl.diagnosis.search import fits
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
+from taccorl.report.verdict import verdict
 from taccorl.sim.effects.effect import number
 
 
@@ -503,6 +505,35 @@ def test_an_effect_that_removes_most_of_the_error_stays_though_another_number_ma
     (remark,) = found.remarks
     assert "product.strength" in remark and "product.idle" in remark
     assert "7.1" in remark  # √(1 + 10² / 2) floors remain without it
+
+
+@dataclasses.dataclass(kw_only=True)
+class Double(Hidden):
+    """With a number more, which does nothing."""
+
+    name: ClassVar = "double"
+    idle: float = number("i", "1", None, 1.0, (0.5, 2.0), "made up")
+
+
+class Scaled(MadeProblem):
+    """measured = effort_scale × 3 drive + offset + effects."""
+
+    base = (
+        *MadeProblem.base[1:],
+        Free(name=EFFORT_SCALE, unit="1", start=1.0, low=0.1, high=10.0, log=True, held=True),
+    )
+
+    def simulate(self, base, effects, recording):
+        return super().simulate({"gain": 3.0 * base[EFFORT_SCALE], **base}, effects, recording)
+
+
+@pytest.mark.parametrize(("kind", "names"), [(Hidden, ("hidden",)), (Double, ())])
+def test_one_factor_on_all_efforts_is_told_beside_an_effect_of_one_number_and_in_place_of_one_of_two(kind, names):
+    fit, validation = ([record(k, gain=4.5)] for k in (0, 1))
+    found = diagnose(Scaled(kind), fit, validation)
+    assert found.names == names and found.or_scale == bool(names)
+    assert [c.after for c in found.changed] == pytest.approx([1.5] * (not names), rel=0.01)
+    assert "one factor" in verdict("it", found).finding
 
 
 @dataclasses.dataclass(kw_only=True)
