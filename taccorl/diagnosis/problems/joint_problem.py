@@ -191,11 +191,8 @@ class JointProblem(WithoutMaps):
 
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """For each recording and case (T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver
-        would report it; with ``law: effort`` the effort alone. NaN after the last measured row.
-
-        Args:
-            cases: always fitted numbers, and effects in addition to those of the machine that are not fitted.
-        """
+        would report it; with ``law: effort`` the effort alone. NaN after the last measured row. ``cases``: always fitted numbers,
+        and effects in addition to those of the machine that are not fitted."""
         motions = [measured_part(recording) for recording in recordings]
         answers = self.model.simulate_all(motions, [self._numbers(*case) for case in cases])
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]

@@ -269,12 +269,8 @@ def set_numbers(
     config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
 ) -> None:
     """Change ``config`` in place: write fitted gains into one arm, and the delay of the speed unless its interval contains 0.
-    Payload positions and effort scales belong to recordings, not to the twin.
-
-    Args:
-        base: fitted number → value.
-        intervals: fitted number → (low, high).
-    """
+    Payload positions and effort scales belong to recordings, not to the twin. ``base``: fitted number → value. ``intervals``:
+    fitted number → (low, high)."""
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
     k = ROBOT.joints.index(joint)

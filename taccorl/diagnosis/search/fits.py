@@ -429,7 +429,7 @@ class Fits:
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
         the error, or a tenth of it for sure, is told even if other numbers make up for its strength. Near the floor, where noise
-        and equations leave as much, only much is sure, and the gain must be there the other way round, too (``_unrepeated``).
+        and equations leave as much, only much is sure: else the gain must be there the other way round, too (``_unrepeated``).
 
         Args:
             left_over: whether intervals widen by what ``model`` leaves above the floor.
@@ -438,19 +438,21 @@ class Fits:
             return why
         name = next(n for n in model.names if n not in parent.names)
         gain, score = gain_of(model.squares, parent.squares), standard_score(parent.squares - model.squares)
-        near = parent.error <= self.config.little
-        sure = gain >= self.config.sure_gain or (score >= self.config.sure_score and not near)
-        why = "" if sure else not_told_from_none(model.fit, name, left_over)
+        near, sure = parent.error <= self.config.little, score >= self.config.sure_score
+        if gain >= self.config.sure_gain or (sure and not near):
+            return ""
+        why = not_told_from_none(model.fit, name, left_over and not sure)
         return why or (self._unrepeated(model, parent) if near else "")
 
     def _unrepeated(self, model: Model, parent: Model) -> str:
-        """Text: why ``model``, fitted to the validation recordings, is not better than ``parent`` on those that it was fitted to;
-        empty if it is."""
+        """Text: why ``model``, fitted to the validation recordings, leaves no less than ``parent`` of those that it was fitted
+        to; empty if it does."""
         if (key := (model, parent)) not in self._repeats:
             self.progress(f"does {model.names[-1]} repeat on other recordings")
             fits = [fit(self.problem, self.validation, m.names, m.fit.values, STEPS) for m in key]
             with_it, without = (model_of(self.problem, f, self.fit_to) for f in fits)
-            self._repeats[key] = refusal(with_it, without, self.config)
+            surely = standard_score(without.squares - with_it.squares) >= self.config.min_score
+            self._repeats[key] = "" if surely else refusal(with_it, without, self.config)
         why = self._repeats[key]
         return f"fitted to the validation recordings, it does not repeat on the others: {why}" if why else ""
 
