@@ -28,7 +28,7 @@ from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_sco
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
 from taccorl.diagnosis.search.identifiable import not_told_from_none
-from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress, with_scale
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Problem, Progress, Recording, Values, no_progress, with_scale
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
@@ -39,6 +39,8 @@ motion causes."""
 GAINS_MOVED = 2.0
 """Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
 wrong unit of time, or gains other than the commanded ones."""
+SCALE_OFF = 1.15
+"""Least factor on efforts that is a finding where gains are stated, so that it is fitted in any case. A choice."""
 EXCHANGES = 4
 """Most times that the best model is exchanged for a better one with one effect another; a choice, two were seen."""
 
@@ -90,6 +92,8 @@ def diagnose(
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
     }
     changed = changed_numbers(fits, model, beam.names)
+    if fits.problem is problem:  # the scale was fitted anyway, beside gains that are stated
+        changed = tuple(c for c in changed if c.name != EFFORT_SCALE or abs(np.log(c.after)) > np.log(SCALE_OFF))
     standing = fits.standing_out(answer) or fits.standing_out(answer, test)
     return Diagnosis(
         status=_status(fits, answer, changed, bool(standing)),
