@@ -429,7 +429,7 @@ class Fits:
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
         the error, or a tenth of it for sure, is told even if other numbers make up for its strength. Near the floor, where noise
-        and equations leave as much, only much is sure: else the gain must be there the other way round, too (``_unrepeated``).
+        and equations leave as much, it is not, and what is not much must be there the other way round, too (``_unrepeated``).
 
         Args:
             left_over: whether intervals widen by what ``model`` leaves above the floor.
@@ -438,11 +438,10 @@ class Fits:
             return why
         name = next(n for n in model.names if n not in parent.names)
         gain, score = gain_of(model.squares, parent.squares), standard_score(parent.squares - model.squares)
-        near, sure = parent.error <= self.config.little, score >= self.config.sure_score
-        if gain >= self.config.sure_gain or (sure and not near):
-            return ""
-        why = not_told_from_none(model.fit, name, left_over and not sure)
-        return why or (self._unrepeated(model, parent) if near else "")
+        near, much = parent.error <= self.config.little, gain >= self.config.sure_gain
+        sure = much or score >= self.config.sure_score
+        why = not_told_from_none(model.fit, name, left_over and not sure) if near or not sure else ""
+        return why or (self._unrepeated(model, parent) if near and not much else "")
 
     def _unrepeated(self, model: Model, parent: Model) -> str:
         """Text: why ``model``, fitted to the validation recordings, leaves no less than ``parent`` of those that it was fitted
