@@ -301,7 +301,7 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
     for axis, at_m in zip(
         "xy", SCARA_AT_M[:2], strict=True
     ):  # hardly determined: the inertia also hangs on the loops' timing
-        low, high = payload.interval[f"{axis}_link6_m"]
+        low, high = payload.interval[f"{axis}_m"]
         assert low <= at_m <= high
     assert payload.z_m == 0.0 and "z_m" not in payload.interval, "no vertical axis feels its height"
     assert not lift.diagnosis.rivals.get("payload")
