@@ -158,12 +158,13 @@ def _next(
 ) -> Iterator[str]:
     """Write the corrected machine if it was asked for; what was written, or what to do next. ``held``: parts whose recordings
     are to be corrected first."""
+    from taccorl.diagnosis.search.problem import EFFORT_SCALE
     from taccorl.report.evidence_words import may_stand_in, unit_words, untested_words
     from taccorl.report.verdict import added
 
     found = sorted(found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"])  # the largest first
     names = list(dict.fromkeys(name for f in found for name in added(f.diagnosis)))
-    off = [(f.part, c) for f in found for c in f.diagnosis.changed]
+    off = [(f.part, c) for f in found for c in f.diagnosis.changed if c.name != EFFORT_SCALE]  # which no file has
     of_file = [c.effect for f in found if not added(f.diagnosis) for c in f.diagnosis.changed if c.effect]
     whole = machine.changes_as_a_whole(found)
     further = shlex.join(command("diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"))

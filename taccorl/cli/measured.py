@@ -154,10 +154,8 @@ def checked(
     steps = Steps(every_s=0.0 if rows > MANY_ROWS else LINE_EVERY_S)
     found: dict[str, list[Finding]] = {}
     if machine.of_joints:
-        found = check_measurements(measurements.all, accept=accept, limits=machine.effort_limits, progress=steps)
-        for m in measurements.all:  # a target that is sent between two rows acts before the row that shows it
-            often = {name for name, hz in machine.command_rates.items() if hz * m.period_s > 1.0}
-            found[m.name] = [f for f in found[m.name] if f.check != "measured_before_command" or f.feature not in often]
+        limits, rates = machine.effort_limits, machine.command_rates
+        found = check_measurements(measurements.all, accept=accept, limits=limits, rates=rates, progress=steps)
     uneven = [f for own in found.values() for f in own if f.feature == "time" and f.severity == "error"]
     timed = not uneven and all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
@@ -167,7 +165,7 @@ def checked(
         + accepted(own.get(m.name, []), accept)
         for m in measurements.all
     }
-    found = one_cause(found, measurements.all)
+    found = one_cause(found, measurements.all, machine.command_rates)
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
     show(*found_in_recordings({name: [f for f in own if not _waits(f)] for name, own in found.items()}))
     lines = [f"not read: {line}" for line in measurements.skipped]

@@ -120,16 +120,14 @@ def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad]) -> Iterato
 
 # ---- holds ----
 
-FEELS, SILENT = (
-    0.8,
-    0.2,
-)  # A pad reads a hold if in contact in more than this share of its rows; is silent in less than that
+FEELS, SILENT = 0.8, 0.2  # A pad reads a hold if in contact in more of its rows; is silent in less than that share
 TOUCH_LAG_S = (-0.13, 0.15)
 """Plausible times from the gripper's stop to the first contact [s]. Contact can come first, since pads are soft (the twin's pads,
 1.5 mm at 30 N: 0.06 and 0.11 s for the hands of assembly_2, 0.12 s at most in 95 % of 20 demonstrations); scans at 100 Hz and
 drivers make it later."""
 TOUCH_LAG_SEARCH_S = 1.5  # Time around the gripper's stop in which the first contact is searched [s]
 PAD_LAG_S = 0.1  # Largest time between first contacts of a gripper's pads [s]: one first, but not for three rows
+PAD_LAG_LEAVES = 0.5  # Most of what the best shift within that time leaves that a lag leaves: short stretches fit many
 
 
 def _share(contact: np.ndarray, rows: np.ndarray, fps: int) -> float:
@@ -223,8 +221,9 @@ def _pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterato
         if len(both) != 2:
             continue
         one, other = (pad.smooth.mean(axis=(1, 2))[:, None] for pad in both)
-        lag = find_lag(one, other, fps, (-1.0, 1.0))
-        if lag.correlation >= LAG_SURE and abs(lag.lag_s) > PAD_LAG_S:
+        lag, near = (find_lag(one, other, fps, (-far, far)) for far in (1.0, PAD_LAG_S))
+        left, near_left = 1.0 - lag.correlation**2, 1.0 - max(near.correlation, 0.0) ** 2
+        if lag.correlation >= LAG_SURE and abs(lag.lag_s) > PAD_LAG_S and left < PAD_LAG_LEAVES * near_left:
             first, second = both if lag.lag_s > 0 else both[::-1]
             text = f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the "
             text += f"same part (limit {PAD_LAG_S:g} s): one is on another clock, or "

@@ -282,8 +282,7 @@ def _saturated(key: str, pad: Pad) -> Iterator[Finding]:
         share, where = len(rows) / max(int(pad.contact.sum()), len(rows)), (int(rows[0]), int(rows[-1]) + 1)
         bad = len(rows) / pad.fps >= SATURATED_S and share >= SATURATED_SHARE
         text = f"{pad.name}: up to {full.sum(axis=(1, 2)).max()} taxels at {most} in {len(rows)} rows, {share:.0%} of "
-        text += "those in "
-        text += f"contact, {place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
+        text += f"those in contact, {place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
         yield finding("saturated", key, text, where, None if bad else "note")
 
 
@@ -294,8 +293,7 @@ def _noisy(key: str, pad: Pad) -> Iterator[Finding]:
         pad.noise_count / NOISE_SIGMAS,
     )
     if std > limit:
-        text = f"{pad.name}: a typical taxel jitters by {std:.1f} counts (standard deviation from row to row), "
-        text += "noise_count "
+        text = f"{pad.name}: a typical taxel jitters by {std:.1f} counts (standard deviation from row to row), noise_count "
         text += f"{pad.noise_count:g} allows {limit:.1f}: loose connector, missing ground, or a byte shift on the wire"
         yield finding("noisy_pad", key, text)
 

@@ -96,19 +96,10 @@ class Alignment:
 _NOT_STORED = ("numbers", "effects", "twin", "overlays")
 
 
-def align_part(
-    part: str,
-    config: TwinConfig,
-    measurements: Measurements,
-    *,
-    fit_kp: bool = False,
-) -> Alignment:
+def align_part(part: str, config: TwinConfig, measurements: Measurements, *, fit_kp: bool = False) -> Alignment:
     """Align one joint (``left_joint5``) or the pads of one arm (``left pads``); why it cannot be done is its ``trouble``.
-
-    Args:
-        fit_kp: fit K_p, too. Positions determine K_d / K_p and T_ref / K_p, and K_p only through small terms that other errors
-            of the model change; without, K_p is what the recordings state, or the twin's.
-    """
+    ``fit_kp``: fit K_p, too. Positions determine K_d / K_p and T_ref / K_p, and K_p only through small terms that other errors of
+    the model change; without, K_p is what the recordings state, or the twin's."""
     try:
         if part in joints.SIGNALS:
             return _align_joint(part, config, measurements, fit_kp)
@@ -127,12 +118,8 @@ def align_parts(
     done: Callable[[str], None] = lambda part: None,
 ) -> list[Alignment]:
     """Align ``parts``, ``workers`` of them at the same time; return one alignment for each, in their order. The number of workers
-    does not change the results.
-
-    Args:
-        fit_kp: as in ``align_part``.
-        done: function that is called with the name of each part that was aligned.
-    """
+    does not change the results. ``fit_kp``: as in ``align_part``. ``done``: function that is called with the name of each part
+    that was aligned."""
     one = partial(align_part, config=config, measurements=measurements, fit_kp=fit_kp)
     return joints.each(one, {part: part for part in parts}, workers, done)
 
@@ -145,10 +132,7 @@ def _align_joint(signal: str, config: TwinConfig, measurements: Measurements, fi
     free += ["kd"] * (not all(m.kd_known for m in motions))
     free += ["kp"] * (fit_kp and not all(m.kp_known for m in motions))
     fit = identify_controller(
-        motions,
-        model,
-        free=free,
-        validation=[joint_motion(m, config, signal) for m in own.validation],
+        motions, model, free=free, validation=[joint_motion(m, config, signal) for m in own.validation]
     )
     judged = [e for e in fit.errors if e.use == "validation"] or list(fit.errors)
     before, after = (

@@ -31,11 +31,7 @@ def verdict_section(v: Verdict) -> Section:
 
 
 def diagnosed(
-    f: Finding,
-    v: Verdict,
-    origins: Sequence[Origin],
-    regimes: RegimeErrors | None = None,
-    options: Sequence[str] = (),
+    f: Finding, v: Verdict, origins: Sequence[Origin], regimes: RegimeErrors | None = None, options: Sequence[str] = ()
 ) -> Section:
     """What was found at one part; a page has its verdict in another place. ``origins``: of the recordings, for the titles of
     figures. ``regimes``: errors by recording and regime; None: left out. ``options``: as in ``verdict``."""

@@ -34,11 +34,8 @@ def evidence_words(e: Evidence) -> str:
 
 
 def unjudged(d: Diagnosis, short: Mapping[str, Sequence[str]] | None = None) -> str:
-    """Text on the regimes in which fit and validation recordings disagree after the fit; empty if there are none.
-
-    An error that appears only in fit recordings can be neither confirmed nor rejected; one that appears only in validation
-    recordings was not part of the fit. ``short``: fit, validation → variables, such as velocity, whose range in the recordings
-    of the other use its own do not cover; None if that is not known."""
+    """Text on fit and validation recordings that disagree after the fit; empty if they agree. ``short``: fit, validation →
+    variables, such as velocity, whose range in the recordings of the other use its own do not cover; None if not known."""
     fit, validation = d.errors["after"]["fit"], d.errors["after"]["validation"]
     if fit > UNJUDGED * max(validation, 1.0):
         return (
@@ -63,12 +60,8 @@ def _to_mark(use: str, short: Mapping[str, Sequence[str]] | None) -> str:
 
 
 def may_be_two(d: Diagnosis) -> str:
-    """Text on added effects that may stand for two: a near-twin with fewer numbers removes ``MOST_OF_IT`` of what the effect
-    removes, so that the near-twin and another effect may do so, too; empty if there are none.
-
-    Effects that contain a simpler one (``Effect.reduces_to``) are left out: the search tries the simpler one and another
-    itself.
-    """
+    """Text on added effects that may stand for two: a near-twin with fewer numbers removes ``MOST_OF_IT`` of what it does, so
+    that this and another effect may, too; empty if there are none. The search itself tries those of ``Effect.reduces_to``."""
     for found in d.rounds:
         cls = effect_class(found.added) if found.added in d.names else None
         if cls is None:

@@ -118,10 +118,7 @@ def heat_map_figure(cells: Sequence[Cell], origins: Sequence[Origin], title: str
 
 
 def residual_along_variables(
-    before: Sequence[Curve],
-    after: Sequence[Curve],
-    traces: Sequence[Trace],
-    names: tuple[str, str] = TWINS,
+    before: Sequence[Curve], after: Sequence[Curve], traces: Sequence[Trace], names: tuple[str, str] = TWINS
 ) -> Figure:
     """Figure of the mean or RMS residual along each variable, with its 95 % band. ``before``: curves of one signal with a
     twin. ``after``: curves of the same signal with another twin; empty without one. ``traces``: traces of the same signal, for

@@ -97,6 +97,7 @@ class Report:
                 doubts=[*self._clock_or_effect(f.part, f.diagnosis), *(own.remarks if own else ())],
                 options=self.options,
                 repeated=self._repeated(f.part),
+                floor=next((t.floor.words() for t in self.comparison.of(f.part) if t.floor.is_unknown), ""),
                 short={use: own.short(use, other) for use, other in _PAIRS} if own else None,
                 worst=own.worst if own else None,
             )

@@ -10,6 +10,7 @@ from typing import Literal
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
+from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, Status, of_test
 from taccorl.report.evidence_words import (
     effect_class,
@@ -65,6 +66,7 @@ UNCERTAIN: Mapping[Kind, str] = {
     "more": "what is still missing may change what was named",
 }
 """Kind of low confidence → its first reason."""
+SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
     "gains_moved": "Nothing yet: state the commanded gains (kp, kd in measurements.yaml) and check the time stamps.",
@@ -112,27 +114,27 @@ def verdict(
     doubts: Sequence[str] = (),
     options: Sequence[str] = (),
     repeated: bool = False,
+    floor: str = "",
     short: Mapping[str, Sequence[str]] | None = None,
     worst: RegimeError | None = None,
 ) -> Verdict:
-    """Verdict on one part. ``can_tell``: effects that its recordings can show and separate. ``known``: its numbers, if they
-    were divided into identified and other ones. ``data``: faults of the recordings that must be corrected before an effect can
-    be named. ``doubts``: other reasons for less confidence, such as ranges that no validation recording covers. ``options``:
-    options of suggested commands, such as ``--twin=twin.yaml``. ``repeated``: a motion of the part was repeated, so that the
-    noise floor includes the variation between repeats. ``short``: fit, validation → variables whose range in the recordings of
-    the other use its own do not cover, if it is known. ``worst``: recording and regime with the largest error after the fit,
-    if they are known."""
+    """Verdict on one part. ``can_tell``: effects that its recordings can show and separate. ``known``: its numbers, if they were
+    divided into identified and other ones. ``data``: faults of the recordings that come before any effect. ``doubts``: other
+    reasons for less confidence. ``options``: of suggested commands, such as ``--twin=twin.yaml``. ``repeated``: the noise floor
+    includes what differs between repeats. ``floor``: text on one that is not known (``SignalFloor.is_unknown``). ``short``: fit,
+    validation → variables whose range in the recordings of the other use its own do not cover, if it is known. ``worst``:
+    recording and regime with the largest error after the fit, if they are known."""
     kind, w = _kind(d, data), _Words(part, d, known, data)
     remarks = (*d.remarks, *doubts[:_MOST])
     finding = FOUND[kind].format(w=w, refitted=refitted_words(d))
     if d.changed and kind not in ("data_first", "not_converged"):
         finding = f"{finding} Numbers of the file that change: {'; '.join(changed_words(d))}."
-    reasons = [*_doubts(d, kind, short)]
+    reasons = [*_doubts(d, kind, short, floor)]
     if remarks:
         reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
     # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
-    unsure = kind in UNCERTAIN or bool(d.untested and d.errors[d.baseline]["validation"] <= LITTLE)
-    level: Level = "low" if unsure else "moderate" if reasons or kind == "ties" else "high"
+    unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (floor and kind == "nothing_missing")
+    level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
     first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
     why = [reason.rstrip(".") for reason in (*first, *reasons)]
     more = f"; and {len(why) - _MOST} more" if len(why) > _MOST else ""
@@ -143,7 +145,8 @@ def verdict(
         level=level,
         finding=finding,
         confidence=f"Confidence {level}: {'; '.join(why[:_MOST])}{more}.",
-        record_next=words,
+        record_next=bool(floor) * "The motion of the two recordings that differ a third time, for the noise floor. "
+        + words,
         command=" ".join([command, *options]) if command else "",
         remarks=remarks,
     )
@@ -173,6 +176,8 @@ def _change(c: Changed, d: Diagnosis) -> str:
     if c.name == "loop_hz":
         low, high = (1.0 / end if end > 0.0 else math.inf for end in reversed(d.intervals["loop_s"]))
     edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
+    edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (c.name == EFFORT_SCALE)
+    edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))
     return f"{c.name} {c.was} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g}){edit}"
 
 
@@ -233,11 +238,13 @@ class _Words:
     @property
     def off(self) -> str:
         how = {c.effect or c.name: "off" if math.isfinite(c.before) else "not stated" for c in self.d.changed}
-        off = " and ".join(f"{name} of the file is {word}" for name, word in how.items())
+        off = " and ".join(SCALED if n == EFFORT_SCALE else f"{n} of the file is {word}" for n, word in how.items())
         if not self.instead:
             return f"no effect is missing, but {off}: {self.fell}"
-        missing = f"or {' or '.join(self.instead)} is missing instead"
-        return f"{off}, {missing}: {self.fell}, and these recordings do not tell which it is"
+        missing = [name for name in self.instead if name != EFFORT_SCALE]
+        ways = [f"{' or '.join(missing)} is missing instead"] * bool(missing)
+        ways += [SCALED] * (EFFORT_SCALE in self.instead)
+        return f"{off}, or {', or '.join(ways)}: {self.fell}, and these recordings do not tell which it is"
 
     @property
     def instead(self) -> tuple[str, ...]:
@@ -252,7 +259,7 @@ class _Words:
 
     @property
     def place(self) -> str:
-        """Effects of the file of whose strength the refit beside an added effect leaves less than ``GONE``."""
+        """Effects of the file of whose strength the refit beside an added effect leaves less than ``GONE``, and ``SCALED``."""
         found = []
         for c in self.d.changed if added(self.d) else ():
             cls = effect_class(c.effect) if c.effect else None
@@ -260,7 +267,8 @@ class _Words:
             none = own[0].absent if own else None
             if none is not None and abs(c.after - none) < GONE * abs(c.before - none):
                 found.append(c.effect)
-        return f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
+        place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
+        return place + f", or {SCALED}" * self.d.or_scale
 
     @property
     def sizes(self) -> str:
@@ -288,7 +296,9 @@ class _Words:
         return f"validation recordings end at {self.after:.2f}{test}"
 
 
-def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None) -> Iterator[str]:
+def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None, floor: str) -> Iterator[str]:
+    if floor:
+        yield f"the noise floor may be wrong, and every error with it: {floor}"
     after, first = d.errors["after"], d.errors[d.baseline]["validation"]
     fit, validation, test = after["fit"], after["validation"], after.get("test")
     named = kind in ("effects", "ties")
@@ -315,7 +325,7 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None)
         yield (
             f"validation recordings keep {validation:.2f} of {first:.2f} noise floors, so little that no effect was looked for"
         )
-    yield from filter(None, (unjudged(d, short), may_be_two(d)))
+    yield from filter(None, ("a wrong torque constant does as well" * d.or_scale, unjudged(d, short), may_be_two(d)))
     if d.one_pose:
         yield (
             f"{_some(tuple(d.one_pose))} found in one pose of the other joints, in which the weight of a tilted base or of a "
@@ -349,6 +359,8 @@ def _record_next(
         how = ": " + " ".join(cls.to_record for cls in classes) if not command and classes else "."
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how}"
         return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
+    if EFFORT_SCALE in w.instead or d.or_scale:
+        return "The same motions with a known load (`payload_kg`), whose part of the inertia is known.", ""
     if w.instead:
         own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)
         words = f"A wider motion, or another pose: {own} is the same there, the torque of {_some(w.instead)} is not."

@@ -243,9 +243,9 @@ KINDS: dict[str, Kind] = {
     ),
     "payload": Kind(
         severity=_range(0.01, 1.5),
-        shape=_uniform(x_link6_m=(-0.03, 0.03), y_link6_m=(-0.03, 0.03), z_link6_m=(0.05, 0.2)),
+        shape=_uniform(x_m=(-0.03, 0.03), y_m=(-0.03, 0.03), z_m=(0.05, 0.2)),
         values=lambda s, c, shape: {"mass_kg": s, **shape},
-        plant=lambda v: Change(ball=(v["mass_kg"], v["x_link6_m"], v["y_link6_m"], v["z_link6_m"])),
+        plant=lambda v: Change(ball=(v["mass_kg"], v["x_m"], v["y_m"], v["z_m"])),
         whole_arm=True,
         joints=(2, 3, 5),
     ),

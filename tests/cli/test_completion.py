@@ -71,12 +71,6 @@ def test_a_shell_offers_verbs_options_words_and_files(
     assert "a file.mcap" in offered("taccorl", "check", "a").replace("\\", "")
 
 
-def test_an_unknown_shell_is_named_with_those_that_are_known(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", "tcsh"]) == 2
-    shown = capsys.readouterr().err
-    assert "'tcsh'" in shown and "bash|zsh|fish" in shown
-
-
 def test_every_verb_has_options_or_words() -> None:
     for group in VERBS.values():
         for verb in group:

@@ -2,14 +2,10 @@
 
 import pickle
 
-import pytest
-
 from taccorl.cli import progress as tables
 
 
-def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_left(monkeypatch, capsys) -> None:
     now_s = 100.0
     monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
     with tables.Bars(2) as bars:
@@ -26,9 +22,7 @@ def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_l
     ]
 
 
-def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(monkeypatch, capsys) -> None:
     now_s = 100.0
     monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
     steps = pickle.loads(pickle.dumps(tables.Steps()))
@@ -36,20 +30,3 @@ def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(
         now_s = 100.0 + second
         steps("elbow", f"step {second}")
     assert capsys.readouterr().err.splitlines() == ["elbow: step 6 (6 s)", "elbow: step 12 (12 s)"]
-
-
-def test_lines_of_attempts_have_the_rate_of_successes_and_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now_s = 100.0
-    monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
-    said = tables.Attempts(3, tables.is_success)
-    for line in ("0: timeout", "1: success after 12 s", "2: success after 13 s", "3: success after 14 s"):
-        now_s += 10.0
-        said(f"attempt {line}")
-    assert capsys.readouterr().out.splitlines() == [
-        "attempt 0: timeout",
-        "attempt 1: success after 12 s; 0.05/s, 40 s left",  # one in 20 s, two are missing
-        "attempt 2: success after 13 s; 0.0667/s, 15 s left",
-        "attempt 3: success after 14 s; 0.075/s",
-    ]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from synthetic_episode import GRIPPER, PADS, SPEC, TOUCH, base, copies, make, with_arrays
+from synthetic_episode import ACTION, GRIPPER, PADS, SPEC, STATE, TOUCH, base, copies, make, with_arrays
 
 from taccorl.data import grip_checks, touch_checks
 from taccorl.data.checks import check_episode, check_recording_episodes
@@ -420,6 +420,14 @@ def test_touch_on_another_clock_is_found(clock_s: float, is_found: bool) -> None
 def test_one_pad_on_another_clock_is_named(late: float) -> None:
     findings = found(make(seed=15, touch_clock_s={"right_b": late}), "pad_lag")
     assert [f.text.startswith("right_b feels everything 0.") for f in findings] == [True] * (late > 0.1)
+
+
+def test_short_stretches_of_presses_show_no_pad_late() -> None:
+    for seed in (22, 24, 26):
+        arrays = make(seed=seed).arrays
+        for first in range(124, 249, 31):
+            state, action, touch = (arrays[key][first : first + 63] for key in (STATE, ACTION, TOUCH))
+            assert not found(with_arrays(make(seed=seed), state=state, action=action, touch=touch), "pad_lag")
 
 
 def test_lag_of_a_whole_recording_is_judged_without_a_rows_slack() -> None:

@@ -60,12 +60,6 @@ def test_joint_response_shows_measurement_twins_residual_floor_and_origin():
     drawn(figure)
 
 
-def test_effort_has_no_tracking_error():
-    figure = joint_response(trace(LEFT, POSITION, kind="effort", unit="N·m"))
-    assert len(figure.axes) == 3 and "tracking" not in words(figure) and "N·m" in words(figure)
-    drawn(figure)
-
-
 def test_heat_map_shows_every_cell_s_number():
     cells = heat_map(comparison(trace(LEFT, POSITION), trace(3 * LEFT, POSITION, signal="right_joint1")))
     figure = heat_map_figure(cells, [ORIGIN], "where")

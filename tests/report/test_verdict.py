@@ -16,12 +16,11 @@ from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.report.diagnosed import diagnosed
-from taccorl.report.evidence_words import last_refit_words, to_record, unit_words
+from taccorl.report.evidence_words import to_record, unit_words
 from taccorl.report.report import Report
 from taccorl.report.section import Section, cell
-from taccorl.report.verdict import Verdict, verdict
+from taccorl.report.verdict import verdict
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.pads import TaxelThreshold
 
 PART = "left_joint5"
 
@@ -43,10 +42,6 @@ def changed(d: Diagnosis, **fields: Any) -> Diagnosis:
     return dataclasses.replace(d, **fields)
 
 
-def sentences(v: Verdict) -> list[str]:
-    return [v.finding, v.confidence, v.record_next]
-
-
 def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one: Diagnosis):
     number = Identified(name="ripple.strength/kp", value=0.002, low=0.0019, high=0.0021, unit="rad")
     known = Known(
@@ -56,16 +51,13 @@ def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one: Dia
     )
     v = verdict(PART, one, known=known)
     assert (v.kind, v.level) == ("effects", "high")
-    assert (
-        f"{one.errors['fitted']['validation']:.2f}" in v.finding
-        and f"{one.errors['after']['validation']:.2f}" in v.finding
-    )
+    assert all(f"{one.errors[stage]['validation']:.2f}" in v.finding for stage in ("fitted", "after"))
     assert PART in v.finding and "ripple" in v.finding and "0.002 rad (0.0019 … 0.0021)" in v.finding
     assert f"{one.errors['after']['test']:.2f}" in v.confidence
     assert "110" in v.record_next and "152" in v.record_next, "what the recordings leave of K_p"
     pinned = verdict(PART, one, known=dataclasses.replace(known, pinned_by=("recorded effort",)))
     assert "K_p" not in pinned.record_next
-    assert all(s.endswith(".") and "\n" not in s for s in sentences(v))
+    assert all(s.endswith(".") and "\n" not in s for s in (v.finding, v.confidence, v.record_next))
 
 
 def test_errors_fall_from_those_of_the_twin_as_it_was_where_its_refit_is_worse(one: Diagnosis):
@@ -181,19 +173,6 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     assert "repeat_of" in v.record_next and "repeat_of" not in again.record_next and again.command == v.command
 
 
-def test_without_a_nearest_effect_and_a_regime_the_press_of_the_first_effect_is_described():
-    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(2)]
-    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:])
-    last = d.rounds[-1]
-    of_cells = tuple(
-        dataclasses.replace(e, name=name, gain=0.0)
-        for e, name in zip(last.evidence, ("taxel_threshold", "taxel_play"), strict=True)
-    )
-    d = changed(d, rounds=(*d.rounds[:-1], dataclasses.replace(last, evidence=of_cells)))
-    v = verdict("array", d, repeated=True)
-    assert "taxel_threshold" in v.record_next and v.record_next.endswith(TaxelThreshold.to_record)
-
-
 def test_one_effect_where_more_is_missing_is_not_called_the_answer():
     recordings = [record(k, Bump(strength=5.0), Ripple(strength=1.0)) for k in range(2)]
     d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:], config=SearchConfig(max_effects=1))
@@ -266,6 +245,12 @@ def test_data_comes_before_any_effect(one: Diagnosis):
     assert "5 ms late" in v.finding and "1 more" in v.finding and "ripple" not in v.finding
 
 
+def test_nothing_is_missing_is_not_sure_where_the_noise_floor_is_not_known(one: Diagnosis, nothing: Diagnosis):
+    for d, level in ((one, "moderate"), (nothing, "low")):
+        v = verdict(PART, d, floor="2 mrad; not known")
+        assert v.level == level and "2 mrad; not known" in v.confidence and "a third time" in v.record_next
+
+
 @pytest.mark.parametrize("reason", ["test", "no test", "bound", "doubt", "disagree"])
 def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one: Diagnosis, reason: str):
     after = one.errors["after"]
@@ -277,13 +262,7 @@ def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one: Diagnosis,
     d = changed(one, errors=one.errors | {"after": errors.get(reason, after)})
     d = changed(d, at_bound=("ripple.strength",)) if reason == "bound" else d
     v = verdict(PART, d, doubts=["velocity: not validated"] if reason == "doubt" else [])
-    said = {
-        "test": "2.34",
-        "no test": "no test recording",
-        "bound": "ripple.strength",
-        "doubt": "velocity",
-        "disagree": "1.47",
-    }
+    said = {"test": "2.34", "no test": "no test rec", "bound": "strength", "doubt": "velocity", "disagree": "1.47"}
     assert v.level == "moderate"
     assert said[reason] in " ".join((v.confidence, *v.remarks))
     assert reason != "doubt" or "1 remark below" in v.confidence
@@ -304,21 +283,6 @@ def printed(d: Diagnosis) -> str:
         return [s.title, *(cell(value).text for value in cells), *(text for part in s.parts for text in texts(part))]
 
     return "\n".join(texts(diagnosed(found(d), verdict(PART, d), ())))
-
-
-def test_the_terminal_names_a_nearest_effect_only_if_it_takes_away_some_of_the_error():
-    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(3)]
-    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
-    last = d.rounds[-1]
-
-    def shown(gain: float) -> str:
-        best = dataclasses.replace(last.evidence[0], gain=gain)
-        rounds = (*d.rounds[:-1], dataclasses.replace(last, evidence=(best, *last.evidence[1:])))
-        return printed(changed(d, rounds=rounds))
-
-    name = f"nearest: {last.evidence[0].name}"
-    assert name in shown(0.08)
-    assert name not in shown(0.004) and "nearest" not in shown(-0.2)
 
 
 def test_the_terminal_prints_no_interval_of_a_number_that_was_not_fitted(one: Diagnosis):
@@ -358,15 +322,6 @@ def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_ref
     assert verdict(PART, d).command.endswith("--effects=coulomb_friction,load_friction"), "the check of one effect"
     held = verdict(PART, changed(tied, base={}))  # torque_ff is known
     assert held.command.endswith("--effects=coulomb_friction,asymmetric_friction")
-
-
-def test_the_error_of_the_last_round_is_named_where_the_last_refit_changed_it(one: Diagnosis):
-    assert "last round" not in printed(one), "both are printed alike"
-    errors = {**one.errors, "after": {"fit": 1.84, "validation": 1.1845}}
-    d = changed(one, errors=errors, steps=(("", 21.27), ("ripple", 1.2956)))
-    (line,) = [line.strip() for line in printed(d).splitlines() if "last round" in line]
-    assert "1.30" in line and "1.18" in line and line == last_refit_words(d)
-    assert "last round" not in printed(changed(d, steps=(("", 21.27),))), "no round added anything"
 
 
 def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts(one: Diagnosis):

@@ -170,14 +170,9 @@ def calibrate_camera(
     """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
 
     Every fourth frame and the frames of the stages are held out: they are not used in the fit, and errors and overlays are
-    computed from them.
-
-    Args:
-        known: at least ``FEWEST_POINTS`` points for a start by PnP; without them the fit starts at the twin's mount. Points in
-            held-out frames are used for validation only.
-
-    Raises TaccorlError: there is no such camera, there are too few frames or points, the pictures are of another stream, or
-    no arm is in view."""
+    computed from them. ``known``: at least ``FEWEST_POINTS`` points for a start by PnP; without them the fit starts at the twin's
+    mount. Points in held-out frames are used for validation only. Raises TaccorlError: there is no such camera, there are too
+    few frames or points, the pictures are of another stream, or no arm is in view."""
     if len(frames.joints) < FEWEST_FRAMES:
         raise TaccorlError(
             f"{frames.name}: {len(frames.joints)} frames; a calibration needs at least {FEWEST_FRAMES}, with the arms in "
@@ -221,13 +216,9 @@ def calibrate_camera(
 
 def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.ndarray:
     """Pose (6,) = rotation vector [rad] and translation [m] relative to the nominal mount, from known points and their pixels
-    (OpenCV: SQPNP, then Levenberg–Marquardt).
-
-    Args:
-        joints: (F, 14) [rad, m] of the frames that ``KnownPoint.frame`` counts.
-        known: at least ``FEWEST_POINTS`` points; their pixels include the black bars.
-
-    Raises TaccorlError: there are too few points, or no pose explains them."""
+    (OpenCV: SQPNP, then Levenberg–Marquardt). ``joints``: (F, 14) [rad, m] of the frames that ``KnownPoint.frame`` counts.
+    ``known``: at least ``FEWEST_POINTS`` points; their pixels include the black bars. Raises TaccorlError: there are too few
+    points, or no pose explains them."""
     if len(known) < FEWEST_POINTS:
         raise TaccorlError(
             f"camera {view.camera.name}: {len(known)} known points in frames of the fit; give at least {FEWEST_POINTS}, on "

@@ -41,12 +41,8 @@ class TwinEdges:
 
 
 def twin_edges(bodies: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) -> TwinEdges:
-    """Outlines in a view.
-
-    Args:
-        bodies: (rows, columns) int, index of the body that each pixel shows; 0 if it shows no arm.
-        depth_m: (rows, columns), distance along the optical axis [m], infinite where nothing is shown.
-    """
+    """Outlines in a view. ``bodies``: (rows, columns) int, index of the body that each pixel shows; 0 if it shows no arm.
+    ``depth_m``: (rows, columns), distance along the optical axis [m], infinite where nothing is shown."""
     near_depth = np.where(bodies > 0, depth_m, np.inf)
     # A value of its own for each body: whatever meets, its gradient points across the edge.
     value = ((bodies * 0.618034) % 1.0).astype(np.float32) + (bodies > 0)

@@ -22,12 +22,9 @@ _GRIPPER_RAD = 0.5 / ROBOT.opening_max_m  # a gripper from end to end counts as 
 
 def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s: float = 0.0) -> CameraFrames:
     """Select rows of an episode at which the arms are at rest in different poses, and the stages of the paper's figure.
-
-    Args:
-        num_frames: number of frames to select, without those of the stages.
-        latency_s: age of the scene in a picture relative to its row [s]; 0 if ingest has already corrected for it.
-
-    Raises TaccorlError: there is no such camera, or the state does not hold the robot's joints and grippers."""
+    ``num_frames``: number of frames to select, without those of the stages. ``latency_s``: age of the scene in a picture relative
+    to its row [s]; 0 if ingest has already corrected for it. Raises TaccorlError: there is no such camera, or the state does not
+    hold the robot's joints and grippers."""
     joints = joint_rows(episode)
     time_s = episode.time_s
     shown = np.column_stack([np.interp(time_s - latency_s, time_s, column) for column in joints.T])

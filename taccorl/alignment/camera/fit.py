@@ -167,11 +167,8 @@ def moved(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 def solve(view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray, *, search: bool) -> Solution:
     """Fit the pose (6,) at which the outlines of the arms at ``joints`` (F, 14) [rad, m] coincide with the edges in ``levels``.
-
-    Args:
-        start: (6,) pose of the first iteration [rad, m].
-        search: first compare many poses within 3° and 30 mm of ``start`` along each axis.
-    """
+    ``start``: (6,) pose of the first iteration [rad, m]. ``search``: first compare many poses within 3° and 30 mm of ``start``
+    along each axis."""
     reaches = _REACH_PX[-len(levels) :] if len(levels) > 1 else [_REACH_PX[0] + _REACH_PX[-1]]
     starts = _starts(view, joints, levels[0], start) if search else [start]
     tried = [_descend(view, joints, levels[0], reaches[0], one) for one in starts]

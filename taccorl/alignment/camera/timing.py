@@ -48,13 +48,9 @@ class LatencyFit:
 def camera_latency(
     pictures: Iterable[np.ndarray], time_s: np.ndarray, joints: np.ndarray, config: TwinConfig, camera: str
 ) -> LatencyFit:
-    """Estimate the latency of ``camera`` from pictures T × (rows, columns, 3) uint8 with time stamps ``time_s`` (T,).
-
-    Args:
-        joints: (T, 14) rad, m, as reported at the same times.
-
-    Raises TaccorlError: the pictures cover less than 3 s, times are not even, or the number of rows differs from that of
-    pictures."""
+    """Estimate the latency of ``camera`` from pictures T × (rows, columns, 3) uint8 with time stamps ``time_s`` (T,). ``joints``:
+    (T, 14) rad, m, as reported at the same times. Raises TaccorlError: the pictures cover less than 3 s, times are not even, or
+    the number of rows differs from that of pictures."""
     time_s = np.asarray(time_s, float)
     if len(time_s) < 3 or time_s[-1] - time_s[0] < _FEWEST_S:
         raise TaccorlError(

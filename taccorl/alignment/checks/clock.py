@@ -97,8 +97,9 @@ def check_clock(t: Trial) -> Iterator[Finding]:
     m, even = t.m, t.even
     stepped = _early_steps(t)
     for name, rows in stepped.items():
+        where = "before the row of its step" if t.early_rows(name) else "where its step is only commanded"
         text = (
-            f"{name} has moved at row {rows[0]} ({m.time_s[rows[0]]:.3f} s), where its step is only commanded ({len(rows)} such "
+            f"{name} has moved at row {rows[0]} ({m.time_s[rows[0]]:.3f} s), {where} ({len(rows)} such "
             f"steps): one row or more too early. {_earlier_targets(m, m.period_s)}, or log both by one clock"
         )
         yield find("measured_before_command", name, text, (rows[0], rows[0] + 1))
@@ -114,8 +115,8 @@ def check_clock(t: Trial) -> Iterator[Finding]:
         if name in stepped:
             continue
         lag = find_lag(target[:, None] * factor, measured[:, None] * factor, max(1, round(even.rate_hz)))
-        delay = f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms"
-        if lag.correlation >= LAG_SURE and lag.lag_s < -0.5 * row_s:  # velocities of steps hardly correlate
+        delay, early_s = f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms", t.early_rows(name) * row_s
+        if lag.correlation >= LAG_SURE and lag.lag_s < -0.5 * row_s - early_s:  # velocities of steps hardly correlate
             if _exchanged(target, measured, even.period_s, -lag.lag_s):
                 yield _exchange(name, -lag.lag_s, m)
             else:
@@ -131,7 +132,7 @@ def check_clock(t: Trial) -> Iterator[Finding]:
         elif not fit.rms < max(FITTING * t.floor[name], FITTING_ROWS * fit.row_rms):
             why = f"it shows in steps; {_steps_wanted(m, name, t.floor[name])}"
             yield not_judged(name, f"an offset of one row ({row_s * 1e3:.1f} ms)", why, CLOCK)
-        elif fit.delay_s + SURE * fit.delay_sd_s < -LEAD_ROWS * row_s:
+        elif fit.delay_s + SURE * fit.delay_sd_s < -LEAD_ROWS * row_s - early_s:
             yield _lead(name, -fit.delay_s, m, f"lag {fit.time_constant_s * 1e3:.1f} ms, delay {delay}")
         elif fit.delay_s - SURE * fit.delay_sd_s > LATE_ROWS * row_s:
             text = (
@@ -183,16 +184,18 @@ def _until_stopped(m: Measurement, j: int) -> np.ndarray:
 
 
 def _early_steps(t: Trial) -> dict[str, list[int]]:
-    """Signal → rows of its steps from rest at which it has moved already, where that is at least half of its steps."""
+    """Signal → rows of its steps from rest at which it has moved already, where that is at least half of its steps; the rows
+    before those where targets are sent between rows."""
     m, before, settle = t.m, round(REST_S / t.m.period_s), 5
     changes = np.diff(m.target, axis=0)
     still = np.all(np.abs(changes) < 1e-6, axis=1)
     found: dict[str, list[int]] = {}
     for j in t.moving:
-        floor = t.floor[m.signals[j]]
+        floor, first = t.floor[m.signals[j]], t.early_rows(m.signals[j])
         large = np.flatnonzero(np.abs(changes[:, j]) > _least_step(m, floor)) + 1
         steps = [int(k) for k in large if k > before and still[k - 1 - before : k - 1].all()]
-        early = [k for k in steps if _moved(m.measured[k - 1 - before : k + 1, j], settle, changes[k - 1, j], floor)]
+        seen = [(k - first, m.measured[k - 1 - before : k + 1 - first, j], changes[k - 1, j]) for k in steps]
+        early = [k for k, values, step in seen if _moved(values, settle, step, floor)]
         if early and len(early) >= len(steps) / 2:
             found[m.signals[j]] = early
     return found

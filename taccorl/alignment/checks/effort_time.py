@@ -63,11 +63,8 @@ def check_effort_time(
 ) -> None:
     """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
     or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it. Where they
-    follow other gains than stated, a warning alone (``other_scale``: both are off by one factor).
-
-    Args:
-        recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
-        file: that states the law."""
+    follow other gains than stated, a warning alone (``other_scale``: both are off by one factor). ``recordings``: those that move
+    the signal. Ones with an error of it, or without the gains of ``law``, are not used. ``file``: that states the law."""
     of_it = ("effort_unit", signal, "")
     wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]

@@ -116,14 +116,10 @@ def delay_between(
 ) -> Shift:
     """Delay of ``measured`` (T,) relative to ``other`` (T,), both responses to ``target`` (T,) [rad, m].
 
-    measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linearised about the mean of both fits: a part of the response that the
-    lag describes in neither cancels in the difference. Responses ``changed`` add a column each, their difference from ``other``.
-
-    Args:
-        period_s: time between two rows [s].
-        changed: responses (T,) like ``other`` with another inertia, damping …, which may be the reason of the difference.
-
-    Raises TaccorlError: there are too few rows."""
+    measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linearised about the mean of both fits: a part of the response that the lag
+    describes in neither cancels in the difference. Responses ``changed`` add a column each, their difference from ``other``.
+    ``period_s``: time between two rows [s]. ``changed``: responses (T,) like ``other`` with another inertia, damping …, which may
+    be the reason of the difference. Raises TaccorlError: there are too few rows."""
     fits = [fit_first_order(target, values, period_s) for values in (measured, other)]
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
@@ -145,13 +141,8 @@ def delay_between(
 def pure_shift(measured: np.ndarray, other: np.ndarray, period_s: float) -> Shift:
     """Delay of ``measured`` (T,) relative to ``other`` (T,) without any other difference than a constant: a delay of commands or
     of a clock shifts a response, whatever the joint's physics is. Searched within ± ``DELAY_ROWS`` rows or ± 2 ``DELAY_S``.
-
-    Args:
-        measured, other: (T,) positions [rad, m]; rows with NaN in ``measured`` are left out, as are those that a delay brings to
-            an end.
-        period_s: time between two rows [s].
-
-    Raises TaccorlError: there are too few rows."""
+    ``measured``, ``other``: (T,) positions [rad, m]; rows with NaN in ``measured`` are left out, as are those that a delay brings
+    to an end. ``period_s``: time between two rows [s]. Raises TaccorlError: there are too few rows."""
     rows, ends = np.arange(len(other)), math.ceil(max(DELAY_ROWS, 2 * DELAY_S / period_s))
     inner = rows[ends:-ends]
     inner = inner[np.isfinite(measured[inner])]
@@ -168,11 +159,8 @@ def pure_shift(measured: np.ndarray, other: np.ndarray, period_s: float) -> Shif
 
 
 def left_by_change(measured: np.ndarray, other: np.ndarray, changed: np.ndarray) -> float:
-    """Least RMS of measured − other − a (changed − other) − b over factors a and constants b [rad, m].
-
-    Args:
-        measured, other, changed: (T,) positions; rows with NaN in ``measured`` are left out.
-    """
+    """Least RMS of measured − other − a (changed − other) − b over factors a and constants b [rad, m]. ``measured``, ``other``,
+    ``changed``: (T,) positions; rows with NaN in ``measured`` are left out."""
     known = np.isfinite(measured)
     return float(np.std(beside((measured - other)[known], (changed - other)[known])[0]))
 

@@ -49,11 +49,7 @@ class Onset:
 
 def onset_delay(m: Measurement, signal: str, reported: np.ndarray, floor: float) -> Onset | None:
     """Compare the motion of one joint after the steps of its target; None if fewer than ``LEAST_STEPS`` are alike in both.
-
-    Args:
-        reported: (T,) positions of the replay [rad, m].
-        floor: noise floor of the positions [rad, m].
-    """
+    ``reported``: (T,) positions of the replay [rad, m]. ``floor``: noise floor of the positions [rad, m]."""
     j, rate_hz = m.column(signal), m.rate_hz
     target, measured = m.target[:, j], m.measured[:, j]
     rest, held, window = (max(1, round(seconds * rate_hz)) for seconds in (REST_S, HELD_S, WINDOW_S))

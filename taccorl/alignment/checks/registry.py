@@ -34,13 +34,8 @@ _FUNCTIONS: dict[str, list[Callable[..., Any]]] = {}
 def check[F: Callable[..., Any]](
     name: str, severity: Severity, *, needs: str = "", explains: tuple[str, ...] = ()
 ) -> Callable[[F], F]:
-    """Decorator that puts a check into the list.
-
-    Args:
-        needs: what a trial needs for the function to run (see ``run``); "": the function stands in the list under another of its
-            names, or is called by other code.
-        explains: as in ``Check``.
-    """
+    """Decorator that puts a check into the list. ``needs``: what a trial needs for the function to run (see ``run``); "": the
+    function stands in the list under another of its names, or is called by other code. ``explains``: as in ``Check``."""
     CHECKS[name] = Check(severity, explains)
 
     def listed(function: F) -> F:

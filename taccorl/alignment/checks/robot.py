@@ -141,12 +141,8 @@ def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
 
 @check("beyond_effort", "error")
 def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[Finding]:
-    """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none.
-
-    Args:
-        law: the drive of signal ``name``.
-        file: name of its file, for the message.
-    """
+    """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none. ``law``:
+    the drive of signal ``name``. ``file``: name of its file, for the message."""
     limit, j = law.effort_limit, m.column(name)
     if limit is None or not m.has_effort()[j]:
         return []

@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -42,6 +43,7 @@ def check_measurement(
     floor: dict[str, float] | None = None,
     accept: Sequence[str] = (),
     limits: Mapping[str, float] | None = None,
+    rates: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Finding]:
     """All findings on one measurement, worst first.
@@ -51,20 +53,21 @@ def check_measurement(
         floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
         accept: names of checks whose errors are known and become warnings.
         limits: signal → largest effort that its machine states [N·m, N]; a plateau there is no finding.
+        rates: as in ``Trial``.
         progress: function that is called with a text about the present check.
     """
     progress("checking times and values")
     for name in joints:
         if name not in m.signals:
             raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
-    whole = Trial(m, joints, limits or {}, floor)
+    whole = Trial(m, joints, limits or {}, floor, rates or {})
     findings = accepted([*m.findings, *run("rows", whole)], accept)
     if not any(f.check in NO_MORE for f in findings):
         progress("checking efforts, motion and wiring")
         findings += accepted(run("effort", whole), accept)
         followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
         if followed:
-            trial = Trial(m.only(followed), joints, limits or {}, floor)
+            trial = Trial(m.only(followed), joints, limits or {}, floor, rates or {})
             findings += accepted(run("position", trial), accept)
             if not any(f.severity == "error" and f.check not in ("lost_samples", "dead_channel") for f in findings):
                 progress("checking its clock")
@@ -78,6 +81,7 @@ def check_measurements(
     joints: Sequence[str] = (),
     accept: Sequence[str] = (),
     limits: Mapping[str, float] | None = None,
+    rates: Mapping[str, float] | None = None,
     progress: Callable[[str, str], None] = lambda name, text: None,
 ) -> dict[str, list[Finding]]:
     """Check several measurements; each joint must move in one of them. Also finds measurements that repeat another without
@@ -86,7 +90,7 @@ def check_measurements(
     Args:
         joints: signals to be fitted.
         accept: names of checks whose errors are known and become warnings.
-        limits: signal → largest effort that its machine states [N·m, N]; a plateau there is no finding.
+        limits, rates: as in ``check_measurement``.
         progress: function that is called with (name of a measurement, text about the present check).
 
     Returns:
@@ -95,9 +99,8 @@ def check_measurements(
     found = {}
     for k, m in enumerate(measurements, 1):
         place = f"recording {k} of {len(measurements)}, "
-        found[m.name] = check_measurement(
-            m, accept=accept, limits=limits, progress=lambda text, m=m, place=place: progress(m.name, place + text)
-        )
+        trial = partial(check_measurement, m, accept=accept, limits=limits, rates=rates)
+        found[m.name] = trial(progress=lambda text, m=m, place=place: progress(m.name, place + text))
     moved = {name for m in measurements for name, far in zip(m.signals, Trial(m).moves, strict=True) if far}
     for m in measurements[:1]:
         found[m.name] += [no_motion(m, name) for name in joints if name not in moved]
@@ -199,13 +202,15 @@ CORRECTED: Mapping[str, Callable[[Measurement, Finding], Measurement]] = {
 corrected."""
 
 
-def one_cause(found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measurement]) -> dict[str, list[Finding]]:
+def one_cause(
+    found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measurement], rates: Mapping[str, float] | None = None
+) -> dict[str, list[Finding]]:
     """Findings of a set with one cause for each signal whose column is wrong in every recording: it looks reversed in one and
     late in another.
 
     If a signal is reversed, or exchanged with its target, in most of the recordings that have an error of it, the others are
     checked again with that corrected. Those that pass have the same cause; findings that it explains are removed.
-    ``found``: name of a recording → its findings."""
+    ``found``: name of a recording → its findings. ``rates``: as in ``Trial``."""
     result = {name: list(findings) for name, findings in found.items()}
     wrong = {f.feature for own in result.values() for f in own if f.check in CORRECTED and f.severity == "error"}
     for signal in sorted(wrong):
@@ -220,7 +225,8 @@ def one_cause(found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measu
             continue
         first = errors[of[cause][0]][cause]
         corrected = (CORRECTED[cause](m, first).only([signal]) for m in recordings if m.name in others)
-        fails = {m.name for m in corrected for f in check_measurement(m) if f.severity == "error" and f.check in follow}
+        again = [(m.name, f) for m in corrected for f in check_measurement(m, rates=rates)]
+        fails = {name for name, f in again if f.severity == "error" and f.check in follow}
         if cause == "reversed" and any("reversed_effort" in own for own in errors.values()):
             more = f". Its effort pushes against its acceleration as well: it is {signal}.q"
             errors[of[cause][0]][cause] = dataclasses.replace(first, text=first.text + more)

@@ -77,6 +77,12 @@ class Trial:
     """Signal → largest effort that its machine states [N·m, N]."""
     known_floor: Mapping[str, float] | None = None
     """Signal → noise floor of positions [rad, m]; None: estimated from this measurement alone."""
+    rates: Mapping[str, float] = field(default_factory=dict)
+    """Signal → rate at which its drive receives targets [Hz], where its machine states one."""
+
+    def early_rows(self, signal: str) -> int:
+        """Rows by which ``signal`` may move before its target: 1 where targets are sent between rows that have the newest."""
+        return int(self.rates.get(signal, 0.0) * self.m.period_s > 1.0)
 
     @cached_property
     def floor(self) -> Mapping[str, float]:

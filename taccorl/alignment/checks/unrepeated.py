@@ -19,13 +19,17 @@ import numpy as np
 from taccorl.alignment.checks.held_commands import Dropped, find_dropped
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import BURST_POWER, BURST_SHARE, SignalFloor, noise_floor, repeat_pairs
-from taccorl.alignment.measurements.repeats import overlay
+from taccorl.alignment.measurements.noise_floor import (
+    BURST_POWER,
+    BURST_SHARE,
+    DISAGREE,
+    SignalFloor,
+    laid_pairs,
+    noise_floor,
+)
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
 
-DISAGREE = 3.0
-"""Ratio of the floor from repeats to the floor from rest, residue or rounding above which they disagree."""
 BLOCK_S = 0.5
 """Length of a block in which the difference of two repeats is measured [s]."""
 MOST_TIMES = 5
@@ -75,8 +79,7 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
     for group in groups.values():
         name, what = group[0].name, "what the robot does not repeat"
         try:
-            pairs = [(a, b, overlay(a, b)) for a, b in repeat_pairs(group)]
-            floors = noise_floor(group)
+            pairs, floors = laid_pairs(group), noise_floor(group)
         except TaccorlError as error:
             yield name, not_judged("", what, str(error))
             continue
@@ -115,14 +118,9 @@ def _unrepeated(
     signal: str, unit: str, pairs: Sequence[Pair], floor: SignalFloor, certain: bool
 ) -> Iterator[tuple[str, Finding]]:
     """The difference of repeats of one signal, if it is more than ``DISAGREE`` times the signal's noise without use of repeats:
-    the largest of the estimates from rest, from the high-frequency residue and from rounding.
-
-    Args:
-        unit: a thousandth of the unit of its position.
-        certain: dropped commands explain it.
-    """
-    by = {e.method: e.value for e in floor.estimates}
-    quiet = max((by[k] for k in ("rest", "residue", "quantisation") if k in by), default=floor.value)
+    the largest of the estimates from rest, from the high-frequency residue and from rounding. ``unit``: a thousandth of the unit
+    of its position. ``certain``: dropped commands explain it."""
+    quiet = floor.quiet
     squares = np.concatenate([np.empty(0), *(pair.difference**2 for pair in pairs)])
     repeats = float(np.sqrt(np.nanmean(squares) / 2)) if np.isfinite(squares).any() else 0.0
     odd = dict(next((e.left_out for e in floor.estimates if e.method == "repeats"), ()))
@@ -146,7 +144,8 @@ def _unrepeated(
     else:
         how = (
             f"all the time ({share:.0%} of it holds {BURST_POWER:.0%}), most {worst.second} from {worst.first}. The noise floor "
-            "contains it, so a missing effect below that is not found; if one of the two is wrong, remove that `repeat_of`"
+            f"contains it{' and is not known' * floor.is_unknown}, so a missing effect below that is not found: record a third, "
+            "or if one of the two is wrong, remove that `repeat_of`"
         )
     cause = (
         "dropped commands explain it (see dropped_commands)"

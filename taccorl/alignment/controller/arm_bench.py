@@ -106,7 +106,7 @@ def arm_spec(
 def held_payload(arm: str, mass_kg: float, at_m: Position = AT_TCP) -> Payload:
     """The effect ``payload`` of a known mass in the gripper of ``arm``, at ``at_m`` in link 6's frame."""
     x_m, y_m, z_m = at_m
-    return Payload(arm=arm, mass_kg=mass_kg, x_link6_m=x_m, y_link6_m=y_m, z_link6_m=z_m)
+    return Payload(arm=arm, mass_kg=mass_kg, x_m=x_m, y_m=y_m, z_m=z_m)
 
 
 def rigid(

@@ -161,11 +161,7 @@ class JointModel:
         self, motions: Sequence[JointMotion], cases: "Sequence[Numbers]", each_step: bool = False
     ) -> list[list[JointResponse]]:
         """Simulate the responses to the targets of each of ``motions``, from rest at its ``start``, with each of ``cases``, side
-        by side. Their arrays are read-only.
-
-        Args:
-            each_step: give the response after each physics step, not only at the rows.
-
+        by side. Their arrays are read-only. ``each_step``: give the response after each physics step, not only at the rows.
         Raises TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects."""
         prepared = [self._prepared(case) for case in cases]
         return [self._simulated(motion, prepared, each_step) for motion in motions]

@@ -186,9 +186,7 @@ def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config:
         path: the table, for messages.
         header: names of its columns.
 
-    Raises:
-        RecordingError: no column fits the pattern, a cell has none or two, or a column fits and has no cell.
-    """
+    Raises RecordingError: no column fits the pattern, a cell has none or two, or a column fits and has no cell."""
     array = spec.array
     if array is None:
         return spec
@@ -251,9 +249,7 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
     Args:
         header: names of its columns.
 
-    Raises:
-        RecordingError: a column is missing or unknown; the message names file, column and remedy.
-    """
+    Raises RecordingError: a column is missing or unknown; the message names file, column and remedy."""
     load = LOADS[config.load.unit][0]
     known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
     place = ["x_mm", "y_mm"] if config.same_place_mm is not None else []

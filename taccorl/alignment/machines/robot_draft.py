@@ -69,7 +69,7 @@ def _joint(facts: JointFacts) -> list[str]:
     lines += [f"    gains: {TODO}                # commanded: the drive runs kp and kd; fitted: nobody knows them"]
     if facts.armature > 0:
         lines += [
-            f"    rotor_inertia: {facts.armature:.6g}   # {inertia}: the model's armature, already at the joint, so gear is 1",
+            f"    rotor_inertia: {facts.armature:.6g}   # {inertia}: the model's armature, already at the joint, so gear is 1"
         ]
     else:
         lines += [

@@ -49,7 +49,7 @@ SWEEPS = 4
 MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
 """Largest number of positions in ``_KEPT``, which serves all joints of a recording; and of entries of its mass matrices."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
-PAYLOAD_AT = ("x_link6_m", "y_link6_m", "z_link6_m")
+PAYLOAD_AT = ("x_m", "y_m", "z_m")
 """Parameters of ``payload`` for its place along the axes of its body."""
 _SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
 

@@ -7,10 +7,11 @@
     quantisation  q / √12, q the encoder's step
 
 Repeats are used if there are any, because they contain the robot's own variation. If few blocks hold most of their
-difference (bursts), their median is used, so that the floor does not contain the bursts. A repeat that differs ``ODD`` times as
-much as the others (a late clock, another load) is left out. Without repeats the more certain one of
-rest and residue is used (the other one if it is clearly larger), which is a lower bound, or cycles if they differ by more. The
-floor is never below the quantisation, and never 0 (``NUMBER``, ``EXACT``). All estimates are reported.
+difference (bursts), their median is used, so that the floor does not contain the bursts. A recording that differs ``ODD`` times
+as much as the other repeats (a late clock, another load) is left out; of a single pair nothing tells which is right
+(``is_unknown``). Without repeats the more certain one of rest and residue is used (the other one if it is clearly larger), which
+is a lower bound, or cycles if they differ by more. The floor is never below the quantisation, and never 0 (``NUMBER``,
+``EXACT``). All estimates are reported.
 
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
 """
@@ -29,7 +30,7 @@ from scipy.stats import t as student
 from taccorl.alignment.measurements.cycles import cycles
 from taccorl.alignment.measurements.folder import motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.repeats import overlay
+from taccorl.alignment.measurements.repeats import Overlay, overlay
 from taccorl.errors import TaccorlError
 
 Kind = Literal["position", "velocity", "effort"]
@@ -61,6 +62,8 @@ BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
 RMS of all is ``BURST_RATIO`` times that of the typical block."""
 ODD = 5.0
 """A repeat is left out if the RMS of its typical block is more than this many times the others' median. A choice."""
+DISAGREE = 3.0
+"""Ratio of the floor from repeats to that from rest, residue or rounding above which they disagree."""
 NUMBER = 2.0**-24
 """Last bit of a 32-bit number of size 1: no floor is smaller than this rounding."""
 EXACT = 1e-3
@@ -82,6 +85,8 @@ class Estimate:
     computed from the median block instead of from all blocks."""
     left_out: tuple[tuple[str, float], ...] = ()
     """Repeats that were left out: name of the recording, its difference over that of the others."""
+    pairs: int = 0
+    """Number of pairs of repeats that were used."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +110,25 @@ class SignalFloor:
         """The floor, a standard deviation in ``unit``; always above 0."""
         return self.used.value
 
+    @property
+    def quiet(self) -> float:
+        """The largest estimate from rest, residue and rounding, without use of repeats; ``value`` if there is none."""
+        quiet = ("rest", "residue", "quantisation")
+        return max((e.value for e in self.estimates if e.method in quiet), default=self.value)
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether a single pair of repeats differs by so much more than the noise of its rows that one of them may be wrong."""
+        return self.used.pairs == 1 and self.value > DISAGREE * self.quiet
+
     def words(self) -> str:
         """Text such as ``0.204 mrad (0.198 … 0.211, from repeats, n = 4000)``."""
         factor, prefix = (1e3, "m") if self.kind != "effort" else (1.0, "")
         a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
         bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
+        bound += (
+            f"; not known: two recordings differ {self.value / self.quiet:.0f} times as much as rows" * self.is_unknown
+        )
         bursts = ", bursts left out" if self.used.without_bursts else ""
         bursts += "".join(f", without {name}" for name, _ in self.used.left_out)
         return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
@@ -136,7 +155,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
             f"noise floor: {other.name} and {measurements[0].name} have different signals; read them separately"
         )
     blocks: dict[Method, list[_Blocks]] = {
-        "repeats": [_repeat_blocks(a, b, kind) for a, b in repeat_pairs(measurements)],
+        "repeats": [_repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in laid_pairs(measurements)],
         "cycles": [_cycle_blocks(m, kind) for m in measurements],
         "rest": [_rest_blocks(m, kind) for m in measurements],
         "residue": [_residue_blocks(m, kind) for m in measurements],
@@ -173,6 +192,28 @@ def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]
         if first.name != name:
             pairs.append((first, by_name[name]))
     return pairs
+
+
+def laid_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M, Overlay]]:
+    """``repeat_pairs`` with their overlays. Where the first of three or more recordings of a motion is the odd one, as it differs
+    ``ODD`` times as much from most others as these do from each other, the second stands in its place."""
+    pairs = [(a, b, overlay(a, b)) for a, b in repeat_pairs(measurements)]
+    for name in dict.fromkeys(a.name for a, _, _ in pairs):
+        own = [pair for pair in pairs if pair[0].name == name]
+        if len(own) < 2:
+            continue
+        (first, second, _), *others = own
+        among = [(second, b, overlay(second, b)) for _, b, _ in others]
+        usual, odd = (np.median([_typical(laid) for _, _, laid in of], axis=0) for of in (among, own))
+        if ((odd > ODD**2 * usual) & (usual > 0.0)).any():
+            pairs = [p for p in pairs if p not in own] + [(second, first, overlay(second, first)), *among]
+    return pairs
+
+
+def _typical(laid: Overlay) -> np.ndarray:
+    """(J,) median of the squared differences of positions; 0 where none was measured."""
+    squares = np.square(laid.difference["position"])
+    return np.array([np.median(own[np.isfinite(own)]) if np.isfinite(own).any() else 0.0 for own in squares.T])
 
 
 def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
@@ -229,11 +270,10 @@ class _Blocks:
     """Name of the recording that repeats another."""
 
 
-def _repeat_blocks(first: Measurement, second: Measurement, kind: Kind) -> _Blocks:
-    laid = overlay(first, second)
-    rows = _block_rows(first.rate_hz)
+def _repeat_blocks(rate_hz: float, name: str, laid: Overlay, kind: Kind) -> _Blocks:
+    rows = _block_rows(rate_hz)
     squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
-    return _Blocks(_without_beginning(squares), rows, float(rows), second.name)
+    return _Blocks(_without_beginning(squares), rows, float(rows), name)
 
 
 def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -354,7 +394,9 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
         square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
         spread = _log_spread(own, freedom, robust=robust)
         value = math.sqrt(square)
-        found.append(Estimate(method, value, value / spread, value * spread, len(own) * rows, bursts, (*odd.items(),)))
+        pairs = (len(parts) - len(odd)) * (method == "repeats")
+        ends = value / spread, value * spread
+        found.append(Estimate(method, value, *ends, len(own) * rows, bursts, (*odd.items(),), pairs))
     return found
 
 

@@ -50,9 +50,8 @@ def compare(
             if the object is known.
         progress: function that is called with (recording, number of recordings done, number in all).
 
-    Raises:
-        TaccorlError: the robot lacks a signal, a recording has nothing to compare, or the pads contradict the stated object.
-    """
+    Raises TaccorlError: the robot lacks a signal, a recording has nothing to compare, or the pads contradict the stated
+    object."""
     uses: list[tuple[Use, Measurement]] = [
         (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
     ]
@@ -96,10 +95,7 @@ def replay_all(
 ) -> list[Response]:
     """One response per measurement, in their order: without contact and without a gripper command each moving joint is replayed
     alone in the one-joint model, otherwise the whole twin. A measurement without a signal to compare gets a response of NaN.
-
-    Args:
-        progress: function that is called with (recording, number of recordings done, number in all).
-    """
+    ``progress``: function that is called with (recording, number of recordings done, number in all)."""
     found = []
     for k, m in enumerate(measurements):
         progress(m.name, k, len(measurements))
@@ -135,11 +131,8 @@ def held_up(m: Measurement) -> list[str]:
 
 
 def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
-    """A trace for each signal that is compared and was measured, and one for its effort if that was recorded.
-
-    Args:
-        floors: kind → signal → noise floor; signals without one are left out.
-    """
+    """A trace for each signal that is compared and was measured, and one for its effort if that was recorded. ``floors``: kind →
+    signal → noise floor; signals without one are left out."""
     touched = in_contact(response.measurement)
     found = []
     even = response.measurement

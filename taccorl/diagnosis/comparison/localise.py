@@ -224,11 +224,7 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
 
 def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
     """The cell (errors of one signal in one regime of motion) of ``signal`` with the highest root mean square error. Regimes that
-    hold 90 % of the rows or more are left out; None if no other one remains.
-
-    Args:
-        cells: errors as from ``heat_map`` or ``touch_heat_map``.
-        kind: ``position``, ``effort`` or ``touch``.
-    """
+    hold 90 % of the rows or more are left out; None if no other one remains. ``cells``: errors as from ``heat_map`` or
+    ``touch_heat_map``. ``kind``: ``position``, ``effort`` or ``touch``."""
     own = [c for c in cells if c.signal == signal and c.kind == kind and c.share_of_time < 0.9]
     return max(own, key=lambda c: c.ratio, default=None)

@@ -14,8 +14,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.folder import Use
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, repeat_pairs
-from taccorl.alignment.measurements.repeats import overlay
+from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, laid_pairs
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import variable_unit
 from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
@@ -89,11 +88,7 @@ class RegimeErrors:
 
 
 def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
-    """Errors of one signal by recording and regime.
-
-    Args:
-        traces: all recordings of the signal, replayed with the fitted twin.
-    """
+    """Errors of one signal by recording and regime. ``traces``: all recordings of the signal, replayed with the fitted twin."""
     motions, regimes = motions_of(traces), _regimes()
     rows = [_row(m.trace.recording, m.trace.use, name, [m], inside) for m in motions for name, inside in regimes]
     uses: list[Use] = [use for use in USES if any(m.trace.use == use for m in motions)]
@@ -117,19 +112,18 @@ def with_regimes(
 ) -> list[list[Recording]]:
     """``sides`` (fit, validation, test) of a joint or axis, each recording with the rows of its regimes and the noise of
     positions there: by repeats of a motion, and ``EXACT`` of the tracking error, which no equations have more exactly (arms
-    without an effect kept 0.3 % of it in steps). As they are if ``floor`` is that of efforts.
-
-    Args:
-        measurements: those that the recordings were made of, by name.
-        floor: noise floor of the first channel.
-    """
+    without an effect kept 0.3 % of it in steps). As they are if ``floor`` is that of efforts. ``measurements``: those that the
+    recordings were made of, by name. ``floor``: noise floor of the first channel."""
     if floor.kind != "position":
         return [[*side] for side in sides]
     motions = motions_of([_trace(r, floor) for side in sides for r in side])
     rows = {m.trace.recording: {name: inside(m) for name, inside in _regimes()} for m in motions}
     noise = {name: 0.0 for name, _ in _regimes()}
-    for first, second in repeat_pairs(measurements):
-        laid, j = overlay(first, second), first.column(floor.signal)
+    odd = {name for name, _ in floor.used.left_out}
+    for first, second, laid in laid_pairs(measurements):
+        if second.name in odd:
+            continue
+        j = first.column(floor.signal)
         at = np.searchsorted(first.time_s, laid.time_s - 1e-9).clip(max=first.num_rows - 1)
         for name, inside in rows[first.name].items():
             own = laid.difference["position"][inside[at], j]

@@ -63,11 +63,7 @@ def replay_joints(machine: TwinConfig | HasJoints, m: Measurement, signals: Sequ
 
 
 def replay_whole(config: TwinConfig, m: Measurement) -> Response:
-    """Replay with the whole twin on the empty bench, from the robot's measured start.
-
-    Raises:
-        TaccorlError: the twin diverged.
-    """
+    """Replay with the whole twin on the empty bench, from the robot's measured start. Raises TaccorlError: the twin diverged."""
     m = evened(m, config)
     sim = Simulation(Bench(), _as_recorded(config, m))
     sim.reset([0])
@@ -99,11 +95,7 @@ def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
 
 def evened(m: Measurement, config: TwinConfig) -> Measurement:
     """The measurement, resampled to the nearest even rate whose period is a whole number of physics steps: 200 Hz for 199.97 Hz;
-    ``m`` itself if it has such a rate.
-
-    Raises:
-        TaccorlError: its rate is more than 1.25 times that of the physics.
-    """
+    ``m`` itself if it has such a rate. Raises TaccorlError: its rate is more than 1.25 times that of the physics."""
     physics_hz = 1.0 / config.physics.timestep_s
     if m.rate_hz > 1.25 * physics_hz:
         raise TaccorlError(
@@ -137,11 +129,8 @@ def in_contact(m: Measurement) -> np.ndarray:
 
 
 def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
-    """Matched contact replay for the stated object, which must agree with the readings of the pads.
-
-    Raises:
-        TaccorlError: as ``touch_motion``; the object touches no pad, or a pad in contact reads nothing.
-    """
+    """Matched contact replay for the stated object, which must agree with the readings of the pads. Raises TaccorlError: as
+    ``touch_motion``; the object touches no pad, or a pad in contact reads nothing."""
     motion = touch_motion(m, config, pressed)
     depth, _ = motion.depth()
     if not (depth > 0).any():

@@ -346,11 +346,7 @@ def _order(signal: str) -> int:
 
 
 def only(comparison: Comparison, signals: Iterable[str]) -> Comparison:
-    """The comparison restricted to some of its signals.
-
-    Raises:
-        TaccorlError: a signal was not compared.
-    """
+    """The comparison restricted to some of its signals. Raises TaccorlError: a signal was not compared."""
     known = [s for s, _ in comparison.signals]
     wanted = list(signals)
     for name in wanted:

@@ -117,9 +117,7 @@ def load_range(
         span: 0 and the highest load, in the unit of the cells file.
         speed: largest change of the load in a second.
 
-    Raises:
-        TaccorlError: the load is beyond the rated one, or the span does not begin at 0.
-    """
+    Raises TaccorlError: the load is beyond the rated one, or the span does not begin at 0."""
     unit, rated = config.load.unit, config.load.rated
     cells = [m for m in measurements.all if isinstance(m, CellMeasurement)]
     if span and (len(span) != 2 or span[0] != 0 or not 0 < span[1] <= rated):
@@ -148,9 +146,7 @@ class CellsPart(Part):
         measurements: existing recordings; the fit recordings are part of every fit, and state rate, noise floor, gain and offset.
         allowed: loads that may be applied.
 
-    Raises:
-        TaccorlError: no fit recording loads it.
-    """
+    Raises TaccorlError: no fit recording loads it."""
 
     def __init__(self, config: CellsConfig, measurements: Measurements, allowed: LoadRange) -> None:
         measurements = with_places(config, measurements)

@@ -109,9 +109,7 @@ def draw_machine(
         effects: names of the effects to hide; one that the recordings show is drawn if not given.
         strength: error that remains without each effect after a refit [noise floors]; drawn if not given.
 
-    Raises:
-        TaccorlError: an effect cannot act on the part, or would not show at any strength.
-    """
+    Raises TaccorlError: an effect cannot act on the part, or would not show at any strength."""
     rng = np.random.default_rng([seed, 61])
     plain = MachineSurrogate(ground=ground, seed=seed, hidden=(), numbers={})
     made = recordings(plain, ("fit",))
@@ -234,11 +232,8 @@ def _recorded(
 
 
 def write_machine(case: MachineSurrogate, folder: Path) -> Measurements:
-    """Write the recordings of a case as tables, and what is hidden in a sealed file.
-
-    Raises:
-        FileExistsError: the folder exists.
-    """
+    """Write the recordings of a case as tables, and what is hidden in a sealed file. Raises FileExistsError: the folder
+    exists."""
     made, part = recordings(case), case.ground.part
     sweeps = folder / SWEEPS
     folder.mkdir(parents=True)

@@ -180,11 +180,7 @@ class Ground:
 
     def fitted(self, motion: Motion) -> tuple[Measurement, np.ndarray]:
         """The answered motion in the largest of ``SIZES`` (at the PiPER in its own size) whose effort is within the limit of the
-        part, and its efforts (T,) [N·m, N].
-
-        Raises:
-            TaccorlError: even the smallest needs more, or moves beyond the range.
-        """
+        part, and its efforts (T,) [N·m, N]. Raises TaccorlError: even the smallest needs more, or moves beyond the range."""
         drive, limit = self.machine.drive(self.part), self.allowed_effort
         sizes, peak = SIZES[:1] if self.of_piper else SIZES, 0.0
         for size in sizes:
@@ -215,9 +211,7 @@ class Ground:
             The motion with the simulated answer of the joint; its efforts (T,) [N·m, N]; and the largest value that it reaches
             in multiples of the limit (1: just at the limit).
 
-        Raises:
-            TaccorlError: even the smallest needs more, or the part takes no positions.
-        """
+        Raises TaccorlError: even the smallest needs more, or the part takes no positions."""
         drive, room, allowed = self.machine.drive(self.part), self.room, self.allowed_effort
         if drive.target_kind != "position" and motion.target is JUMPS.target:
             raise TaccorlError("targets of a velocity cannot jump in position")
@@ -260,9 +254,7 @@ def ground_of(
         span: lowest and highest position [rad, m].
         speed: highest speed [rad/s, m/s].
 
-    Raises:
-        TaccorlError: range or speed are not known, or the part is driven by torque.
-    """
+    Raises TaccorlError: range or speed are not known, or the part is driven by torque."""
     if part not in machine.units:
         raise TaccorlError(f"{machine.name}: no {machine.part_word} {part!r}; it has {', '.join(machine.units)}")
     drive = machine.drive(part)
@@ -311,11 +303,8 @@ def _moved(m: Measurement, part: str) -> bool:
 
 def arm_ground(config: TwinConfig, signal: str, pose: np.ndarray) -> Ground:
     """Limits of a joint of the PiPER in ``pose`` (7,), angles of its arm's joints and opening [rad, m], with the joint in the
-    middle of its motions: within its limits, and with a sweep whose torque is within ``motions.TORQUE_NM``.
-
-    Raises:
-        TaccorlError: there is no such joint, or it cannot move about its pose.
-    """
+    middle of its motions: within its limits, and with a sweep whose torque is within ``motions.TORQUE_NM``. Raises TaccorlError:
+    there is no such joint, or it cannot move about its pose."""
     number, arm = joint_number(signal), signal.split("_", 1)[0]
     body, middle = arm_bench.rigid(config, signal, pose, 0.0, []), float(pose[number - 1])
     weight = body.gravity_sin * math.sin(middle) + body.gravity_cos * math.cos(middle)
@@ -342,11 +331,8 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
 
 
 def posed(signal: str, pose: np.ndarray, positions: Mapping[str, float]) -> np.ndarray:
-    """``pose`` (7,) of the PiPER's arm of ``signal`` with other joints, or its gripper, at ``positions`` [rad, m].
-
-    Raises:
-        TaccorlError: a name is none of them, or a position is beyond its limits.
-    """
+    """``pose`` (7,) of the PiPER's arm of ``signal`` with other joints, or its gripper, at ``positions`` [rad, m]. Raises
+    TaccorlError: a name is none of them, or a position is beyond its limits."""
     names, found = _of_arm(signal), pose.copy()
     for name, position in positions.items():
         if name == signal or name not in names:

@@ -138,10 +138,8 @@ def stated_pose(
     Args:
         span: lowest and highest position of the part's motion [rad, m].
 
-    Raises:
-        TaccorlError: the machine has no other joints, there is no recording, a name is none of another joint, or the pose must
-            not be recorded.
-    """
+    Raises TaccorlError: the machine has no other joints, there is no recording, a name is none of another joint, or the pose must
+    not be recorded."""
     pose = _begun(machine, part, like, span)
     others = [name for name in pose.robot.units if name != part]
     for name in positions:

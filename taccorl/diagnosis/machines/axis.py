@@ -134,12 +134,7 @@ class Axis(Machine):
                 changed, rivals = partial(with_other_numbers, model, motion), partial(with_more_lead, model, motion)
                 clock[m.name] = tuple(
                     check_against_twin(
-                        own,
-                        reported,
-                        floor,
-                        uncertain,
-                        lambda _, f=changed: f(),
-                        lambda _, f=rivals: f(),
+                        own, reported, floor, uncertain, lambda _, f=changed: f(), lambda _, f=rivals: f()
                     )
                 )
         progress("", len(uses), len(uses))

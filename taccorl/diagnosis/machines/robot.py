@@ -195,10 +195,10 @@ class RobotMachine(Machine):
 
     def diagnose(self, part: str, measurements: Measurements, **options: Any) -> Finding:
         found = diagnose_joint(self.robot, part, measurements, **options)
-        if "payload" in found.diagnosis.names:
+        if any("payload" in own for own in (found.diagnosis.names, *found.diagnosis.rivals.values())):
             body = self.robot.body_name(self.robot.last_body(part))
             text = (
-                f"payload: x_link6_m, y_link6_m and z_link6_m are along the axes of {body} in {self.robot.rigid.path.name}, from "
+                f"payload: x_m, y_m and z_m are along the axes of {body} in {self.robot.rigid.path.name}, from "
                 f"its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
             )
             idle = self.robot.idle_axes(part)

@@ -8,7 +8,7 @@ would use them for what the joint lacks. Unknown gains (``gains: fitted``) are f
 the inertia then stays as the file states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF
 are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``,
 since a cycle of the drive's loop is visible in the data. So is the delay of a speed that the drive filters; it is fitted if
-efforts were recorded and the file states ``loop_hz``.
+efforts were recorded and the file states ``loop_hz``. The scale of efforts is fitted in place of the inertia where that decides.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import seen_in
+from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, seen_in
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -109,7 +109,7 @@ class AxisProblem(WithoutMaps):
         """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone. NaN after the last measured
         row. ``effects``: in addition to those of the file that are not fitted."""
         answer = simulated(self._bare.with_numbers(base), measured_part(recording), effects)
-        of = {"position": answer.reported, "effort": answer.effort}
+        of = {"position": answer.reported, "effort": base.get(EFFORT_SCALE.name, 1.0) * answer.effort}
         return whole_rows([of[kind] for kind in self._kinds], recording)
 
     def learn(self, values: Mapping[str, float]) -> None:
@@ -130,6 +130,9 @@ class AxisProblem(WithoutMaps):
                 self.candidates[name] = dataclasses.replace(c, frees=holding(c.frees, self.known, self._stated))
 
     def _base(self) -> tuple[Free, ...]:
+        return (*self._numbers(), *[dataclasses.replace(EFFORT_SCALE, held=True)] * self.effort)
+
+    def _numbers(self) -> tuple[Free, ...]:
         axis, unit = self.axis, self.axis.scale.unit_of
         force, inertia = axis.scale.force, axis.inertia
         most = max(MOST_TORQUE * force, 10.0 * abs(axis.torque_ff))

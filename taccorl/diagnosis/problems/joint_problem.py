@@ -191,11 +191,8 @@ class JointProblem(WithoutMaps):
 
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """For each recording and case (T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver
-        would report it; with ``law: effort`` the effort alone. NaN after the last measured row.
-
-        Args:
-            cases: always fitted numbers, and effects in addition to those of the machine that are not fitted.
-        """
+        would report it; with ``law: effort`` the effort alone. NaN after the last measured row. ``cases``: always fitted numbers,
+        and effects in addition to those of the machine that are not fitted."""
         motions = [measured_part(recording) for recording in recordings]
         answers = self.model.simulate_all(motions, [self._numbers(*case) for case in cases])
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
@@ -252,8 +249,9 @@ class JointProblem(WithoutMaps):
         )
         joint = self.model.joint
         units = Scale(unit=joint.unit)
+        scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (self.effort and not self._left_out)
         if joint.target_kind == "effort":
-            return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found)
+            return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in [*found, *scale])
         if self.commanded:
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
             age = POSITION_AGE if joint.position_age_s or POSITION_AGE.name in self.known else LOOP
@@ -262,7 +260,7 @@ class JointProblem(WithoutMaps):
         elif not joint.winding:
             starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
             gains = [_around(*starts[name]) for name in joint.gain_names]
-            found = gains + found + [delay] * (self.effort or self._weight_shows(1.0))
+            found = gains + found + [delay] * (self.effort or self._weight_shows(1.0)) + scale
         found += [_within(name, value) for name, value in joint.winding.items()]
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known

@@ -27,8 +27,6 @@ from taccorl.sim.twin import TwinConfig
 
 MOVES_RAD = 2e-3
 """Least commanded (or, without position commands, measured) range of a joint that is diagnosed [rad]."""
-EFFORT_OFF = 0.15
-"""Least relative difference of a fitted ``effort_scale`` from 1 that is remarked. A choice."""
 SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
 """Names of the joints of both arms, without grippers."""
 
@@ -187,7 +185,7 @@ def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
 
 def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
     """Copy of ``found`` with the intervals of ``known.absolute``, also in its effects, with the identified numbers in their
-    evidence, and with remarks where a payload is not where the twin has it, or efforts fit only with a factor."""
+    evidence, and with a remark where a payload is not where the twin has it."""
     effects = []
     for effect in found.effects:
         prefix = f"{effect.name}."
@@ -196,7 +194,7 @@ def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
         mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
         ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
         effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
-    remarks = (*found.remarks, *_payload_remarks(found), *_effort_remarks(found))
+    remarks = (*found.remarks, *_payload_remarks(found))
     return dataclasses.replace(
         found, effects=tuple(effects), intervals=found.intervals | known.intervals, remarks=remarks
     )
@@ -212,18 +210,6 @@ def _payload_remarks(found: Diagnosis) -> list[str]:
     return [
         f"The payload pulls as if it were {off_mm:.1f} mm off the TCP. No recording states its place: state payload_position_m "
         "in measurements.yaml, else compare shows an error there that this diagnosis does not."
-    ]
-
-
-def _effort_remarks(found: Diagnosis) -> list[str]:
-    """Efforts that fit only with a factor that differs from 1 by more than its interval and ``EFFORT_OFF``."""
-    factor = found.base.get("effort_scale", 1.0)
-    low, high = found.intervals.get("effort_scale", (factor, factor))
-    if low <= 1.0 <= high or 1.0 / (1.0 + EFFORT_OFF) <= factor <= 1.0 + EFFORT_OFF:
-        return []
-    return [
-        f"the recorded efforts are {factor:.3g} ({low:.3g} … {high:.3g}) times those of the fit (effort_scale), with gains "
-        "that are stated: their unit or the motor's torque constant is wrong, or an inertia or mass is missing in the model"
     ]
 
 
@@ -269,12 +255,8 @@ def set_numbers(
     config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
 ) -> None:
     """Change ``config`` in place: write fitted gains into one arm, and the delay of the speed unless its interval contains 0.
-    Payload positions and effort scales belong to recordings, not to the twin.
-
-    Args:
-        base: fitted number → value.
-        intervals: fitted number → (low, high).
-    """
+    Payload positions and effort scales belong to recordings, not to the twin. ``base``: fitted number → value. ``intervals``:
+    fitted number → (low, high)."""
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
     k = ROBOT.joints.index(joint)

@@ -14,7 +14,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import repeat_pairs
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.diagnosis.comparison.replays import matched_contact
-from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
+from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem, odd_cells
 from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.identifiability import Identifiability
@@ -62,8 +62,13 @@ class PadFinding:
 
     @property
     def remark(self) -> str:
-        """Text on what the search could not decide, and the press that would show it; empty if there is nothing."""
-        return gain_words(self.gains, self.not_shared) if self.gains else ""
+        """Text on what the search could not decide, and the press that would show it, or the cells that a found map of gains has
+        as dead or odd; empty if there is nothing."""
+        if self.gains:
+            return gain_words(self.gains, self.not_shared)
+        maps = [e for e in self.diagnosis.effects if isinstance(e, TaxelGainMap) and len(e.gains) > 1]
+        named = [odd_cells(np.reshape(e.gains, (len(e.pads), *ROBOT.pad.shape)), e.pads) for e in maps]
+        return f"{TaxelGainMap.name}: {named[0]}" if any(named) else ""
 
     @property
     def noise(self) -> str:
@@ -189,10 +194,11 @@ def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
         share = gains.num_dead / max(gains.num_taxels, 1)
         parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({share:.0%}) read nothing")
     parts.append(f"the gains of {'the others' if parts else 'taxels'} spread by {gains.log_std:.0%}")
+    cells = f"; {gains.odd}" * bool(gains.odd)
     return (
-        f"{' and '.join(parts)} (dead_taxels, taxel_gain_spread): this explains what is left. No taxel_gain_map could be judged, "
-        f"as {', '.join(not_shared)} press{'es' if len(not_shared) == 1 else ''} other taxels than the fit recordings; record a "
-        "validation press at a place that a fit recording presses (excite --pads: rod_across)"
+        f"{' and '.join(parts)} (dead_taxels, taxel_gain_spread){cells}: this explains what is left. No taxel_gain_map could be "
+        f"judged, as {', '.join(not_shared)} press{'es' if len(not_shared) == 1 else ''} other taxels than the fit recordings; "
+        "record a validation press at a place that a fit recording presses (excite --pads: rod_across)"
     )
 
 

@@ -23,6 +23,7 @@ from taccorl.alignment.measurements.repeats import overlay
 from taccorl.alignment.touch.calibration import noise_level
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
+from taccorl.data.touch_checks import taxel_list
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
@@ -45,6 +46,8 @@ _MOST_GAIN = 5.0
 _PRESSED_M, _PRESSED_FRAMES = 5e-5, 25  # a taxel that deep for a quarter of a second is pressed
 DEAD_GAIN = 0.1
 """A taxel is dead if its gain is below this share of the median gain."""
+ODD_SPREADS, ODD_BY = 4.0, 0.2
+"""A gain is odd if it is this many standard deviations (robust) of all and this share of their median from it. A choice."""
 FEWEST_SHARED = 8
 """Least number of pressed taxels that a validation recording must share with the fit recordings for judging a gain map on it."""
 _WINDOW_M = 1e-3  # taxels that the object comes so near to are simulated,
@@ -92,6 +95,8 @@ class GainStatistics:
     """Number of taxels with a gain below ``DEAD_GAIN``."""
     num_taxels: int
     """Number of pressed taxels, dead ones included."""
+    odd: str = ""
+    """Text of ``odd_cells``."""
 
 
 @dataclass(frozen=True)
@@ -328,15 +333,29 @@ class TouchProblem(WithoutMaps):
         """Statistics of the gains of the taxels that ``recordings`` press, with ``effects`` other than a gain map and the always
         fitted numbers ``base``."""
         found = self._gains(dict(base), [e for e in effects if not isinstance(e, TaxelGainMap)], recordings)
-        dead = found.least < DEAD_GAIN
+        dead, odd = found.least < DEAD_GAIN, odd_cells(found.gains, self.pads)
         alive = np.maximum(found.least[~dead], DEAD_GAIN)
-        if len(alive) < 2:
-            return GainStatistics(log_std=0.0, num_dead=int(dead.sum()), num_taxels=len(dead))
-        own = found.variance[~dead] / np.square(alive)  # of ln g
-        square = float(np.var(np.log(alive), ddof=1) - own.mean())
-        return GainStatistics(
-            log_std=math.sqrt(max(square, 0.0)), num_dead=int(dead.sum()), num_taxels=len(found.least)
-        )
+        square = 0.0
+        if len(alive) > 1:
+            own = found.variance[~dead] / np.square(alive)  # of ln g
+            square = max(float(np.var(np.log(alive), ddof=1) - own.mean()), 0.0)
+        return GainStatistics(log_std=math.sqrt(square), num_dead=int(dead.sum()), num_taxels=len(dead), odd=odd)
+
+
+def odd_cells(gains: np.ndarray, pads: Sequence[str]) -> str:
+    """Text that names pad, row and column of taxels that read nothing, or far more or less than the others, by the ``gains``
+    (P, R, C) of a map, which are 1 where nothing pressed; empty if there are none."""
+    known = gains[gains != 1.0]
+    middle = float(np.median(known)) if known.size else 1.0
+    dead, off = (gains != 1.0) & (gains < DEAD_GAIN * middle), np.abs(gains - middle)
+    most = max(ODD_SPREADS * 1.4826 * float(np.median(np.abs(known - middle))), ODD_BY * middle) if known.size else 0.0
+    odd = (gains != 1.0) & ~dead & (off > most)
+    named = [f"{pad}: {taxel_list(dead[p])} read nothing" for p, pad in enumerate(pads) if dead[p].any()]
+    for p, pad in enumerate(pads):
+        if odd[p].any():
+            ends = dict.fromkeys(f"{end / middle:.2g}" for end in (gains[p][odd[p]].min(), gains[p][odd[p]].max()))
+            named.append(f"{pad}: {taxel_list(odd[p])} read {' … '.join(ends)} times as much as the median one")
+    return "; ".join(named)
 
 
 def touch_candidate(cls: type[Effect], seen: Mapping[str, float], pads: list[str]) -> Candidate:

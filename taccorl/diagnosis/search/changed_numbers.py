@@ -6,6 +6,7 @@ file, its refit removes the error, and no effect is missing: the change is then 
 A change is named by the rule of the search: the fit is clearly better than the one with the number as the file has it, and all
 others refitted. Numbers can make up for each other, so they
 are returned to the file's values one after another, the least significant first, and stay there where the error hardly rises.
+All efforts by one factor, as of a wrong torque constant, act as another inertia does, unless weight, friction or a load is known.
 A number of the drive may have moved because an effect is missing that acts alike in these recordings, such as a weight on a
 constant torque: effects that do as well in its place are named with it (``Changed.instead``).
 """
@@ -16,12 +17,13 @@ import numpy as np
 
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.fits import STEPS, Fits, model_of, refusal
-from taccorl.diagnosis.search.problem import Free, Values, with_held
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Values, with_held, with_scale
 from taccorl.diagnosis.search.result import Changed
 
 STATED = {
     "torque_ff": "torque_ff",
     "inertia": "inertia",
+    EFFORT_SCALE: "effort_scale",
     "weight_sin": "weight",
     "weight_cos": "weight",
     "stall_nm": "winding",
@@ -41,7 +43,7 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
-            of_drive = not fits.added(model) and frees[0].name in (*STATED, *OF_LOOP)
+            of_drive = frees[0].name in (*STATED, *OF_LOOP)
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
                 name, before, after, unit = f.name, float(fits.given[f.name]), float(model.values[f.name]), f.unit
@@ -95,10 +97,18 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
 
 
 def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]) -> tuple[str, ...]:
-    """Effects of which each, with ``frees`` as the file has them, explains as much as ``model``."""
-    problem = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees})
+    """Effects of which each, with ``frees`` as the file has them, explains as much as ``model``, where none was added; instead of
+    an inertia ``EFFORT_SCALE`` alone, if it does."""
+    problem, answer = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees}), fits.model_of(model)
+    if frees[0].name == "inertia" and (scaled := with_scale(problem)) is not None:
+        problem = scaled
+        one = best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
+        if refusal(answer, model_of(problem, one, fits.validation), fits.config):
+            return (EFFORT_SCALE,)
+    if fits.added(model):
+        return ()
     beside = Fits(problem, fits.fit_to, fits.validation, fits.given, fits.present, fits.config, fits.report)
-    answer, found = fits.model_of(model), beside.children(beside.base, names)
+    found = beside.children(beside.base, names)
     as_good = [m for m in found if m.full and not beside.flaw(m) and refusal(answer, m, fits.config)]
     return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 

@@ -139,6 +139,7 @@ class Fits:
         self.probes: dict[tuple[frozenset[str], str], Probe] = {}
         """(effects of a model, effect) → its best probe beside them."""
         self._probed: dict[frozenset[str], int] = {}
+        self._repeats: dict[tuple[Model, Model], str] = {}
         there = chosen(problem, present)
         self.given = {f.name: start.get(f.name, f.start) for f in (*problem.base, *(f for x in there for f in x.frees))}
         """Value of every number of the problem as the machine's file has it, before any fit."""
@@ -427,7 +428,8 @@ class Fits:
 
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
-        the error, or a tenth of it for sure, is told even if other numbers make up for its strength.
+        the error, or a tenth of it for sure, is told even if other numbers make up for its strength. Near the floor, where noise
+        and equations leave as much, it is not, and what is not much must be there the other way round, too (``_unrepeated``).
 
         Args:
             left_over: whether intervals widen by what ``model`` leaves above the floor.
@@ -436,8 +438,22 @@ class Fits:
             return why
         name = next(n for n in model.names if n not in parent.names)
         gain, score = gain_of(model.squares, parent.squares), standard_score(parent.squares - model.squares)
-        sure = gain >= self.config.sure_gain or score >= self.config.sure_score
-        return "" if sure else not_told_from_none(model.fit, name, left_over)
+        near, much = parent.error <= self.config.little, gain >= self.config.sure_gain
+        sure = much or score >= self.config.sure_score
+        why = not_told_from_none(model.fit, name, left_over and not sure) if near or not sure else ""
+        return why or (self._unrepeated(model, parent) if near and not much else "")
+
+    def _unrepeated(self, model: Model, parent: Model) -> str:
+        """Text: why ``model``, fitted to the validation recordings, leaves no less than ``parent`` of those that it was fitted
+        to; empty if it does."""
+        if (key := (model, parent)) not in self._repeats:
+            self.progress(f"does {model.names[-1]} repeat on other recordings")
+            fits = [fit(self.problem, self.validation, m.names, m.fit.values, STEPS) for m in key]
+            with_it, without = (model_of(self.problem, f, self.fit_to) for f in fits)
+            surely = standard_score(without.squares - with_it.squares) >= self.config.min_score
+            self._repeats[key] = "" if surely else refusal(with_it, without, self.config)
+        why = self._repeats[key]
+        return f"fitted to the validation recordings, it does not repeat on the others: {why}" if why else ""
 
     def evidence(self, model: Model, parent: Model, verdict: str) -> Evidence:
         """What a report says of the newest effect of ``model``, with the ``verdict`` of the search on it."""

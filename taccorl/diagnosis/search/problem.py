@@ -247,6 +247,19 @@ def with_held(problem: Problem, stated: Mapping[str, float]) -> Problem:
     return with_frees(problem, held)
 
 
+EFFORT_SCALE = "effort_scale"
+"""Name of the ratio of recorded efforts to the true ones, that of a torque constant to the true one. Held where the inertia is
+fitted: both change alike all that efforts show."""
+
+
+def with_scale(problem: Problem) -> Problem | None:
+    """Copy of ``problem`` in which the scale of efforts is fitted and the inertia stays, where it is the other way round."""
+    if not any(f.name == EFFORT_SCALE and f.held for f in problem.base):
+        return None
+    held = {"inertia": True, EFFORT_SCALE: False}
+    return with_frees(problem, lambda f: dataclasses.replace(f, held=held.get(f.name, f.held)))
+
+
 Progress = Callable[[str], None]
 """Function that is called with a text about the present step."""
 

@@ -201,6 +201,8 @@ class Diagnosis:
     rivals: dict[str, tuple[str, ...]]
     """Added effect → other effects that fit these recordings as well in its place, among them more general forms of it, which
     have more parameters."""
+    or_scale: bool = False
+    """Whether all efforts by one factor, a wrong torque constant, explain as much as the added effects."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]

@@ -28,7 +28,7 @@ from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_sco
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
 from taccorl.diagnosis.search.identifiable import not_told_from_none
-from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Problem, Progress, Recording, Values, no_progress, with_scale
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
@@ -39,6 +39,8 @@ motion causes."""
 GAINS_MOVED = 2.0
 """Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
 wrong unit of time, or gains other than the commanded ones."""
+SCALE_OFF = 1.15
+"""Least factor on efforts that is a finding where gains are stated, so that it is fitted in any case. A choice."""
 EXCHANGES = 4
 """Most times that the best model is exchanged for a better one with one effect another; a choice, two were seen."""
 
@@ -68,11 +70,18 @@ def diagnose(
         progress: function that is called with a text about the present step.
     """
     began = time.process_time()
-    fits = Fits(problem, fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
-    problem.learn(fits.first.values)
-    beam = Beam(fits, [name for name in problem.candidates if name not in without])
-    answer = beam.search()
-    answer, removed, remarks = beam.pruned(answer)
+    how = (fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
+    fits, by_scale = Fits(problem, *how), None
+    if not fits.at_floor(fits.base) and (scaled := with_scale(problem)) is not None:
+        by_scale = own if (own := Fits(scaled, *how)).at_floor(own.base) else None
+    if by_scale is not None and by_scale.base.numbers <= fits.base.numbers:
+        fits, by_scale = by_scale, None
+    fits.problem.learn(fits.first.values)
+    beam = Beam(fits, [name for name in fits.problem.candidates if name not in without])
+    answer, removed, remarks = beam.pruned(beam.search())
+    if by_scale is not None and better(by_scale.base, answer, fits.config):
+        fits, by_scale, beam = by_scale, None, Beam(by_scale, beam.names)
+        answer, removed, remarks = beam.pruned(beam.search())
     steps = beam.steps(answer)
     rivals = beam.rivals(answer, steps)
     rounds = beam.rounds(answer, steps, rivals)
@@ -83,6 +92,8 @@ def diagnose(
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
     }
     changed = changed_numbers(fits, model, beam.names)
+    if fits.problem is problem:  # the scale was fitted anyway, beside gains that are stated
+        changed = tuple(c for c in changed if c.name != EFFORT_SCALE or abs(np.log(c.after)) > np.log(SCALE_OFF))
     standing = fits.standing_out(answer) or fits.standing_out(answer, test)
     return Diagnosis(
         status=_status(fits, answer, changed, bool(standing)),
@@ -91,13 +102,14 @@ def diagnose(
         changed=changed,
         effects=tuple(_described(fits, model, errors, without_it)),
         offers=tuple(_offers(beam, answer, rivals, test)),
+        or_scale=by_scale is not None and bool(fits.added(answer) and refusal(answer, by_scale.base, fits.config)),
         present=fits.present,
         base=_base(model),
         start=fits.given,
         intervals=model.intervals(),
         rounds=rounds,
         rivals=rivals,
-        twins={n: dict(problem.candidates[n].cls.near_twins) for n in fits.added(model)},
+        twins={n: dict(fits.problem.candidates[n].cls.near_twins) for n in fits.added(model)},
         removed=tuple(removed),
         errors=errors,
         test_without=without_it,

@@ -155,13 +155,13 @@ class EndStop(JointEffect):
 
 @effect("payload", slot="body", needs="bodies")
 class Payload(ArmEffect):
-    """Unknown payload: a ball of mass m fixed to link 6 at c. It adds the torque m g × lever arm to every joint, and its
-    inertia. It has no contacts."""
+    """Unknown payload: a ball of mass m fixed to the last body at c, along that body's axes. It adds the torque m g × lever arm
+    to every joint, and its inertia. It has no contacts."""
 
     mass_kg: float = number("m", "kg", 0, 0.2, (0, 1.5), "a choice; rated: 1.5 kg (PiPER manual)", over_kp=True)
-    x_link6_m: float = number("c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
-    y_link6_m: float = number("c_y", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
-    z_link6_m: float = number("c_z", "m", None, 0.1, (-0.05, 0.25), "a choice: between flange and pads (TCP at 0.168)")
+    x_m: float = number("c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
+    y_m: float = number("c_y", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
+    z_m: float = number("c_z", "m", None, 0.1, (-0.05, 0.25), "a choice: between flange and pads (TCP at 0.168)")
 
     @classmethod
     def accepted(cls, p: Parameter) -> tuple[float, float]:
@@ -172,7 +172,7 @@ class Payload(ArmEffect):
         for arm in self.arms():
             ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")
             ball.mass, ball.explicitinertial = self.mass_kg, True
-            ball.ipos = [self.x_link6_m, self.y_link6_m, self.z_link6_m]
+            ball.ipos = [self.x_m, self.y_m, self.z_m]
             ball.inertia = [inertia] * 3
 
 

@@ -90,14 +90,6 @@ def test_friction_is_no_fault_of_the_telemetry(friction_nm):
         assert not any(f.severity != "note" for f in check_measurement(m))
 
 
-def test_progress_names_each_recording_with_its_place_and_the_check(clean):
-    said: list[tuple[str, str]] = []
-    two = [clean, dataclasses.replace(clean, name="again", repeat_of=clean.name)]
-    check_measurements(two, progress=lambda name, text: said.append((name, text)))
-    own = [text for name, text in said if name == "again"]
-    assert len(own) == 3 and all("recording 2 of 2" in text for text in own) and "clock" in own[-1]
-
-
 def test_steps_and_holds_are_clean_too():
     target = steps(3, 0.1, rows=1400)
     assert found(measured(target, answer(target), np.random.default_rng(0), 2e-4)) == {}
@@ -109,6 +101,17 @@ def test_positions_one_row_early_are_an_error_at_every_joint(seed, rows):
     m = shifted(sweep(seed), rows)
     assert len(found(m)["measured_before_command"]) == len(ARMS_JOINTS)
     assert all(f.severity == "error" for f in check_measurement(m) if f.check == "measured_before_command")
+
+
+@pytest.mark.parametrize(("rows", "hz", "early"), [(1, 1000.0, False), (2, 1000.0, True), (1, 150.0, True)])
+def test_targets_that_are_sent_between_rows_of_200_hz_lead_by_a_row_and_no_more(
+    clean, rows: int, hz: float, early: bool
+):
+    target = steps(4, 0.15)
+    stepped = measured(target, answer(target), np.random.default_rng(0), 2e-4)
+    for m, joints in ((clean, len(ARMS_JOINTS)), (stepped, 1)):
+        errors = found(shifted(m, rows), rates=dict.fromkeys(m.signals, hz))
+        assert len(errors.get("measured_before_command", ())) == joints * early
 
 
 def test_lead_names_joint_time_and_way_out(clean):

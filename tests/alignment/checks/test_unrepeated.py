@@ -125,6 +125,17 @@ def test_a_repeat_that_differs_far_more_than_the_others_is_left_out_of_the_floor
     assert floor.left_out[0][1] == pytest.approx(6.0, rel=0.25)  # with the noise: √(6² + 1)
 
 
+def test_the_first_recording_may_be_the_odd_one_and_of_two_nothing_tells_which_is():
+    """The drift of 12 floors is in the recording that the others repeat; of a single pair it is 6 times the noise of rows."""
+    a, *others = [recording("a", 1), recording("b", 2, repeat_of="a"), recording("c", 3, repeat_of="a")]
+    odd = dataclasses.replace(a, measured=a.measured + 12 * NOISE_RAD * np.sin(np.arange(2400) / 50)[:, None])
+    floor = noise_floor([odd, *others])["left_joint5"]
+    assert [name for name, _ in floor.used.left_out] == ["a"] and floor.value == pytest.approx(NOISE_RAD, rel=0.1)
+    assert ["a from b" in f.text for name, f in check_repeatability([odd, *others]) if name == "a"] == [True]
+    alone, fine = (noise_floor([first, others[0]])["left_joint5"] for first in (odd, a))
+    assert alone.is_unknown and "not known" in alone.words() and not floor.is_unknown and not fine.is_unknown
+
+
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
     m = recording("a", 3, drop=0.05, longest=4)
     dropped = find_dropped([m], 0)

@@ -350,11 +350,11 @@ def test_a_known_payload_is_carried_and_weighs() -> None:
     m.target[3:, 4] += 1e-3  # so that it does not only rest
     bare, loaded = (joint_motion(dataclasses.replace(m, payload_kg=kg), TWIN, signal) for kg in ({}, {"left": 0.5}))
     sag = model.simulate(loaded, model.gains).reported[-1] - model.simulate(bare, model.gains).reported[-1]
-    hidden = model.simulate(bare, model.gains, [make_effect("payload", mass_kg=0.5, z_link6_m=0.168)]).reported
+    hidden = model.simulate(bare, model.gains, [make_effect("payload", mass_kg=0.5, z_m=0.168)]).reported
     np.testing.assert_allclose(model.simulate(loaded, model.gains).reported, hidden, atol=1e-12)
     torque_nm = 0.5 * 9.81 * 0.168
     assert 0.3 * torque_nm / model.gains.kp < abs(sag) <= 3 * torque_nm / model.gains.kp
-    both = model.simulate(loaded, model.gains, [make_effect("payload", mass_kg=0.5, z_link6_m=0.168)]).reported
+    both = model.simulate(loaded, model.gains, [make_effect("payload", mass_kg=0.5, z_m=0.168)]).reported
     assert both[-1] - hidden[-1] == pytest.approx(sag, rel=0.05), "a hidden one adds to a known one"
 
 

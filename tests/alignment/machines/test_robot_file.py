@@ -95,7 +95,7 @@ def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> Non
 def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_joint_feels_it(tmp_path: Path) -> None:
     """0.5 kg, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with the elbow bent √(0.5² + 0.3²) m from
     the shoulder. The controller carries the arm's weight, and not this one's."""
-    held = "effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, z_link6_m: 0.0}]"
+    held = "effects: [{effect: payload, mass_kg: 0.5, x_m: 0.1, z_m: 0.0}]"
     bent = swept(shoulder=np.zeros(400), elbow=np.full(400, 0.5 * np.pi))
     compensated = ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:")
     without = robot(tmp_path, compensated)
@@ -108,14 +108,14 @@ def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_jo
         assert with_it.inertia - bare.inertia == pytest.approx(inertia, rel=1e-9)
         at_0 = with_it.gravity_cos - with_it.compensation_cos  # about +y a positive angle lowers the mass
         assert at_0 == pytest.approx(-9.81 * moment_kgm, rel=1e-6), name
-    idle = {"y_link6_m": 0.0}  # both turn about y
+    idle = {"y_m": 0.0}  # both turn about y
     assert [made.joint(name).selectors(Payload) for name in ("shoulder", "elbow")] == [None, idle], "one mass"
     assert without.joint("shoulder").selectors(Payload) == idle
     twice = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, {held}}}").replace("100.0}", f"100.0, {held}}}")
     with pytest.raises(SpecError, match=r"elbow.*payload.*shoulder.*lower"):
         robot(tmp_path, twice)
     upright = robot(tmp_path, model=TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'))
-    assert upright.joint("elbow").selectors(Payload) == {"z_link6_m": 0.0}, "inertia shows it about a vertical axis"
+    assert upright.joint("elbow").selectors(Payload) == {"z_m": 0.0}, "inertia shows it about a vertical axis"
 
 
 def test_a_payload_on_a_vertical_slide_weighs_and_has_inertia(tmp_path: Path) -> None:
@@ -123,10 +123,10 @@ def test_a_payload_on_a_vertical_slide_weighs_and_has_inertia(tmp_path: Path) ->
     slide = """<mujoco><worldbody><body name="head"><inertial pos="0 0 0.1" mass="2" diaginertia="0.01 0.01 0.01"/>
     <joint name="lift" type="slide" axis="0 0 1"/></body></worldbody></mujoco>"""
     file = "kind: robot\nmodel: arm.xml\ngravity_compensation: 1.0\njoints:\n  lift: {kp: 1000.0, kd: 100.0EFFECTS}\n"
-    held = ", effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.3, y_link6_m: 0.0, z_link6_m: 0.0}]"
+    held = ", effects: [{effect: payload, mass_kg: 0.5, x_m: 0.3, y_m: 0.0, z_m: 0.0}]"
     made, bare = (robot(tmp_path, file.replace("EFFECTS", text), slide) for text in (held, ""))
     m = dataclasses.replace(swept(lift=np.zeros(400)), units=("m",))
-    place = dict.fromkeys(("x_link6_m", "y_link6_m", "z_link6_m"), 0.0)
+    place = dict.fromkeys(("x_m", "y_m", "z_m"), 0.0)
     assert bare.joint("lift").selectors(Payload) == place and bare.idle_axes("lift") == (0, 1, 2)
     model = JointModel(made, "lift")
     motion = motion_of(m, "lift", model.joint)
@@ -144,7 +144,7 @@ def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity:
     """Both joints move: the torque that one costs the other, from MuJoCo's own inverse dynamics of a model with that mass."""
     time_s = np.arange(600) / 200
     both = swept(shoulder=0.4 * np.sin(3.0 * time_s), elbow=1.0 + 0.5 * np.sin(4.0 * time_s))
-    held = "effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, y_link6_m: 0.02, z_link6_m: -0.05}]"
+    held = "effects: [{effect: payload, mass_kg: 0.5, x_m: 0.1, y_m: 0.02, z_m: -0.05}]"
     ball = '<body pos="0.3 0.02 -0.05"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-9 1e-9 1e-9"/></body>'
     (tmp_path / "true").mkdir()
     file = gravity + ROBOT_YAML
@@ -171,7 +171,7 @@ def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity:
         ]
         np.testing.assert_allclose(terms[0], terms[1], atol=1e-7)
         (stated,) = made.joint("elbow").effects([])
-        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_link6_m", "y_link6_m", "z_link6_m")})
+        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_m", "y_m", "z_m")})
         # At the elbow the file has it; at the shoulder of a robot without it a search tries it.
         for r, m, own in ((made, seen[0], made.joint(name).effects([])), (plain, seen[2], [one])):
             loads = m.coupling_nm + r.joint(name).moving_masses_nm(m, own)

@@ -96,7 +96,7 @@ def test_known_numbers_of_a_robot_file_are_held_saved_and_checked(tmp_path: Path
     model = fit(problem, problem.fit, problem.present, problem.start, 5)
     assert model.values["payload.mass_kg"] == 0.25 and model.values["torque_ff"] == config.torque_ff
     fitted = {f.name for f in model.frees}
-    assert "payload.x_link6_m" in fitted and not {"payload.mass_kg", "torque_ff"} & fitted
+    assert "payload.x_m" in fitted and not {"payload.mass_kg", "torque_ff"} & fitted
     text = path.read_text(encoding="utf-8").replace("torque_ff]", "gear]")
     path.write_text(text, encoding="utf-8")
     line = next(k for k, row in enumerate(text.splitlines(), 1) if "known" in row)

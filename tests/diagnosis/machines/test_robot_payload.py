@@ -126,6 +126,18 @@ def recorded(
     return logged(name, arm.joints, arm.units, again, time_s=time_s, target=target, measured=measured, effort=effort)
 
 
+def test_a_wrong_torque_constant_of_a_joint_that_weight_loads_is_no_mass(tmp_path: Path) -> None:
+    """Efforts times 1.3. With gains that nobody knows a payload makes up for it, by more numbers."""
+    arm = TWO._replace(true=TWO.known, delay_s=0.0)
+    one, again = (recorded(n, 1, 0.3, 2.5, k, of, arm) for k, n, of in ((1, "a", None), (11, "b", "a")))
+    other = recorded("c", 1, 0.25, 2.2, 21, None, arm)
+    fit, validation = ([dataclasses.replace(m, effort=1.3 * m.effort) for m in of] for of in ((one, again), (other,)))
+    way = {"search": SearchConfig(max_effects=1), "without": WITHOUT, "gains": "fitted"}
+    found = machine(tmp_path).diagnose("elbow", Measurements(tuple(fit), tuple(validation)), **way).diagnosis
+    assert found.names == () and found.base["effort_scale"] == pytest.approx(1.3, rel=0.01)
+    assert [c.name for c in found.changed] == ["effort_scale"]
+
+
 @pytest.mark.slow
 def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(tmp_path: Path) -> None:
     """0.35 kg at 0.4 m from the yaw axis is half of its known inertia: without it the delay is wrong, and efforts fit only with a
@@ -139,22 +151,22 @@ def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(
     alone = arm.diagnose("yaw", made, search=one, without=WITHOUT).diagnosis
     low, high = alone.intervals["command_delay.delay_s"]
     assert not low < DELAY_S < high
-    assert alone.base["effort_scale"] > 1.15 and any("effort_scale" in r for r in alone.remarks)
+    assert alone.base["effort_scale"] > 1.15 and "effort_scale" in [c.name for c in alone.changed]
 
     yaw, elbow = diagnose_parts(arm, JOINTS, made, search=one, without=WITHOUT)
     (payload,) = elbow.diagnosis.effects
     assert payload.name == "payload"
     values = {p.name: getattr(payload, p.name) for p in payload.parameters()}
     assert values["mass_kg"] == pytest.approx(MASS_KG, rel=0.02)
-    assert values["x_link6_m"] == pytest.approx(0.15, abs=0.02)  # from the forearm's centre of mass
-    assert abs(values["y_link6_m"]) < 2e-3, "the elbow turns about y"
+    assert values["x_m"] == pytest.approx(0.15, abs=0.02)  # from the forearm's centre of mass
+    assert abs(values["y_m"]) < 2e-3, "the elbow turns about y"
     assert "forearm" in elbow.remark
     assert [e.name for e in yaw.diagnosis.effects] == ["command_delay"]
     low, high = yaw.diagnosis.intervals["command_delay.delay_s"]
     assert low < DELAY_S < high and high - low < 5e-3
     assert yaw.diagnosis.errors["after"]["validation"] < 0.2 * alone.errors["after"]["validation"]
     assert any("elbow" in r for r in yaw.diagnosis.remarks)
-    assert not any("effort_scale" in r for r in yaw.diagnosis.remarks)
+    assert "effort_scale" not in [c.name for c in yaw.diagnosis.changed]
 
     mended, left = arm.mended([yaw, elbow])
     assert left == "" and {*mended.effects} - {"speed_delay"} == {
@@ -183,11 +195,11 @@ def test_one_body_has_one_payload(tmp_path: Path) -> None:
     held_at_elbow = arm.with_additions(held[1:])
     assert held_at_elbow.effect("payload", "yaw", {"mass_kg": 0.1}) is None, "yaw feels the elbow's"
     # Bounds of a search follow the robot: half of 0.15 + 0.1 m of links, or twice 0.1 m from the elbow to the centre of mass.
-    payload = arm.effect("payload", "elbow", {"mass_kg": 0.1, "x_link6_m": 0.18})
+    payload = arm.effect("payload", "elbow", {"mass_kg": 0.1, "x_m": 0.18})
     assert payload is not None
     ends = {p.name: (p.low, p.high) for p in payload.parameters()}
-    assert ends["x_link6_m"] == (-0.2, 0.2) and ends["mass_kg"] == (0.0, 1.5)
-    assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(Payload) == {"y_link6_m": 0.0}
+    assert ends["x_m"] == (-0.2, 0.2) and ends["mass_kg"] == (0.0, 1.5)
+    assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(Payload) == {"y_m": 0.0}
 
 
 TEACH_KG, TEACH_AT_M = 0.15, (0.02, -0.01, 0.03)
@@ -246,7 +258,7 @@ def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
     assert added[owner] == ["payload"]
     assert all(f.diagnosis.errors["after"]["validation"] < 1.2 for f in found)
     (payload,) = [e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)]
-    true = {"mass_kg": TEACH_KG, "x_link6_m": TEACH_AT_M[0], "z_link6_m": TEACH_AT_M[2]}
+    true = {"mass_kg": TEACH_KG, "x_m": TEACH_AT_M[0], "z_m": TEACH_AT_M[2]}
     for name, value in true.items():
         low, high = payload.interval[name]
         assert low <= value <= high and low <= getattr(payload, name) <= high, name
@@ -289,9 +301,9 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
     for axis, at_m in zip(
         "xy", SCARA_AT_M[:2], strict=True
     ):  # hardly determined: the inertia also hangs on the loops' timing
-        low, high = payload.interval[f"{axis}_link6_m"]
+        low, high = payload.interval[f"{axis}_m"]
         assert low <= at_m <= high
-    assert payload.z_link6_m == 0.0 and "z_link6_m" not in payload.interval, "no vertical axis feels its height"
+    assert payload.z_m == 0.0 and "z_m" not in payload.interval, "no vertical axis feels its height"
     assert not lift.diagnosis.rivals.get("payload")
     assert elbow.diagnosis.errors["after"]["validation"] < 1.2 and not elbow.diagnosis.names
     assert any("torque_ff of lift" in text for text in lift.diagnosis.remarks)

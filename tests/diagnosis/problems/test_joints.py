@@ -24,7 +24,6 @@ from taccorl.diagnosis.problems.joints import (
     of_joints,
     set_numbers,
     swept_joints,
-    with_intervals,
 )
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
@@ -57,19 +56,6 @@ def sweeps(signal: str = SIGNAL, torque_nm: float = TRUTH_NM, stated: bool = Tru
 @pytest.fixture(scope="module")
 def finding() -> JointFinding:
     return diagnose_joint(TwinConfig(), SIGNAL, sweeps(stated=False), search=ONE, without=WITHOUT)
-
-
-@pytest.mark.parametrize(
-    ("factor", "interval", "said"), [(1.49, (1.34, 1.66), True), (1.49, (0.9, 2.4), False), (1.1, (1.09, 1.11), False)]
-)
-def test_efforts_that_fit_only_with_a_factor_are_remarked(finding, factor, interval, said):
-    d = dataclasses.replace(
-        finding.diagnosis,
-        base={**finding.diagnosis.base, "effort_scale": factor},
-        intervals={**finding.diagnosis.intervals, "effort_scale": interval},
-    )
-    remarks = [r for r in with_intervals(d, finding.known).remarks if "effort_scale" in r]
-    assert bool(remarks) == said and all(f"{factor:g}" in r for r in remarks)
 
 
 # which joints ----------------------------------------------------------------------------------------------------------

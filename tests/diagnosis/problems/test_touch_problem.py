@@ -10,7 +10,7 @@ from made_press import K_D, K_N, Law, ball_at, plain, press
 
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.diagnosis.problems.pads import gain_words, unjudged_gains
-from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, TouchProblem, _noise_gain, _repeat_floor
+from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, TouchProblem, _noise_gain, _repeat_floor, odd_cells
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.problem import Problem, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
@@ -311,6 +311,17 @@ def test_gains_that_no_validation_recording_can_judge_are_named_by_their_statist
     words = gain_words(gains, made.not_shared)
     assert "dead_taxels" in words and "taxel_gain_spread" in words and "press_3 presses other taxels" in words
     assert "excite --pads: rod_across" in words
+
+
+def test_dead_and_odd_cells_are_named_by_pad_row_and_column() -> None:
+    """Gains of a twentieth, 1.9 and 1.05 among such of 1 ± 0.05; what nothing pressed has 1."""
+    gains = np.ones((2, 32, 12))
+    gains[:, 4:20, 2:9] += 0.05 * np.random.default_rng(0).standard_normal((2, 16, 7))
+    gains[0, 5, 7], gains[1, 10, 3], gains[1, 11, 3] = 0.05, 1.9, 1.05
+    dead, odd = odd_cells(gains, ("left_a", "left_b")).split("; ")
+    assert dead == "left_a: 1 taxel (row, column): (5, 7) read nothing"
+    assert odd.startswith("left_b: 1 taxel (row, column): (10, 3) read 1.9 times")
+    assert odd_cells(np.ones((2, 32, 12)), ("left_a", "left_b")) == ""
 
 
 def test_no_statistics_are_named_where_nothing_is_left_over() -> None:

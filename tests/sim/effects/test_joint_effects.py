@@ -97,7 +97,7 @@ def test_a_payload_sags_every_joint_by_its_moment_over_the_stiffness(centre: tup
     mujoco.mj_jac(model, data, jacobian, None, point, model.body("right_link6").id)
     dofs = [model.joint(f"right_joint{k}").dofadr[0] for k in range(1, 7)]
     expected = -0.3 * GRAVITY * jacobian[2, dofs] / np.array(ROBOT.kp_nm_per_rad)
-    keys = ("x_link6_m", "y_link6_m", "z_link6_m")
+    keys = ("x_m", "y_m", "z_m")
     loaded = start(make_effect("payload", mass_kg=0.3, arm="right", **dict(zip(keys, centre, strict=True))))
     drive(loaded, 1.5)
     sag = loaded.proprioception()[0, 7:13] - RIGHT_HOME
