@@ -234,9 +234,9 @@ def test_another_rate_than_the_file_says_is_an_error_and_can_be_accepted(tmp_pat
 def test_the_cell_at_fault_is_named_and_no_fit_recording_is_called_sound(tmp_path: Path, said) -> None:
     (tmp_path / "taxel.yaml").write_text(SENSOR.replace("[thumb]", "[thumb, index]"))
     for name in ("one.csv", "two.csv"):
-        table(tmp_path / "presses", name, index__reading=np.full(len(T_S), 7.0))
+        table(tmp_path / "presses", name, index__reading=np.where(LOAD_N > 0.5, 1023, 20))
     code, shown = said("compare", "presses", "--twin=taxel.yaml")
-    lines = [line for line in shown.splitlines() if "no_reading" in line]
+    lines = [line for line in shown.splitlines() if "saturated" in line]
     assert code == 1 and len(lines) == 1 and "1 more" in lines[0], shown
     assert "index" in lines[0] and "thumb" not in lines[0]
     assert not any(line.startswith("ok") for line in shown.splitlines())

@@ -139,7 +139,7 @@ def _together(s: CellSet, exchanged: set[int]) -> Iterator[Finding]:
             )
             yield find("saturated", name, text)
         elif use.sum() < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
-            if loaded.any():
+            if loaded.any() and not s.dead[k]:  # which is a warning where others respond
                 text = (
                     f"{name}: the reading never changes under load: a broken wire, or the column of another channel; the search "
                     "leaves such a cell out with --accept=no_reading"

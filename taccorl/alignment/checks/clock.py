@@ -53,8 +53,8 @@ HALF_ROW_MOST = 0.75
 LEAD_ROWS = 0.3
 """Least lead that is reported [rows]; a smaller one can be an error of the fit."""
 HIDDEN = 3.0
-"""A lead is ignored if it alone would leave so many times what measurement and replay differ by: other numbers would have to hide
-it. A choice."""
+"""A shift is ignored if it alone would leave so many times what measurement and replay differ by: other numbers would have to
+hide it. A choice."""
 BETTER = 0.9
 """A lead is an offset of the clock if a shift leaves less than this share of what an effect of the drive leaves. Of simulated
 joints with stated gains that led by one row it left 0.27 to 0.85 of what velocity_feedforward left, and 1.6 to 15 times as much
@@ -334,10 +334,9 @@ def check_against_twin(
             why = f"look for the missing effect first, which leaves {plain.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
             findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
+        elif name not in uncertain and _would_leave(shift, period_s) > HIDDEN * np.nanstd(rows[1] - rows[2]):
+            continue
         elif _leads(shift, period_s):
-            would_leave = abs(shift.delay_s) / period_s * shift.row_rms
-            if name not in uncertain and would_leave > HIDDEN * np.nanstd(rows[1] - rows[2]):
-                continue
             effects = {} if name in uncertain else rivals(name)
             rival = _rival(*rows[1:], plain, effects)
             findings.append(_led(m, name, plain if is_plain and plain.delay_s < 0 else shift, rival, name in uncertain))
@@ -373,6 +372,10 @@ def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Fin
         return dataclasses.replace(f, severity="warning", text=f"{f.text.partition('): ')[0]}), {why}")
 
     return {n: tuple(said(f) for f in own if f.check != UNDECIDED or f.feature not in same) for n, own in clock.items()}
+
+
+def _would_leave(shift: Shift, period_s: float) -> float:
+    return abs(shift.delay_s) / period_s * shift.row_rms
 
 
 def _size(shift: Shift, period_s: float) -> str:

@@ -142,7 +142,7 @@ def _read_csv(
             rows = csv.reader(lines, delimiter=SEPARATORS[separator], strict=True)
             header = [cell.strip() for cell in next(rows, [])]
             if not header:
-                raise RecordingError(f"{path}: is empty")
+                raise RecordingError(f"{path}: is empty; remove it, or copy it again")
             if any("\0" in cell for cell in header):
                 raise RecordingError(
                     f"{path}:{first + 1}: has bytes of 0, as UTF-16 without a byte order mark; write `encoding: utf-16-le` (or "
@@ -160,12 +160,12 @@ def _read_csv(
                 if not row:
                     continue
                 if len(row) != len(header):
-                    hint = (
-                        "; decimal commas where commas part the columns? Save it with `;` between columns, with `separator: "
-                        "semicolon` and `decimal: comma` in a columns file"
-                        if separator == "comma" and len(row) > len(header)
-                        else ""
-                    )
+                    hint = "; cut off while it was written? Remove the row, or copy the file again"
+                    if separator == "comma" and len(row) > len(header):
+                        hint = (
+                            "; decimal commas where commas part the columns? Save it with `;` between columns, with `separator: "
+                            "semicolon` and `decimal: comma` in a columns file"
+                        )
                     raise RecordingError(
                         f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}{hint}"
                     )
