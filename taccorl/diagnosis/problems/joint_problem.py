@@ -309,7 +309,9 @@ def seen_in(
 ) -> dict[str, float]:
     """Scales of recordings, from which fits of effects begin. ``asked``: (T,) positions [rad, m] that each drive aims at."""
     speeds = [np.abs(np.gradient(q, 1.0 / m.rate_hz)).max() for q, m in zip(asked, motions, strict=True)]
+    measured = np.abs(np.concatenate([m.effort for m in motions]))
     return {
+        **({"peak_measured_nm": float(np.nanmax(measured))} if np.isfinite(measured).any() else {}),
         "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
         "peak_speed_rad_per_s": float(max(speeds)),
         "span_rad": max(float(np.ptp(q)) for q in asked),

@@ -259,10 +259,14 @@ class Fits:
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
         """``parent`` with one effect more, after a few steps for each of its numbers; from where the numbers began if those of
-        ``parent``, which have made up for the effect, do not go with it."""
+        ``parent``, which have made up for the effect, do not go with it, or went to an end of their range and are far off."""
         steps = FIRST_STEPS * max(sum(not f.optional for f in self.problem.candidates[name].frees), 1)
         model = self.fitted((*parent.names, name), [start], steps)
         more = [start | self.given] * (model.error > STUCK * parent.error)
+        if parent.at_an_end and model.error > FAR_OFF:
+            own = self.problem.candidates[name]
+            starts = [{f.name: f.start for f in own.frees} | one | self.given for one in own.starts]
+            more.append(self.fitted((*parent.names, name), [parent.values | one for one in starts], 1).values)
         # At a whole row a delayed target comes before that row's effort is measured, or after it: the error jumps there.
         row_s = min(float(np.median(np.diff(r.time_s))) for r in self.fit_to)
         for delay in [f.name for f in self.problem.candidates[name].frees if f.name.endswith(".delay_s")]:

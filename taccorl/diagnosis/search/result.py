@@ -246,9 +246,10 @@ class Diagnosis:
 
     @property
     def baseline(self) -> Literal["before", "fitted"]:
-        """Key of ``errors`` with which the result is compared: the smaller validation error without the added effects."""
-        before, fitted = (self.errors[stage]["validation"] for stage in ("before", "fitted"))
-        return "before" if before < fitted else "fitted"
+        """Key of ``errors`` with which the result is compared: the smaller validation error without the added effects. What
+        hardly acts in validation recordings lowers only that of the refit."""
+        before, fitted, after = (self.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
+        return "fitted" if fitted <= before or (self.names != self.present and 0.9 * before < after) else "before"
 
     @property
     def words(self) -> str:

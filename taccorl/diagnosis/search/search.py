@@ -41,6 +41,8 @@ GAINS_MOVED = 2.0
 wrong unit of time, or gains other than the commanded ones."""
 SCALE_OFF = 1.15
 """Least factor on efforts that is a finding where gains are stated, so that it is fitted in any case. A choice."""
+MOST, HARDLY = 0.5, 0.05
+"""Share of the squared fit error, and change of the validation error, below which effects act in the fit recordings alone."""
 EXCHANGES = 4
 """Most times that the best model is exchanged for a better one with one effect another; a choice, two were seen."""
 
@@ -234,10 +236,18 @@ class Beam:
             _, name, answer = min(gone, key=lambda item: item[:2])
             removed.append(name)
         as_it_was = fits.model_of(fits.as_it_was)
-        if parts and as_it_was.squares.mean < fits.base.squares.mean and refusal(last, as_it_was, c):
+        worse = as_it_was.squares.mean < fits.base.squares.mean and refusal(last, as_it_was, c)
+        if parts and worse and not self._acts_in_fit_alone(last):
             removed += [n for n, _ in parts]  # they only undo what the refit of the always fitted numbers made worse
             return fits.model_of(fits.finished(fits.base.fit)), removed, []
         return last, removed, [text for n, p in parts if (text := self._entangled(last, n, p))]
+
+    def _acts_in_fit_alone(self, model: Model) -> bool:
+        """Whether the added effects remove most of the fit error, and do nothing in the validation recordings: a limit."""
+        fits, fit = self.fits, model.fit
+        kept = tuple(e for e in fit.effects if e.name in fits.present)
+        error = fits.errors(fit.values, kept, ())["validation"]
+        return fit.error**2 < MOST * fits.base.fit.error**2 and abs(error / model.error - 1.0) < HARDLY
 
     def _entangled(self, model: Model, name: str, without: Model) -> str:
         """Sentence on an effect whose strength is not known, although it removes much of the error; empty if it is known."""
@@ -400,7 +410,7 @@ def _described(fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: 
     test error: before and after if it is the only one, else without and with it."""
     intervals = model.intervals()
     as_it_was, after = fits.error(fits.as_it_was), fits.error(model)
-    stage = "fitted" if fits.added(model) and fits.base.error <= as_it_was else "before"
+    stage = "fitted" if fits.added(model) and (fits.base.error <= as_it_was or 0.9 * as_it_was < after) else "before"
     before = fits.base.error if stage == "fitted" else as_it_was
     for effect in model.effects:
         prefix = f"{effect.name}."

@@ -259,9 +259,10 @@ class TorqueSaturation(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search, parameter → value each: 55 to 97 % of the largest commanded torque."""
+        """Start values of a search, parameter → value each: 55 to 97 % of the largest commanded torque; the largest measured."""
         peak_nm = seen.get("peak_motor_nm", seen["peak_torque_nm"])
-        return [{"torque_max_nm": cls.clipped("torque_max_nm", s * peak_nm)} for s in (0.55, 0.75, 0.88, 0.97)]
+        values = [s * peak_nm for s in (0.55, 0.75, 0.88, 0.97)] + [seen[n] for n in ("peak_measured_nm",) if n in seen]
+        return [{"torque_max_nm": cls.clipped("torque_max_nm", value)} for value in values]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
@@ -309,8 +310,7 @@ class TorqueSpeedLimit(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search, parameter → value each: stall torques near the largest commanded torque, no-load speeds
-        near the largest commanded speed."""
+        """Start values of a search: stall torques near the largest commanded torque, no-load speeds near the largest speed."""
         peak_nm, fastest = seen.get("peak_motor_nm", seen["peak_torque_nm"]), seen["peak_speed_rad_per_s"]
         ends = (("stall_nm", peak_nm), ("no_load_rad_per_s", fastest))
         pairs = ((0.7, 2.0), (1.3, 1.3), (3.0, 1.1), (1.3, 0.85))

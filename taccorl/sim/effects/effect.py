@@ -248,8 +248,8 @@ class Effect:
         By default a third of, equal to and three times the typical strength, with both signs if the parameter has two; for a
         torque 3, 10 and 30 % of the largest commanded torque. ``seen``: facts of the recordings on which start values may
         depend. Of joints: ``peak_torque_nm`` that the twin's controller commands, ``peak_motor_nm`` including gravity
-        compensation, ``peak_speed_rad_per_s`` of the targets, ``span_rad`` of the targets, ``lowest_rad`` and
-        ``highest_rad`` that were measured, ``duration_s``."""
+        compensation, ``peak_measured_nm`` of efforts, ``peak_speed_rad_per_s`` and ``span_rad`` of the targets,
+        ``lowest_rad`` and ``highest_rad`` that were measured, ``duration_s``."""
         strength, absent = next((p, p.absent) for p in cls.parameters() if p.absent is not None)
         if not math.isfinite(absent):
             return [{}]
