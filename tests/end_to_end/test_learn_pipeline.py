@@ -18,7 +18,7 @@ from taccorl.sim.twin_file import load_twin
 @pytest.mark.timeout(900)
 def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--episodes=[1,2]", "--sources=[0,2]"]
-    less, done, _, many = learn.main(words)
+    less, done, *_ = learn.main(words)
     dataset = Dataset(done.dataset)
     stored = dataset.num_episodes, dataset.rows_per_picture, len(dataset.unstored)
     assert stored == (2, 3, 3)  # three cameras whose frames are in the cache alone
@@ -36,7 +36,6 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     ]
     made = ("1", "2", "1 of 2 sources", "2 of 2 sources")
     assert [(row[2], row[6], row[8]) for row in rows] == [(n, "8", "0 of 2") for n in made]
-    assert json.loads((many.scores[0] / "settings.json").read_text())["sources"] == 2
     commands: list[str] = []
     monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))

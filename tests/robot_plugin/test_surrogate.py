@@ -247,7 +247,7 @@ def test_names_units_zero_and_order_are_those_of_the_data_spec(tmp_path: Path) -
     pads = seen["tactile"].newest.reshape(4, 384)
     assert pads[0].min() > 150 and np.abs(pads[1:]).max() <= 8
     shown = np.split(seen["tactile"].picture().astype(int).sum(axis=2), 4, axis=1)  # a pad each, in Rerun's live view
-    assert shown[0][25:200, 8:70].min() > 2 * shown[1][25:200, 8:70].max()
+    assert shown[0][25:200, 8:70].min() > 1.5 * shown[1][25:200, 8:70].max()  # which is noise
     assert robot.robot_type == spec.robot_type
 
 
