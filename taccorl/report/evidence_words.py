@@ -60,8 +60,8 @@ def _to_mark(use: str, short: Mapping[str, Sequence[str]] | None) -> str:
 
 
 def may_be_two(d: Diagnosis) -> str:
-    """Text on added effects that may stand for two: a near-twin with fewer numbers removes ``MOST_OF_IT`` of what it does, so
-    that this and another effect may, too; empty if there are none. The search itself tries those of ``Effect.reduces_to``."""
+    """Sentence on an added effect in whose place two simpler ones may act, as a near-twin with fewer numbers removes the share
+    ``MOST_OF_IT`` of the error that it removes; empty if there is none. The search itself tries ``Effect.reduces_to``."""
     for found in d.rounds:
         cls = effect_class(found.added) if found.added in d.names else None
         if cls is None:

@@ -167,8 +167,8 @@ def _events(
 def _pursued(
     target: np.ndarray, e: np.ndarray, sigma: np.ndarray, w: np.ndarray, changed: np.ndarray
 ) -> tuple[Events, Events, dict[int, np.ndarray]]:
-    """As ``_events``, by matching pursuit, in the order of rows; an event's amplitude is fixed by the commands. ``e``, ``sigma``:
-    (T,) whitened residual and its standard deviation. ``w``: (L,) response of e to the applied target."""
+    """Find lost and late commands by matching pursuit, in the order of rows; the commands fix each one's amplitude. ``e``: (T,)
+    whitened residual, ``sigma``: its standard deviation, ``w``: (L,) response of ``e`` to the applied target."""
     lengths = np.array(HOLDS) * int(np.median(np.diff(changed)))
     auto = np.correlate(w, w, "full")[len(w) - 1 :]
     auto = np.pad(auto, (0, max(0, int(lengths[-1]) - len(auto))))

@@ -131,8 +131,8 @@ def held_up(m: Measurement) -> list[str]:
 
 
 def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
-    """A trace for each signal that is compared and was measured, and one for its effort if that was recorded. ``floors``: kind →
-    signal → noise floor; signals without one are left out."""
+    """Measured and replayed values over time: one trace for each compared signal, one for its effort if recorded. ``floors``:
+    kind → signal → noise floor; signals without one are left out."""
     touched = in_contact(response.measurement)
     found = []
     even = response.measurement

@@ -236,8 +236,8 @@ class Machine(ABC):
         the message states what to record."""
 
     def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
-        """Those of ``parts`` that ``--joints`` and ``--pads`` name; all if neither is given. Raises TaccorlError: a name is not
-        among them."""
+        """Parts of the machine that ``--joints`` and ``--pads`` name; all ``parts`` if neither is given. Raises TaccorlError: the
+        machine has no part of that name."""
         if pads:
             raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; remove --pads")
         known = [*self.units] or parts

@@ -149,7 +149,7 @@ def test_of_a_mass_that_takes_no_force_nothing_is_claimed_and_the_friction_is_fo
 def test_a_wrong_torque_constant_is_told_from_a_wrong_mass_where_friction_is_known(
     slide: Measurements, known: tuple[str, ...], mass_kg: float, scale: float, off: dict[str, float], instead: tuple
 ):
-    """Efforts times 1.2 are those of 1.2 times the mass, the gains, and the friction, unless that one is known."""
+    """Efforts read 1.2 times too large fit 1.2 times the mass, gains and friction as well, unless the friction is known."""
     friction = (EffectEntry("coulomb_friction", {"torque_nm": FRICTION_N}),)
     axis = dataclasses.replace(AXIS, inertia=mass_kg, effects=friction, known=known)
     fit, validation = (

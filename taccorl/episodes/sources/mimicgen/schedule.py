@@ -23,8 +23,8 @@ class ConstraintSpec:
     """Two of (arm, index of its subtask from 0); for a sequence the former first."""
     constraint_type: Literal["sequential", "coordination"]
     coordination_scheme: Literal["replay", "transform"] = "replay"
-    """How both arms repeat one source demonstration. replay: as it was recorded; transform: moved by as much as the object of the
-    subtask that begins first lies elsewhere in the new scene."""
+    """How both arms repeat one source demonstration. replay: as it was recorded; transform: moved by the displacement of the
+    object of the subtask that begins first, from the source's scene to the new one."""
     coordination_synchronize_start: bool = False
     """True: both begin together, at the later of their first rows in the source. False: only their ends run together."""
 
