@@ -6,7 +6,7 @@ now() { echo $(($(date +%s) - $(cat /dev/shm/t0))); }
 echo "from $(now) s"
 while [ "$(now)" -lt "$1" ] && [ ! -e /dev/shm/done ]; do sleep 1; done
 cd /dev/shm || exit 1
-for policy in learn_*/assembly_1/policy_*/checkpoints/0*/pretrained_model; do # not last, a link to one of these
+for policy in learn_*/*/policy_*/checkpoints/0*/pretrained_model; do # not last, a link to one of these
   if [ -e "$policy/model.safetensors" ] && ! grep -qs "$policy" fetched && [ $(($(date +%s) - $(stat -c %Y "$policy/model.safetensors"))) -gt 10 ]; then
     echo "$policy" >>fetched
     python3 - "$policy" "$OUT" <<'P'
@@ -30,9 +30,9 @@ tar czf "$OUT/scores.tgz" --ignore-failed-read $(find learn_* -path '*score_*' \
   $(find learn_* -name scores.md -o -name progress.jsonl) ./*.log times study.jsonl
 cat times
 tail -qn 1 made_*.log
-for log in learn_*/assembly_1/policy_*.log; do echo "$log $(tail -c 120 "$log" | tr '\r' '\n' | tail -n 1)"; done
-tail -qn 1 learn_*/assembly_1/policy_*/score*.log
-grep -h '^| assembly' learn_*.log
+for log in learn_*/*/policy_*.log; do echo "$log $(tail -c 120 "$log" | tr '\r' '\n' | tail -n 1)"; done
+tail -qn 1 learn_*/*/policy_*/score*.log
+grep -hE '^\| (assembly|test_tube|puzzle)' learn_*.log
 tail -n 1 study.log
 uptime
 nvidia-smi --query-gpu=memory.used,utilization.gpu --format=csv,noheader

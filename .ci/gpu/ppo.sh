@@ -3,7 +3,8 @@
 # outputs/ppo_K carried, `mkdir -p /dev/shm/ppo && cp outputs/ppo_K/* /dev/shm/ppo`; then
 # setsid bash .ci/gpu/ppo.sh SURROGATE SECOND > /dev/shm/job.log 2>&1 < /dev/null &
 # PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
-# clock; then start and result are scored in the surrogate.
+# clock; then start and result are scored in the surrogate. `TASK=assembly_2 bash .ci/gpu/ppo.sh nominal SECOND`: of $POLICIES/nominal,
+# in the nominal twin alone.
 if [ "$1" = pack ]; then
   mkdir -p outputs/ppo_{1,2,3}
   ln -sfn "$(realpath "$2")" outputs/ppo_1/nominal && ln -sfn "$(realpath "$3")" outputs/ppo_1/mended
@@ -13,41 +14,49 @@ if [ "$1" = pack ]; then
   exit
 fi
 . /dev/shm/env.sh
-name=$1 end=$2 policies=${POLICIES:-/dev/shm/policies}
-robot=configs/surrogates/$name.yaml threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
+name=$1 end=$2 task=${TASK:-assembly_1} policies=${POLICIES:-/dev/shm/policies}
+if [ "$name" = nominal ]; then
+  robot='' scored_in=() runs=("nominal ppo")
+else
+  robot=configs/surrogates/$name.yaml
+  scored_in=(--twin="$robot") runs=("nominal ppo" "nominal ppo_anchored" "mended ppo" "mended ppo_anchored")
+fi
+threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
 scored=${SCORED:-192} demonstrations=${DEMONSTRATIONS:-50} options=(${OPTIONS:-})
 quarter=$((threads / gpus))
 since() { echo "$1 $(($(date +%s) - $(cat /dev/shm/t0)))" >>/dev/shm/times; }
 since start
 if [ -e /dev/shm/ppo ]; then mkdir -p "$policies" && cat /dev/shm/ppo/* | python3 -c "import sys, tarfile, zstandard
 tarfile.open(fileobj=zstandard.ZstdDecompressor().stream_reader(sys.stdin.buffer), mode='r|').extractall('$policies', filter='data')"; fi
-python3 -c "import sys
+if [ -n "$robot" ]; then
+  python3 -c "import sys
 from pathlib import Path
 from pipelines.learn import LearnConfig, demonstrations, parsed
-demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), 'assembly_1', Path('$robot'))" --task=assembly_1 --episodes="$demonstrations" \
-  --scored_in=["$robot"] --out=/dev/shm/anchor --workers="$threads" >/dev/shm/made_anchor.log 2>&1
-since "anchor made: $?"
+demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), '$task', Path('$robot'))" --task="$task" --episodes="$demonstrations" \
+    --scored_in=["$robot"] --out=/dev/shm/anchor --workers="$threads" >/dev/shm/made_anchor.log 2>&1
+  since "anchor made: $?"
+fi
 improve() { # NUMBER TWIN STAGE
-  out=/dev/shm/learn_ppo/assembly_1/policy_$2_$3 twin=() first=$(($1 % gpus * quarter))
+  out=/dev/shm/learn_ppo/$task/policy_$2_$3 twin=() first=$(($1 % gpus * quarter))
   local cores=$first-$((first + quarter - 1))
   if [ "$2" = mended ]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
   if [ "$3" = ppo_anchored ]; then
-    anchor=(--anchor.dataset="$(echo /dev/shm/anchor/assembly_1/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store)
+    anchor=(--anchor.dataset="$(echo /dev/shm/anchor/$task/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store)
   else
     anchor=(--anchor.weight=0)
   fi
   export CUDA_VISIBLE_DEVICES=$(($1 % gpus))
   mkdir -p "$(dirname "$out")"
   taskset -c "$cores" timeout -s TERM $((end - $(date +%s) + $(cat /dev/shm/t0))) python3 -m taccorl.cli.main post-train \
-    --config_path=configs/post_train/small.yaml --policy.path="$policies/$2" --env.task=assembly_1 --env.shards="$quarter" \
+    --config_path=configs/post_train/small.yaml --policy.path="$policies/$2" --env.task="$task" --env.shards="$quarter" \
     --save_freq=5 --keep_checkpoints=1 --rerun=false "${twin[@]}" "${anchor[@]}" "${options[@]}" --out="$out" >"$out.log" 2>&1
   since "$2 $3 ended: $?"
   for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
     stage=$([ "$scored_of" = "$policies/$2" ] && echo start || echo "$3")
     score=$out/score_${scored}_train_8_clear_nothing_$stage
     if [ "$3" = ppo ] || [ "$scored_of" != "$policies/$2" ]; then
-      OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task=assembly_1 \
-        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 --twin="$robot" --batch_size=64 --workers=$(((quarter + 1) / 2)) --failures=0 \
+      OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task="$task" \
+        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=$(((quarter + 1) / 2)) --failures=0 \
         --out="$score" >"$score.log" 2>&1
       since "$2 $3 scored: $?"
       python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" <<'P'
@@ -58,14 +67,14 @@ from pipelines.learn import named
 
 learnt, robot, score, stage = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
 of, twin = re.fullmatch(r"train_(\d+)_20_steps_?(.*)", Path(learnt["dataset"]["root"]).name).groups()
-about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin, "scored_in": named(Path(robot)), "steps": learnt["steps"]}
+about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin, "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
 (Path(score) / "settings.json").write_text(json.dumps(about | {"stage": stage}))
 P
     fi
   done
 }
-for k in 0 1 2 3; do
-  improve $k "$([ $k -lt 2 ] && echo nominal || echo mended)" "$([ $((k % 2)) = 0 ] && echo ppo || echo ppo_anchored)" &
+for k in "${!runs[@]}"; do
+  improve "$k" ${runs[k]} &
 done
 wait
-touch /dev/shm/done
+if [ -n "$robot" ]; then touch /dev/shm/done; fi # the nominal one runs beside learn.sh
