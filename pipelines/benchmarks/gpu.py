@@ -6,7 +6,7 @@ Needs the extra gpu. Without CUDA a few worlds run on Warp's CPU device, to try 
 import importlib.util
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from statistics import median
 from typing import Any
@@ -30,6 +30,8 @@ STEPS = 20
 """Physics steps within a control step."""
 ACTIONS = 8
 """Control steps of one measurement: a chunk."""
+SIZE = (112, 112)
+"""Rows and columns of a picture."""
 SHIFT_RAD = 0.02
 """Targets move by this within a chunk, so that contacts work."""
 _CPUS = len(os.sched_getaffinity(0))
@@ -37,7 +39,7 @@ _CPUS = len(os.sched_getaffinity(0))
 
 @benchmark("physics_on_gpu")
 def physics_on_gpu() -> Iterator[Row]:
-    """Benchmark of control steps with parts in both hands: physics, touch, predicates, no pictures; and of the physics alone."""
+    """Benchmark of control steps with parts in both hands, of those with three pictures a chunk, and of the physics alone."""
     if importlib.util.find_spec("mujoco_warp") is None:
         print('  physics_on_gpu needs the extra gpu (pip install ".[gpu]"): nothing measured')
         return
@@ -52,6 +54,11 @@ def physics_on_gpu() -> Iterator[Row]:
         yield from _agreement(envs, on_cpu, held, targets, where)
         for what, one, goal_text in (
             ("physics, touch and predicates", _whole_s, "≥ 3" if on_gpu else ""),
+            (
+                f"physics, touch, predicates and three pictures of {SIZE[0]}² a chunk",
+                _pictured_s,
+                "≥ 2.5" if on_gpu else "",
+            ),
             ("physics alone", _physics_s, ""),
         ):
             turns = [(one(envs, held, targets), one(on_cpu, held, targets)) for _ in range(1 + REPEATS)][1:]
@@ -66,11 +73,6 @@ def physics_on_gpu() -> Iterator[Row]:
             yield Row.of(
                 [num * ACTIONS / ours for ours, _ in turns], name=f"{where}: {what}", unit="control steps/s (wall)"
             )
-        for what, one in (
-            ("touch", lambda envs=envs: envs.sim.touch()),
-            ("predicates", lambda envs=envs: _judge(envs)),
-        ):
-            yield Row.of([1e3 * t for t in _wall_s(one)], name=f"{where}: {what}, once", unit="ms (wall)")
         envs.close()
     on_cpu.close()
 
@@ -83,7 +85,7 @@ def _moving(goal: np.ndarray) -> np.ndarray:
 
 
 def _environments(twin: TwinConfig, held: Snapshot, physics: str, num: int) -> TaccorlVectorEnv:
-    envs = TaccorlVectorEnv("assembly_1", num, twin=twin, physics=physics, num_threads=_CPUS)
+    envs = TaccorlVectorEnv("assembly_1", num, twin=twin, physics=physics, num_threads=_CPUS, images="on_request")
     envs.reset(seed=0)
     _place(envs, held)
     return envs
@@ -109,6 +111,14 @@ def _whole_s(envs: TaccorlVectorEnv, held: Snapshot, targets: np.ndarray) -> flo
     return time.perf_counter() - before
 
 
+def _pictured_s(envs: TaccorlVectorEnv, held: Snapshot, targets: np.ndarray) -> float:
+    """As ``_whole_s``, and the three pictures of each environment after the chunk."""
+    took = _whole_s(envs, held, targets)
+    before = time.perf_counter()
+    envs.sim.render(size=SIZE)
+    return took + time.perf_counter() - before
+
+
 def _physics_s(envs: TaccorlVectorEnv, held: Snapshot, targets: np.ndarray) -> float:
     """As ``_whole_s``, without touch, predicates and sub-commands, and without copies of what has been computed."""
     _place(envs, held)
@@ -118,19 +128,6 @@ def _physics_s(envs: TaccorlVectorEnv, held: Snapshot, targets: np.ndarray) -> f
         ctrl[:, envs.sim.action_actuators] = actions[:, k]
         envs.sim.batch.step(nstep=STEPS)
     return time.perf_counter() - before
-
-
-def _judge(envs: TaccorlVectorEnv) -> None:
-    envs.sim.judge.update(envs.sim, None)
-
-
-def _wall_s(work: Callable[[], object]) -> list[float]:
-    times = []
-    for _ in range(1 + REPEATS):
-        before = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - before)
-    return times[1:]
 
 
 def _agreement(
