@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from joint_bench import COLUMN, asked_nm, drive, on_joint5
-from press_bench import start
+from press_bench import RIGHT_HOME, start
 
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
@@ -15,6 +15,16 @@ def test_the_constant_part_of_asymmetric_friction_is_not_the_motors() -> None:
     sim = start(on_joint5("asymmetric_friction", torque_nm=0.5, asymmetry=0.3))
     motion = drive(sim, 1.0, lambda t: 0.05 * t)
     assert sim.effort()[0, COLUMN] == pytest.approx(asked_nm(motion)[-1], abs=1e-9)
+
+
+@pytest.mark.parametrize("balanced", [True, False])
+def test_integral_action_has_balanced_what_acts_on_a_joint_at_its_target(balanced: bool) -> None:
+    half = make_effect("gravity_mismatch", share=0.5, arm="right")
+    sim = start(half, *[on_joint5("integral_action", rate_per_s=2.0)] * balanced)
+    joints = sim.proprioception()[0].copy()
+    sim.place_arms(joints, joints)
+    moved = np.abs(drive(sim, 0.5)["q"] - RIGHT_HOME[4]).max()
+    assert moved < 1e-4 if balanced else moved > 1e-3  # the other joints sag a little, and change its load
 
 
 SEEN = {"peak_torque_nm": 4.0, "peak_speed_rad_per_s": 0.8, "span_rad": 1.5, "duration_s": 10.0}

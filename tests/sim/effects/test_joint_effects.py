@@ -22,6 +22,12 @@ def test_delays_reach_grippers_too() -> None:
     assert openings[-1] < openings[0] - 0.005
 
 
+def test_a_gravity_mismatch_of_one_arm_leaves_the_other_where_it_was() -> None:
+    sim = start(make_effect("gravity_mismatch", share=0.8, arm="right"))
+    drive(sim, 0.5)
+    np.testing.assert_allclose(sim.proprioception()[0, :6], start().proprioception()[0, :6], atol=1e-9)
+
+
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.1), (0.08, -0.05, 0.15)])
 def test_a_payload_sags_every_joint_by_its_moment_over_the_stiffness(centre: tuple[float, float, float]) -> None:
     sim = start()

@@ -54,6 +54,12 @@ def balance(torque_nm: Callable[[float], float], goal: float) -> float:
         ({"cable_spring": {"stiffness_nm_per_rad": 5.0, "rest_rad": -0.4}}, 0.0, lambda q: 5.0 * (q + 0.4), 1e-6),
         ({"unbalance": {"torque_nm": 3.0, "hangs_at_rad": -0.8}}, 0.0, lambda q: 3.0 * np.sin(q + 0.8), 1e-6),
         (
+            {"end_stop": {"angle_rad": HOME - 0.03, "stiffness_nm_per_rad": 1000.0}},
+            -0.1,
+            lambda q: 1000.0 * (q - HOME + 0.03),
+            1e-6,
+        ),
+        (
             {
                 "end_stop": {"angle_rad": HOME + 0.03, "stiffness_nm_per_rad": 1000.0},
                 "cable_spring": {"stiffness_nm_per_rad": 20.0, "rest_rad": 0.5},
