@@ -92,7 +92,7 @@ def of(name: str, values: Values) -> Values:
 
 
 def inputs() -> Path:
-    """Recordings (two episodes, a gap, of the twin, cobot_magic's, other encodings) and a tiny policy, made once."""
+    """Recordings (two episodes, a gap, of the twin, cobot_magic's) and a tiny policy, made once."""
     folder = TESTS.parent / PLACE / "inputs"
     if not folder.exists():
         from tiny_checkpoint import write_checkpoint
@@ -102,8 +102,7 @@ def inputs() -> Path:
         made, small = folder.with_suffix(".part"), functools.partial(StandInConfig, camera_size=(120, 160))
         shutil.rmtree(made, ignore_errors=True)
         gap = ("/camera_l/color/image_raw/compressed", 1.0, 2.0)
-        for k, encoding in enumerate(("json", "protobuf")):
-            write_mcap(made / f"drafts/{encoding}.mcap", small(encoding=encoding, duration_s=3.0, seed=k))
+        write_mcap(made / "drafts/ros2.mcap", small(duration_s=3.0, seed=0))
         write_mcap(made / "mcap/two.mcap", small(episodes=2, outcomes=("success", "failure"), seed=3))
         write_mcap(made / "mcap/gap.mcap", small(gap=gap, seed=4))
         write_cobot_magic_hdf5(made / "hdf5/episode_0.hdf5", small(duration_s=3.0, seed=5))

@@ -20,11 +20,11 @@ MOST_LINES = {
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 358,
     "taccorl/sim": 9_307,
-    "taccorl/surrogate": 3_769,
+    "taccorl/surrogate": 3_765,
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_682,
-    "tests": 60_546,
+    "tests": 57_522,
     "pipelines": 6_257,
 }
 MOST_LINES_OF_A_FILE = 500

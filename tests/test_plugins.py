@@ -62,12 +62,6 @@ def test_an_outside_package_adds_a_reader_by_its_entry_point(tmp_path):
     assert find(site, "lines", recording) == ["TextReader", "lines"]
 
 
-def test_a_package_without_that_entry_point_is_left_alone(tmp_path):
-    site = install(tmp_path / "site", "lines_reader", READER.format(name="lines"))
-    (told,) = find(site, "lines", tmp_path)
-    assert told.startswith("TaccorlError: no reader 'lines'; ")
-
-
 def test_a_broken_outside_package_is_named_with_its_reason(tmp_path):
     site = install(tmp_path / "site", "broken_reader", "import no_such_module_here", mine="broken_reader")
     (told,) = find(site, "mcap", tmp_path)
@@ -75,20 +69,6 @@ def test_a_broken_outside_package_is_named_with_its_reason(tmp_path):
         "TaccorlError: plug-in 'mine' (broken_reader) of entry-point group 'taccorl.plugins' cannot be imported: "
         "ModuleNotFoundError: No module named 'no_such_module_here'. Correct or uninstall it."
     )
-
-
-def test_an_entry_point_to_something_that_is_not_there_is_named(tmp_path):
-    site = install(tmp_path / "site", "half_reader", "x = 1", mine="half_reader:Nothing")
-    (told,) = find(site, "mcap", tmp_path)
-    assert "plug-in 'mine' (half_reader:Nothing)" in told
-    assert "AttributeError" in told
-
-
-def test_an_outside_package_cannot_take_a_name_that_is_ours(tmp_path):
-    site = install(tmp_path / "site", "thief", READER.format(name="mcap"), thief="thief")
-    (told,) = find(site, "mcap", tmp_path)
-    assert "plug-in 'thief'" in told
-    assert "reader 'mcap' is registered twice" in told
 
 
 def folder_of_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, **modules: str) -> Registry:
@@ -145,15 +125,6 @@ def test_a_plugin_may_look_others_up_while_it_is_imported(tmp_path, monkeypatch)
     code = REGISTER.format("Ant") + "assert the_registry.get('Ant') is Ant\n"
     registry = folder_of_plugins(tmp_path, monkeypatch, "plugs_d", a=code, b=REGISTER.format("Bee"))
     assert list(registry) == ["Ant", "Bee"]
-
-
-def test_our_own_readers_are_there():
-    from taccorl.data.recording import Reader, readers
-
-    assert "mcap" in set(readers)
-    for name in readers:
-        assert issubclass(readers.get(name), Reader)
-        assert readers.get(name).__doc__
 
 
 @pytest.mark.parametrize(

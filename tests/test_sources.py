@@ -1,11 +1,10 @@
-"""What sources name is there: documents that comments cite, packages that are imported; arrays have a stated shape."""
+"""What sources name is there: documents that comments cite, packages that are imported."""
 
 import ast
 import re
 import sys
 import tomllib
 import zipfile
-from collections import defaultdict
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -106,50 +105,3 @@ def test_nothing_that_a_folder_holds_is_unpickled() -> None:
             found |= {(path.relative_to(ROOT / path.relative_to(ROOT).parts[0]).as_posix(), name) for name in unsafe}
     assert {entry for entry in found if entry[0] not in OWN_MESSAGES} == set()
     assert found == {(name, "pickle") for name in OWN_MESSAGES}, "the search finds what there is"
-
-
-# (T,)  (N, 14)  (…, 3)  (rows, columns, 3)  (boxes,)
-SHAPE = re.compile(r"\(((?:[\w.…·+*/×` −-]+,)+[\w.…·+*/×` −-]*|…|\.\.\.)\)")
-# Of one axis: a number, a letter of the legend, rows, nq.
-SIZE = re.compile(r"\d.*|[A-Z]\b.*|\.\.\.|…|rows.*|[np][a-z]?")
-
-
-def states_a_shape(docstring: str) -> bool:
-    """Whether the text holds a shape, such as (T, 14) or (boxes,), and not only units, such as (rad, m)."""
-    found = SHAPE.findall(re.sub(r"len\(\w+\)", "n", docstring))
-    sizes = [size.strip(" `") for text in found for size in text.split(",")]
-    named = re.search(r"\b((any|one|own|'s) shape|shape of|scalars?|1-D)\b", docstring)
-    return bool(named) or any(text.endswith(",") for text in found) or any(map(SIZE.fullmatch, sizes))
-
-
-def has_arrays(f: ast.FunctionDef) -> bool:
-    """Whether an annotation names an array; a name with a shape suffix (contact_B, actions_NnA) states its shape itself."""
-    given = [(a.arg, a.annotation) for a in [*f.args.posonlyargs, *f.args.args, *f.args.kwonlyargs]]
-    return any(
-        re.search(r"\b(ndarray|Tensor)\b", ast.unparse(annotation)) and not re.search(r"_\w*[A-Z]\w*$", name)
-        for name, annotation in [*given, ("", f.returns)]
-        if annotation is not None
-    )
-
-
-def test_docstrings_state_the_shape_of_every_array() -> None:
-    """A method without a docstring is described where another class documents it; not checked if only another package does."""
-    functions: list[tuple[str, ast.FunctionDef, ast.ClassDef | None]] = []
-    for path in sorted((ROOT / "taccorl").rglob("*.py")):
-        body = ast.parse(path.read_text("utf-8")).body
-        for cls in [None, *(node for node in body if isinstance(node, ast.ClassDef) and node.name[0] != "_")]:
-            for f in body if cls is None else cls.body:
-                if isinstance(f, ast.FunctionDef) and f.name[0] != "_":
-                    functions.append((f"{path.relative_to(ROOT)}:{f.lineno} {f.name}", f, cls))
-    of_methods = defaultdict(list)
-    for _, f, cls in functions:
-        if cls and ast.get_docstring(f):
-            of_methods[f.name].append(f"{ast.get_docstring(cls)}\n{ast.get_docstring(f)}")
-    missing = []
-    for name, f, cls in functions:
-        texts = [f"{ast.get_docstring(cls) if cls else ''}\n{ast.get_docstring(f)}"]
-        if cls and ast.get_docstring(f) is None and (f.name in of_methods or cls.bases):
-            texts = of_methods[f.name] or ["(…)"]
-        if has_arrays(f) and not any(map(states_a_shape, texts)):
-            missing.append(name)
-    assert missing == []

@@ -180,10 +180,6 @@ class Streams:
         self.config, self.story, self.scene = config, story, scene
         self.baseline_counts = {pad: self._random(f"baseline {pad}").uniform(10, 40, PAD_WIRE_SHAPE) for pad in PADS}
 
-    def encoder(self, writer: Writer) -> MessageWriter:
-        """Writer of the messages."""
-        return MessageWriter(writer)
-
     def all(self) -> list[Iterator[Event]]:
         """One iterator of events per topic, each in order of log time."""
         return [
@@ -315,7 +311,7 @@ def publish(path: Path, streams: Streams, label: dict[str, str]) -> None:
     with path.open("wb") as file:
         compression = CompressionType[config.compression.upper()]
         writer = Writer(file, chunk_size=config.chunk_size_bytes, compression=compression)
-        encoder = streams.encoder(writer)
+        encoder = MessageWriter(writer)
         writer.start(profile=encoder.profile, library="taccorl")
         writer.add_metadata("taccorl", label)
         for event in heapq.merge(*streams.all(), key=lambda event: event.log_s):

@@ -12,7 +12,7 @@ import pytest
 
 from pipelines.benchmarks import rows as module
 from pipelines.benchmarks import run as runner
-from pipelines.benchmarks.rows import BENCHMARKS, Row, benchmark, meets, spread
+from pipelines.benchmarks.rows import Row, benchmark, meets
 from pipelines.benchmarks.run import machine, render, run
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import cpu_s
@@ -37,11 +37,6 @@ def stored(folder: Path) -> dict[str, dict]:
 
 
 # ---- arithmetic ----
-
-
-def test_spread_is_half_the_range() -> None:
-    assert spread([2.0, 5.0, 3.0]) == 1.5
-    assert spread([7.0]) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -91,12 +86,6 @@ def test_a_cost_is_told_in_steps_of_the_reference_loop(monkeypatch: pytest.Monke
     assert (row.value, row.unit, row.n) == (pytest.approx(8.0), "reference steps", 3)  # median 80 µs of 10 µs each
     assert row.spread == pytest.approx(2.5)  # (9 − 4) / 2
     assert (row.rival, row.rival_value) == ("one reference step, µs CPU", pytest.approx(10.0))
-
-
-def test_the_reference_loop_costs_the_same_whatever_ran_before() -> None:
-    first, second = module.reference_step_s(1), module.reference_step_s(1)
-    assert 1e-6 < first < 1e-3
-    assert 1 / 3 < first / second < 3  # a shared machine
 
 
 def test_no_goal_is_one_of_cpu_seconds_but_on_a_named_gpu() -> None:
@@ -206,27 +195,7 @@ def test_an_unknown_name_is_told_with_the_nearest(only_mine: Path) -> None:
     assert not (only_mine / "bench.json").exists()
 
 
-@pytest.mark.slow  # it imports every package
-def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None:
-    done = fresh_python("-m", "pipelines.benchmarks", "--only=corupton")
-    assert done.returncode == 2
-    assert done.stderr == "no benchmark 'corupton'; did you mean 'corruption'?\n"
-
-
 def test_a_bare_word_would_run_everything_and_is_refused() -> None:
     done = fresh_python("-m", "pipelines.benchmarks", "ingest")
     assert done.returncode == 2
     assert "--only=" in done.stderr
-
-
-def test_every_registered_goal_can_be_read() -> None:
-    import re
-
-    import pipelines.benchmarks.recordings
-
-    assert {"ingest", "memory", "corruption", "kill", "start_up"} <= set(BENCHMARKS)
-    source = Path(pipelines.benchmarks.recordings.__file__ or "").read_text()
-    goals = re.findall(r'goal="([^"]+)"', source) + re.findall(r'"(< [0-9.]+)"', source)
-    assert len(goals) >= 7
-    for goal in goals:
-        assert meets(0.0, goal) in (True, False)

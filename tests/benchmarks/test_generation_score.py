@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipelines.benchmarks.demonstrations import mimicgen_cells
-from pipelines.benchmarks.generation_score import Score, _holds, score_generation, stiffened
+from pipelines.benchmarks.generation_score import _holds, score_generation, stiffened
 from taccorl.episodes.sources.mimicgen.attempt import Generated
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
@@ -36,11 +35,6 @@ def test_a_score_counts_every_attempt_and_what_it_took(collected):
     assert score.broken == 0
 
 
-def test_failures_are_counted_by_category():
-    score = Score(outcomes=["dropped", "success", "force", "dropped"])
-    assert score.failures == {"dropped": 2, "force": 1}
-
-
 def test_what_is_not_in_place_or_ends_elsewhere_does_not_hold():
     sim = Simulation(Assembly2())
     sim.reset([5])
@@ -52,19 +46,3 @@ def test_what_is_not_in_place_or_ends_elsewhere_does_not_hold():
     )
     assert not _holds(sim, done)  # the same state, but the plug stands on the table
     assert not _holds(sim, dataclasses.replace(done, actions=still[:2]))
-
-
-@pytest.mark.slow
-def test_the_rows_of_a_task_name_every_cell():
-    rows = list(mimicgen_cells("assembly_2", 1, 1))
-    assert [(row.unit, row.goal) for row in rows] == [
-        ("%", "≥ 80"),
-        ("episodes", "≤ 0"),
-        ("%", "≥ 70"),
-        ("%", ""),
-        ("×", "≥ 3"),
-        *[("%", "≥ 75"), ("%", "≤ 30")] * 2,
-    ]
-    assert len({row.name for row in rows}) == len(rows)
-    assert rows[0].n == 1
-    assert rows[1].value == 0

@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import pytest
+from edited import rewrite
 
 from taccorl.cli.main import main
+from taccorl.surrogate.drivers import CAMERA_TOPICS
 from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 SMALL = StandInConfig(duration_s=2.0, camera_size=(96, 128))
@@ -52,7 +54,10 @@ def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(
     share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a.mcap"
-    write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), encoding="json"))
+    write_mcap(tmp_path / "known.mcap", SMALL)
+    types = {CAMERA_TOPICS["front"]: "foxglove_msgs/msg/CompressedImage"}
+    rewrite(tmp_path / "known.mcap", path, list, types=types)
+    (tmp_path / "known.mcap").unlink()
     path.write_bytes(path.read_bytes()[: round(share * path.stat().st_size)])
     code, printed = main(["ingest", "inspect", str(path)]), capsys.readouterr().out
     assert "no shipped spec fits" in printed and list(tmp_path.iterdir()) == [path]

@@ -172,16 +172,6 @@ def test_nan_is_an_error_with_name_and_rows(good: Episode) -> None:
     assert "left_joint_5.pos, left_gripper.pos: 4 values are NaN or infinite in 4 rows" in finding.text
 
 
-def test_degrees_are_recognised(good: Episode) -> None:
-    state, _, _ = copies(good)
-    joints = [i for i in range(14) if i not in GRIPPER.values()]
-    state[:, joints] = np.degrees(state[:, joints])
-    finding = one(with_arrays(good, state=state), "joint_limit")
-    assert finding.severity == "error"
-    assert "degrees? " in finding.text
-    assert "rad" in finding.text
-
-
 @pytest.mark.parametrize(
     ("unit", "limit", "factor", "hint"),
     [
@@ -255,18 +245,6 @@ def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_
     # At rest it counts from a row before: 2 × 3.93 / 30 = 262 mrad.
     assert jumps([0] * 100 + [0.261]) == []
     assert len(jumps([0] * 100 + [0.263])) == 1
-
-
-@pytest.mark.parametrize("window", [2, 5, 30, 31])
-def test_still_rows_are_those_of_every_still_window(window: int) -> None:
-    rng = np.random.default_rng(window)
-    moving = rng.random((200, 1)) < 0.03
-    values = np.cumsum(moving, axis=0).astype(float)
-    expected = np.zeros(200, dtype=bool)
-    for first in range(200 - window + 1):
-        if np.ptp(values[first : first + window]) == 0:
-            expected[first : first + window] = True
-    assert np.array_equal(joint_checks.still_rows(values, np.array([0.5]), window), expected)
 
 
 @pytest.mark.parametrize(("rest_s", "is_found"), [(1.5, False), (4.5, True)])
@@ -343,11 +321,6 @@ def test_lag_of_state_behind_command_must_be_plausible(clock_s: float, severity:
     # The good lag is about 0.08 s: together 0.08, 0.23, 0.48, 0.03 and −0.12 s; −1 row … 0.3 s + 1 row are allowed.
     findings = found(make(seed=5, state_clock_s=clock_s), "action_lag")
     assert [f.severity for f in findings] == ([severity, severity] if severity else [])
-
-
-def test_state_that_is_the_action_has_lag_zero_and_is_no_fault(good: Episode) -> None:
-    same = with_arrays(without(good, TOUCH), state=good.arrays[ACTION])
-    assert found(same, "action_lag") == []
 
 
 def test_one_arm_on_another_clock_is_found(good: Episode) -> None:

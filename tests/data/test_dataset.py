@@ -19,7 +19,6 @@ from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.origin import UNSTATED, Origin
 from taccorl.data.spec import data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, SpecError
-from tests.fresh_python import fresh_python
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 LENGTHS = (20, 23, 18)
@@ -252,12 +251,6 @@ def test_other_versions_are_named_with_the_way_out(copy: Path, version: str, wor
         Dataset(copy)
 
 
-def test_the_converter_that_the_message_names_exists() -> None:
-    import importlib.util
-
-    assert importlib.util.find_spec("lerobot.scripts.convert_dataset_v21_to_v30") is not None
-
-
 def test_an_incomplete_dataset_says_what_is_missing(copy: Path) -> None:
     edit_info(copy, total_episodes=5)
     with pytest.raises(DatasetError, match=r"5 episodes,.*meta/episodes lists 3, episode 3.*missing"):
@@ -303,16 +296,6 @@ def test_rows_with_several_tasks_are_stages(copy: Path) -> None:
     episode = Dataset(copy).episode(0)
     assert episode.instruction == TASKS[0]
     assert episode.stages == ((0, TASKS[0]), (5, TASKS[1]))
-
-
-def test_datasets_are_read_without_torch_and_lerobot(made: dict[str, Path]) -> None:
-    code = (
-        "import sys; from pathlib import Path; from taccorl.data.dataset import Dataset\n"
-        f"d = Dataset(Path({str(made['h264'])!r})); assert d.video_problems() == []\n"
-        "assert len(list(d.episode(0).pictures())) == 20\n"
-        "assert not {'torch', 'lerobot', 'datasets'} & set(sys.modules)"
-    )
-    assert fresh_python("-c", code).returncode == 0
 
 
 # ---- meta/taccorl

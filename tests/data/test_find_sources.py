@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from taccorl.cli.main import main
-from taccorl.data.file_kinds import sniff
 from taccorl.data.recording import find_sources
 from taccorl.errors import RecordingError
 from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
@@ -80,16 +79,6 @@ def test_a_known_file_with_an_odd_ending_is_opened_by_what_it_is(mixed: Path) ->
     for reader in (None, "mcap"):
         [(name, source)] = find_sources(mixed / "odd.bin", reader=reader)
         assert (name, source.path) == ("mcap", mixed / "odd.bin")
-
-
-def test_files_are_known_by_their_first_bytes(mixed: Path, tmp_path: Path) -> None:
-    kind = sniff(mixed / "aloha1.hdf5")
-    assert kind is not None and (kind.name, kind.reader) == ("an HDF5 file", "hdf5")
-    (tmp_path / "a").write_bytes(b"SQLite format 3\0" + bytes(100))
-    kind = sniff(tmp_path / "a")
-    assert kind is not None and (kind.name, kind.reader) == ("an SQLite bag", "db3")
-    (tmp_path / "a").write_bytes(b"")
-    assert sniff(tmp_path / "a") is sniff(tmp_path) is sniff(tmp_path / "gone") is None
 
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"

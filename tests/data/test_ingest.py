@@ -6,7 +6,6 @@ import os
 import resource
 import shlex
 import shutil
-import subprocess
 import tempfile
 import traceback
 from collections.abc import Callable, Sequence
@@ -464,37 +463,6 @@ def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
     assert ingests.run(good) == 0, "with room again, it goes on"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("size", ["200k", "900k"])
-def test_a_full_disk_stops_the_run_with_one_clear_line(
-    tmp_path: Path,
-    spec: Path,
-    good: Path,
-    size: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(disk)], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("mounting a small disk takes root")
-    try:
-        ingests = Ingests(disk, spec, monkeypatch)
-        ingests.log = tmp_path / "written.log"
-        assert ingests.run(good) == 2
-        shown = capfd.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        last = shown.err.strip().splitlines()[-1]
-        assert last.startswith("taccorl ingest: no space left")
-        _no_damage(ingests)
-        subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
-        assert ingests.run(good) == 0
-        assert Dataset(ingests.out).num_episodes == 2
-    finally:
-        subprocess.run(["umount", "--lazy", str(disk)], check=True)  # encoders that failed may still hold files
-
-
 def test_a_store_that_is_read_only_is_told_at_once(
     tmp_path: Path, spec: Path, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -519,15 +487,3 @@ def test_two_workers_write_the_same_bytes_as_one(ingests: Ingests, good: Path, t
     )
     assert two == one and "meta/info.json" in one
     assert json.loads((tmp_path / "out2.ingest_report.json").read_text()) == ingests.report()
-
-
-@pytest.mark.slow
-def test_two_commands_at_once_share_the_work_and_agree(ingests: Ingests, good: Path) -> None:
-    import lerobot.datasets.lerobot_dataset  # noqa: F401
-
-    pids = [in_fork(lambda: ingests.run(good)) for _ in range(2)]
-    assert [exit_code(pid) for pid in pids] == [0, 0]
-    assert ingests.written() == 2, "each recording was written once"
-    assert Dataset(ingests.out).num_episodes == 2
-    assert Dataset(ingests.out).video_problems() == []
-    _ = ingests.report()

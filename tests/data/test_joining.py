@@ -142,21 +142,15 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
     for kind in ("data", "meta/episodes"):
         assert len(list((tmp_path / "all" / kind).glob("chunk-*/file-*.parquet"))) == files
         assert len(list((tmp_path / "all" / kind).glob("chunk-*"))) == -(-files // per_chunk)
-    joined = LeRobotDataset("local/all", root=tmp_path / "all")
-    place = 0
-    sources = [(part, k) for part in parts for k in range(Dataset(part).num_episodes)]
-    for number, (root, k) in enumerate(sources):
-        source = Dataset(root).values(k, ["action"])["action"]
-        begin, end = (int(joined.meta.episodes[number][f"dataset_{edge}_index"]) for edge in ("from", "to"))
-        assert (begin, end) == (place, place + len(source))
-        for row in (begin, end - 1):
-            item = joined[row]
-            assert item["episode_index"] == number and item["index"] == row
-            np.testing.assert_array_equal(item["action"].numpy(), source[row - begin])
-            original = LeRobotDataset("local/x", root=root)
-            assert item["task"] == original.meta.episodes[k]["tasks"][0]
-        place = end
-    assert joined.meta.total_frames == place
+    assert [*check_bookkeeping(Dataset(tmp_path / "all"))] == []
+    joined, numbers = (
+        Dataset(tmp_path / "all"),
+        [(part, k) for part in parts for k in range(Dataset(part).num_episodes)],
+    )
+    for number, (part, k) in enumerate(numbers):
+        one, other = joined.episode(number), Dataset(part).episode(k)
+        assert one.instruction == other.instruction
+        np.testing.assert_array_equal(one.arrays["action"], other.arrays["action"])
 
 
 def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(

@@ -20,7 +20,7 @@ from edited import SIZE
 from taccorl.data import lerobot_format
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.exact_statistics import QUANTILES, exact_stats, stats_of_counts
+from taccorl.data.exact_statistics import QUANTILES, exact_stats
 from taccorl.data.lerobot_format import lerobot_features, merge, quiet_lerobot, write_episodes
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, RecordingError
@@ -221,19 +221,6 @@ def test_exact_statistics_are_lerobots_within_one_histogram_bin() -> None:
     # by hand: of 0 … 199, half do not exceed 99 (the 100th), and 1 % (two of them) do not exceed 1
     assert (ours["q50"][8], ours["q01"][8], ours["q99"][8]) == (99, 1, 197)
     assert (ours["std"][7], ours["q99"][7]) == (0.0, 4.0)
-
-
-def test_statistics_of_counted_pixels_are_the_exact_ones() -> None:
-    rng = np.random.default_rng(4)
-    values = rng.integers(10, 200, (10_000, 3)).astype(np.uint8)
-    values[:, 2] = np.repeat([3, 250], 5000)
-    counts = np.stack([np.bincount(column, minlength=256) for column in values.T])
-    counted, exact = stats_of_counts(counts), exact_stats(values)
-    assert set(counted) == set(exact)
-    for name in exact:
-        np.testing.assert_allclose(counted[name], exact[name], rtol=1e-12, err_msg=name)
-    # by hand: half of them are 3 and do not exceed 3; the mean of 3 and 250 is 126.5, both are 123.5 away
-    assert (counted["q50"][2], counted["q90"][2], counted["mean"][2], counted["std"][2]) == (3, 250, 126.5, 123.5)
 
 
 def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec: DatasetSpec, tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """A whole recording read once: numbers as arrays, pictures as stamps, and an error that names what does not meet the spec."""
 
 import base64
-import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording
 from taccorl.data.spec import load_recording_spec
 from taccorl.data.spool import Spool
-from taccorl.errors import RecordingError, TaccorlError
+from taccorl.errors import RecordingError
 from tests.fresh_python import fresh_python
 
 T0_NS = 1_700_000_000_000_000_000
@@ -251,18 +250,12 @@ def test_a_topic_is_either_pictures_or_numbers(tmp_path):
     assert message == "/camera: the spec reads it both as pictures and as numbers"
 
 
-H = header(T0_NS)
-
-
 @pytest.mark.parametrize(
     ("topic", "message", "expected"),
     [
         ("/pad", {"data": [1] * 5}, "message 1: 5 taxels, but sensor little_pad has 3×2; other layouts: a file in"),
-        ("/pad", {"data": [0.5] * 6}, "message 1: counts that are not uint8 (normalised by the driver?): record raw counts"),
-        ("/pad", {"data": [[1, 2, 3]] * 2}, "message 1: a frame of 2×3 taxels, but the wire format of little_pad is 3×2"),
         ("/pad", {"date": [1]}, "message 1: no field 'data'; did you mean 'date'?"),
         ("/joints", joint_state(T0_NS, 1.0), "message 1: 1 values for 2 names in 'position'"),
-        ("/joints", {"header": H, "name": ["g", "j1"], "position": "no"}, "message 1: position is not a list of numbers"),
         ("/episode", {"data": 3}, "expected a text (std_msgs/String), found int"),
         ("/episode", {"text": "x"}, "expected a text (std_msgs/String), found dict"),
     ],
@@ -272,24 +265,7 @@ def test_a_message_that_does_not_fit_names_its_topic_and_number(tmp_path, topic,
     assert told.startswith(f"{topic}, {expected}" if expected.startswith("message") else f"{topic}: {expected}")
 
 
-def test_an_unknown_reader_names_the_nearest(tmp_path):
-    spec = dataclasses.replace(recording_spec(tmp_path), reader="mcpa")
-    with pytest.raises(TaccorlError, match="no reader 'mcpa'; did you mean 'mcap'"):
-        load_recording(write(tmp_path / "a.mcap", usual_messages()), spec, tmp_path)
-
-
 # --- the spool
-
-
-def test_spool_gives_back_its_rows_as_one_array(tmp_path):
-    spool = Spool(tmp_path, "x")
-    rows = np.random.default_rng(0).normal(size=(1000, 7))
-    for row in rows:
-        spool.append(row)
-    found = spool.finish()
-    assert isinstance(found, np.memmap) and found.dtype == np.float64
-    assert np.array_equal(found, rows)
-    assert Spool(tmp_path, "y").finish().shape == (0, 0)
 
 
 def test_spool_keeps_the_dtype_of_the_first_row_and_refuses_another_size(tmp_path):

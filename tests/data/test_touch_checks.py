@@ -187,13 +187,6 @@ def test_what_cannot_be_judged_is_said(good: Episode, name: str, words: str) -> 
 # ---- measures ----
 
 
-def test_constant_runs_count_rows_and_keep_the_value() -> None:
-    counts = np.array([[1, 1, 1, 2, 2, 3], [0, 1, 0, 1, 0, 1], [7, 7, 7, 7, 7, 7]]).T
-    length, value = touch_checks.constant_runs(counts)
-    assert length.tolist() == [3, 1, 6]
-    assert value.tolist() == [1, 0, 7]
-
-
 def test_enclosed_taxels_ought_to_show_the_lesser_neighbour() -> None:
     frame = np.zeros((1, 5, 7))
     frame[0, 2, [1, 3]] = 50, 80  # one taxel between
@@ -390,11 +383,6 @@ def test_exchanged_arms_show_as_exchanged_pads(good: Episode) -> None:
     state, action, _ = copies(good)
     episode = with_arrays(good, state=np.roll(state, 7, axis=1), action=np.roll(action, 7, axis=1))
     assert one(episode, "swapped_pads").severity == "error"
-
-
-@pytest.mark.parametrize("std", [0.0, 1.5, 8.0, 25.0])
-def test_touch_that_is_only_noise_is_an_error(good: Episode, std: float) -> None:
-    assert one(touched(good, noise(np.s_[:], std)), "noise_only").severity == "error"
 
 
 @pytest.mark.parametrize("p", range(4))

@@ -71,20 +71,6 @@ def test_lerobot_dataset_viz_writes_a_recording(dataset: Path, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_lerobot_trains_act_on_it_for_two_steps(dataset: Path, tmp_path: Path) -> None:
-    done = run(
-        "lerobot-train", "--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu",
-        "--policy.pretrained_backbone_weights=null", "--policy.dim_model=64", "--policy.n_heads=2",
-        "--policy.dim_feedforward=128", "--policy.chunk_size=10", "--policy.n_action_steps=5",
-        "--dataset.repo_id=local/demo", f"--dataset.root={dataset}", "--dataset.video_backend=pyav",
-        "--steps=2", "--batch_size=2", "--num_workers=0", "--log_freq=1", "--save_freq=2",
-        f"--output_dir={tmp_path / 'act'}", "--wandb.enable=false",
-    )  # fmt: skip
-    assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
-    assert (tmp_path / "act/checkpoints/000002/pretrained_model/model.safetensors").is_file()
-
-
-@pytest.mark.slow
 def test_lerobot_train_help_loads_our_plugin_without_a_flag() -> None:
     code = (
         "import sys; sys.argv = ['lerobot-train', '--help']\n"

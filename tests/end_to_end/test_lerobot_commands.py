@@ -1,7 +1,6 @@
 """What is left of a training or a scoring, told from the files that LeRobot writes."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -89,25 +88,3 @@ def test_a_policy_that_was_trained_on_is_scored_again(dataset: Path, recipe: Pat
     assert scoring.command() == [] and scoring.successes() == [True, False]
     checkpoint(training, step=10)
     assert Scoring(training, ["--env.task=puzzle"], episodes=12).command()
-
-
-def test_lerobot_understands_the_commands(
-    dataset: Path, recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from lerobot.configs import parser
-    from lerobot.configs.train import TrainPipelineConfig
-
-    import taccorl.lerobot_plugin  # noqa: F401
-
-    recipe.write_text("policy: {type: tactile_pi05, backbone: tiny, push_to_hub: false}\nsteps: 10\n")
-    training = Training(recipe, dataset, ["--steps=7"], tmp_path)
-    monkeypatch.setattr(sys, "argv", training.command())
-
-    @parser.wrap()
-    def train(cfg: TrainPipelineConfig) -> TrainPipelineConfig:
-        cfg.validate()
-        return cfg
-
-    config = train()  # pyright: ignore[reportCallIssue]
-    assert config.steps == 7 and config.output_dir == training.folder
-    assert config.policy.backbone == "tiny" and config.dataset.repo_id == "local/both"

@@ -108,17 +108,6 @@ def test_every_line_of_the_readme_calls_a_program_of_ours() -> None:
     assert len(commands(README)) == lines + len(CELL.findall(README))
 
 
-def test_an_option_that_was_renamed_is_found() -> None:
-    planted = [
-        Command([w.replace("--", "--no_such_", 1) if w == option else w for w in c.words], c.is_run)
-        for c in commands(README) + sections()
-        for option in [w for w in c.words if w.startswith("--")]
-        if c.words[0] == "taccorl"
-    ]
-    assert len(planted) > 30
-    assert all(len(unknown_options(c)) == 1 for c in planted)
-
-
 def smaller(command: Command) -> list[str]:
     """The words of a line, small enough for a test."""
     options = SMALL.get(command.verb, ())

@@ -1,13 +1,11 @@
 """Collecting demonstrations: a dataset that LeRobot reads and a run that goes on where it was stopped; recordings that ingest
 reads back."""
 
-import itertools
 import math
 import shutil
 import subprocess
 import sys
 import time
-import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +14,6 @@ import pytest
 from mcap.reader import make_reader
 
 from taccorl.cli.main import main as cli
-from taccorl.data import lerobot_format
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
 from taccorl.episodes.attempt import Attempt, Source, Targets, outcome_of
@@ -353,21 +350,6 @@ def test_a_pose_out_of_reach_ends_its_attempt_and_no_other(tmp_path, rows):
     assert "out of reach" in report["entries"][0]["reason"]
     dataset = Dataset(tmp_path / "x")
     assert [(dataset.episode(k).success, dataset.episode(k).num_rows) for k in range(3)] == [(False, 3)] * 3
-
-
-def test_rows_are_written_at_most_ten_functions_below_produce_and_no_module_is_entered_again(tmp_path, monkeypatch):
-    stacks, write = [], lerobot_format.write_episodes
-
-    def spy(*words, **named):
-        names = [frame.f_globals["__name__"] for frame, _ in traceback.walk_stack(sys._getframe(1))]
-        stacks.append([name for name in names if name.startswith("taccorl.")])
-        return write(*words, **named)
-
-    monkeypatch.setattr(lerobot_format, "write_episodes", spy)
-    plan = Three(task="assembly_1", source=Idle(), images=False, keep_failures=True)
-    produce(plan, tmp_path / "x", Store(tmp_path / "store"), lambda _: None, LocalEngine())
-    modules = [name for name, _ in itertools.groupby(stacks[0])]
-    assert len(stacks[0]) <= 10 and len(set(modules)) == len(modules)
 
 
 # recordings ---------------------------------------------------------------------------------------------------------------

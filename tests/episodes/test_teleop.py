@@ -108,22 +108,6 @@ def test_turn_is_about_the_hands_own_axis_and_leaves_the_tcp_where_it_is(jogger:
     np.testing.assert_allclose(jogger.hands["left"].goal, before, atol=1e-12)
 
 
-def test_twins_hand_arrives_where_the_keys_sent_it(sim: Simulation, jogger: Jogger) -> None:
-    before = sim.tcp("left")[0].copy(), sim.tcp("right")[0].copy()
-    tap(jogger, UP, UP, HOME)
-    settle(sim, jogger)
-    moved_mm = (sim.tcp("left")[0] - before[0])[:3, 3] * 1e3
-    np.testing.assert_allclose(moved_mm, (10, 0, 5), atol=0.5)  # rest error: T_ref is constant, the pose is not
-    assert np.abs(sim.tcp("right")[0] - before[1])[:3, 3].max() < 1e-4
-
-
-def test_without_a_wish_the_arms_stand_still(sim: Simulation, jogger: Jogger) -> None:
-    np.testing.assert_allclose(jogger.targets(), sim.targets[0], atol=2e-5)  # inverse kinematics stops at 10 µm
-    before = sim.tcp("left")[0].copy()
-    settle(sim, jogger, 0.5)
-    assert np.abs(sim.tcp("left")[0] - before).max() < 1e-4
-
-
 def test_space_switches_the_arm_and_page_down_the_step(jogger: Jogger) -> None:
     keyboard = Keyboard()
     assert keyboard.requested_steps([SPACE, PAGE_DOWN], ())[1] == [Command.SWITCH_ARM, Command.STEP_SIZE]
@@ -406,11 +390,6 @@ def test_actions_reach_the_file_at_once_and_the_disk_each_second(
     assert synced == [30, 60]
     log.close()
     assert synced == [30, 60, 75]
-
-
-def test_teleoperation_starts_without_torch_or_lerobot() -> None:
-    code = "import sys; from taccorl.episodes.sources import teleop; assert not {'torch', 'lerobot'} & set(sys.modules)"
-    assert fresh_python("-c", code).returncode == 0
 
 
 def test_damaged_and_foreign_files_are_refused_by_line(tmp_path: Path, sim: Simulation) -> None:

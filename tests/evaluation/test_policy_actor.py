@@ -257,42 +257,6 @@ def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest
     assert all(np.array_equal(a.actions, b.actions) for a, b in zip(ours, again, strict=True))
 
 
-@pytest.mark.slow
-def test_success_per_seed_is_that_of_lerobot_eval() -> None:
-    """A stand-in that repeats one expert episode: it succeeds in that episode's scene and fails in the next one."""
-    import torch
-
-    from taccorl.evaluation.expert_actor import ExpertActor
-    from taccorl.evaluation.policy_actor import PolicyActor
-
-    (expert,) = score(Scenes(tasks=("assembly_1",), episodes=1, seed=0), ExpertActor())
-    assert expert.row.success
-
-    class Repeats(torch.nn.Module):
-        def reset(self) -> None:
-            self.step = 0
-
-        def select_action(self, batch: dict) -> torch.Tensor:
-            action = torch.from_numpy(expert.actions[min(self.step, len(expert.actions) - 1)])
-            self.step += 1
-            return action.repeat(len(batch["observation.state"]), 1)
-
-    length = len(expert.actions) + 5
-
-    def unchanged(batch: Any) -> Any:
-        return batch
-
-    config = TaccorlEnvConfig(task="assembly_1", episode_length=length)
-    envs = config.create_envs(2)["taccorl"][0]
-    theirs: Any = rollout(envs, Repeats(), *config.get_env_processors(), unchanged, unchanged, seeds=[0, 1])  # pyright: ignore[reportArgumentType]
-    envs.close()
-    actor = PolicyActor("repeats", Repeats(), unchanged, unchanged)
-
-    ours = score(Scenes(tasks=("assembly_1",), episodes=2, seed=0, episode_length=length), actor)
-    assert [r.row.success for r in ours] == theirs["success"].any(1).tolist() == [True, False]
-    assert [r.row.steps for r in ours] == (theirs["done"].int().argmax(1) + 1).tolist()
-
-
 @pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.cluster.Job", "no_such_package.Step"])
 def test_a_class_that_is_no_step_is_not_called(checkpoint: Path, tmp_path: Path, named: str) -> None:
     """LeRobot imports and calls the class that a processor's file names."""

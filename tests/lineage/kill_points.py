@@ -1,4 +1,4 @@
-"""Script ``kill_points.py FOLDER sound|hasty``: kill a run before each of its file operations, in turn.
+"""Script ``kill_points.py FOLDER``: kill a run before each of its file operations, in turn.
 
 Prints how many such points there are, and after how many of them an artefact in the store did not match its manifest.
 A script of its own because it forks: a fresh process has no threads that a fork could catch half-way.
@@ -14,8 +14,8 @@ from typing import Any
 
 from taccorl.lineage.explain import trace
 from taccorl.lineage.manifest import read_manifest
-from taccorl.lineage.stage import Artefact, Stage
-from taccorl.lineage.store import Store, _seal
+from taccorl.lineage.stage import Stage
+from taccorl.lineage.store import Store
 
 FILE_EVENTS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.listdir", "os.scandir", "fcntl.flock"}
 
@@ -36,19 +36,7 @@ TWO, PUBLISHED = Stage("two", write_two), Stage("published", copy_one)
 def run(store: Store) -> None:
     """An artefact in the store, and one that is made from it beside the store."""
     made = store.run(TWO, None, [])
-    if not isinstance(store, HastyStore):
-        store.run(PUBLISHED, None, [made], destination=store.root.with_name(f"{store.root.name}_out"))
-
-
-class HastyStore(Store):
-    """A planted bug: builds in the final place, manifest first."""
-
-    def _make(self, job: Any) -> Artefact:
-        job.final.mkdir(parents=True)
-        (job.final / "one").write_text("early")
-        digest = _seal(job.final, job, seconds=0.0, origins={})
-        job.stage.fn(job.config, [], job.final)
-        return Artefact(job.final, digest)
+    store.run(PUBLISHED, None, [made], destination=store.root.with_name(f"{store.root.name}_out"))
 
 
 def wrong(store: Store) -> list[Path]:
@@ -84,11 +72,11 @@ def survives(kill_at: int, work: Callable[[], Any]) -> bool:
     return status == 0
 
 
-def main(folder: Path, store_class: type[Store]) -> None:
+def main(folder: Path) -> None:
     num_wrong = 0
     for kill_at in range(1, 1000):
         root = folder / f"at_{kill_at}"
-        if survives(kill_at, lambda root=root: run(store_class(root))):
+        if survives(kill_at, lambda root=root: run(Store(root))):
             print(kill_at - 1, num_wrong)
             return
         store = Store(root)
@@ -100,4 +88,4 @@ def main(folder: Path, store_class: type[Store]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), {"sound": Store, "hasty": HastyStore}[sys.argv[2]])
+    main(Path(sys.argv[1]))

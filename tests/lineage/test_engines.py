@@ -33,19 +33,6 @@ def test_results_come_in_the_order_of_the_items(workers):
     assert sorted(done) == [(0, 0), (1, 2), (2, 4), (3, 6), (4, 8), (5, 10)]
 
 
-def test_on_done_is_called_as_items_are_done_whatever_their_order(tmp_path):
-    """The second item is done first, whatever the machine does besides: the first one waits until the parent was told of it."""
-    items, done = [tmp_path / "0", tmp_path / "1"], []
-
-    def on_done(item: Path, result: str) -> None:
-        done.append(result)
-        item.touch()
-
-    results = LocalEngine(workers=2).map(toys.wait_for_the_second, items, on_done=on_done)
-    assert done == ["1", "0"]
-    assert results == ["0", "1"]
-
-
 @ONE_AND_TWO_WORKERS
 def test_item_that_fails_is_named_and_the_others_are_done(workers):
     done = []

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.cli.lineage import PruneConfig, main
-from taccorl.cli.parse import parse
+from taccorl.cli.lineage import main
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.explain import render, trace
-from taccorl.lineage.prune import delete, open_store, unneeded
+from taccorl.lineage.prune import delete, unneeded
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 
@@ -134,13 +133,6 @@ def test_dataset_of_unknown_origin_cannot_be_kept(world):
         unneeded(Store(world / "store"), [world / "datset"])
 
 
-def test_folder_that_is_no_store_is_refused(world):
-    for folder in (world / "raw", world / "absent", Path("/")):
-        with pytest.raises(TaccorlError, match="not a taccorl store"):
-            open_store(folder)
-    assert not (world / "absent").exists()
-
-
 def test_what_a_run_is_building_now_is_neither_listed_nor_deleted(world):
     store = Store(world / "store")
     script = (
@@ -184,14 +176,6 @@ def test_command_lists_first_and_deletes_only_with_yes(world, capsys):
     assert f"1 dataset gone or moved; name moved ones with --keep=DATASET:\n  {world / 'dataset'}\n" in out
 
 
-@pytest.mark.parametrize("verb", ["explain", "prune"])
-def test_help_names_the_verb_as_it_is_typed(verb, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([verb, "--help"])
-    assert stop.value.code == 0
-    assert f"usage: taccorl lineage {verb} " in capsys.readouterr().out
-
-
 def test_command_explains_and_its_status_tells_if_anything_changed(world, capsys):
     words = ["explain", str(world / "dataset"), f"--store={world / 'store'}"]
     assert main(words) == 0
@@ -214,10 +198,3 @@ def test_unknown_verb_names_the_nearest(capsys):
         main(["explian"])
     assert main([]) == 0
     assert capsys.readouterr().out.startswith("taccorl lineage explain PATH")
-
-
-def test_keep_may_be_repeated_and_is_one_list():
-    both = [Path("a"), Path("b c")]
-    assert parse(PruneConfig, ["--keep=a", "--yes=true", "--keep", "b c"]) == PruneConfig(keep=both, yes=True)
-    assert parse(PruneConfig, ["--keep=[a, b c]"]) == PruneConfig(keep=both)
-    assert parse(PruneConfig, ["--yes=true"]) == PruneConfig(yes=True)

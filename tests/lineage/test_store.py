@@ -4,7 +4,6 @@ import errno
 import hashlib
 import json
 import os
-import pickle
 import resource
 import shutil
 import signal
@@ -98,16 +97,6 @@ def test_key_changes_with_stage_version_config_and_inputs_and_with_nothing_else(
     assert len({key, *others}) == 6
     copy = shutil.copy(raw / "demo_0.raw", raw / "elsewhere")
     assert store.key(INGEST, IngestConfig(log=Path("any")), [store.source(Path(copy)), b]) == key
-
-
-def test_artefact_lies_under_its_key_and_is_made_once(store, raw, tmp_path):
-    log = tmp_path / "log"
-    first = run_pipeline(store, raw, log=log)
-    again = run_pipeline(Store(store.root), raw, log=log)
-    assert again == first
-    assert first.path == store.root / "merge" / first.manifest["key"]
-    assert log.read_text().splitlines() == ["ingest demo_0.raw", "ingest demo_1.raw", "merge"]
-    assert store.find(INGEST, IngestConfig(rate_hz=1.0), [store.source(raw / "demo_0.raw")]) is None
 
 
 def test_manifest_says_what_was_made_from_what(store, raw):
@@ -455,14 +444,6 @@ def test_a_damaged_artefact_at_a_destination_is_refused_and_left_as_it_is(store,
     assert {p: p.read_bytes() for p in sorted(made.path.rglob("*")) if p.is_file()} == before
 
 
-def test_killed_while_a_damaged_artefact_is_removed_the_next_run_makes_it(store):
-    made = store.run(ONE, "x", [])
-    (made.path / "one").unlink()  # as rmtree leaves it
-    assert store.run(ONE, "x", []) == made and (made.path / "one").read_text() == "x"
-    (made.path / "manifest.json").unlink()
-    assert store.run(ONE, "x", []) == made
-
-
 # --- a published file is not stored twice
 
 
@@ -565,19 +546,6 @@ def test_a_clone_is_taken_where_there_are_some(store, tmp_path, monkeypatch):
     (stored,) = store.root.glob("rows/*/data/rows")
     assert not (made / "data/rows").samefile(stored) and verify(made).changed == ()
     assert (made / "data/rows").stat().st_mode == stored.stat().st_mode
-
-
-def test_stage_may_remake_its_folder_as_lerobot_does(store):
-    def remake(config, inputs, out_dir):
-        out_dir.rmdir()
-        out_dir.mkdir(exist_ok=False)
-        (out_dir / "one").write_text("x")
-
-    assert (store.run(Stage("remake", remake), None, []).path / "one").read_text() == "x"
-
-
-def test_store_can_be_sent_to_another_process(store):
-    assert pickle.loads(pickle.dumps(store)).run(ONE, "x", []).path.parent.parent == store.root
 
 
 def test_the_place_of_a_store_is_told_when_it_is_made(tmp_path, caplog):

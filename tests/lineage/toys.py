@@ -90,14 +90,6 @@ def double(x: int) -> int:
     return 2 * x
 
 
-def wait_for_the_second(note: Path) -> str:
-    """The item named ``0`` is done only after the parent was told of the item named ``1``, and wrote its note."""
-    end_s = time.monotonic() + PATIENCE_S
-    while note.name == "0" and not note.with_name("1").exists() and time.monotonic() < end_s:
-        time.sleep(0.01)
-    return note.name
-
-
 def refuse_odd(x: int) -> int:
     if x % 2:
         raise RecordingError(f"recording {x} is odd")

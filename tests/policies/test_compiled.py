@@ -77,13 +77,6 @@ def test_without_contact_it_is_plain_pi05_up_to_rounding(as_on_a_gpu):
     torch.testing.assert_close(ours, plain, rtol=1e-5, atol=1e-6)
 
 
-def test_evaluation_is_lerobots_forward_to_the_bit(request):
-    policy, batch = tiny_policy(), batch_of(True, True)
-    theirs = losses(policy, batch)
-    called = request.getfixturevalue("as_on_a_gpu")
-    assert torch.equal(losses(policy.eval(), batch), theirs) and not called
-
-
 def test_evaluation_recomputed_activations_and_the_setting_are_lerobots_forward():
     gpu = torch.device("cuda")
     policy = tiny_policy().train()

@@ -9,9 +9,8 @@ from typing import Any
 import draccus
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, load_optimizer_state, save_optimizer_state
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from safetensors.torch import save_file
@@ -29,7 +28,7 @@ from tiny_policies import (
 )
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, NormReLU, Residual
+from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, NormReLU
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, TouchInput, WarmupThenCosine
 from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder, scales
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
@@ -54,13 +53,6 @@ def metadata(**changes: Any) -> SimpleNamespace:
     """Of a dataset, as much of it as the policy reads."""
     known = {"repo_id": "local/demo", "root": "/demo", "fps": 30, "episodes": {"length": [40, 12]}}
     return SimpleNamespace(**{**known, "features": {TACTILE: FEATURE, "observation.state": {}}, **changes})
-
-
-def test_lerobot_finds_the_policy_by_its_name():
-    import taccorl.lerobot_plugin  # noqa: F401
-
-    assert PreTrainedConfig.get_choice_class("tactile_pi05") is TactilePI05Config
-    assert get_policy_class("tactile_pi05") is TactilePI05Policy
 
 
 @pytest.mark.parametrize(("history", "ages"), [(4, (3, 2, 1, 0)), (3, (4, 2, 0)), (1, (0,))])
@@ -280,15 +272,9 @@ def test_the_state_is_the_backbones_own_affair_unless_told():
     assert TactilePI05Config(backbone="small", discrete_state_input=True).has_discrete_state
 
 
-def test_a_token_of_the_state_is_the_waves_of_each_joint_and_no_joint_is_beyond_its_limit():
-    torch.manual_seed(0)
-    token, state = StateToken(2, 8), torch.tensor([[0.3, -0.7]])
-    waves = [math.pi * 2**k * x for x in (0.3, -0.7) for k in range(5)]  # ½ … 8 turns over the range of −1 … 1
-    told = torch.tensor([[0.3, -0.7, *map(math.sin, waves), *map(math.cos, waves)]])
-    expected = token.out(torch.nn.functional.gelu(token.hidden(told)))
-    torch.testing.assert_close(token(state), expected[:, None])
-    assert token(state).shape == (1, 1, 8)
-    # LeRobot's normaliser makes 2e8 of the noise of a joint that stood still in all of the data.
+def test_no_joint_is_beyond_its_limit_in_the_token_of_the_state():
+    """LeRobot's normaliser makes 2e8 of the noise of a joint that stood still in all of the data."""
+    token = StateToken(2, 8)
     assert torch.equal(token(torch.tensor([[0.3, 2e8]])), token(torch.tensor([[0.3, 4.0]])))
 
 
@@ -310,31 +296,6 @@ def test_a_point_is_where_its_map_is_high():
     weight = math.exp(3) / (math.exp(3) + 8)
     places = [-1 + column / 4 for column in range(9)]
     assert camera.points(soft)[0, 0].item() == pytest.approx(weight + (1 - weight) * sum(places[:8]) / 8, rel=1e-5)
-
-
-def test_tokens_of_a_picture_are_made_of_its_points_their_waves_and_means_of_cells():
-    torch.manual_seed(0)
-    size = CameraSize(
-        stem_channels=16, blocks=((16, 2), (32, 2)), points=2, pooled_cells=(2, 3), pooled_width=4, tokens=3
-    )
-    camera, image = CameraEncoder(size, 8), torch.rand(1, 3, 32, 48)
-    features = camera.features(image)
-    assert features.shape == (1, 32, 4, 6)  # the stem and both blocks halve it
-    points = camera.points(camera.maps(features))
-    waves = [math.pi * 2**k * p for p in points[0].tolist() for k in range(3)]
-    told = torch.tensor([[*points[0].tolist(), *map(math.sin, waves), *map(math.cos, waves)]])
-    cells = features.unflatten(3, (3, 2)).unflatten(2, (2, 2)).mean((3, 5))  # 2 × 3 cells of 2 × 2
-    told = torch.cat([told, camera.pooled(cells.flatten(1))], dim=1)
-    expected = camera.out(torch.nn.functional.gelu(camera.hidden(told)))
-    torch.testing.assert_close(camera(image), expected.view(1, 3, 8))
-
-
-def test_a_block_of_a_camera_is_the_identity_beside_two_convolutions():
-    block, x = Residual(16, 16, 1), torch.randn(2, 16, 5, 5)
-    torch.nn.init.zeros_(block.out.weight)
-    torch.nn.init.zeros_(block.out.bias)
-    torch.testing.assert_close(block(x), x.clamp(min=0))
-    assert Residual(16, 32, 2)(x).shape == (2, 32, 3, 3)
 
 
 def test_norm_sum_and_relu_are_those_of_pytorchs_modules_in_the_maps_own_precision():

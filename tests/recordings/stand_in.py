@@ -16,13 +16,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from mcap.writer import Writer
 
 from taccorl.data.origin import Origin, labelled
 from taccorl.robots import ROBOT
 from taccorl.surrogate import drivers
-from taccorl.surrogate.driver_messages import MessageWriter
-from tests.recordings.encodings import WRITERS
 from tests.recordings.pictures import Scene
 from tests.recordings.story import Story, plan_episodes
 
@@ -42,8 +39,6 @@ class StandInConfig(drivers.DriverConfig):
     """Number of episodes: equal time slots of at least 2 s, each with one attempt between its markers."""
     outcomes: tuple[str, ...] = ("success",)
     """Closing markers, repeated over the episodes; in an episode with ``failure`` the tube misses the hole."""
-    encoding: str = "ros2"
-    """Encoding of messages in MCAP files."""
     # Faults
     joints_in_degrees: bool = False
     """Fault: joint messages are in degrees."""
@@ -105,9 +100,6 @@ class StandInStreams(drivers.Streams):
             }
         if config.swap_pads:
             self._renamed |= dict(_each_other(*(drivers.PAD_TOPICS[pad] for pad in config.swap_pads)))
-
-    def encoder(self, writer: Writer) -> MessageWriter:
-        return WRITERS[self.config.encoding](writer)
 
     def all(self) -> list[Iterator[drivers.Event]]:
         return [self._with_faults(stream) for stream in super().all()]

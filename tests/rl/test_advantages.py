@@ -1,20 +1,9 @@
-"""Generalised advantage estimation by hand, and across resets."""
+"""Generalised advantage estimation by hand."""
 
 import pytest
 import torch
 
 from taccorl.rl.advantages import estimate_advantages, explained_variance, normalise
-
-
-def episodes(seed: int = 0) -> dict[str, torch.Tensor]:
-    """12 decisions of 7 environments, with successes and time limits."""
-    g = torch.Generator().manual_seed(seed)
-    reward, value, last = (torch.rand(12, 7, generator=g) for _ in range(3))
-    terminated = torch.rand(12, 7, generator=g) < 0.2
-    end = terminated | (torch.rand(12, 7, generator=g) < 0.2)
-    following = torch.cat([value[1:], last[-1:]])
-    next_value = torch.where(terminated, 0.0, torch.where(end, last, following))
-    return {"reward_TN": reward, "value_TN": value, "next_value_TN": next_value, "end_TN": end}
 
 
 def test_three_decisions_by_hand() -> None:
@@ -29,15 +18,6 @@ def test_three_decisions_by_hand() -> None:
     given = {name: torch.tensor(x)[:, None] for name, x in column.items()}
     advantage, returns = estimate_advantages(**given, gamma=0.5, gae_lambda=0.5)
     assert advantage[:, 0].tolist() == [0.25, 1.0, 2.0] and returns[:, 0].tolist() == [2.25, 5.0, 3.0]
-
-
-def test_no_credit_passes_over_a_reset() -> None:
-    given = episodes()
-    before, _ = estimate_advantages(**given, gamma=0.99, gae_lambda=0.95)
-    t = int(given["end_TN"][:, 0].nonzero()[0])
-    given["reward_TN"][t + 1 :] += 100.0
-    after, _ = estimate_advantages(**given, gamma=0.99, gae_lambda=0.95)
-    assert torch.equal(before[: t + 1, 0], after[: t + 1, 0]) and not torch.equal(before[t + 1 :, 0], after[t + 1 :, 0])
 
 
 def test_normalised_advantages_and_explained_variance() -> None:

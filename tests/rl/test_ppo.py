@@ -270,27 +270,6 @@ def test_float32_weights_keep_a_small_learning_rate() -> None:
     assert (before != weights(learner.actor)).float().mean() > 0.99  # pyright: ignore
 
 
-def test_stopped_and_resumed_learner_is_the_same_bit_for_bit() -> None:
-    """After a warm-up, which does not begin again, and a step, whose moments count."""
-    settings = PPOSettings(actor_lr=3e-4, batch_size=64, critic_warmup=1, adapt_lr=True, kl_stop=1.0)
-
-    def after(resumed: bool) -> torch.Tensor:
-        learner, generator = ppo(LinePolicy(), settings), torch.Generator().manual_seed(9)
-        for _ in range(2):
-            learner.update(rollout(learner), generator)
-        if resumed:
-            state, own = learner.state_dict(), [p.detach().clone() for p in learner.actor.trained_parameters()]
-            learner = ppo(LinePolicy(seed=8), settings)
-            for p, value in zip(learner.actor.trained_parameters(), own, strict=True):
-                p.data.copy_(value)
-            learner.load_state_dict(state)
-        assert learner.actor_lr == pytest.approx(1.2 * 3e-4)
-        learner.update(rollout(learner, seed=1), generator)
-        return weights(learner.actor)  # pyright: ignore
-
-    assert torch.equal(after(False), after(True))
-
-
 def test_running_normalisation_of_privileged_numbers() -> None:
     x = torch.randn(100, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor([0.0, 3.0, -2.0])
     critic = Critic(2, 3)
@@ -329,12 +308,3 @@ def test_the_anchor_holds_the_policy_to_the_demonstrations() -> None:
     assert all(before < 0.3 and after > 0.8 for before, after, _ in found)
     free, loose, held = (drift for _, _, drift in found)
     assert held < loose < 0.5 * free
-
-
-def test_no_credit_passes_from_an_episode_to_the_one_before_it() -> None:
-    """With γ = λ = 1 and a critic that always says 0 the return is the reward that is left in the episode: 0 or 1."""
-    learner = ppo(imitated(steps=50), PPOSettings(gamma=1.0, gae_lambda=1.0))
-    torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
-    found = collect(LineWorld(32), learner, 20, torch.Generator().manual_seed(0))
-    assert found.facts["outcomes"][SUCCESS] > 32  # more than one episode of some environments
-    assert set(found.decisions.return_M.round(decimals=4).tolist()) == {0.0, 1.0}

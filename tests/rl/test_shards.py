@@ -94,11 +94,6 @@ def test_a_process_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not shard.process.is_alive()
 
 
-def test_what_environments_refuse_in_a_process_is_said_here() -> None:
-    with pytest.raises(TaccorlError, match="assembly_22"):
-        call(ProcessShard(maker(task="assembly_22")), "facts")
-
-
 def test_a_process_that_was_killed_is_named() -> None:
     shard = ProcessShard(maker())
     call(shard, "restart", 0)

@@ -5,8 +5,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import taccorl
 from taccorl.robots import ROBOT
 
@@ -80,50 +78,6 @@ def _is_size(value: object) -> bool:
 
 def _is_literal_type(node: ast.AST) -> bool:
     return isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name) and node.value.id == "Literal"
-
-
-@pytest.mark.parametrize(
-    "code",
-    [
-        "action[7 * a : 7 * a + 6] = joints",
-        "command[a * 7 + 6]",
-        "openings = rows[:, [6, 13]]",
-        "action = np.empty(14)",
-        "feature = PolicyFeature(kind, (14,))",
-        "rows = array.reshape(-1, 14)",
-        "if values.shape[1] != 14: pass",
-        "SIZE = 14",
-        "taxels = np.zeros((n, 1536))",
-        "pad = np.zeros((n, 4, 32, 12))",
-        "still = np.tile([0.02] * 6 + [0.001], 2)",
-        "for i in range(6): pass",
-        "names = [f'joint{j}' for j in range(1, 7)]",
-        "own = joints[..., :6]",
-        "grip = sim.proprioception()[0, 6]",
-        "CAMERAS = ('front', 'left_wrist', 'right_wrist')",
-        "for arm in ('left', 'right'): pass",
-        "pads = ['left_a', 'right_b']",
-    ],
-)
-def test_a_literal_of_the_robot_is_found(code: str) -> None:
-    assert list(robot_literals(code))
-
-
-@pytest.mark.parametrize(
-    "code",
-    [
-        "pose = np.zeros(6)",  # a twist
-        "x = 10 * t**3 - 15 * t**4 + 6 * t**5",
-        "align = {'left': 0, 'right': 1}",
-        "arm: Literal['left', 'right'] = 'left'",
-        "for side in ('top', 'right'): pass",
-        "qpos[i, first : first + 7] = pose",  # position and quaternion
-        "font = load(14)",
-        "joints = state[ROBOT.joint_slice(arm)]",
-    ],
-)
-def test_what_is_not_the_robot_s_passes(code: str) -> None:
-    assert not list(robot_literals(code))
 
 
 def test_no_module_states_numbers_or_names_of_the_robot_itself() -> None:

@@ -17,7 +17,6 @@ from taccorl.sim.cameras import (
     bench_cameras,
     letterbox_window,
     look_at_quat,
-    offset_pose,
     project,
     sensor_intrinsics,
 )
@@ -109,29 +108,6 @@ def test_the_target_is_in_the_middle_and_up_is_up():
         middle, above = project(np.stack([ahead, higher]), position, world_from_camera, camera)
         assert middle == pytest.approx((319.5, 239.5), abs=1e-9)
         assert above[0] == pytest.approx(319.5, abs=1e-6) and above[1] < 239.5 - 5
-
-
-def test_a_wrist_camera_moves_with_its_hand():
-    spec = bench_bodies()
-    add_cameras(spec, bench_cameras())
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    seen = []
-    for angle in (0.0, 0.7):
-        data.joint("left_joint").qpos = angle
-        mujoco.mj_forward(model, data)
-        hand = data.body("left_link6")
-        seen.append(hand.xmat.reshape(3, 3).T @ (data.camera("left_wrist").xpos - hand.xpos))
-    assert np.allclose(seen, [(-0.09, 0.0, 0.06)] * 2, atol=1e-12)
-    assert data.camera("right_wrist").xpos[1] < 0 < data.camera("left_wrist").xpos[1]
-
-
-def test_no_offset_leaves_the_pose_bit_identical():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        position, quat = rng.normal(size=3), rng.normal(size=4)
-        moved = offset_pose(position, quat, CameraOffset())
-        assert moved[0].tobytes() == position.tobytes() and moved[1].tobytes() == quat.tobytes()
 
 
 def test_an_offset_moves_the_picture_as_the_pinhole_says():

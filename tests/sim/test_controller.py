@@ -72,7 +72,3 @@ def test_an_arm_may_have_gains_of_its_own():
 def test_wrong_gains_are_refused_by_name(settings, said):
     with pytest.raises(TaccorlError, match=said):
         ControllerConfig(**settings)
-
-
-def test_a_drive_without_damping_or_torque_is_one() -> None:
-    ControllerConfig(kd_nms_per_rad=[0.0] * 6, torque_ff_nm=[0.0] * 6)

@@ -121,14 +121,6 @@ def test_pads_are_noisy_yet_repeatable(env: TaccorlEnv) -> None:
     assert same(env.reset(seed=3)[0], first) and same(env.step(first[STATE])[0], later)
 
 
-def test_time_limit_truncates() -> None:
-    env = TaccorlEnv("assembly_1", images=False, max_episode_steps=3)
-    action = env.reset(seed=0)[0][STATE]
-    ends = [env.step(action)[2:4] for _ in range(3)]
-    assert ends == [(False, False), (False, False), (False, True)]
-    assert env.step(action)[4]["failure"] == "timeout"
-
-
 def test_wrong_actions_are_named(env: TaccorlEnv) -> None:
     action = env.reset(seed=0)[0][STATE]
     with pytest.raises(TaccorlError, match=r"action: shape \(13,\), expected \(14\): left_joint1"):

@@ -12,7 +12,6 @@ from taccorl.errors import TaccorlError
 from taccorl.robots.robot_spec import PadLayout
 from taccorl.sim.pad import KINEMATIC_FIELDS, OneSim, PadArray, Touch
 from taccorl.sim.shapes import triangle_outline
-from taccorl.sim.touch_kernel import take_off_sinking
 
 PADS = ("a", "b")
 STIFFNESS_N_PER_M = 1e4
@@ -295,28 +294,6 @@ def test_deepest_taxel_moves_as_the_spring_does() -> None:
         assert touch.depth_rate_mps[0, p, deepest] == pytest.approx(spring.qvel[0], abs=1e-7)
 
 
-def test_sinking_is_taken_off_all_taxels_alike() -> None:
-    """D = 0, 0.9, 1.5, 1.2 mm on a plate pressed in by 1.2, 1.1, 1.0, 0.9 mm (it tilts): D − c = −, −0.2, 0.5, 0.3 mm.
-
-    So r = 0.5 mm, δ = 0, 0.4, 1.0, 0.7 mm. With Ḋ = 0, 5, 8, 6 and ċ = 9, 8, 6, 5 mm/s: ṙ = 8 − 6 = 2 mm/s."""
-    depth, rate, c, c_rate = (
-        np.array(values, np.float32) * np.float32(1e-3)
-        for values in ([0, 0.9, 1.5, 1.2], [0, 5, 8, 6], [1.2, 1.1, 1.0, 0.9], [9, 8, 6, 5])
-    )
-
-    def without(*pad: np.ndarray) -> np.ndarray:
-        depth, rate, *plate = (a.copy() for a in pad)
-        take_off_sinking(depth, rate, *plate)
-        return np.stack([depth, rate])
-
-    assert without(depth, rate, c, c_rate) == pytest.approx(
-        np.array([[0, 0.4e-3, 1e-3, 0.7e-3], [0, 3e-3, 6e-3, 4e-3]]), abs=1e-9
-    )
-    # A plate that is further in than the part: nothing has sunk, nothing is taken off.
-    assert without(depth, rate, c + 1, c_rate)[0].tolist() == depth.tolist()
-    assert not without(0 * depth, 0 * rate, -c, c_rate).any()
-
-
 def test_plate_that_tilts_is_pressed_in_by_a_plane() -> None:
     """Finger a, plate in by 1 mm and turned by 0.02 rad about +y (its pivot 1.8 mm behind the surface) and −0.01 rad about z.
 
@@ -333,33 +310,6 @@ def test_plate_that_tilts_is_pressed_in_by_a_plane() -> None:
     # Plus second-order terms of the pivot's 1.8 mm: 1.8e-3 · 2.5e-4 = 0.5 µm.
     assert compression.depth_m[0, 0] == pytest.approx(expected, abs=2e-6)
     assert compression.depth_m[0, 1] == pytest.approx(0, abs=1e-9)
-
-
-def test_plates_speed_is_the_central_difference_of_its_compression() -> None:
-    """Pressed in by 4 mm, tilted by 0.1 rad and turning at 2 rad/s, on fingers that move: all terms count."""
-    model = rig("box", tilts=True)
-    data = mujoco.MjData(model)
-    pads, state = PadArray(model, PADS), OneSim(data)
-    rng = np.random.default_rng(3)
-    step_s = 1e-4
-    for _ in range(5):
-        start, speed = np.zeros(model.nq), rng.normal(0, 0.05, model.nv)
-        for pad in PADS:
-            start[model.joint(f"{pad}_spring").qposadr] = 0.004
-            for axis in "yz":
-                start[model.joint(f"{pad}_tilt_{axis}").qposadr] = rng.choice([-0.1, 0.1])
-                speed[model.joint(f"{pad}_tilt_{axis}").dofadr] = rng.normal(0, 2.0)
-        start[model.joint("part").qposadr[0] + 3] = 1.0
-        found = []
-        for time_s in (-step_s, 0.0, step_s):
-            data.qpos[:], data.qvel[:] = start, speed
-            mujoco.mj_integratePos(model, data.qpos, speed, time_s)
-            mujoco.mj_forward(model, data)
-            found.append(pads.compression(state))
-        before, now, after = found
-        difference = (after.depth_m.astype(float) - before.depth_m) / (2 * step_s)
-        assert np.abs(difference).max() > 0.02
-        assert now.depth_rate_mps == pytest.approx(difference, abs=2e-5)
 
 
 # ---- what is felt ----

@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-import sys
 import textwrap
 import threading
 from pathlib import Path
@@ -257,20 +256,6 @@ def test_shadows_reflections_and_sites_are_not_drawn_and_the_model_is_left_alone
     assert model.vis.quality.offsamples == 4 and model.vis.quality.shadowsize == 4096  # MuJoCo's defaults
 
 
-def test_style_does_not_change_physics():
-    paths = []
-    for with_style in (False, True):
-        model = clutter(with_style).compile()
-        data = mujoco.MjData(model)
-        path = []
-        for _ in range(200):
-            mujoco.mj_step(model, data)
-            path.append(data.qpos.copy())
-        paths.append(np.stack(path))
-    assert paths[0].tobytes() == paths[1].tobytes()
-    assert np.abs(paths[0][-1] - paths[0][0]).max() > 0.01  # something did fall
-
-
 def test_close_frees_and_another_picture_opens_again(cluttered):
     model, datas, together = cluttered
     renderer = Renderer(model, NAMES)
@@ -285,24 +270,6 @@ def test_close_frees_and_another_picture_opens_again(cluttered):
         assert np.array_equal(one.render(datas[:1]), together[:1])
         assert np.array_equal(other.render(datas[1:2]), together[1:2])
         assert np.array_equal(one.render(datas[2:3]), together[2:3])
-
-
-@pytest.mark.slow
-def test_a_renderer_that_outlives_python_is_left_alone(monkeypatch):
-    model, closed = spots(), []
-    monkeypatch.setattr(Renderer, "close", lambda self: closed.append(self._gl))
-    renderers = [Renderer(model, []), Renderer(model, [])]
-    for renderer in renderers:
-        renderer._gl = object()  # as if it had drawn
-    monkeypatch.setattr(sys, "is_finalizing", lambda: True)
-    del renderer
-    renderers.pop()
-    gc.collect()
-    assert closed == []
-    monkeypatch.setattr(sys, "is_finalizing", lambda: False)
-    renderers.pop()
-    gc.collect()
-    assert len(closed) == 1
 
 
 def test_a_renderer_may_be_used_from_another_thread(cluttered):

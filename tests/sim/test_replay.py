@@ -37,17 +37,6 @@ def test_sample_k_is_the_twin_before_command_k_acts(bench):
     np.testing.assert_allclose(done.time_s, np.arange(30) / 200)
 
 
-def test_replay_of_a_twin_s_own_commands_gives_its_own_answer(bench):
-    rng = np.random.default_rng(0)
-    walk = bench.targets[0] + np.cumsum(rng.normal(size=(60, 14)) * 2e-3, axis=0)
-    walk[:, [6, 13]] = 0.05
-    start = bench.proprioception()[0].copy()
-    first = replay(bench, walk, 100.0, start)
-    bench.reset([0])
-    again = replay(bench, walk, 100.0, start)
-    np.testing.assert_array_equal(first.reported, again.reported)
-
-
 def test_a_measured_episode_is_replayed_row_by_row(bench):
     # "Measured" in a twin with friction: its rows hold the state at each 1/30 s and the target reached 1/30 s later. The twin
     # without friction replays it: same rows, same commands, and the residual is what friction does; with friction it is nothing.

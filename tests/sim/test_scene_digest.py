@@ -14,10 +14,3 @@ def test_evidence_and_interval_of_an_effect_make_no_other_scene_but_its_value_do
     told = digest(torque_nm=0.4, interval={"torque_nm": (0.3, 0.5)}, evidence="validation error halves")
     assert told == digest(torque_nm=0.4)
     assert told != digest(torque_nm=0.41)
-
-
-def test_telling_changes_nothing_in_the_twin_itself():
-    effect = make_effect("coulomb_friction", torque_nm=0.4, evidence="kept")
-    config = TwinConfig(effects=[effect])
-    scene_digest(Assembly1(), config, 1.0)
-    assert config.effects[0].evidence == "kept"

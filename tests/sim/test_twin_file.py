@@ -57,13 +57,6 @@ def test_a_file_of_another_machine_is_refused_with_its_kind_and_line(tmp_path: P
         load_twin(path)
 
 
-@pytest.mark.parametrize("name", ["impratio"])
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_physics_without_sense_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(TaccorlError, match=rf"physics\.{name}: {value} .* finite number > 0"):
-        PhysicsConfig(**{name: value})
-
-
 def changed_everywhere() -> TwinConfig:
     front, left, right = bench_cameras()
     turned = CameraOffset(rotation_rad=(0.01, -0.02, 1e-7))

@@ -112,12 +112,6 @@ def test_a_near_twin_of_a_kind_outside_the_registry_is_named_and_another_effect_
     assert silently_wrong(row(("magnetic_hysteresis",), ("cogging",)))
 
 
-def test_near_twins_of_kinds_outside_are_joint_effects_or_will_be():
-    for name, k in KINDS.items():
-        if not k.registered:
-            assert set(k.near) <= set(KINDS) - {name}, name
-
-
 def test_lost_commands_are_said_by_a_finding_or_an_effect():
     assert drop_said(row(("dropped_commands",), (), findings=["does_not_repeat", "dropped_commands"]))
     assert not drop_said(row(("dropped_commands",), ("backlash",), findings=["does_not_repeat"]))
@@ -169,12 +163,6 @@ def test_keys_tell_jobs_apart_and_are_the_same_for_the_same_job():
     ]
     assert len({job.key for job in jobs}) == len(jobs) == 18
     assert {job.key for job in nothing("chirp", [0])} == {"none chirp none seed 0"}
-
-
-def test_a_removed_effect_is_hidden_and_unknown_to_the_search():
-    known, outside = removed("chirp", ["cogging", "nothing_in_the_registry"], [4])
-    assert (known.hidden, known.without) == (("cogging",), ("cogging",))
-    assert (outside.hidden, outside.without) == (("nothing_in_the_registry",), ())
 
 
 @pytest.mark.slow

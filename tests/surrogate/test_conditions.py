@@ -90,29 +90,6 @@ SLOW = 0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 
 """0.1 rad/s."""
 
 
-def test_a_tight_spot_brakes_where_it_is():
-    run = made(Change(drive={"spot": 0.05, "spot_angle": 0.15, "spot_width": 0.04}), SLOW)
-    up = run[:600]
-    at = lambda angle: up[np.argmin(np.abs(up[:, 0] - angle)), 1]  # noqa: E731
-    assert at(0.15) == pytest.approx(0.05, rel=0.03)
-    assert at(0.19) == pytest.approx(0.05 * np.exp(-1), rel=0.1)
-    assert abs(at(0.02)) < 2e-3
-
-
-def test_an_end_stop_pushes_back_in_proportion_to_how_deep_it_is():
-    run = made(Change(drive={"stop": 20.0, "stop_angle": 0.2}), np.repeat([0.0, 0.3], [200, 600]))
-    # K_p (0.3 − q) = k (q − 0.2): q = (5 · 0.3 + 20 · 0.2) / 25
-    assert run[-1, 0] == pytest.approx(0.22, abs=1e-4)
-
-
-def test_a_motor_has_no_torque_left_at_its_no_load_speed():
-    target = np.repeat([0.0, 1.5], [100, 700])
-    run = made(Change(drive={"stall": 2.0, "no_load": 1.2}), target)
-    speed = np.gradient(run[:, 0], 0.005)
-    assert 1.0 < speed.max() < 1.201
-    assert np.gradient(made(Change(), target)[:, 0], 0.005).max() > 3.0
-
-
 def test_gains_that_differ_by_direction_hold_a_spring_differently():
     drive = {"one_way": 0.2, "spring": 1.0, "spring_rest": 0.0}
     for side, gain in ((1.0, 1.2), (-1.0, 0.8)):

@@ -8,7 +8,7 @@ from scipy.signal import cont2discrete, lfilter
 
 from taccorl.alignment.measurements.motions import CHIRP, LOADED_CHIRP, POSES, RATE_HZ, Motion, Room
 from taccorl.sim.robot import RobotConfig, link_poses
-from taccorl.surrogate.arm import GRAVITY, bodies, mass_matrix, torques
+from taccorl.surrogate.arm import GRAVITY, bodies, mass_matrix
 from taccorl.surrogate.hidden import KINDS, Change, Scale
 from taccorl.surrogate.plant import Arm, Drive, Run, simulate
 from taccorl.surrogate.robot import Robot, inertia_and_weight
@@ -76,6 +76,14 @@ def test_energy_stays_when_nothing_drives_or_brakes():
     assert np.ptp(total) < 2e-3 * (energy(run.angle[-1], run.velocity[-1]) - energy(run.angle[-1], NONE))
 
 
+def test_stiction_is_greater_in_slow_motion_than_in_fast():
+    sticky = robot(coulomb=0.02, stribeck=0.06, stribeck_speed=0.05)
+    for speed in (0.007, 0.3):
+        run = sticky.run(of_targets(speed * np.arange(800) / 200), ROOM)
+        friction = 0.02 + 0.06 * math.exp(-((speed / 0.05) ** 2))
+        assert run.effort[-200:, JOINT - 1].mean() == pytest.approx(friction, rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("drive", "up_nm", "down_nm"),
     [
@@ -91,52 +99,6 @@ def test_in_slow_motion_friction_costs_what_its_law_says(drive, up_nm, down_nm):
     assert effort[5500:6500].mean() == pytest.approx(down_nm, rel=0.04)
 
 
-def test_a_command_within_the_friction_moves_nothing():
-    # K_p · 0.002 rad is less than the friction.
-    run = robot(coulomb=0.003 * KP).run(of_targets(np.repeat([0.0, 0.002], 400)), ROOM)
-    assert np.ptp(joint(run)) < 1e-4
-
-
-def test_stiction_is_greater_in_slow_motion_than_in_fast():
-    sticky = robot(coulomb=0.02, stribeck=0.06, stribeck_speed=0.05)
-    for speed in (0.007, 0.3):
-        run = sticky.run(of_targets(speed * np.arange(800) / 200), ROOM)
-        friction = 0.02 + 0.06 * math.exp(-((speed / 0.05) ** 2))
-        assert run.effort[-200:, JOINT - 1].mean() == pytest.approx(friction, rel=0.02)
-
-
-def test_a_delayed_command_gives_the_same_motion_later():
-    plain, late = joint(robot().run(CHIRP, ROOM)), joint(robot(delay=0.02).run(CHIRP, ROOM))
-    np.testing.assert_allclose(late[4:], plain[:-4], rtol=0, atol=1e-5)
-
-
-def test_a_delayed_report_is_the_same_motion_later():
-    plain = robot()
-    late = Robot(f"left_joint{JOINT}", (KP, KD, 0.0), [Change(report_delay_s=0.02)], POSE)
-    run = plain.run(CHIRP, ROOM)
-    np.testing.assert_array_equal(late.run(CHIRP, ROOM).angle, run.angle)
-    np.testing.assert_allclose(late.reported(run)[4:, 4], plain.reported(run)[:-4, 4], rtol=0, atol=1e-12)
-
-
-def test_the_torque_limit_holds_and_counts_the_weight():
-    plain = robot()
-    run = plain.run(CHIRP, ROOM)
-    most = 0.7 * np.abs(run.effort[:, JOINT - 1] + plain.carried_nm(run)).max()
-    limited = robot(torque_max=float(most))
-    run = limited.run(CHIRP, ROOM)
-    drawn = np.abs(run.effort[:, JOINT - 1] + limited.carried_nm(run))
-    assert 0.99 * most < drawn.max() < 1.01 * most
-
-
-def test_a_weak_motor_lets_the_arm_sag_by_what_it_does_not_carry():
-    run = robot(torque_scale=0.8).run(REST, ROOM)
-    angle = np.array(POSE)
-    angle[JOINT - 1] += joint(run)[-1]
-    weight = torques(bodies(RobotConfig(), 0.02), angle, NONE, NONE, GRAVITY)[JOINT - 1]
-    # 0.8 (K_p e + weight) = weight
-    assert joint(run)[-1] == pytest.approx(-(weight / 0.8 - weight) / KP, rel=0.01)
-
-
 def test_an_encoders_bias_is_taken_for_the_angle():
     biased = robot(encoder_bias=0.05)
     run = biased.run(REST, ROOM)
@@ -144,23 +106,9 @@ def test_an_encoders_bias_is_taken_for_the_angle():
     np.testing.assert_allclose(biased.reported(run)[:, JOINT - 1], POSE[JOINT - 1], atol=1e-5)
 
 
-def test_integral_action_takes_a_constant_error_away():
-    target = np.repeat([0.0, 0.3], [200, 1400])
-    plain = joint(robot(coulomb=0.01 * KP).run(of_targets(target), ROOM))[-1]
-    mended = joint(robot(coulomb=0.01 * KP, integral=2.0).run(of_targets(target), ROOM))[-1]
-    assert 0.3 - plain > 0.005
-    assert abs(0.3 - mended) < 0.002
-
-
-def test_a_dead_band_leaves_its_width():
-    target = np.repeat([0.0, 0.3], [200, 800])
-    assert joint(robot(deadband=0.01).run(of_targets(target), ROOM))[-1] == pytest.approx(0.29, abs=1e-4)
-
-
 # Joint 1 turns about a vertical axis: no weight, so that in its play the motor is alone.
 INERTIA_1, _ = inertia_and_weight(np.array(POSES[0]), 1)
 KP_1, KD_1 = INERTIA_1 * OMEGA**2, 2 * ZETA * OMEGA * INERTIA_1
-ROTOR = 0.01
 
 
 def geared(target: np.ndarray, **drive: float) -> np.ndarray:
@@ -168,37 +116,6 @@ def geared(target: np.ndarray, **drive: float) -> np.ndarray:
     made = Robot("right_joint1", (KP_1, KD_1, 0.0), [Change(drive=drive)], POSES[0])
     room = Room.of(1, 0.0, INERTIA_1, 0.0)
     return made.run(Motion(name="made", target=lambda room: target), room).angle[::5, 0]
-
-
-def test_within_the_play_a_motor_moves_itself_alone():
-    step = np.repeat([0.0, 0.002], [100, 100])
-    discrete = cont2discrete(([KP_1 / ROTOR], [1.0, KD_1 / ROTOR, KP_1 / ROTOR]), 1 / RATE_HZ)
-    alone = lfilter(np.ravel(discrete[0]), discrete[1], step)
-    np.testing.assert_allclose(geared(step, play=0.02), alone, atol=2e-5)
-    assert np.abs(geared(step) - alone).max() > 1e-4  # a rigid one does not
-
-
-def test_with_a_spring_in_the_gear_motor_and_link_are_two_masses():
-    compliance, damping_s = 0.05, 0.002
-    k, link = 1 / compliance, INERTIA_1 - ROTOR
-    c = damping_s * k
-    a = np.array(
-        [
-            [0, 1, 0, 0],
-            [-(KP_1 + k) / ROTOR, -(KD_1 + c) / ROTOR, k / ROTOR, c / ROTOR],
-            [0, 0, 0, 1],
-            [k / link, c / link, -k / link, -c / link],
-        ]
-    )
-    b = np.array([[0], [KP_1 / ROTOR], [0], [0]])
-    step = np.repeat([0.0, 0.05], [100, 300])
-    ad, bd, *_ = cont2discrete((a, b, np.eye(4), np.zeros((4, 1))), 1 / RATE_HZ)
-    state, motor = np.zeros(4), []
-    for u in step:
-        motor.append(state[0])
-        state = ad @ state + bd[:, 0] * u
-    np.testing.assert_allclose(geared(step, compliance=compliance, compliance_damping=damping_s), motor, atol=2.5e-4)
-    assert np.abs(geared(step) - motor).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (k % 4 > 0)) for k, n in enumerate(KINDS)])

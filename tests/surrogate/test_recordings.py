@@ -7,7 +7,6 @@ import pytest
 from taccorl.alignment.checks.telemetry import check_measurements
 from taccorl.alignment.measurements import motions
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig, empty_bench
 from taccorl.surrogate.cases import draw_case
@@ -129,8 +128,3 @@ def test_the_other_arm_rests_and_the_other_joints_wobble_a_little(measurements):
     wobble = np.ptp(run.angle, axis=0)
     assert 1e-6 < wobble[1] < 5e-3
     assert wobble[4] > 0.3
-
-
-def test_a_design_that_does_not_exist_is_refused(case):
-    with pytest.raises(TaccorlError, match="no design"):
-        recordings(case, "everything")

@@ -10,7 +10,6 @@ from scipy.signal import cont2discrete, lfilter
 from taccorl.alignment.measurements.motions import CHIRP, POSES, RATE_HZ, Motion, Room
 from taccorl.errors import TaccorlError
 from taccorl.surrogate.cases import LOOP_FLOORS, draw_case
-from taccorl.surrogate.hidden import Change
 from taccorl.surrogate.plant import STEP_S
 from taccorl.surrogate.robot import TWIN_LATE_S, Robot, free_inertia, inertia_and_weight
 from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable, spectral_radius
@@ -72,25 +71,6 @@ def test_a_sampled_loop_moves_as_a_lighter_joint_does():
     assert late / INERTIA == pytest.approx(0.088, abs=0.002)  # K_p from angles and J is 9.6 % too large
     as_light, as_heavy = (rms(angle - linear(inertia)) for inertia in (INERTIA - late, INERTIA))
     assert as_light < 0.4 * as_heavy  # the twin's half step is left
-
-
-def test_a_fast_loop_moves_as_a_continuous_one_does():
-    plain, fast = (
-        Robot(f"left_joint{JOINT}", (KP, KD, 0.0), [], POSE, loop=loop).run(CHIRP, ROOM).angle[::5, 0]
-        for loop in (None, SampledLoop(steps=2, filter_s=0.0))
-    )
-    assert rms(fast - plain) < 2e-3 * rms(plain - POSE[JOINT - 1])
-
-
-def test_what_is_hidden_acts_on_a_sampled_loop_too():
-    def robot(**drive: float) -> np.ndarray:
-        made = Robot(f"left_joint{JOINT}", (KP, KD, 0.0), [Change(drive=drive)] if drive else [], POSE, loop=LOOP)
-        return made.run(Motion(name="made", target=lambda room: np.repeat([0.0, 0.3], [100, 900])), ROOM).angle[:, 0]
-
-    assert robot(deadband=0.01)[-1] == pytest.approx(0.29, abs=1e-4)
-    assert 0.3 - robot(coulomb=0.02 * KP)[-1] > 0.002
-    assert robot(coulomb=0.02 * KP, integral=3.0)[-1] == pytest.approx(0.3, abs=1e-3)
-    assert robot()[-1] == pytest.approx(0.3, abs=1e-6)
 
 
 def test_a_drawn_loop_is_no_later_than_asked():

@@ -1,7 +1,5 @@
 """Surrogate pads: what can be said of them beforehand, and what the twin's replay makes of their recordings."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 from taccorl.surrogate import touch
 from taccorl.surrogate.touch import FIT, TouchCase, draw_touch_case, record_touch, touch_recordings
-from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS, board, material, spread
+from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS, board, material
 
 QUICK = touch.Press(
     name="quick", knots=((0, -1e-3), (1.5, -1e-3), (1.8, 8e-4), (3.0, 8e-4), (3.2, -1e-3), (4.2, -1e-3))
@@ -63,55 +61,6 @@ def test_the_registrys_effect_with_the_true_numbers_explains_what_is_hidden(name
         before, after = rms((without - recorded)[:, pressed]), rms((with_it - recorded)[:, pressed])
         assert after < 0.75 * before or before < 1.6
         assert after < 2.2
-
-
-def test_a_power_of_two_squares_and_saturation_halves_at_its_limit():
-    ramp = load([(0, 0), (1, 2.0)], 1.0)
-    np.testing.assert_allclose(through("taxel_power_law", ramp, exponent=2.0), ramp[:, 0] ** 2, atol=1e-9)
-    np.testing.assert_allclose(
-        through("taxel_saturation", ramp, limit=2.0), ramp[:, 0] / (1 + ramp[:, 0] / 2), atol=1e-9
-    )
-    assert through("taxel_threshold", ramp, threshold=0.5).max() == pytest.approx(1.498, abs=0.002)
-
-
-def test_hysteresis_reads_less_on_the_way_in_and_more_on_the_way_out():
-    slow = load([(0, 0), (2, 1.0), (4, 0.0)], 4.0)
-    quick = load([(0, 0), (0.2, 1.0), (0.4, 0.0)], 0.4)
-    for reading in (slow, quick):  # at any speed
-        out = through("taxel_hysteresis", reading, half_width=0.2)
-        half = len(out) // 2
-        assert out[half // 2] == pytest.approx(0.8 * 0.5, rel=0.01)
-        assert out[half + half * 3 // 4] == pytest.approx(1.2 * 0.25, rel=0.05)
-    hold = load([(0, 0), (1, 1.0), (5, 1.0)], 5.0)
-    assert np.ptp(through("taxel_hysteresis", hold, half_width=0.2)[1001:]) < 1e-9
-
-
-def test_creep_goes_on_in_a_hold_and_fades_after_it():
-    hold = load([(0, 0), (0.01, 1.0), (8, 1.0), (8.01, 0.0)], 14.0)
-    out = through("taxel_creep", hold, share=0.4, time_constant_s=1.0)
-    assert out[20] == pytest.approx(1.0, abs=0.02)
-    # 1 + 0.4 (1 − ½ exp(−1/0.8) − ½ exp(−1/1.25)) after a second
-    assert out[1010] == pytest.approx(1 + 0.4 * (1 - 0.5 * math.exp(-1 / 0.8) - 0.5 * math.exp(-1 / 1.25)), abs=0.005)
-    assert out[7990] == pytest.approx(1.4, abs=0.005)
-    assert out[8050] > 0.35 and out[-1] < 0.01
-
-
-def test_delay_and_lag_are_late_by_their_time():
-    ramp = load([(0, 0), (2, 2.0)], 2.0)
-    for name, key in (("touch_delay", "delay_s"), ("touch_lag", "time_constant_s")):
-        out = through(name, ramp, **{key: 0.0535})
-        assert out[1500] == pytest.approx(1.5 - 0.0535, abs=1e-3)
-
-
-def test_what_spreads_is_not_lost():
-    frames = np.zeros((1, *ROBOT.pad.shape))
-    frames[0, 5, 0] = 1.0  # at the edge
-    shared = spread("taxel_crosstalk", {"share": 0.4}, frames)
-    assert shared.sum() == pytest.approx(1.0, abs=1e-12)
-    assert shared[0, 4, 0] == pytest.approx(0.1 * 0.9) and shared[0, 5, 1] == pytest.approx(0.1 * 0.8)
-    ghost = spread("taxel_ghosting", {"share": 0.02}, frames)[0]
-    assert ghost[5, 0] == pytest.approx(1.0)
-    assert ghost[5, 7] == pytest.approx(0.02) and ghost[20, 0] == pytest.approx(0.02) and ghost[20, 7] == 0
 
 
 def test_boards_have_the_spread_and_the_dead_taxels_of_their_numbers():

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from lerobot.configs.train import TrainPipelineConfig
 
 from taccorl.alignment.machines.axis_file import load_axis
@@ -16,7 +15,6 @@ from taccorl.sim.twin_file import load_twin
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ALL = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*"))
-TRAINING = [name for name in ALL if name.startswith(("cotrain/", "learn/"))]
 
 
 def lerobot_train(path: Path | None, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
@@ -59,19 +57,6 @@ def test_every_file_is_loaded_by_what_reads_it(name: str, monkeypatch: pytest.Mo
     assert readers[name.split("/")[0]](CONFIGS / name) is not None
 
 
-@pytest.mark.parametrize("name", TRAINING)
-def test_a_training_file_holds_differences_from_the_defaults_only(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
-
-    written = yaml.safe_load((CONFIGS / name).read_text(encoding="utf-8"))
-    policy = written.pop("policy")
-    assert policy.pop("type") == "tactile_pi05"
-    for given, default in ((written, TrainPipelineConfig), (policy, TactilePI05Config)):
-        for key, value in given.items():
-            assert default.__dataclass_fields__[key].default != value, f"{name}: {key} is the default"
-    assert f"--config_path=configs/{name}" in (CONFIGS / name).read_text(encoding="utf-8")  # the line to type
-
-
 @pytest.mark.parametrize(
     ("task", "steps"),
     [
@@ -96,10 +81,3 @@ def test_the_papers_co_training_is_the_papers_table(task: str, steps: int, monke
     scheduler = config.scheduler
     # T_warm, η_max, η_min
     assert (scheduler.num_warmup_steps, scheduler.peak_lr, scheduler.decay_lr) == (100, 2.5e-5, 5e-6)
-
-
-def test_words_after_the_file_count_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ("--steps=7", "--policy.sim_weight=0.95", "--policy.image_randomization=true")
-    config = lerobot_train(CONFIGS / "learn" / "tiny.yaml", monkeypatch, *words)
-    assert (config.steps, config.policy.sim_weight, config.policy.image_randomization) == (7, 0.95, True)
-    assert config.policy.backbone == "tiny" and config.policy.optimizer_lr == 1e-3

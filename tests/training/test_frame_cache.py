@@ -248,19 +248,3 @@ def test_options_that_go_with_no_cache_are_refused():
         cache_request(cfg(streaming=True))
     with pytest.raises(TaccorlError, match=r"image_transforms"):
         cache_request(cfg(image_transforms=SimpleNamespace(enable=True)))
-
-
-def test_lerobots_configuration_of_a_dataset_has_the_options_and_keeps_its_own():
-    from lerobot.configs.default import DatasetConfig
-
-    config = DatasetConfig(repo_id="a/b", cache="gpu")
-    assert (config.cache, config.cache_store, config.streaming, config.eval_split) == (
-        "gpu",
-        "outputs/store",
-        False,
-        0.0,
-    )
-    assert config == DatasetConfig("a/b", cache="gpu") != DatasetConfig("a/b")
-    assert config.image_transforms is not DatasetConfig("a/b").image_transforms
-    with pytest.raises(ValueError, match="eval_split"):  # LeRobot's own checks
-        DatasetConfig("a/b", eval_split=2.0)

@@ -162,13 +162,6 @@ def test_only_touch_gets_a_window(root, monkeypatch):
     assert resolve(config, metadata) == {"action": [0.0, 1 / 30]}
 
 
-def test_padded_start_of_a_window_repeats_the_first_row(root, monkeypatch):
-    item = load(root, FastReader, monkeypatch, delta_timestamps=WINDOWS)[16]  # third row of the second episode
-    assert item[f"{TOUCH}_is_pad"].tolist() == [True] * 7 + [False] * 3
-    assert all(torch.equal(item[TOUCH][k], item[TOUCH][7]) for k in range(7))
-    assert not torch.equal(item[TOUCH][8], item[TOUCH][7])
-
-
 def test_it_is_installed_once_and_for_the_version_it_was_compared_with(installed, monkeypatch, caplog):
     stock = factory.resolve_delta_timestamps
     assert reading.install() and reading.install()

@@ -3,13 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from made_traces import FLOOR_RAD, ORIGIN, comparison, swing, trace
 from rerun.experimental import RrdReader
 
 from taccorl.diagnosis.comparison.result import Comparison, TouchTrace
 from taccorl.views.compare_view import MOST_ROWS, comparison_blueprint, save_comparison
-from taccorl.views.outputs import OutputError
 
 _, POSITION = swing(seconds=3.0)
 LEFT = np.where(np.gradient(POSITION) >= 0, 2e-3, -2e-3)
@@ -86,17 +84,6 @@ def test_file_says_where_its_data_is_from_and_shows_the_pads(tmp_path: Path):
     assert set(images) == {f"/press_1_mcap/touch/{name}" for name in ("measured", "twin", "corrected")}
     frame = np.array(images["/press_1_mcap/touch/measured"][20][0], np.uint8).view(np.uint16).reshape(32, 2 * 12 + 3)
     np.testing.assert_array_equal(frame[:, 15:], touch().measured[20, 1])
-
-
-def test_somebody_else_s_file_is_left_alone(tmp_path: Path):
-    path = tmp_path / "x.rrd"
-    path.write_text("mine")
-    with pytest.raises(OutputError, match="exists and was not written"):
-        save_comparison(pair()[0], path)
-    assert path.read_text() == "mine"
-    path.unlink()
-    save_comparison(pair()[0], path)
-    save_comparison(pair()[0], path)  # ours is replaced
 
 
 def test_many_recordings_are_spread_over_tabs():

@@ -10,7 +10,6 @@ from PIL import Image
 from taccorl.data.episode import Episode
 from taccorl.views.colors import CONTACT_COLOR, heat
 from taccorl.views.contact_sheet import GATE_COLORS, ORIGIN_COLOR, PAPER, choose_instants, contact_sheet, nice_ticks
-from taccorl.views.outputs import OutputError
 from taccorl.views.touch import contact_gate, pads_of, peak_row
 
 from .made_episode import ORIGIN, TOUCH, draw, made_episode, without
@@ -125,17 +124,6 @@ def test_pictures_are_decoded_in_one_pass(episode: Episode, tmp_path: Path):
 
     contact_sheet(dataclasses.replace(episode, pictures=stream), tmp_path / "sheet.png")
     assert asked == list(range(ROWS)), "once each"
-
-
-def test_sheet_replaces_its_own_and_nothing_else(episode: Episode, tmp_path: Path):
-    ours, theirs = tmp_path / "ours.png", tmp_path / "theirs.png"
-    contact_sheet(episode, ours)
-    contact_sheet(episode, ours)
-    Image.new("RGB", (8, 8)).save(theirs)
-    before = theirs.read_bytes()
-    with pytest.raises(OutputError, match=r"theirs\.png: exists and was not written by `taccorl view`"):
-        contact_sheet(episode, theirs)
-    assert theirs.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from taccorl.data.sensor_spec import load_sensor_spec
 from taccorl.data.spec import data_specs_folder
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, Pad, contact_gate, pads_of, peak_row
 
-from .made_episode import TOUCH, made_episode, touch_counts, without
+from .made_episode import TOUCH, made_episode, without
 
 FLEXITAC = load_sensor_spec(data_specs_folder() / "sensors" / "flexitac_v2.yaml")
 SMALL = dataclasses.replace(FLEXITAC, rows=2, columns=2)
@@ -42,13 +42,6 @@ def test_gate_asks_all_pads_together():
     quiet, loud = pad([[0, 0], [0, 0]]), pad([[0, 0], [0, 90]])
     assert contact_gate([quiet, loud]).tolist() == [True]
     assert contact_gate([quiet, quiet]).tolist() == [False]
-
-
-def test_pads_come_in_the_specs_order_with_the_counts_of_the_dataset():
-    pads = pads_of(made_episode(20, picture_size=32))
-    assert [p.name for p in pads] == ["left_a", "left_b", "right_a", "right_b"]
-    for i, p in enumerate(pads):
-        assert np.array_equal(p.counts, touch_counts(20)[:, i])
 
 
 def test_a_window_feature_shows_its_newest_reading_and_no_pad_twice():

@@ -11,7 +11,6 @@ from taccorl.alignment.controller.identification import identify_controller, pap
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion
-from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
@@ -200,9 +199,3 @@ def test_recordings_that_tell_nothing_are_refused_by_name() -> None:
         identify_controller([good], model, validation=[dead])
     with pytest.raises(TaccorlError, match=r"free parameters \['mass'\]; choose among kp, kd, torque_ff"):
         identify_controller([good], model, free=["mass"])
-
-
-def test_a_fit_says_how_it_was_found() -> None:
-    fit = identify_controller([motion_of(ELBOW)], JointModel(REFERENCE_TWIN, ELBOW), start=Gains(2000.0, 20.0, -5.0))
-    assert fit.converged and fit.gains.kp == pytest.approx(TRUTH[ELBOW].kp, rel=0.05)
-    assert fit.signal == ELBOW and fit.estimates["kd"].unit == "N·m/(rad/s)"

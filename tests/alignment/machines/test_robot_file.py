@@ -206,18 +206,6 @@ def test_coupling_follows_a_step_of_another_joint_and_leaves_out_noise(tmp_path:
     assert np.std(off[100:900]) < 0.007  # N·m: noise of 0.05 mrad below 20 Hz is 0.006, below 60 Hz more
 
 
-def test_a_slide_holds_its_weight_and_has_no_angle(tmp_path: Path) -> None:
-    lift = TWO_LINKS.replace('name="shoulder" axis="0 1 0"', 'name="shoulder" type="slide" axis="0 0 1"')
-    made = robot(tmp_path, model=lift)
-    m = dataclasses.replace(swept(shoulder=np.zeros(300), elbow=np.zeros(300)), units=("m", "rad"))
-    model = JointModel(made, "shoulder")
-    seen = motion_of(m, "shoulder", model.joint)
-    np.testing.assert_allclose(seen.coupling_nm, 3 * 9.81, rtol=1e-6)
-    assert model.inertia_kgm2(seen) == pytest.approx(3.0)
-    answer = model.simulate(dataclasses.replace(seen, start=-3 * 9.81 / 50), model.gains)
-    np.testing.assert_allclose(answer.reported, -3 * 9.81 / 50, atol=1e-9)  # it hangs m g / K_p below its target
-
-
 @pytest.mark.parametrize("bias_rad", [0.0, 0.2])
 def test_carried_weight_is_no_load_for_the_controller_and_is_in_the_effort(bias_rad: float, tmp_path: Path) -> None:
     model = JointModel(robot(tmp_path, ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:")), "elbow")

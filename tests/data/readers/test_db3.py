@@ -169,24 +169,6 @@ def test_a_file_that_was_cut_off_keeps_what_lies_before_the_cut(bag: Path) -> No
     assert any("to the last cannot be read" in d.reason for d in reader.damage)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_random_damage_ends_as_messages_and_damages_or_as_an_error_in_plain_words(bag: Path, seed: int) -> None:
-    path = db3_of(bag)
-    rng = np.random.default_rng(seed)
-    content = bytearray(path.read_bytes())
-    for _ in range(3):
-        at = int(rng.integers(0, len(content) - 2000))
-        content[at : at + 2000] = rng.bytes(2000)
-    path.write_bytes(content)
-    reader = reader_of(bag)
-    try:
-        found = list(reader.messages(None))
-    except RecordingError as error:
-        assert str(path) in str(error)
-    else:
-        assert len(found) == NUM + NUM // 2 or reader.damage
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -281,14 +263,3 @@ def test_bags_compressed_message_by_message_are_read_and_compressed_files_say_wh
     whole = write_bag(tmp_path / "whole", compression=CompressionMode.FILE, num=10)
     with pytest.raises(RecordingError, match=r"a compressed bag file: unpack it with `unzstd whole\.db3\.zstd`"):
         find_sources(whole)
-
-
-def test_files_of_a_split_bag_are_one_recording_in_the_order_of_metadata_yaml(tmp_path: Path) -> None:
-    bag = tmp_path / "split"
-    bag.mkdir()
-    for number in (0, 1):
-        shutil.copyfile(db3_of(write_bag(tmp_path / f"part_{number}", num=3 + number)), bag / f"split_{number}.db3")
-    names = "[split_1.db3, split_0.db3]"
-    (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {{relative_file_paths: {names}}}\n")
-    found = list(reader_of(bag).messages({"/joints"}))
-    assert [round((m.log_ns - LATE_NS - START_NS) / 5e6) for m in found] == [0, 1, 2, 3, 0, 1, 2]

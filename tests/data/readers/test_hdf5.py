@@ -263,12 +263,3 @@ def test_values_of_another_kind_are_refused_when_asked_for(tmp_path: Path) -> No
     assert len(messages(path, "/fine")) == 3
     with pytest.raises(RecordingError, match=r"/pairs: values of type .* are not read"):
         messages(path, "/pairs")
-
-
-def test_the_original_is_only_read(tmp_path: Path) -> None:
-    path = write(tmp_path / "e.hdf5", rows=3)
-    before = (path.read_bytes(), path.stat().st_mtime_ns)
-    path.chmod(0o444)
-    for _ in readers.get("hdf5")(Source(path, (path,))).messages({"/action"}):
-        assert [p.name for p in tmp_path.iterdir()] == ["e.hdf5"]
-    assert (path.read_bytes(), path.stat().st_mtime_ns) == before

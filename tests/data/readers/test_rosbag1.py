@@ -95,15 +95,6 @@ def test_only_times_may_be_asked_for_and_only_a_part(bag: Path) -> None:
     assert list(reader.messages({"/none"})) == []
 
 
-def test_files_of_a_split_bag_are_one_recording_if_the_spec_says_so(tmp_path: Path) -> None:
-    for k in (0, 1, 10):  # in the order of the numbers, not of the letters
-        write_bag(tmp_path / f"x_{k}.bag", start=k * NUM)
-    assert len(find_sources(tmp_path)) == 3
-    ((name, source),) = find_sources(tmp_path, split_bag=True)
-    frames = [m.value.frame for m in readers.get(name)(source).messages({"/pad"})]
-    assert frames == [k * NUM + i for k in (0, 1, 10) for i in range(NUM)]
-
-
 def test_inspect_drafts_a_spec_that_names_this_reader(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ingest", "inspect", str(bag)]) == 0
     shown = capsys.readouterr().out

@@ -203,15 +203,6 @@ def test_seeds_are_of_root_task_and_attempt_and_not_those_of_collect():
 
 
 @pytest.mark.slow
-def test_an_attempt_is_the_same_whatever_ran_before(pool, succeeded):
-    again = Attempts(pool, Simulation(Assembly2()), seed=11).run(succeeded.attempt)
-    np.testing.assert_array_equal(again.actions, succeeded.actions)
-    assert again.last_state == succeeded.last_state
-    assert again.outcome == "success"
-    assert again.provenance["subtasks"] == succeeded.provenance["subtasks"]
-
-
-@pytest.mark.slow
 def test_replay_of_commands_sends_the_source_s_commands_and_learns_nothing(collected, sim):
     spec = with_options(load_mimic_spec("assembly_2"), retarget="eef_command")
     sources = read_sources(collected, spec)
@@ -262,14 +253,6 @@ def test_actions_that_do_not_reach_the_goal_are_not_reproduced(sim, rows_spec, s
     cut = dataclasses.replace(succeeded, actions=succeeded.actions[:200])
     done = execute(sim, cut, rows_spec, GatesSpec())
     assert done.facts["differs"] and done.outcome == "not reproduced"
-
-
-@pytest.mark.slow
-def test_a_gate_that_is_not_passed_is_the_outcome(pool, sim, succeeded):
-    spec = dataclasses.replace(pool.spec, gates=GatesSpec(max_force_n=1.0))
-    strict = Attempts(SourcePool(spec, pool.sources), sim, seed=11).run(succeeded.attempt)
-    assert strict.outcome == "force"
-    assert "N between mating parts, the gate is 1" in strict.reason
 
 
 def test_each_gate_names_what_it_measured():

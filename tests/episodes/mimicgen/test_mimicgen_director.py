@@ -108,17 +108,6 @@ def test_a_grasp_of_a_displaced_object_is_the_displaced_grasp_and_the_bridge_kee
     assert steps_m.max() < 0.25 / 30
 
 
-def test_a_gripper_one_step_late_is_noticed():
-    source = demonstration(scene())
-    late = {
-        arm: dataclasses.replace(track, opening_m=np.r_[track.opening_m[:1], track.opening_m[:-1]])
-        for arm, track in source.arms.items()
-    }
-    made = generate(pool_of(mimic_spec(), dataclasses.replace(source, arms=late)), scene())
-    for arm in BOX:
-        assert np.flatnonzero(made.openings[arm] != source.arms[arm].opening_m)[0] == GRIP_ROW[arm]
-
-
 def test_without_coordination_the_hands_do_not_meet():
     sources = [demonstration(scene())]
     new = scene(plug=pose(0.24, -0.16, 0.02))  # the right hand's way is longer

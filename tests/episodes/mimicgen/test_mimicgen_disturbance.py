@@ -180,13 +180,6 @@ def test_rows_show_what_was_intended_and_keep_what_was_executed(pushed, pool):
 
 
 @pytest.mark.slow
-def test_the_provenance_states_disturbance_and_who_moves_the_hands_in_contact(pushed, pool):
-    assert pushed.provenance["disturbance"] == {"joint_rad": 0.02, "time_s": 0.7}
-    assert pushed.provenance["contact_mode"] == pool.spec.datagen_config.contact_mode
-    assert ("corrections" in pushed.provenance) == (pool.spec.datagen_config.contact_mode == "closed_loop_expert")
-
-
-@pytest.mark.slow
 def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     store = Store(tmp_path / "store")
     plan = AugmentPlan(spec=SPEC, sources=store.dataset(collected), episodes=1, images=False)

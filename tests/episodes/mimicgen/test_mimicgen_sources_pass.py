@@ -11,7 +11,7 @@ from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.mimicgen.from_dataset import simulation_of
 from taccorl.episodes.sources.mimicgen.gates import GateKeeper, Measured, foreign_contact
-from taccorl.episodes.sources.mimicgen.spec import GatesSpec, load_mimic_spec
+from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
@@ -41,18 +41,6 @@ def check(root: Path, task: str) -> None:
         assert measured.force_n > 0, episode.name  # parts do mate, and the gates saw it
         refused = measured.refused(spec.gates) or foreign_contact(sim, states)
         assert refused is None, (episode.name, refused, measured)
-
-
-@pytest.mark.slow
-def test_a_source_of_assembly_2_passes_the_gates(collected):
-    check(collected, "assembly_2")
-
-
-@pytest.mark.slow
-def test_the_check_can_fail(collected):
-    episode = Dataset(collected).episode(0)
-    measured, _ = redone(episode, simulation_of(episode, "assembly_2"))
-    assert measured.refused(GatesSpec(max_force_n=0.5 * measured.force_n)) is not None
 
 
 @pytest.mark.slow

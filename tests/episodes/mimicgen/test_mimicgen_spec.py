@@ -6,7 +6,6 @@ import pytest
 import yaml
 
 from taccorl.episodes.sources.mimicgen.spec import (
-    GenerationSpec,
     check_task,
     load_mimic_spec,
     mimic_spec_path,
@@ -101,9 +100,3 @@ def test_a_spec_that_is_not_the_tasks_is_named(old, new, said, tmp_path):
     path.write_text(mimic_spec_path("assembly_2").read_text().replace(old, new, 1))
     with pytest.raises(SpecError, match=said):
         check_task(load_mimic_spec(path), tasks.get("assembly_2")())
-
-
-def test_defaults_are_the_held_object_without_noise():
-    generation = GenerationSpec()
-    assert (generation.retarget, generation.contact_mode) == ("held_object", "replay")
-    assert generation.noise.position_m == generation.noise.rotation_rad == 0.0

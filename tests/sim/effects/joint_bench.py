@@ -3,9 +3,7 @@
 At rest at home everything is in balance: the controller's targets stand T_ref / K_p below the angles, and weight is carried.
 """
 
-import mujoco
 import numpy as np
-from press_bench import PressBench
 
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
@@ -38,23 +36,6 @@ def drive(sim: Simulation, seconds: float, offset=lambda t: 0.0, column: int = C
     return dict(zip(("t", "u", "q", "v", "reported"), np.array(rows).T, strict=True))
 
 
-def static_torque_nm(sim: Simulation, column: int = COLUMN) -> float:
-    """What it takes to hold a joint up against weight, compensation left out."""
-    model, data = sim.batch.get_model(0), sim.batch.get_data(0)
-    data.qvel[:] = 0.0
-    mujoco.mj_forward(model, data)
-    return float(data.qfrc_bias[model.joint(ROBOT.action_names[column]).dofadr[0]])
-
-
 def asked_nm(motion: dict[str, np.ndarray]) -> np.ndarray:
     """(T,) what a controller without effects would ask for: K_p (u − q) − K_d q̇ + T_ref."""
     return KP * (motion["u"] - motion["q"]) - KD * motion["v"] + TORQUE_FF
-
-
-def without_feedforward(*effects: Effect) -> Simulation:
-    """As ``press_bench.start`` at home, but T_ref of joint 5 is 0: it rests at its target."""
-    config = TwinConfig(effects=list(effects))
-    config.controller.torque_ff_nm[4] = 0.0
-    sim = Simulation(PressBench(), config)
-    sim.reset([0])
-    return sim

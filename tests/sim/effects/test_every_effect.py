@@ -2,8 +2,7 @@
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import TOUCH_SLOTS, ArmEffect, Effect, JointEffect, Memory, TouchEffect, number
+from taccorl.sim.effects.effect import TOUCH_SLOTS, ArmEffect, Effect
 
 BASE = ("kp", "kd", "torque_ff", "k_n", "k_d")
 """Numbers that are always fitted."""
@@ -203,48 +202,3 @@ def one_joint(**numbers: float) -> np.ndarray:
     target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
     none, ones = np.zeros(200), np.ones(200)
     return simulate(drive, target, none, none, ones, ones, none, 0.5, 6, 1, 1 / 1200, 0.0)[0]
-
-
-@dataclass(kw_only=True)
-class JumpsIn(JointEffect):
-    """Planted: the slightest bias acts as one of 10 mrad."""
-
-    name: ClassVar = "jumps_in"
-    bias_rad: float = number("b", "rad", 0.0, 0.01, (0.0, 0.1), "planted")
-
-    def encoder(self, values: np.ndarray) -> np.ndarray:
-        return values + 0.01
-
-
-@dataclass(kw_only=True)
-class DoesNothing(JumpsIn):
-    """Planted: a parameter without an effect."""
-
-    def encoder(self, values: np.ndarray) -> np.ndarray:
-        return values
-
-
-@pytest.mark.parametrize("cls", [JumpsIn, DoesNothing])
-def test_an_effect_whose_absent_value_is_wrong_or_that_does_nothing_is_caught(cls: type[Effect]) -> None:
-    with pytest.raises(AssertionError):
-        check_fades_out(cls)
-
-
-@dataclass(kw_only=True)
-class Forgetful(TouchEffect):
-    """Planted: what it remembers is not part of the state."""
-
-    name: ClassVar = "forgetful"
-    slot: ClassVar = "material"
-    share: float = number("a", "1", 0.0, 0.5, (0.0, 1.0), "planted")
-    scans: ClassVar = 0
-
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        type(self).scans += 1
-        return reading + self.share * self.scans
-
-
-def test_a_memory_outside_of_the_state_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(effects._entries, "forgetful", Forgetful)
-    with pytest.raises(AssertionError):
-        test_a_run_is_the_same_alone_and_in_a_batch_on_any_number_of_threads_and_from_a_snapshot("forgetful")
