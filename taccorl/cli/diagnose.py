@@ -52,7 +52,7 @@ def run(config: DiagnoseConfig) -> int:
 
     check_folder(config.out, config.measurements)
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.report.diagnosed import diagnosed
+    from taccorl.report.diagnosed import brief
     from taccorl.report.report import write_report
     from taccorl.report.terminal import show
     from taccorl.sim.effects import effects
@@ -78,8 +78,8 @@ def run(config: DiagnoseConfig) -> int:
     found = _diagnosed(config, machine, parts, measurements)
     mended, disagree = machine.mended(found)
     report = _report(config, machine, found, beside, measurements, mended)
-    verdicts, regimes = report.verdicts(), report.regimes()
-    show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part), report.options) for f in found))
+    verdicts = report.verdicts()
+    show(*(brief(f, verdicts[f.part], report.options) for f in found))
     clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
     written = write_report(report, config.out)  # makes the folder of the corrected twin, too

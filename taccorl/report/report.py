@@ -144,7 +144,7 @@ class Report:
             *([compared.touch(self.without_effects, self.after)] if c.touches else []),
             compared.cell_numbers(self.last),
             compared.how_far(*twins),
-            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part), self.options) for f in self.found),
+            *(diagnosed(f, self.origins, regimes.get(f.part), self.options) for f in self.found),
             compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
             compared.checked(self.findings),
             compared.not_compared(c),
