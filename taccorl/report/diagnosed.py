@@ -34,11 +34,9 @@ def brief(f: Finding, v: Verdict, options: Sequence[str] = ()) -> Section:
     """Lines of a terminal; a page has more. The verdict, numbers and command of what was added, reasons, and what to record where
     that decides. ``options``: as in ``verdict``."""
     d, names = f.diagnosis, added(f.diagnosis)
-    found = v.kind in ("effects", "ties")
-    new = [e for e in d.effects if e.name in names]
     text: list[Value] = [Cell(v.finding, "bold")]
-    text += [f"{f'{e.name} ' * (len(names) > 1)}{_in_twin(d)}: {_values(e)}" for e in new]
-    text += [Cell(f"to add it: {_to_add(f.part, names, options)}", "bold")] * found
+    text += [f"{f'{e.name} ' * (len(names) > 1)}{_in_twin(d)}: {_values(e)}" for e in d.effects if e.name in names]
+    text += [Cell(f"to add it: {_to_add(f.part, names, options)}", "bold")] * (v.kind in ("effects", "ties"))
     text += [Cell(v.confidence, v.level)]
     if v.kind != "effects":
         text += [f"Record next: {v.record_next}", *[Cell(v.command, "bold")] * bool(v.command)]
@@ -242,17 +240,12 @@ def _regimes(found: RegimeErrors) -> Section:
 
 def _evidence(number: int, r: Round) -> Section:
     heads = ("", "effect", "fitted", "validation × floor", "gain", "z", "evidence", "verdict")
-    marks = dict.fromkeys(r.ties, "tie") | {r.added: "added"}
+    kinds = dict.fromkeys(r.ties, "tie") | {r.added: "added"}
+    marks = [kinds.get(e.name, "") for e in r.evidence]
+    rows = [_evidence_row(e, {"added": "→", "tie": "="}.get(m, "")) for e, m in zip(r.evidence, marks, strict=True)]
     left = [f"Screened out by their first probe: {', '.join(r.not_refitted)}."] if r.not_refitted else []
-    return Section(
-        title=f"Evidence, round {number}",
-        heads=heads,
-        rows=[_evidence_row(e, {"added": "→", "tie": "="}.get(marks.get(e.name, ""), "")) for e in r.evidence],
-        right=range(3, 6),
-        marks=[marks.get(e.name, "") for e in r.evidence],
-        notes=left,
-        folded=True,
-    )
+    title = f"Evidence, round {number}"
+    return Section(title=title, heads=heads, rows=rows, right=range(3, 6), marks=marks, notes=left, folded=True)
 
 
 def _evidence_row(e: Evidence, mark: str) -> list[Value]:
