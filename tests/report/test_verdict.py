@@ -149,8 +149,7 @@ def test_no_motion_is_planned_for_an_effect_and_the_same_with_a_number_at_its_en
     v = verdict(
         PART, changed(one, effects=(make_effect("coulomb_friction", torque_nm=0.4),), rivals=tied, intervals=ends)
     )
-    assert (v.command == "") == same == ("exponent" in v.record_next)
-    assert ("power_law_friction" in v.command) != same
+    assert (v.command == "") == same == ("exponent" in v.record_next) and ("power_law_friction" in v.command) != same
 
 
 def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest():
@@ -158,8 +157,7 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
     assert d.status == "something_else"
     v = verdict(PART, d)
-    assert (v.kind, v.level) == ("something_else", "low")
-    assert f"{d.errors['after']['validation']:.2f}" in v.finding
+    assert (v.kind, v.level) == ("something_else", "low") and f"{d.errors['after']['validation']:.2f}" in v.finding
     assert max(e.gain for e in d.rounds[-1].evidence) < 0.05, "neither takes away anything"
     worst = RegimeError(recording="fast.csv", use="validation", regime="high speed", error=12.3, n=100)
     where = verdict(PART, d, worst=worst)
