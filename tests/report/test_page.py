@@ -65,8 +65,7 @@ def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(
     }
     show(ingested({"recordings": [{**entry, "episodes": []}], "outcomes": {"refused": 1}}))
     shown = capsys.readouterr().out
-    assert f"refused {reason}\n" in shown
-    assert f"taccorl check {path}\n" in shown
+    assert f"refused {reason}\n" in shown and f"taccorl check {path}\n" in shown
     assert "…" not in shown
     table = shown.split("refused /data")[0]
     assert path in "".join(line.split("  ")[0].strip() for line in table.splitlines()[1:])  # folded, not cut

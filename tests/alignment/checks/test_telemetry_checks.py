@@ -124,9 +124,9 @@ def test_lead_names_joint_time_and_way_out(clean):
     assert "target_rows_late: 2" in table and "latency_s" not in table
 
 
-def resonant(motion: np.ndarray, rate_hz: float) -> Measurement:
-    """ω = 20 rad/s, ζ = 0.1, with noise."""
-    seen = lfilter(*_second_order(20.0, 0.1, 1 / rate_hz), motion - motion[0]) + motion[0]
+def resonant(motion: np.ndarray, rate_hz: float, zeta: float = 0.1) -> Measurement:
+    """ω = 20 rad/s, with noise."""
+    seen = lfilter(*_second_order(20.0, zeta, 1 / rate_hz), motion - motion[0]) + motion[0]
     noise = 1e-4 * np.random.default_rng(0).standard_normal(len(motion))
     return of_signal("made", rate_hz, motion, seen + noise, "table", source=Path("a.csv"))
 
@@ -134,7 +134,13 @@ def resonant(motion: np.ndarray, rate_hz: float) -> Measurement:
 def test_exchanged_columns_of_target_and_position_are_no_latency():
     clean, time_s = sweep(0, joints=[2, 4], seconds=5.0), np.arange(1000) / 100
     sways = resonant(0.3 * np.minimum(time_s, 1.0) * np.sin(3.0 * time_s), 100.0)
-    for m, joints in ((clean, 2), (sweep(0, joints=[2, 4], friction_nm=0.3, seconds=5.0), 2), (sways, 1)):
+    phase = 2 * np.pi * (0.1 + 0.12 * time_s) * time_s
+    each = [resonant(0.3 * np.minimum(time_s, 1.0) * np.sin(phase + late), 100.0, 1.0) for late in (0.0, 0.7, 1.9)]
+    columns = {key: np.hstack([getattr(m, key) for m in each]) for key in ("target", "measured")}
+    alike = Measurement(name="alike", time_s=time_s, signals=("a", "b", "c"), units=("rad",) * 3, **columns)
+    assert not any(f.severity == "error" for f in check_measurement(alike)), "of one motion, one after the other"
+    rough = sweep(0, joints=[2, 4], friction_nm=0.3, seconds=5.0)
+    for m, joints in ((clean, 2), (rough, 2), (sways, 1), (alike, 3)):
         swapped = dataclasses.replace(m, target=m.measured, measured=m.target, source=Path("a.csv"))
         errors = [f for f in check_measurement(swapped) if f.severity == "error"]
         assert {f.check for f in errors} == {"exchanged_target"} and len(errors) == joints
