@@ -75,7 +75,8 @@ def run(config: AddEffectConfig) -> int:
     mended.save(out)
     words = made_by[2:3] or ["YOUR_RECORDINGS"]
     words += [w for w in made_by if w.startswith(("--spec=", "--columns=", "--accept="))]
-    show(Section(text=[f"wrote {out}; next: {shlex.join(['taccorl', 'compare', *words, f'--twin={out}'])}"]))
+    words += [f"--twin={config.twin}"] * (config.twin is not None) + [f"--against={out}"] * (not config.in_place)
+    show(Section(text=[f"wrote {out}; next: {shlex.join(['taccorl', 'compare', *words])}"]))
     return 0
 
 

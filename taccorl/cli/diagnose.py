@@ -40,8 +40,8 @@ class DiagnoseConfig(PartsConfig):
     without: list[str] = field(default_factory=list)
     """Effects that the search does not add. Where a joint's twin has one already, it stays with its present numbers."""
     out: Path = Path("diagnosis")
-    """Folder of report.html, report.json, which ``taccorl add-effect`` reads, and the corrected twin.yaml. An earlier report is
-    replaced; other files are not overwritten."""
+    """Folder of report.html, report.json, which ``taccorl add-effect`` reads, and the corrected twin.yaml. An earlier report of
+    this twin is replaced; other files are not overwritten."""
 
 
 @verb(DiagnoseConfig, positional="measurements")
@@ -50,9 +50,9 @@ def run(config: DiagnoseConfig) -> int:
     something else remains, or the measurements have errors, or efforts of other gains than the file's."""
     from taccorl.report.report import check_folder
 
-    check_folder(config.out, config.measurements)
+    check_folder(config.out, config.measurements, config.twin or Path("nominal twin"))
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.report.diagnosed import diagnosed
+    from taccorl.report.diagnosed import brief
     from taccorl.report.report import write_report
     from taccorl.report.terminal import show
     from taccorl.sim.effects import effects
@@ -78,8 +78,8 @@ def run(config: DiagnoseConfig) -> int:
     found = _diagnosed(config, machine, parts, measurements)
     mended, disagree = machine.mended(found)
     report = _report(config, machine, found, beside, measurements, mended)
-    verdicts, regimes = report.verdicts(), report.regimes()
-    show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part), report.options) for f in found))
+    verdicts = report.verdicts()
+    show(*(brief(f, verdicts[f.part], report.options) for f in found))
     clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
     written = write_report(report, config.out)  # makes the folder of the corrected twin, too

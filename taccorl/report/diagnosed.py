@@ -1,6 +1,6 @@
-"""Sections of a diagnosed part: verdict, errors, numbers, effects, evidence, and what its recordings cannot tell."""
+"""Sections of a diagnosed part: verdict, errors, numbers, effects, evidence, and what its recordings cannot tell; and the few
+lines of a terminal."""
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
@@ -12,14 +12,14 @@ from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
-from taccorl.report.evidence_words import effect_class, evidence_words, last_refit_words, to_record, unit_words
+from taccorl.report.evidence_words import effect_class, evidence_words, last_refit_words, unit_words
 from taccorl.report.section import Cell, Picture, Section, Value, change
 from taccorl.report.verdict import NEAR, Verdict, added, refitted_words
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
-SHOWN = 6
-"""Rows of evidence, and of effects that look alike, in a terminal; a page has all."""
+REMARKS = 3
+"""Most remarks in a terminal; a page has all."""
 
 
 def verdict_section(v: Verdict) -> Section:
@@ -30,26 +30,66 @@ def verdict_section(v: Verdict) -> Section:
     return Section(text=text, style=v.level)
 
 
+def brief(f: Finding, v: Verdict, options: Sequence[str] = ()) -> Section:
+    """Lines of a terminal; a page has more. The verdict, numbers and command of what was added, reasons, and what to record where
+    that decides. ``options``: as in ``verdict``."""
+    d, names = f.diagnosis, added(f.diagnosis)
+    text: list[Value] = [Cell(v.finding, "bold")]
+    text += [f"{f'{e.name} ' * (len(names) > 1)}{_in_twin(d)}: {_values(e)}" for e in d.effects if e.name in names]
+    text += [Cell(f"to add it: {_to_add(f.part, names, options)}", "bold")] * (v.kind in ("effects", "ties"))
+    text += [Cell(v.confidence, v.level)]
+    if v.kind != "effects":
+        text += [f"Record next: {v.record_next}", *[Cell(v.command, "bold")] * bool(v.command)]
+    text += [f"Remark: {remark}" for remark in v.remarks[:REMARKS]]
+    text += [f"and {len(v.remarks) - REMARKS} more remarks: see the page"] * (len(v.remarks) > REMARKS)
+    text += [f"{_judged(f)}; noise floor {f.noise}", *[f.remark] * bool(f.remark)]
+    return Section(title=_title(f), parts=[Section(text=text)])
+
+
 def diagnosed(
-    f: Finding, v: Verdict, origins: Sequence[Origin], regimes: RegimeErrors | None = None, options: Sequence[str] = ()
+    f: Finding, origins: Sequence[Origin], regimes: RegimeErrors | None = None, options: Sequence[str] = ()
 ) -> Section:
-    """What was found at one part; a page has its verdict in another place. ``origins``: of the recordings, for the titles of
-    figures. ``regimes``: errors by recording and regime; None: left out. ``options``: as in ``verdict``."""
+    """What was found at one part, on a page, which has its verdict in another place. ``origins``: of the recordings, for the
+    titles of figures. ``regimes``: errors by recording and regime; None: left out. ``options``: as in ``verdict``."""
     d = f.diagnosis
-    new = [e for e in d.effects if e.name not in d.present]
     parts = [
-        dataclasses.replace(verdict_section(v), only="terminal"),
         _errors(f, regimes),
-        Section(figures=[_waterfall(f.part, d, origins)], only="page"),
+        Section(figures=[_waterfall(f.part, d, origins)]),
         *([] if f.known is None else [_identified(f.known)]),
-        *(_effect(f.part, d, e, options) for e in new),
+        *(_effect(f.part, d, e, options) for e in d.effects if e.name in added(d)),
         _numbers(d, f.known),
         *([] if regimes is None else [_regimes(regimes)]),
         *(_evidence(k, r) for k, r in enumerate(d.rounds, start=1)),
         *([Section(notes=[LEGEND])] if d.rounds else []),
         _can_tell(f),
     ]
-    return Section(title=f"{f.part}: {', '.join(added(d)) or 'nothing was added'}", parts=parts)
+    return Section(title=_title(f), parts=parts)
+
+
+def _title(f: Finding) -> str:
+    return f"{f.part}: {', '.join(added(f.diagnosis)) or 'nothing was added'}"
+
+
+def _judged(f: Finding) -> str:
+    judged = "the last rows of each" if f.rows_split else ", ".join(f.recordings.get("validation", ()))
+    return f"{f.numbers}; chosen by the error on {judged} (validation)"
+
+
+def _in_twin(d: Diagnosis) -> str:
+    return f"in the twin, with kp {d.base['kp']:.4g}" if "kp" in d.base else "in the twin"
+
+
+def _values(e: Effect) -> str:
+    return ", ".join(
+        f"{p.name} {p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)} ({_interval(e.interval, p.name)})"
+        for p in e.parameters()
+    )
+
+
+def _to_add(part: str, names: Sequence[str], options: Sequence[str]) -> str:
+    pads = [f"--pads={part.removesuffix(' pads')}"] * part.endswith(" pads")
+    own = [option for option in options if not option.startswith("--measurements=")]
+    return " ".join(["taccorl add-effect", ",".join(names), *pads, *own])
 
 
 LEGEND = (
@@ -67,13 +107,12 @@ def _errors(f: Finding, regimes: RegimeErrors | None) -> Section:
         if use in d.errors["after"]:
             before, fitted, after = (d.errors[stage][use] for stage in ("before", "fitted", "after"))
             rows.append([use, *map(_floors, (before, fitted, after)), change(fitted, after)])
-    judged = "the last rows of each" if f.rows_split else ", ".join(f.recordings.get("validation", ()))
-    text = [f"{d.words}", f"noise floor {f.noise}", f"{f.numbers}; chosen by the error on {judged} (validation)"]
+    text = [d.words, f"noise floor {f.noise}", _judged(f)]
     notes = [f.remark, last_refit_words(d), *(f"{name}: {words}" for name, words in summarised(d.base)[1].items())]
     if d.status == "something_else" and d.rounds and not d.standing_out:
         best = [e for e in d.rounds[-1].evidence[:1] if e.gain >= NEAR]
-        near = f"nearest: {best[0].name}, {best[0].verdict}" if best else "no effect comes near to it"
-        notes.append(f"the figures show where the residual is; {near}")
+        near = [f"nearest: {', '.join(filter(None, (e.name, e.verdict)))}" for e in best]
+        notes.append(f"the figures show where the residual is; {(near or ['no effect comes near to it'])[0]}")
     notes.append(d.trouble and f"the last fit: {d.trouble}")
     for names, what in (
         (d.undetermined, "not determined by these recordings, one of many values that fit"),
@@ -149,38 +188,22 @@ def _numbers(d: Diagnosis, known: Known | None) -> Section:
     notes = []
     if known is not None and not known.pinned_by and "kp" in d.base:
         notes = ["Together they reproduce the recordings; intervals include what the loop's timing leaves open."]
-    return Section(
-        heads=("number of the twin", "before", "fitted", "95 %"),
-        rows=rows,
-        right=range(1, 4),
-        notes=notes,
-        only="" if known is None else "page",
-    )
+    return Section(heads=("number of the twin", "before", "fitted", "95 %"), rows=rows, right=range(1, 4), notes=notes)
 
 
 def _effect(part: str, d: Diagnosis, e: Effect, options: Sequence[str]) -> Section:
     """What it is, on a robot and for a policy, who looks like it, and what to do next."""
-    values = [
-        f"{p.name} {p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)} ({_interval(e.interval, p.name)})"
-        for p in e.parameters()
-    ]
     rows: list[tuple[str, Value]] = [
         ("equation", Cell(e.equation, "code")),
-        (f"in the twin, with kp {d.base['kp']:.4g}" if "kp" in d.base else "in the twin", ", ".join(values)),
+        (_in_twin(d), _values(e)),
         ("what this is", e.in_words),
         ("what it does to a policy", e.at_a_policy),
         ("what shows it best", e.to_record),
     ]
     if rivals := d.rivals.get(e.name, ()):
         rows.append(("does as well", Cell(f"{', '.join(rivals)}: these recordings do not tell which it is", "bold")))
-        rows += [
-            ("what to record next", Cell(x, "code" if x.startswith("taccorl ") else ""))
-            for x in to_record(part, d, e.name, rivals, options)
-        ]
     rows += [(f"near-twin {other}", why) for other, why in d.twins.get(e.name, {}).items()]
-    pads = [f"--pads={part.removesuffix(' pads')}"] * part.endswith(" pads")
-    own = [option for option in options if not option.startswith("--measurements=")]
-    rows.append(("to add it", Cell(" ".join(["taccorl add-effect", e.name, *pads, *own]), "code")))
+    rows.append(("to add it", Cell(_to_add(part, [e.name], options), "code")))
     return Section(title=f"→ {e.name}", rows=rows)
 
 
@@ -212,24 +235,17 @@ def _regimes(found: RegimeErrors) -> Section:
         notes=[note],
         parts=[covered],
         folded=True,
-        only="page",
     )
 
 
 def _evidence(number: int, r: Round) -> Section:
     heads = ("", "effect", "fitted", "validation × floor", "gain", "z", "evidence", "verdict")
-    marks = dict.fromkeys(r.ties, "tie") | {r.added: "added"}
+    kinds = dict.fromkeys(r.ties, "tie") | {r.added: "added"}
+    marks = [kinds.get(e.name, "") for e in r.evidence]
+    rows = [_evidence_row(e, {"added": "→", "tie": "="}.get(m, "")) for e, m in zip(r.evidence, marks, strict=True)]
     left = [f"Screened out by their first probe: {', '.join(r.not_refitted)}."] if r.not_refitted else []
-    return Section(
-        title=f"Evidence, round {number}",
-        heads=heads,
-        rows=[_evidence_row(e, {"added": "→", "tie": "="}.get(marks.get(e.name, ""), "")) for e in r.evidence],
-        right=range(3, 6),
-        marks=[marks.get(e.name, "") for e in r.evidence],
-        shown=SHOWN,
-        parts=[Section(notes=left, only="page")],
-        folded=True,
-    )
+    title = f"Evidence, round {number}"
+    return Section(title=title, heads=heads, rows=rows, right=range(3, 6), marks=marks, notes=left, folded=True)
 
 
 def _evidence_row(e: Evidence, mark: str) -> list[Value]:
@@ -262,11 +278,6 @@ def _can_tell(f: Finding) -> Section:
     for name in found.invisible:
         twins = [t for t in effects.get(name).near_twins if t in d.start] if effect_class(name) else []
         hardly.append(f"{name} (looks like {' and '.join(twins)}, always fitted)" if twins else name)
-    few = ", ".join(hardly[:SHOWN]) + f" and {len(hardly) - SHOWN} more: see the page" * (len(hardly) > SHOWN)
-    how = "would hardly show at a typical strength"
-    parts = [
-        Section(text=[f"{how}: {few}"], only="terminal"),
-        Section(text=[f"{how}: {', '.join(hardly)}"], only="page"),
-    ] * bool(hardly)
+    notes = [f"would hardly show at a typical strength: {', '.join(hardly)}"] * bool(hardly)
     text = [] if rows or hardly else ["every effect would show, and none looks like another"]
-    return Section(title="What these recordings can tell", text=text, rows=rows, shown=SHOWN, parts=parts, folded=True)
+    return Section(title="What these recordings can tell", text=text, rows=rows, notes=notes, folded=True)

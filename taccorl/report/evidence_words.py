@@ -174,19 +174,6 @@ def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:
     return " ".join([*[alike] * bool(same), *nested])
 
 
-def to_record(part: str, d: Diagnosis, name: str, rivals: Sequence[str], options: Sequence[str] = ()) -> list[str]:
-    """Recordings that would separate an effect from its rivals: one command line, with ``options``; without one, the description
-    of each effect's own recording. Before it a sentence on rivals that no motion separates from it."""
-    same = [text] if (text := inseparable_words(d, name, rivals)) else []
-    rivals = separable(d, name, rivals)
-    if not rivals:
-        return same
-    command = excite_command(part, (name, *rivals))
-    if command:
-        return [*same, " ".join([command, *options])]
-    return same + list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
-
-
 def effect_class(name: str) -> type[Effect] | None:
     """Class of a registered effect; None for an effect that only a problem defines."""
     try:

@@ -144,7 +144,7 @@ class Report:
             *([compared.touch(self.without_effects, self.after)] if c.touches else []),
             compared.cell_numbers(self.last),
             compared.how_far(*twins),
-            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part), self.options) for f in self.found),
+            *(diagnosed(f, self.origins, regimes.get(f.part), self.options) for f in self.found),
             compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
             compared.checked(self.findings),
             compared.not_compared(c),
@@ -182,16 +182,23 @@ def numbers_of(diagnosis: Path) -> Path:
     return diagnosis if diagnosis.name == NUMBERS else diagnosis / NUMBERS
 
 
-def check_folder(folder: Path, measurements: Path | None = None) -> str:
+def check_folder(folder: Path, measurements: Path | None = None, twin: Path | None = None) -> str:
     """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
-    is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read. Raises
-    TaccorlError: another file has the report's name, the folder cannot be written, or it is the folder of the recordings."""
+    is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read. ``twin``:
+    file of the machine, if a diagnosis of another one is not to be replaced. Raises TaccorlError: another file has the report's
+    name, the folder cannot be written, or it is the folder of the recordings or of another machine's diagnosis."""
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
         raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
         raise TaccorlError(f"{folder}: is a file; give a folder for the report")
     check_writable(folder)
     page.check_free([folder / PAGE, folder / NUMBERS], GENERATOR, "another folder")
+    if twin is not None and (folder / NUMBERS).is_file():
+        of = json.loads((folder / NUMBERS).read_text("utf-8"))["provenance"].get("twin", "")
+        if of and Path(of).resolve() != twin.resolve():
+            raise TaccorlError(
+                f"{folder}: has the diagnosis of {of}, this one is of {twin}: give --out=diagnosis_{twin.stem}"
+            )
     if not (folder / PAGE).exists():
         return ""
     return datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M")

@@ -43,8 +43,6 @@ class Section:
     """Indices of the columns that are right-aligned."""
     marks: Sequence[str] = ()
     """Style of each row: added, tie, or empty."""
-    shown: int | None = None
-    """Most rows in a terminal; None: all."""
     figures: Sequence[Picture] = ()
     notes: Sequence[Value] = ()
     """Remarks below the rows."""
@@ -56,7 +54,7 @@ class Section:
     """Frame of the lines on a page and their colour in a terminal: high, moderate, low, or data."""
     folded: bool | None = None
     """True, False: a page shows a title to be unfolded, closed or open."""
-    only: Literal["", "page", "terminal"] = ""
+    only: Literal["", "page"] = ""
     """Where it is shown; empty: everywhere."""
 
 

@@ -50,10 +50,8 @@ def show(*sections: Section, indent: str = "") -> None:
         if s.rows and (any(s.heads) or len(s.rows[0]) != 2):
             out.print(_table(s, indent))
         elif s.rows:  # names and values
-            for name, value in s.rows[: s.shown]:
+            for name, value in s.rows:
                 out.print(_line(name, indent) + Text(": ") + _line(value, ""), soft_wrap=True)
-        if s.shown is not None and len(s.rows) > s.shown:
-            out.print(Text(f"{indent}and {len(s.rows) - s.shown} more: see the page", "dim"))
         for value in s.notes:
             out.print(_line(value, indent, "note"), soft_wrap=True)
         if s.command:
@@ -73,6 +71,6 @@ def _table(s: Section, indent: str) -> Table:
         table.add_column(
             Text(f"{indent if k == 0 else ''}{head}"), justify="right" if k in s.right else "left", overflow="fold"
         )
-    for row in s.rows[: s.shown]:
+    for row in s.rows:
         table.add_row(*(_line(value, indent if k == 0 else "") for k, value in enumerate(row)))
     return table

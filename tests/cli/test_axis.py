@@ -114,7 +114,7 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
     code, text = said("diagnose", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'found'}", FEW)
     assert code in (0, 1) and "slide lacks coulomb_friction" in text, text
     assert "_joint" not in text and "PiPER" not in text
-    assert re.search(r"torque_nm [\d.]+ N\b", text) and "N·m" not in text
+    assert re.search(r"torque_nm F = [\d.]+ N\b", text) and "N·m" not in text
     assert f"next: taccorl add-effect coulomb_friction --twin={drive}" in text
     page = (tmp_path / "found" / "report.html").read_text()
     assert page.count("<img") >= 5 and "slide" in page

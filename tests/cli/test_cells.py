@@ -67,8 +67,7 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said
         assert said(*shlex.split(command), f"--out={creeping / f'printed_{k}'}")[0] in (0, 1), command
     assert len(printed) >= 2 and given[0] in printed[-1]
     mended = load_cells(creeping / "taxel+taxel_creep.yaml")
-    assert [e.name for e in mended.effects] == ["taxel_creep"]
-    assert len(mended.gain) == len(mended.offset) == 1
+    assert [e.name for e in mended.effects] == ["taxel_creep"] and len(mended.gain) == len(mended.offset) == 1
     code, shown = said(
         "compare",
         presses,
@@ -115,8 +114,7 @@ def test_the_next_press_is_planned_with_the_columns_of_recordings(creeping: Path
 
 def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path: Path, said) -> None:
     code, shown = said("surrogate", "--secret=3", "--cells=true", "--effects=[taxel_threshold]", "--out=made")
-    assert code == 0
-    assert "simulated, not a real one" in shown
+    assert code == 0 and "simulated, not a real one" in shown
     assert "taxel_threshold" not in (tmp_path / "made" / "sealed_truth.json").read_text()
     assert "taxel_threshold" in said("surrogate", "--reveal=made")[1]
     assert load_cells(tmp_path / "made" / "taxel.yaml").names == ("thumb",)
@@ -133,8 +131,7 @@ def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path: Pat
     assert mended.gain == [40.0]
     assert mended.effects[0].threshold == 0.2  # pyright: ignore[reportAttributeAccessIssue]
     code, shown = said("add-effect", "coulomb_friction", "--twin=taxel.yaml", "--values={torque_nm: 1}")
-    assert code == 2
-    assert "coulomb_friction is not an effect of a sensor of cells" in shown
+    assert code == 2 and "coulomb_friction is not an effect of a sensor of cells" in shown
 
 
 def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
@@ -144,12 +141,10 @@ def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
         "effects:\n- {effect: taxel_crosstalk, share: 0.1}\n- {effect: taxel_creep, share: -0.1, time_constant_s: 2}\n"
     )
     config = load_cells(path)
-    assert config.names == ("r0c0", "r0c1", "r0c2", "r1c0", "r1c1", "r1c2")
-    assert config.sign == -1
+    assert config.names == ("r0c0", "r0c1", "r0c2", "r1c0", "r1c1", "r1c2") and config.sign == -1
     again = tmp_path / "again.yaml"
     again.write_text(cells_text(config))
-    assert load_cells(again) == config
-    assert "pads" not in cells_text(config)
+    assert load_cells(again) == config and "pads" not in cells_text(config)
 
 
 @pytest.mark.parametrize(
@@ -179,8 +174,7 @@ def test_a_wrong_line_of_the_file_is_said_with_the_way_out(
     table(tmp_path / "presses")
     (tmp_path / "taxel.yaml").write_text(SENSOR.replace(old, new))
     code, shown = said("compare", "presses", "--twin=taxel.yaml")
-    assert code == 2
-    assert words in shown
+    assert code == 2 and words in shown
     assert f"taxel.yaml:{line}:" in shown
     assert not re.search(r"\b(\w+): \1:", shown), "a key is said once"
 

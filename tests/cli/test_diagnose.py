@@ -108,20 +108,20 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert code == 0
     assert f"\n{SIGNAL}: coulomb_friction\n" in text and "noise floor 0.3" in text
     assert "commanded gains; chosen by the error on held_chirp.csv (validation)" in text
-    lines = text.split(f"\n{SIGNAL}: coulomb_friction\n", 1)[1].splitlines()
-    assert lines[0].startswith(f"  {SIGNAL} lacks coulomb_friction or asymmetric_friction: ")
-    assert lines[1].startswith("  Confidence moderate: ") and "no test recording" in lines[1]
-    assert lines[2].startswith("  Record next: ")
-    assert "coulomb_friction from asymmetric_friction" in lines[2], "which no motion separates without efforts"
+    lines = text.split(f"\n{SIGNAL}: coulomb_friction\n", 1)[1].partition("\nwrote ")[0].splitlines()
+    assert lines[0].startswith(f"  {SIGNAL} lacks coulomb_friction or asymmetric_friction: ") and len(lines) < 10
+    assert "torque_nm F = 0.028" in lines[1] and "N·m (0.028" in lines[1]
+    assert lines[3].startswith("  Confidence moderate: ") and "no test recording" in lines[3]
+    assert lines[4].startswith("  Record next: ")
+    assert "coulomb_friction from asymmetric_friction" in lines[4], "which no motion separates without efforts"
     assert "taccorl excite" not in text
-    assert "fixed by commanded gains" in text and "worst after the fit: " in text
-    found = json.loads((out / "report.json").read_text())
+    page, found = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
+    assert "fixed by commanded gains" in page and "worst after the fit: " in page and "→ coulomb_friction" in page
     assert found["identified"][SIGNAL]["pinned_by"] == ["commanded gains"]
     friction = {n["name"]: n for n in found["identified"][SIGNAL]["identifiable"]}["coulomb_friction.torque_nm"]
     assert friction["low"] <= TRUTH_NM <= friction["high"]
-    assert "encoder_bias (looks like torque_ff, always fitted)" in text and "at the noise floor\n" in text
-    assert "tied with coulomb_friction" in text and "does as well: asymmetric_friction" in text
-    assert "→ coulomb_friction" in text and "torque_nm F = 0.028" in text and "N·m (0.028" in text
+    assert "encoder_bias (looks like torque_ff, always fitted)" in page
+    assert found["diagnoses"][SIGNAL]["words"] == "at the noise floor" and "tied with coulomb_friction" in page
     command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
     assert f"next: {command}\nasymmetric_friction does as well as coulomb_friction: see Record next" in text
     assert {f"taccorl {end}" for line in text.splitlines() if (end := line.partition("taccorl ")[2])} == {command}

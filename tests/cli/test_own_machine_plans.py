@@ -186,8 +186,7 @@ def test_excite_writes_targets_that_the_axis_can_follow(drive: Path, said: Any, 
     assert motion["peak_effort"] <= 160.0 and min(motion["floors_apart"].values()) > 1.25
     with (out / motion["table"]).open() as file:
         head, *rows = csv.reader(file)
-    assert head == ["t", "slide.q_target"]
-    assert np.abs(np.array(rows, dtype=float)[:, 1]).max() <= 0.15
+    assert head == ["t", "slide.q_target"] and np.abs(np.array(rows, dtype=float)[:, 1]).max() <= 0.15
 
 
 @pytest.mark.slow
@@ -248,8 +247,9 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said:
     (tmp_path / "d" / "report.json").write_text(json.dumps({"provenance": provenance, "diagnoses": diagnoses}))
     found_by = f"--diagnosis={tmp_path / 'd'}"
     code, text = said("add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", found_by)
-    assert code == 0 and "next: taccorl compare 'my sweeps' --columns=c.yaml --twin=" in text, text
     both = tmp_path / "arm+viscous_friction+coulomb_friction.yaml"
+    words = f"next: taccorl compare 'my sweeps' --columns=c.yaml --twin={twin} --against={both}"
+    assert code == 0 and words in text, text
     made = yaml.safe_load(both.read_text())["joints"]
     for part, (name, values) in found.items():
         (effect,) = made[part]["effects"]

@@ -15,12 +15,12 @@ from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
-from taccorl.report.diagnosed import diagnosed
-from taccorl.report.evidence_words import to_record, unit_words
+from taccorl.report.diagnosed import brief
+from taccorl.report.evidence_words import excite_command, unit_words
 from taccorl.report.report import Report
-from taccorl.report.section import Section, cell
+from taccorl.report.section import cell
 from taccorl.report.verdict import verdict
-from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects import make_effect
 
 PART = "left_joint5"
 
@@ -149,8 +149,7 @@ def test_no_motion_is_planned_for_an_effect_and_the_same_with_a_number_at_its_en
     v = verdict(
         PART, changed(one, effects=(make_effect("coulomb_friction", torque_nm=0.4),), rivals=tied, intervals=ends)
     )
-    assert (v.command == "") == same == ("exponent" in v.record_next)
-    assert ("power_law_friction" in v.command) != same
+    assert (v.command == "") == same == ("exponent" in v.record_next) and ("power_law_friction" in v.command) != same
 
 
 def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest():
@@ -158,8 +157,7 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
     assert d.status == "something_else"
     v = verdict(PART, d)
-    assert (v.kind, v.level) == ("something_else", "low")
-    assert f"{d.errors['after']['validation']:.2f}" in v.finding
+    assert (v.kind, v.level) == ("something_else", "low") and f"{d.errors['after']['validation']:.2f}" in v.finding
     assert max(e.gain for e in d.rounds[-1].evidence) < 0.05, "neither takes away anything"
     worst = RegimeError(recording="fast.csv", use="validation", regime="high speed", error=12.3, n=100)
     where = verdict(PART, d, worst=worst)
@@ -275,21 +273,16 @@ def found(d: Diagnosis) -> PartFinding:
     )
 
 
-def printed(d: Diagnosis) -> str:
-    """All texts of the section."""
-
-    def texts(s: Section) -> list[str]:
-        cells = [*s.text, *(value for row in s.rows for value in row), *s.notes]
-        return [s.title, *(cell(value).text for value in cells), *(text for part in s.parts for text in texts(part))]
-
-    return "\n".join(texts(diagnosed(found(d), verdict(PART, d), ())))
-
-
-def test_the_terminal_prints_no_interval_of_a_number_that_was_not_fitted(one: Diagnosis):
+def test_the_terminal_has_verdict_numbers_and_command_first_and_few_lines(one: Diagnosis):
+    """Six remarks; no interval of a number that was not fitted."""
     for interval, words in (({"strength": (0.9, 1.1)}, "(0.9 … 1.1)"), ({}, "(not fitted)")):
         effect = dataclasses.replace(one.effects[0], interval=interval)
-        text = printed(changed(one, effects=(effect,)))
-        assert words in text and "nan" not in text
+        d = changed(one, effects=(effect,), remarks=tuple("abcdef"))
+        (section,) = brief(found(d), verdict(PART, d), ["--twin=a.yaml"]).parts
+        lines = [cell(value).text for value in section.text]
+        assert [f"{d.errors[stage]['validation']:.2f}" in lines[0] for stage in ("fitted", "after")] == [True, True]
+        assert words in lines[1] and lines[2].endswith(f"taccorl add-effect {effect.name} --twin=a.yaml")
+        assert len(lines) <= 14 and "3 more" in "".join(lines) and "nan" not in "".join(lines)
 
 
 @pytest.mark.parametrize(("led", "doubts"), [(1, 0), (2, 1)])
@@ -314,8 +307,6 @@ def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_ref
     v = verdict(PART, tied)
     assert (v.kind, v.command) == ("ties", "")
     assert "coulomb_friction from asymmetric_friction" in v.record_next and "effort" in v.record_next
-    (line,) = to_record(PART, tied, "coulomb_friction", tied.rivals["coulomb_friction"])
-    assert line == v.record_next
     more = verdict(PART, changed(d, rivals={"coulomb_friction": ("asymmetric_friction", "stribeck_friction")}))
     assert more.command == f"taccorl excite {PART} --effects=coulomb_friction,stribeck_friction"
     assert "coulomb_friction from asymmetric_friction" in more.record_next
@@ -324,15 +315,12 @@ def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_ref
     assert held.command.endswith("--effects=coulomb_friction,asymmetric_friction")
 
 
-def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts(one: Diagnosis):
-    command = "taccorl excite left_joint5 --effects=backlash,cogging --twin=a.yaml"
-    assert to_record("left_joint5", one, "backlash", ("cogging",), ["--twin=a.yaml"]) == [command]
-    assert to_record("left pads", one, "taxel_saturation", ("taxel_power_law",)) == [
-        "taccorl excite --pads=left --effects=taxel_saturation,taxel_power_law"
-    ]
-    assert to_record("fingertip", one, "taxel_saturation", ("taxel_power_law",)) == [
-        "taccorl excite --effects=taxel_saturation,taxel_power_law"
-    ]
-    told = to_record("camera", one, "camera_pose", ("camera_latency",))
-    assert set(told) == {effects.get(n).to_record for n in ("camera_pose", "camera_latency")}
+def test_what_to_record_is_a_command_for_joints_pads_and_cells_only():
+    for part, names, command in (
+        ("left_joint5", ("backlash", "cogging"), "taccorl excite left_joint5 --effects=backlash,cogging"),
+        ("left pads", ("touch_lag", "touch_delay"), "taccorl excite --pads=left --effects=touch_lag,touch_delay"),
+        ("fingertip", ("touch_lag", "touch_delay"), "taccorl excite --effects=touch_lag,touch_delay"),
+        ("camera", ("camera_pose", "camera_latency"), ""),
+    ):
+        assert excite_command(part, names) == command
     assert unit_words("1") == "" and unit_words("s/m") == " s/m"

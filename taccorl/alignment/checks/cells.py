@@ -38,8 +38,7 @@ def check_cells(
     config: CellsConfig, measurements: Sequence[CellMeasurement], fit_names: Sequence[str]
 ) -> dict[str, list[Finding]]:
     """Check the recordings of a sensor of cells. Returns recording → findings. A finding about all fit recordings together, and
-    one about all recordings, is stored at the first of them.
-    ``fit_names``: names of the fit recordings."""
+    one about all recordings, is stored at the first of them. ``fit_names``: names of the fit recordings."""
     found = {m.name: [*m.findings, *_of_recording(config, m), *place_findings(config, m)] for m in measurements}
     fit, every = [m for m in measurements if m.name in fit_names], CellSet(config, measurements)
     if not fit:

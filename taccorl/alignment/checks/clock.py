@@ -30,6 +30,7 @@ from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
 from taccorl.alignment.checks.wiring import FOLLOWS_FROM
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, not_judged
 from taccorl.data.joint_checks import LAG_SURE, find_lag
@@ -69,8 +70,7 @@ LATE_ROWS = 1.2
 """Least delay that is reported [rows]. A second pole (inertia over K_d) counts as delay, up to 5.7 ms at the twin's joints 2 and
 3, so that less is expected."""
 FITTING = 3.0
-"""A first-order lag describes a joint if its residual is below so many noise floors, or below
-``FITTING_ROWS``."""
+"""A first-order lag describes a joint if its residual is below so many noise floors, or below ``FITTING_ROWS``."""
 FITTING_ROWS = 0.05
 """A first-order lag also describes a joint if its residual is below this share of that of an offset of one row; the delay is
 then wrong by a sixth of a row at most."""
@@ -84,6 +84,8 @@ that from target to position."""
 ROUGHER = 3.0
 """Columns of target and position are also exchanged if neither fit decides, and the noise of the column given as the target is
 this many times the other's."""
+NOISELESS = 50.0
+"""The column whose noise is so many times the other's, and the step of the other's values, is the measured one. A choice."""
 USUAL_TAU_S = 0.12
 """Slowest time constant of a joint in the paper (Fig. "Per-joint controller SysID"): a step moves a joint in its first row by at
 least step · period / τ."""
@@ -117,7 +119,7 @@ def check_clock(t: Trial) -> Iterator[Finding]:
         lag = find_lag(target[:, None] * factor, measured[:, None] * factor, max(1, round(even.rate_hz)))
         delay, early_s = f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms", t.early_rows(name) * row_s
         if lag.correlation >= LAG_SURE and lag.lag_s < -0.5 * row_s - early_s:  # velocities of steps hardly correlate
-            if _exchanged(target, measured, even.period_s, -lag.lag_s):
+            if _exchanged(target, measured, even.period_s, -lag.lag_s, find_quantum(m.target[:, j]), m.quantum[j]):
                 yield _exchange(name, -lag.lag_s, m)
             else:
                 yield _lead(name, -lag.lag_s, m, "its movement correlates best with a later command")
@@ -245,30 +247,31 @@ def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
     return find(EXCHANGED_COLUMNS, signal, text)
 
 
-def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s: float) -> bool:
+def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s: float, *steps: float) -> bool:
     """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
 
-    The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
-    row would and much less than the other (a resonant joint), the rougher column is the measured one."""
+    Noise of one beside none of the other decides (``steps``: of both encoders). Else a lag is fitted both ways, without the lead.
+    Where neither leaves less than an offset of one row would and much less than the other, the rougher is the measured one."""
     lead = math.ceil(lead_s / period_s)
     if not np.isfinite(measured).all():
         return False
+    noise = noise_of_rows(target), noise_of_rows(measured)
+    for k in (0, 1):
+        if noise[k] > NOISELESS * max(noise[1 - k], steps[1 - k]):
+            return k == 0
     turned = fit_first_order(measured, target, period_s)
     forward = fit_first_order(target[lead:], measured[:-lead], period_s)
     if turned.rms < min(turned.row_rms, EXCHANGED * forward.rms):
         return turned.delay_s > -LEAD_ROWS * period_s
     if forward.rms < min(forward.row_rms, EXCHANGED * turned.rms):
         return False
-    return noise_of_rows(target) > ROUGHER * noise_of_rows(measured)
+    return noise[0] > ROUGHER * noise[1]
 
 
 def _earlier_positions(m: Measurement) -> str:
     """Text: the correction for positions that are late."""
-    where = (
-        "shift the position columns against time, or log both by one clock",
-        "correct `latency_s` of the state's channel",
-    )
-    return write(m, where[0], f"{where[1]} in the recording spec")
+    otherwise = "correct `latency_s` of the state's channel in the recording spec"
+    return write(m, "shift the position columns against time, or log both by one clock", otherwise)
 
 
 def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> str:
@@ -334,7 +337,9 @@ def check_against_twin(
             why = f"look for the missing effect first, which leaves {plain.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
             findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
-        elif name not in uncertain and _would_leave(shift, period_s) > HIDDEN * np.nanstd(rows[1] - rows[2]):
+        elif name not in uncertain and abs(shift.delay_s) / period_s * shift.row_rms > HIDDEN * np.nanstd(
+            rows[1] - rows[2]
+        ):
             continue
         elif _leads(shift, period_s):
             effects = {} if name in uncertain else rivals(name)
@@ -374,10 +379,6 @@ def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Fin
     return {n: tuple(said(f) for f in own if f.check != UNDECIDED or f.feature not in same) for n, own in clock.items()}
 
 
-def _would_leave(shift: Shift, period_s: float) -> float:
-    return abs(shift.delay_s) / period_s * shift.row_rms
-
-
 def _size(shift: Shift, period_s: float) -> str:
     rows = abs(shift.delay_s) / period_s
     return f"{abs(shift.delay_s) * 1e3:.1f} ± {shift.delay_sd_s * 1e3:.1f} ms ({rows:.1f} rows)"
@@ -412,8 +413,7 @@ def _with_common_delay(
     findings: list[Finding], late: Mapping[str, tuple[float, float]], period_s: float
 ) -> list[Finding]:
     """``findings``, of which those that say that a joint comes late have one topic and name the common delay if all late joints
-    agree within half a row or ``SURE`` standard deviations.
-    ``late``: late joint → delay and its standard deviation [s]."""
+    agree within half a row or ``SURE`` standard deviations. ``late``: late joint → delay and its standard deviation [s]."""
     delays_s = np.array([delay_s for delay_s, _ in late.values()])
     allowed = np.array([max(0.5 * period_s, SURE * sd_s) for _, sd_s in late.values()])
     if len(late) < 2 or (np.abs(delays_s - np.median(delays_s)) > allowed).any():

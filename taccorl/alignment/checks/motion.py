@@ -193,9 +193,8 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
             else "its driver repeats old values, or the bus was silent"
         )
         text = (
-            f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command "
-            f"goes {moved:.3g} {m.units[j]}, {place(m, *rows)}: {why}. Record again within its "
-            f"range, or {without(m, rows[0])}"
+            f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command goes "
+            f"{moved:.3g} {m.units[j]}, {place(m, *rows)}: {why}. Record again within its range, or {without(m, rows[0])}"
         )
         yield find("saturated_channel" if edge else "frozen_channel", name, text, rows)
         return
@@ -344,9 +343,8 @@ def check_effort(t: Trial) -> Iterator[Finding]:
             level, least = f"±{value:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
         if len(at) >= least and abs(value - t.limits.get(name, math.inf)) > STATED_LIMIT * value:
             text = (
-                f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} "
-                f"({m.time_s[at[0]]:.2f} s): the drive's limit (effect torque_saturation) or the end of the "
-                "report's range"
+                f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} ({m.time_s[at[0]]:.2f} s): the drive's "
+                "limit (effect torque_saturation) or the end of the report's range"
             )
             yield find("effort_limit", name, text, (int(at[0]), int(at[-1]) + 1))
 

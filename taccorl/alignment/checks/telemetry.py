@@ -11,7 +11,7 @@ value and place, and what to record or change.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -108,6 +108,8 @@ def check_measurements(
     found = {m.name: accepted(found[m.name], accept) for m in measurements}
     sound = [m for m in measurements if not any(f.severity == "error" for f in found[m.name])]
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
+    for name, finding in _slower_rows(sound, rates or {}):
+        found[name].append(finding)
     for a, b in itertools.combinations(sound, 2):
         if not moves[a.name] & moves[b.name]:
             continue  # other joints: of a hundred recordings most pairs
@@ -138,6 +140,24 @@ def _held_and_exchanged(m: Measurement, f: Finding, findings: Sequence[Finding])
     return find(clock.EXCHANGED_COLUMNS, f.feature, text)
 
 
+@check("slower_rows", "warning")
+def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> Iterator[tuple[str, Finding]]:
+    """Recordings with fewer rows than the targets that another one shows to reach a drive whose ``command_hz`` is not stated."""
+    trials = [Trial(m) for m in sound]
+    for signal in (signal for signal, hz in rates.items() if hz == 0.0):
+        moved = [t.m for t in trials if signal in {t.m.signals[j] for j in t.moving}]
+        rows = [(m, np.diff(np.flatnonzero(np.diff(m.target[:, m.column(signal)])))) for m in moved]
+        many = [(m.rate_hz / float(np.median(own)), m.name) for m, own in rows if len(own) > 20]  # a choice, as is 1.5
+        hz, fastest = max(many, default=(0.0, ""))
+        for m in (m for m in moved if 1.5 * m.rate_hz < hz):
+            text = (
+                f"{signal}: {m.rate_hz:g} rows a second here, {hz:g} targets a second in {fastest}: each target is held for its "
+                f"row. If as many were sent here, write `command_hz: {hz:g}` of {signal} into the file of your robot or axis; if "
+                "one a row was sent, nothing"
+            )
+            yield m.name, find("slower_rows", signal, text, topic="rows")
+
+
 @check("same_motion", "note")
 @check("same_commands", "warning")
 def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
@@ -151,10 +171,7 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
             ratios[name] = (float(np.sqrt(np.nanmean(difference**2))), noise)
     worst = max(ratios, key=lambda name: ratios[name][0] / ratios[name][1], default="")
     if not worst or ratios[worst][0] <= DIFFERENT * ratios[worst][1]:
-        text = (
-            f"{b.name} was given the same commands as {a.name}: say `repeat_of: {a.name}`, and the noise floor comes "
-            "from both"
-        )
+        text = f"{b.name} was given the same commands as {a.name}: say `repeat_of: {a.name}`, and the noise floor comes from both"
         return find("same_motion", "", text)
     rms, noise = ratios[worst]
     if worst in ROBOT.action_names:
@@ -166,8 +183,7 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
         f"{b.name} was given the same commands as {a.name}, but {worst} moved differently: by {rms:.2g} "
         f"{a.units[a.column(worst)]} (RMS), {rms / noise:.0f} times what noise allows. Had it other gains? Write `{b.name}: "
         f"{{gain_scale: {{{worst}: 2.0}}}}` with their factor, or kp and kd, under `recordings:` in measurements.yaml. Did it "
-        f"hold something? Write {held}. Only if nothing was changed and the robot does not repeat, write "
-        f"`repeat_of: {a.name}`"
+        f"hold something? Write {held}. Only if nothing was changed and the robot does not repeat, write `repeat_of: {a.name}`"
     )
     return find("same_commands", worst, text)
 

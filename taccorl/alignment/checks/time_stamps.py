@@ -103,8 +103,7 @@ def _channels(m: Measurement) -> Iterator[Finding]:
             yield find("out_of_order", t.channel, text)
         if t.align == "line" and t.age_median_s > JITTER / t.rate_hz and t.age_median_s > JITTER * m.period_s:
             text = (
-                f"samples of {t.channel} lie {t.age_median_s * 1e3:.2f} ms (median) beside the rows: they were "
-                "brought to the rows in straight lines, which smooths their noise. Let one loop send commands and "
-                "read positions"
+                f"samples of {t.channel} lie {t.age_median_s * 1e3:.2f} ms (median) beside the rows: they were brought to the "
+                "rows in straight lines, which smooths their noise. Let one loop send commands and read positions"
             )
             yield find("jitter", t.channel, text, severity="warning")

@@ -104,12 +104,11 @@ def _dropped(signal: str, d: Dropped) -> tuple[str, Finding]:
     where = ", ".join(f"{t:.2f}" for t in times_s[:MOST_TIMES])
     more = f" and {len(times_s) - MOST_TIMES} more" if len(times_s) > MOST_TIMES else ""
     text = (
-        f"{signal}: commands were dropped or repeated: {d.found} times in {len(d.times_s)} recordings the joint moved as "
-        f"if the previous target stayed in force for {d.held / d.found:.1f} commands on average ({d.mirrored} events of the "
-        "opposite sign, which only noise and unmodelled physics produce); at least "
-        f"{d.rate:.1%} of {d.commands} commands. In {worst} at {where} s{more}. Of the twin's effects only "
-        "dropped_commands does that: look for lost frames on the bus (taccorl ingest inspect, candump) or a driver that skips "
-        "commands when its queue is full"
+        f"{signal}: commands were dropped or repeated: {d.found} times in {len(d.times_s)} recordings the joint moved as if "
+        f"the previous target stayed in force for {d.held / d.found:.1f} commands on average ({d.mirrored} events of the "
+        f"opposite sign, which only noise and unmodelled physics produce); at least {d.rate:.1%} of {d.commands} commands. In "
+        f"{worst} at {where} s{more}. Of the twin's effects only dropped_commands does that: look for lost frames on the bus "
+        "(taccorl ingest inspect, candump) or a driver that skips commands when its queue is full"
     )
     return worst, find("dropped_commands", signal, text)
 

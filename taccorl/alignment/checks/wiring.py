@@ -6,6 +6,7 @@
 Letters in shapes: T rows, J signals.
 """
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -71,16 +72,15 @@ OF_ANOTHER_JOINT = (
 def check_wiring(t: Trial) -> Iterator[Finding]:
     """Swapped joints and arms, reversed signs, and wrong units."""
     m, even = t.m, t.even
-    beyond = list(_beyond_range(m))
-    yield from beyond
-    span = np.ptp(even.target, axis=0)
-    commanded = [j for j in range(len(m.signals)) if span[j] * scale(m, j) > MOVED["rad"]]
+    yield from (beyond := list(_beyond_range(m)))
+    commanded = [j for j in range(len(m.signals)) if np.ptp(even.target[:, j]) * scale(m, j) > MOVED["rad"]]
     if not commanded:
         return
-    out_of_range = {f.feature for f in beyond}
     lagged = _lagged(even.target, even.period_s)
     follows, gains = _follows(even, lagged, commanded)
     follows[gains < 0.05] = np.nan
+    answers = _lagged(np.nan_to_num(even.measured), even.period_s)
+    backwards = np.diag(_follows(dataclasses.replace(even, measured=even.target), answers, commanded)[0])
     swapped: dict[str, str] = {}
     for j in commanded:
         own, name = follows[j, j], m.signals[j]
@@ -88,7 +88,7 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             continue
         # Also of one that does not move (NaN), or only as others shake it; other checks say that where no other joint follows.
         other = _follower(m, np.where(gains >= GAIN[0], follows, np.nan), j)
-        if other is not None:
+        if other is not None and not backwards[j] > follows[other, j]:  # else target and position are exchanged
             swapped[name] = m.signals[other]
         elif own < REVERSED:
             way_out = write(
@@ -103,7 +103,9 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             yield find("reversed", name, text)
     yield from _swaps(m, swapped)
     for j in t.moving:
-        if m.signals[j] not in {*out_of_range, *swapped} and (follows[j, j] > FOLLOWS_NOT or in_other_unit(t, j)):
+        if m.signals[j] not in {*(f.feature for f in beyond), *swapped} and (
+            follows[j, j] > FOLLOWS_NOT or in_other_unit(t, j)
+        ):
             yield from _gain(m, even, lagged, j)
             yield from _velocity_unit(m, even, j)
 
@@ -118,8 +120,7 @@ def in_other_unit(t: Trial, j: int) -> bool:
 
 def _lagged(target: np.ndarray, period_s: float) -> np.ndarray:
     keep = np.exp(-period_s / USUAL_LAG_S)
-    start = target[0]
-    return start + lfilter([1 - keep], [1, -keep], target - start, axis=0)
+    return target[0] + lfilter([1 - keep], [1, -keep], target - target[0], axis=0)
 
 
 def _velocity(values: np.ndarray, period_s: float) -> np.ndarray:
@@ -134,7 +135,7 @@ def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> tuple[
     span = np.ptp(np.nan_to_num(m.measured), axis=0)
     for i in range(len(m.signals)):
         for j in commanded:
-            gains[i, j] = span[i] / np.ptp(lagged[:, j])
+            gains[i, j] = span[i] / max(np.ptp(lagged[:, j]), 1e-12)
             if v_measured[:, i].std() == 0 or v_command[:, j].std() == 0:
                 continue
             found[i, j] = np.corrcoef(v_measured[:, i], v_command[:, j])[0, 1]
@@ -143,8 +144,7 @@ def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> tuple[
 
 def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
     """Another joint that follows command j and not its own; of several alike the other arm's same joint."""
-    free = [i for i in range(len(m.signals)) if i != j and not follows[i, i] > FOLLOWS]
-    free = [i for i in free if follows[i, j] > FOLLOWS]
+    free = [i for i in range(len(m.signals)) if i != j and follows[i, j] > FOLLOWS and not follows[i, i] > FOLLOWS]
     if not free:
         return None
     best = max(follows[i, j] for i in free)

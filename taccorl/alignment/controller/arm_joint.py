@@ -82,13 +82,11 @@ class ArmJoint(RigidJoint):
 
     def freed(self, held: Collection[str] = ()) -> "tuple[list[Effect], ArmJoint]":
         effects = self._config.effects
-        mine = [e for e in effects if isinstance(e, ArmEffect) and self._is_on(e)]
+        on = {self.signal, split_signal(self.signal)[0]}
+        mine = [e for e in effects if isinstance(e, ArmEffect) and on & {*e.acts_on()}]
         own: list[Effect] = [e for e in mine if e.fitted and e.name not in held]
         others = [e for e in effects if not any(e is mine for mine in own)]
         return own, ArmJoint(dataclasses.replace(self._config, effects=others), self.signal)
-
-    def _is_on(self, effect: ArmEffect) -> bool:
-        return bool({self.signal, split_signal(self.signal)[0]} & {*effect.acts_on()})
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         return selectors(cls, self.signal)

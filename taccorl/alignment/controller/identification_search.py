@@ -26,8 +26,7 @@ class GainSearch:
     """Residuals of recordings as a function of x, the free ones of log K_p, log (K_d / K_p) and T_ref / K_p. In these
     coordinates the valley of the loss is straight: positions determine the ratios, and hardly K_p. Values beyond the bounds are
     clipped. Gains are those in force in the first recording; the other recordings' gains are in proportion, if they were
-    commanded so.
-    ``bounds``: ``kp``, ``kd``, ``torque_ff`` → low, high."""
+    commanded so. ``bounds``: ``kp``, ``kd``, ``torque_ff`` → low, high."""
 
     def __init__(
         self,

@@ -358,8 +358,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
             for name in getattr(note, key):
                 if name not in m.signals:
                     raise TaccorlError(
-                        f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; "
-                        f"{nearest(name, m.signals)}"
+                        f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; {nearest(name, m.signals)}"
                     )
         for arm in note.payload_position_m:
             if not (m.payload_kg | note.payload_kg).get(arm):

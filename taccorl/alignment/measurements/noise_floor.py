@@ -424,8 +424,7 @@ def _median(squares: np.ndarray, freedom: float) -> np.ndarray:
 
 
 def _log_spread(squares: np.ndarray, freedom: float, *, robust: bool) -> float:
-    """Factor to both sides of a standard deviation, 95 %, from the scatter of its blocks, at least that of white
-    noise."""
+    """Factor to both sides of a standard deviation, 95 %, from the scatter of its blocks, at least that of white noise."""
     least = math.sqrt(2.0 / freedom)
     count = len(squares)
     if count > 1 and (squares > 0).all():

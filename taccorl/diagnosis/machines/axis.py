@@ -158,7 +158,7 @@ class Axis(Machine):
 
     @property
     def command_rates(self) -> Mapping[str, float]:
-        return {self.config.name: self.config.command_hz or 0.0}
+        return {self.config.name: self.config.command_hz or 0.0} if self.config.law != "effort" else {}
 
     def drive(self, part: str) -> Drive:
         c = self.config

@@ -446,7 +446,7 @@ class RobotMachine(Machine):
 
     @property
     def command_rates(self) -> Mapping[str, float]:
-        return {name: joint.command_hz or 0.0 for name, joint in self.robot.config.joints.items()}
+        return {n: law.command_hz or 0.0 for n, law in self.robot.config.joints.items() if law.law != "effort"}
 
     def drive(self, part: str) -> Drive:
         joint, c = self.robot.joint(part), self.robot.config.joints[part]

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
 from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
+from taccorl.alignment.checks.held_commands import _second_order
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import check_measurement, check_measurements, check_names
@@ -122,24 +124,53 @@ def test_lead_names_joint_time_and_way_out(clean):
     assert "target_rows_late: 2" in table and "latency_s" not in table
 
 
+def resonant(motion: np.ndarray, rate_hz: float, zeta: float = 0.1) -> Measurement:
+    """ω = 20 rad/s, with noise."""
+    seen = lfilter(*_second_order(20.0, zeta, 1 / rate_hz), motion - motion[0]) + motion[0]
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(len(motion))
+    return of_signal("made", rate_hz, motion, seen + noise, "table", source=Path("a.csv"))
+
+
 def test_exchanged_columns_of_target_and_position_are_no_latency():
-    clean = sweep(0, joints=[2, 4], seconds=5.0)
-    for m in (clean, sweep(0, joints=[2, 4], friction_nm=0.3, seconds=5.0)):
+    clean, time_s = sweep(0, joints=[2, 4], seconds=5.0), np.arange(1000) / 100
+    sways = resonant(0.3 * np.minimum(time_s, 1.0) * np.sin(3.0 * time_s), 100.0)
+    phase = 2 * np.pi * (0.1 + 0.12 * time_s) * time_s
+    each = [resonant(0.3 * np.minimum(time_s, 1.0) * np.sin(phase + late), 100.0, 1.0) for late in (0.0, 0.7, 1.9)]
+    columns = {key: np.hstack([getattr(m, key) for m in each]) for key in ("target", "measured")}
+    alike = Measurement(name="alike", time_s=time_s, signals=("a", "b", "c"), units=("rad",) * 3, **columns)
+    assert not any(f.severity == "error" for f in check_measurement(alike)), "of one motion, one after the other"
+    rough = sweep(0, joints=[2, 4], friction_nm=0.3, seconds=5.0)
+    for m, joints in ((clean, 2), (rough, 2), (sways, 1), (alike, 3)):
         swapped = dataclasses.replace(m, target=m.measured, measured=m.target, source=Path("a.csv"))
         errors = [f for f in check_measurement(swapped) if f.severity == "error"]
-        assert {f.check for f in errors} == {"exchanged_target"}
-        assert len(errors) == 2
+        assert {f.check for f in errors} == {"exchanged_target"} and len(errors) == joints
         assert all("exchanged" in f.text and f"{f.feature}.q_target" in f.text for f in errors)
     for rows in (1, 5, 20):  # a clock that is off is none
-        assert not any("exchanged" in f.text for f in check_measurement(shifted(clean, rows)))
+        for m in (clean, sweep(0, joints=[2, 4], friction_nm=2.0, seconds=5.0), sways):
+            assert "exchanged_target" not in found(shifted(m, rows))
+
+
+@pytest.mark.parametrize(
+    ("hz", "sent_every", "told"), [(0.0, 1, True), (500.0, 1, False), (0.0, 5, False), (None, 1, False)]
+)
+def test_a_recording_with_fewer_rows_than_targets_of_another_names_both_rates(hz: float, sent_every: int, told: bool):
+    """500 rows a second, and every fifth of them; the drive's rate may be stated, or each target be sent five rows long."""
+    motion = 0.3 * np.sin(np.arange(4000) // sent_every * sent_every / 200.0)
+    fast = resonant(motion, 500.0)
+    slow = of_signal("slow", 100.0, motion[::5], fast.measured[::5, 0], "table")
+    said = check_measurements([fast, slow], rates={} if hz is None else {"table": hz})
+    texts = [f.text for f in said["slow"] if f.check == "slower_rows"]
+    assert len(texts) == told and not any(f.check == "slower_rows" for f in said["made"])
+    assert all(
+        word in text for text in texts for word in ("100 rows", "500 targets", "made", "`command_hz: 500`", "table")
+    )
 
 
 def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_cannot_be_told(clean):
     # A late clock and a real delay give the same rows: both get the same note, and no error.
     late, delayed = shifted(clean, -1), sweep(0, delay_s=0.005)
     for m in (late, delayed):
-        assert set(found(m)) == {"late_answer"}
-        assert "cannot tell apart" in text_of(m, "late_answer")
+        assert set(found(m)) == {"late_answer"} and "cannot tell apart" in text_of(m, "late_answer")
         assert {f.severity for f in check_measurement(m)} == {"note"}
     for repeat, said in ((shifted(sweep(1), -1), 2), (sweep(1), 0)):  # one of two repeats is no delay of the drive
         pair = dataclasses.replace(late, name="a"), dataclasses.replace(repeat, name="b", repeat_of="a")
@@ -214,8 +245,7 @@ def test_first_order_fit_recovers_lag_and_delay_within_its_interval():
     hits = []
     for _ in range(20):
         fit = fit_first_order(target, true + 2e-4 * rng.normal(size=len(true)), 1 / RATE_HZ)
-        assert fit.delay_s == pytest.approx(0.0037, abs=2e-4)
-        assert fit.time_constant_s == pytest.approx(0.09, rel=0.01)
+        assert fit.delay_s == pytest.approx(0.0037, abs=2e-4) and fit.time_constant_s == pytest.approx(0.09, rel=0.01)
         assert fit.gain == pytest.approx(0.98, abs=1e-3)
         hits.append(abs(fit.delay_s - 0.0037) < 3 * fit.delay_sd_s)
     assert np.mean(hits) >= 0.9
@@ -228,8 +258,7 @@ def test_of_many_rows_an_even_selection_begins_the_fit_and_all_of_them_end_it():
     answers = lfilter([0.0, 1 - keep], [1, -keep], np.concatenate([np.zeros(12), target[:-12]]))
     fit = fit_first_order(target, answers + 1e-5 * np.random.default_rng(0).standard_normal(25_000), 1e-3)
     assert fit.time_constant_s == pytest.approx(0.05, rel=1e-3)
-    assert abs(fit.delay_s - 0.012) < 3 * fit.delay_sd_s < 1e-4
-    assert fit.rms == pytest.approx(1e-5, rel=0.02)
+    assert abs(fit.delay_s - 0.012) < 3 * fit.delay_sd_s < 1e-4 and fit.rms == pytest.approx(1e-5, rel=0.02)
 
 
 def test_rows_of_a_dataset_are_read_as_commands_that_moved_on():
@@ -622,8 +651,7 @@ def test_an_accepted_error_is_a_warning_that_stays(clean):
     values[600:700] = values[600]
     m = with_column(clean, "left_joint2", values)
     (finding,) = [f for f in check_measurement(m, accept=["frozen_channel"]) if f.check == "frozen_channel"]
-    assert finding.severity == "warning"
-    assert "accepted by --accept=frozen_channel" in finding.text
+    assert finding.severity == "warning" and "accepted by --accept=frozen_channel" in finding.text
     with pytest.raises(TaccorlError, match=r"--accept=frozen_chanel: no check.*frozen_channel"):
         check_names(["frozen_chanel"])
     check_names([name for name, listed in CHECKS.items() if listed.severity == "error"])
@@ -673,8 +701,7 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
     effort[:, 4] = np.clip(20 * (clean.target - clean.measured)[:, 4], -0.5, 0.5)
     effort[:, 5] = 7.0
     m = dataclasses.replace(clean, effort=effort)
-    assert found(m)["effort_limit"] == ["left_joint5"]
-    assert "exactly ±0.5" in text_of(m, "effort_limit")
+    assert found(m)["effort_limit"] == ["left_joint5"] and "exactly ±0.5" in text_of(m, "effort_limit")
     assert found(m)["dead_effort"] == ["left_joint6"]
     nothing = np.full(effort.shape, np.nan)
     nothing[:, 5] = 0.0
@@ -710,16 +737,14 @@ def test_too_short(clean):
 def test_not_at_rest_at_the_start(clean):
     m = some(clean, slice(900, None))
     m = dataclasses.replace(m, time_s=m.time_s - m.time_s[0])
-    assert "not_at_rest" in found(m)
-    assert "begin the recording a second before the motion" in text_of(m, "not_at_rest")
+    assert "not_at_rest" in found(m) and "begin the recording a second before the motion" in text_of(m, "not_at_rest")
 
 
 def test_time_that_runs_backwards_or_in_milliseconds_stops_everything_else(clean):
     time_s = clean.time_s.copy()
     time_s[500] = time_s[498]
     m = dataclasses.replace(clean, time_s=time_s)
-    assert found(m) == {"time_backwards": ["time"]}
-    assert "at row 500" in text_of(m, "time_backwards")
+    assert found(m) == {"time_backwards": ["time"]} and "at row 500" in text_of(m, "time_backwards")
     time_s[500] = time_s[499] = 2.495
     twice = text_of(dataclasses.replace(clean, time_s=time_s), "time_backwards")
     assert "stands still at 2.495" in twice and "goes from" not in twice and "1 such" in twice
@@ -770,8 +795,7 @@ def test_an_untold_repeat_is_pointed_out(clean):
     again = dataclasses.replace(sweep(0), name="again")
     other = dataclasses.replace(sweep(3), name="other")
     by = check_measurements([clean, again, other], joints=["left_joint5"])
-    assert [f.check for f in by["again"]] == ["same_motion"]
-    assert "repeat_of: sweep" in by["again"][0].text
+    assert [f.check for f in by["again"]] == ["same_motion"] and "repeat_of: sweep" in by["again"][0].text
     assert by["other"] == []
     assert [f.check for f in by["sweep"]] == ["not_judged"]  # what does not repeat, without repeats
     told = dataclasses.replace(again, repeat_of="sweep")
