@@ -112,7 +112,7 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
     weight = dataclasses.replace(off, name="torque_ff", instead=("gravity_mismatch", "payload"))
     v = verdict(PART, changed(nothing, status="numbers_off", changed=(weight,)))
     assert "torque_ff of the file is off, or gravity_mismatch or payload is missing instead" in v.finding
-    assert v.command == f"taccorl excite {PART} --effects=gravity_mismatch,payload"
+    assert v.command == f"taccorl excite {PART} --effects=gravity_mismatch,payload" and "may be a weight" in v.finding
     assert "friction" in verdict(PART, changed(nothing, status="numbers_off", changed=(off,), present=())).command
     held = changed(nothing, status="numbers_off", changed=(off,), present=("coulomb_friction",))
     assert verdict(PART, held).command == ""

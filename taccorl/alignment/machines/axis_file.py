@@ -72,7 +72,7 @@ class AxisConfig(DriveLaw):
     weight_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
-    """C in the torque S sin q + C cos q that holds the axis's own weight [N·m]."""
+    """C in the torque S sin q + C cos q that holds the axis's own weight [N·m]; of a slide its weight [N], constant."""
     payload_kg: float = 0.0
     """Mass that the axis carries [kg], unless a recording states another one; not part of ``inertia``."""
     lever_m: float = 0.0
@@ -129,12 +129,11 @@ class AxisConfig(DriveLaw):
             raise TaccorlError(f"axis.gains: law {self.law} has no gains to fit; remove this key")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
             raise TaccorlError(f"axis.limits: {list(self.limits)} must be ascending; write the lowest position first")
-        of_turning = ("weight_sin", "weight_cos", "lever_m", "arm_kg", "hangs_at_rad")
+        of_turning = ("weight_sin", "lever_m", "arm_kg", "hangs_at_rad")
         of_turning = [name for name in of_turning if getattr(self, name)]
         if self.unit == "m" and of_turning:
             raise TaccorlError(
-                f"axis.{of_turning[0]}: does not apply to a slide: its constant weight is part of torque_ff, which is fitted; "
-                "remove this key"
+                f"axis.{of_turning[0]}: does not apply to a slide, whose weight [N] is weight_cos; remove this key"
             )
 
     @property
@@ -336,6 +335,8 @@ class DrivenAxis(RigidJoint):
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         c = self.config
+        if c.unit == "m":
+            return Rigid(c.inertia + motion.mounted_kgm2, c.rotor_inertia, weight_n=c.weight_cos)
         weight = motion.moment_kgm * GRAVITY_M_PER_S2  # m l g sin(q − q₀)
         sine, cosine = weight * math.cos(c.hangs_at_rad), -weight * math.sin(c.hangs_at_rad)
         return Rigid(c.inertia + motion.mounted_kgm2, c.rotor_inertia, c.weight_sin + sine, c.weight_cos + cosine)

@@ -69,7 +69,7 @@ class Axis(Machine):
         c = self.config
         own = {"inertia": (c.inertia, "kg·m²"), **c.numbers}
         own |= {name: (getattr(c, name), "s") for name in ("target_late_s", "speed_late_s")}
-        own |= {name: (getattr(c, name), "N·m") for name in ("weight_sin", "weight_cos") if c.unit == "rad"}
+        own |= {name: (getattr(c, name), "N·m") for name in ("weight_sin", "weight_cos")[c.unit == "m" :]}
         return {name: (value, c.scale.unit_of(unit)) for name, (value, unit) in own.items()} | numbers_of(c.made())
 
     @property

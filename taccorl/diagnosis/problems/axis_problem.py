@@ -1,14 +1,15 @@
 """Identification of one driven axis: its fitted numbers, candidate effects and recordings, as the search for missing effects
 needs them. An axis is a slide on a bench, a motor with a mass, a servo with a pendulum.
 
-Inertia and a constant torque are always fitted, and the weight if the file states one. If the effort was recorded, the gains are
-also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of a few per cent outweighs the friction of a fast
-drive. They stay, and so do the delays, if the recorded efforts are those of the file's law, row by row, to the noise floor: a fit
-would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts
-the inertia then stays as the file states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF
-are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``,
-since a cycle of the drive's loop is visible in the data. So is the delay of a speed that the drive filters; it is fitted if
-efforts were recorded and the file states ``loop_hz``. The scale of efforts is fitted in place of the inertia where that decides.
+Inertia and a constant torque are always fitted, and the weight if the file states one, or efforts show that of a slide. If the
+effort was recorded, the gains are also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of a few per
+cent outweighs the friction of a fast drive. They stay, and so do the delays, if the recorded efforts are those of the file's
+law, row by row, to the noise floor: a fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted
+within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file states it, because positions determine ratios
+only. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
+delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. So is the delay of a
+speed that the drive filters; it is fitted if efforts were recorded and the file states ``loop_hz``. The scale of efforts is
+fitted in place of the inertia where that decides.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ import numpy as np
 
 from taccorl.alignment.checks.effort_time import law_error
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse
+from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel, JointResponse
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
@@ -135,19 +136,18 @@ class AxisProblem(WithoutMaps):
     def _numbers(self) -> tuple[Free, ...]:
         axis, unit = self.axis, self.axis.scale.unit_of
         force, inertia = axis.scale.force, axis.inertia
-        most = max(MOST_TORQUE * force, 10.0 * abs(axis.torque_ff))
+        heavy = GRAVITY_M_PER_S2 * inertia * (axis.unit == "m")
+        most = max(MOST_TORQUE * force, 10.0 * abs(axis.torque_ff), WEIGHT_WITHIN * heavy)
         unknown = axis.gains == "fitted"
         found = [
             Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True)
         ] * (self.effort or not unknown)
         found.append(Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force))
         if self._weighed:
-            weight = float(np.hypot(axis.weight_sin, axis.weight_cos))
-            for name in ("weight_sin", "weight_cos"):
-                most = WEIGHT_WITHIN * weight
-                found.append(
-                    Free(name=name, unit="N·m", start=getattr(axis, name), low=-most, high=most, scale=0.1 * weight)
-                )
+            weight = max(float(np.hypot(axis.weight_sin, axis.weight_cos)), heavy)
+            for name in ("weight_sin", "weight_cos")[axis.unit == "m" :]:
+                most, at = WEIGHT_WITHIN * weight, getattr(axis, name)
+                found.append(Free(name=name, unit=unit("N·m"), start=at, low=-most, high=most, scale=0.1 * weight))
         if self.law_error <= 1.0:
             return tuple(found)
         if axis.law == "pwm":
@@ -180,7 +180,9 @@ class AxisProblem(WithoutMaps):
 
     @property
     def _weighed(self) -> bool:
-        """Whether the file states the axis's own weight."""
+        """Whether the axis's own weight is fitted: the file states it, or efforts tell that of a slide from ``torque_ff``."""
+        if self.axis.unit == "m":
+            return self.effort and self.axis.law != "effort"
         return bool(self.axis.weight_sin or self.axis.weight_cos)
 
     def _recording(self, m: Measurement) -> Recording:

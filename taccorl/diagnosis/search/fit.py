@@ -243,11 +243,7 @@ def rms(residuals: np.ndarray) -> float:
 def residuals(
     problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
 ) -> np.ndarray:
-    """(T, C) simulation − measurement [floors] of one recording; NaN where not measured.
-
-    Args:
-        base: always fitted numbers: name → value.
-    """
+    """(T, C) simulation − measurement [floors] of one recording; NaN where not measured. ``base``: always fitted numbers."""
     left = np.full(recording.measured.shape, np.nan)
     left.flat[_entries(recording).measured] = stacked(problem, base, effects, [recording])
     return left

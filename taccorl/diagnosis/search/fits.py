@@ -24,7 +24,7 @@ from taccorl.diagnosis.search.fit import (
     rms,
     stacked,
 )
-from taccorl.diagnosis.search.identifiable import not_told_from_none
+from taccorl.diagnosis.search.identifiable import POSITION_AGE_S, not_told_from_none
 from taccorl.diagnosis.search.problem import Candidate, Problem, Progress, Recording, Values, chosen, with_held
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe, is_likely, probe
@@ -444,7 +444,7 @@ class Fits:
         gain, score = gain_of(model.squares, parent.squares), standard_score(parent.squares - model.squares)
         near, much = parent.error <= self.config.little, gain >= self.config.sure_gain
         sure = much or score >= self.config.sure_score
-        why = not_told_from_none(model.fit, name, left_over and not sure) if near or not sure else ""
+        why = not_told_from_none(model.fit, name, left_over and not sure, POSITION_AGE_S) if near or not sure else ""
         return why or (self._unrepeated(model, parent) if near and not much else "")
 
     def _unrepeated(self, model: Model, parent: Model) -> str:

@@ -38,6 +38,8 @@ TIMING_S = 3e-3
 """τ_max [s]. A choice: a loop of 1 kHz (difference of two samples, output held: 1 ms) that filters its speed over 2 ms."""
 POSITION_AGE_S = 1.5e-3
 """a_max [s]. A choice: half a period of a loop of 500 Hz (1 ms), and half a step of the twin (0.4 ms), which has no such age."""
+LATE = (".delay_s", ".time_constant_s")
+"""Ends of the names of delays and lags."""
 GAINS = ("kp", "kd", "torque_ff")
 """Names of the gains among the fitted numbers."""
 OVER_KP = {
@@ -143,7 +145,7 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
     return tuple(_scaled(n, _absent(over[n.name]), most) if n.name in open_ else n for n in plain)
 
 
-def not_told_from_none(fit: Fit, effect: str, left_over: bool) -> str:
+def not_told_from_none(fit: Fit, effect: str, left_over: bool, age_s: float = 0.0) -> str:
     """Text on an effect whose strength the recordings do not tell from none: the 95 % intervals of all of its fitted parameters
     that have an absent value hold that value. Empty if one does not, or if no such parameter was fitted.
 
@@ -152,6 +154,7 @@ def not_told_from_none(fit: Fit, effect: str, left_over: bool) -> str:
 
     Args:
         left_over: whether intervals widen by what the model leaves above the floor (``Fit.covariance``).
+        age_s: how much longer than it is a delay or lag may seem to be, by the loop's timing.
     """
     covariance, index = fit.covariance(left_over), {f.name: k for k, f in enumerate(fit.frees)}
     kp, texts = index.get("kp"), []
@@ -166,9 +169,11 @@ def not_told_from_none(fit: Fit, effect: str, left_over: bool) -> str:
         variance = covariance[k, k]
         if p.over == "kp" and kp is not None:
             variance = min(variance, variance + far**2 * covariance[kp, kp] - 2.0 * far * covariance[k, kp])
-        if abs(far) > fit.quantile * math.sqrt(max(variance, 0.0)):
+        late_s = age_s * name.endswith(LATE)
+        if abs(far) * (1.0 - late_s / value if late_s else 1.0) > fit.quantile * math.sqrt(max(variance, 0.0)):
             return ""
         low, high = fit.intervals()[name]
+        low = max(low - late_s, 0.0) if late_s else low
         texts.append(f"{p.name} {value:.3g} (95 % {low:.3g} … {high:.3g}) is not told from {p.absent:g}")
     return f"{' and '.join(texts)}, where the effect is absent" if texts else ""
 
@@ -260,7 +265,7 @@ def _timed(n: Identified, kd: float) -> Identified:
     are."""
     if n.name == "kd/kp":
         return dataclasses.replace(n, high=n.high + POSITION_AGE_S)
-    if n.name.endswith((".delay_s", ".time_constant_s")):
+    if n.name.endswith(LATE):
         return dataclasses.replace(n, low=max(n.low - POSITION_AGE_S, 0.0))
     if n.unit not in (INERTIA, OVER_KP[INERTIA]):
         return n

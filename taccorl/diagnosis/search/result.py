@@ -61,11 +61,7 @@ class SearchConfig:
     """Most steps of the solver in the last refit of the result, with finer finite differences."""
 
     def refusal(self, gain: float, score: float, bic: float) -> str:
-        """Text: why a model is not better; empty if it is.
-
-        Args:
-            gain, score, bic: as in ``Evidence``.
-        """
+        """Text: why a model is not better; empty if it is. ``gain, score, bic``: as in ``Evidence``."""
         if gain < self.min_gain:
             return f"takes away {max(gain, 0.0):.1%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:

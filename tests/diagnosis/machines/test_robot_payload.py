@@ -110,7 +110,7 @@ def recorded(
     for step in range(10 * len(time_s)):
         row = step // 10
         if step % 2 == 0:
-            late = max(int((0.0005 * step - arm.delay_s) // 0.005), 0)
+            late = max(int((0.0005 * step - arm.delay_s + 1e-9) // 0.005), 0)
             asked = target[row].copy()
             asked[0] = target[late, 0]
             believed.qpos[:] = data.qpos

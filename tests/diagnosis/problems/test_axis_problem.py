@@ -188,15 +188,23 @@ def test_gains_that_nobody_knows_are_fitted_and_positions_alone_leave_the_inerti
 
 
 @pytest.mark.slow
-def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
+@pytest.mark.parametrize("weight_n", [0.0, 17.0])
+def test_dry_friction_of_a_slide_is_found_in_newtons_beside_its_weight(slide: Measurements, weight_n: float):
+    """The file states no weight. Under it the slide moves W / K_p lower, and the drive pushes with W more."""
+    fit, validation = (
+        [dataclasses.replace(m, measured=m.measured - weight_n / KP, effort=m.effort + weight_n) for m in of]
+        for of in (slide.fit, slide.validation)
+    )
+    problem = AxisProblem(AXIS, Measurements(tuple(fit), tuple(validation)))
     found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
-    first = found.rounds[0]
-    assert "coulomb_friction" in (first.added, *first.ties)
+    assert "coulomb_friction" in (found.rounds[0].added, *found.rounds[0].ties)
     assert found.errors["fitted"]["validation"] > 5.0
     assert found.errors["after"]["validation"] < 0.4 * found.errors["fitted"]["validation"]
-    best = next(e for e in first.evidence if e.name == "coulomb_friction")
+    best = next(e for e in found.rounds[0].evidence if e.name == "coulomb_friction")
     assert best.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.2)  # steps of 1 ms cost some
     assert best.base["inertia"] == pytest.approx(MASS_KG, rel=0.1)
+    assert found.base["weight_cos"] == pytest.approx(weight_n, abs=0.5)
+    assert ("weight_cos 0 → " in verdict("drive", found).finding) == (weight_n > 0.0)
 
 
 WEIGHT_NM, LEVEL_RAD = 1.6, 0.5
@@ -278,12 +286,6 @@ def test_targets_that_were_computed_for_one_delay_are_not_used_for_another(slide
     assert np.median((first - later)[moving] / np.gradient(first)[moving]) == pytest.approx(0.4, abs=0.02)
 
 
-def test_floors_are_those_of_the_noise(problem: AxisProblem):
-    assert problem.effort
-    assert problem.fit[0].floor == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
-    assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
-
-
 def of_a_sampled_loop(
     speed_rows: int,
     friction_n: Callable[[float], float] = lambda speed: FRICTION_N,
@@ -346,8 +348,9 @@ def test_the_drive_stays_as_stated_where_its_efforts_are_those_of_its_law(change
 def test_friction_of_grease_is_fitted_with_its_power_and_its_share_of_direction():
     """20 N (1 ∓ 0.2) (v / 0.1 m/s)^0.4 up and down, beside 150 N·s/m."""
     grease = lambda v: 20.0 * (abs(v) / 0.1) ** 0.4 * (0.8 if v > 0.0 else 1.2)  # noqa: E731
-    axis = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
-    problem = AxisProblem(axis, Measurements((of_a_sampled_loop(1, grease),)))
+    timed = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
+    level = dataclasses.replace(timed, known=("weight_cos",))
+    problem = AxisProblem(level, Measurements((of_a_sampled_loop(1, grease),)))
     start = {"torque_nm": 10.0, "exponent": 0.7, "asymmetry": 0.0}
     start = problem.start | {f"power_law_friction.{key}": value for key, value in start.items()}
     start |= {"viscous_friction.damping_nms_per_rad": 100.0}
@@ -392,13 +395,6 @@ def test_an_effect_of_another_size_survives_a_process_and_refuses_what_is_beyond
         scaled("coulomb_friction", AXIS.scale)(torque_nm=250.0)
 
 
-def test_searches_start_at_the_same_effects_whatever_the_size(slide: Measurements, problem: AxisProblem):
-    """Starts of an arm's effects at a tenth of the force, times ten."""
-    (first, *_) = problem.candidates["slew_limit"].starts
-    peak = np.abs(np.gradient(slide.fit[0].target[:, 0], 1e-3)).max()
-    assert first["slew_limit.speed_rad_per_s"] == pytest.approx(0.35 * peak, rel=1e-6)
-
-
 def test_a_known_external_force_moves_the_axis_by_force_over_stiffness(slide: Measurements, problem: AxisProblem):
     pushed = dataclasses.replace(slide.fit[0], load=np.full_like(slide.fit[0].target, 40.0))
     recording = AxisProblem(AXIS, Measurements((pushed,))).fit[0]
@@ -422,19 +418,18 @@ def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(
     slide: Measurements, problem: AxisProblem
 ):
     free = {f.name: f for f in problem.base if not f.held}
-    assert list(free) == ["inertia", "torque_ff", "target_late_s", "kp", "kd"]
+    assert list(free) == ["inertia", "torque_ff", "weight_cos", "target_late_s", "kp", "kd"]
     assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)
     silent = tuple(dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit)
     assert [f.name for f in AxisProblem(AXIS, Measurements(silent)).base] == ["inertia", "torque_ff", "target_late_s"]
-
-
-def test_more_inertia_is_no_candidate_and_effects_of_the_arm_s_bodies_are_none(problem: AxisProblem):
-    assert "armature" not in problem.candidates and "payload" not in problem.candidates
-    assert {"coulomb_friction", "viscous_friction"} <= set(problem.candidates)
+    assert problem.effort and problem.fit[0].floor == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
+    assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
+    peak = np.abs(np.gradient(slide.fit[0].target[:, 0], 1e-3)).max()
+    assert problem.candidates["slew_limit"].starts[0]["slew_limit.speed_rad_per_s"] == pytest.approx(0.35 * peak)
 
 
 def test_play_is_looked_for_only_where_the_motor_s_inertia_is_known(slide: Measurements, problem: AxisProblem):
-    assert not {"backlash", "joint_compliance"} & set(problem.candidates)
+    assert not {"backlash", "joint_compliance", "armature", "payload"} & set(problem.candidates)
     known = dataclasses.replace(AXIS, rotor_inertia=30.0)
     assert {"backlash", "joint_compliance"} <= set(AxisProblem(known, slide).candidates)
     assert known.with_numbers({"inertia": 160.0}).rotor_inertia == pytest.approx(60.0), "the same share of it"

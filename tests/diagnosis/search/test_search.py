@@ -34,6 +34,8 @@ def test_the_hidden_effect_is_found_with_its_strength_and_the_error_falls_to_the
     assert found.errors["fitted"]["test"] == pytest.approx(12.06, rel=0.02)
     assert found.errors["after"]["test"] == pytest.approx(1.0, abs=0.05)
     assert [name for name, _ in found.steps] == ["", "ripple"]
+    left_out = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation, without=["ripple"])
+    assert left_out.status == "something_else" and left_out.names == ()
 
 
 def test_nothing_is_added_where_nothing_is_missing():
@@ -89,20 +91,13 @@ def test_an_effect_that_the_fitted_numbers_take_up_stays_unseen_and_explains_not
     assert row.explained == 0.0
 
 
-def test_structure_that_no_effect_explains_is_called_something_else():
+def test_structure_that_no_effect_explains_or_one_recording_alone_shows_is_called_something_else():
     t = np.arange(0.0, 10.0, 0.005)
     fit, validation, _ = made(extra=np.sign(np.sin(3.0 * t)))
-    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation)
-    assert found.status == "something_else"
-    assert found.names == ()
-    assert all(row.verdict for row in found.rounds[0].evidence)
-
-
-def test_an_effect_that_fits_one_recording_only_is_not_believed():
-    """Validation recordings decide: a ripple in the fit recording alone is an accident of it."""
-    found = diagnose(MadeProblem(Ripple, Square), [record(0, Ripple(strength=1.0))], [record(1, extra=1.0)])
-    assert found.names == ()
-    assert found.status == "something_else"
+    for one, other in ((fit, validation), ([record(0, Ripple(strength=1.0))], [record(1, extra=1.0)])):
+        found = diagnose(MadeProblem(Ripple, Bump, Square), one, other)
+        assert (found.status, found.names) == ("something_else", ())
+        assert all(row.verdict for row in found.rounds[0].evidence)
 
 
 def test_effects_that_the_twin_has_are_refitted_and_stay():
@@ -113,13 +108,6 @@ def test_effects_that_the_twin_has_are_refitted_and_stay():
     assert found.after.values["ripple.strength"] == pytest.approx(2.0, abs=0.02)
     before, fitted, after = (found.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
     assert before > fitted > after
-
-
-def test_the_true_effect_can_be_left_out_and_is_then_missed():
-    fit, validation, _ = made(Ripple(strength=1.0))
-    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation, without=["ripple"])
-    assert found.status == "something_else"
-    assert "ripple" not in found.names
 
 
 def test_an_unknown_effect_is_refused_with_the_nearest_name():
@@ -467,16 +455,33 @@ def test_an_effect_that_removes_much_for_sure_is_told_with_a_remark_where_its_st
     assert (["ripple.strength" in r for r in found.remarks] == [True]) is is_open
 
 
+@dataclasses.dataclass(kw_only=True)
+class Late(Ripple):
+    """A ripple of 100 / s times a delay; 0.9 ms are within what the timing of a loop leaves open."""
+
+    name: ClassVar = "late"
+    strength: float = 0.0
+    delay_s: float = number("τ", "s", 0.0, 1e-3, (0.0, 0.05), "made up")
+
+    def __post_init__(self):
+        self.strength = 100.0 * self.delay_s
+
+
 # ± 3.2 · 0.14 / √4 = 0.22 about 0.12 holds none; 0.12 is three times as much as in any recording that was fitted
 @pytest.mark.parametrize(
-    ("fitted", "validating", "names"),
-    [((0.3, 0.0, 0.03, 0.15), 0.09, ()), ((0.04,) * 3, 0.12, ()), ((0.09,) * 3, 0.09, ("ripple",))],
+    ("kind", "fitted", "validating", "names"),
+    [
+        (Ripple, (0.3, 0.0, 0.03, 0.15), 0.09, ()),
+        (Ripple, (0.04,) * 3, 0.12, ()),
+        (Ripple, (0.09,) * 3, 0.09, ("ripple",)),
+        (Late, (0.09,) * 3, 0.09, ()),
+    ],
 )
-def test_near_the_floor_an_effect_has_to_repeat_on_recordings_that_were_not_fitted(fitted, validating, names):
+def test_near_the_floor_an_effect_has_to_repeat_on_recordings_that_were_not_fitted(kind, fitted, validating, names):
     """A ripple of 0.12 leaves √(1 + 0.12² / 2 / 0.1²) = 1.31 floors; the other wave, in the first second, starts the search."""
     t = np.arange(0.0, 10.0, 0.005)
     fit = [record(k, Ripple(strength=s), extra=1.2 * (t < 1) * np.sin(60.0 * t)) for k, s in enumerate(fitted)]
-    found = diagnose(MadeProblem(Ripple), fit, [record(10, Ripple(strength=validating))])
+    found = diagnose(MadeProblem(kind), fit, [record(10, Ripple(strength=validating))])
     assert found.errors["fitted"]["fit"] > 1.5 > found.errors["fitted"]["validation"]
     row = found.rounds[0].evidence[0]
     assert 0.1 < row.gain < 0.5 and row.score > 3.0 and row.bic > 0.0
