@@ -40,8 +40,8 @@ class DiagnoseConfig(PartsConfig):
     without: list[str] = field(default_factory=list)
     """Effects that the search does not add. Where a joint's twin has one already, it stays with its present numbers."""
     out: Path = Path("diagnosis")
-    """Folder of report.html, report.json, which ``taccorl add-effect`` reads, and the corrected twin.yaml. An earlier report of
-    this twin is replaced; other files are not overwritten."""
+    """Folder of report.html, report.json, which ``taccorl add-effect`` reads, and the corrected twin.yaml. An earlier report is
+    replaced; other files are not overwritten."""
 
 
 @verb(DiagnoseConfig, positional="measurements")
@@ -50,7 +50,7 @@ def run(config: DiagnoseConfig) -> int:
     something else remains, or the measurements have errors, or efforts of other gains than the file's."""
     from taccorl.report.report import check_folder
 
-    check_folder(config.out, config.measurements, config.twin or Path("nominal twin"))
+    check_folder(config.out, config.measurements)
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.diagnosed import brief
     from taccorl.report.report import write_report

@@ -182,26 +182,22 @@ def numbers_of(diagnosis: Path) -> Path:
     return diagnosis if diagnosis.name == NUMBERS else diagnosis / NUMBERS
 
 
-def check_folder(folder: Path, measurements: Path | None = None, twin: Path | None = None) -> str:
-    """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
-    is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read. ``twin``:
-    file of the machine, if a diagnosis of another one is not to be replaced. Raises TaccorlError: another file has the report's
-    name, the folder cannot be written, or it is the folder of the recordings or of another machine's diagnosis."""
+def check_folder(folder: Path, measurements: Path | None = None) -> str:
+    """Check that a report may be written into ``folder``; returns twin and date of the report that it will replace, empty if
+    there is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read.
+    Raises TaccorlError: another file has the report's name, the folder cannot be written, or it is that of the recordings."""
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
         raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
         raise TaccorlError(f"{folder}: is a file; give a folder for the report")
     check_writable(folder)
     page.check_free([folder / PAGE, folder / NUMBERS], GENERATOR, "another folder")
-    if twin is not None and (folder / NUMBERS).is_file():
-        of = json.loads((folder / NUMBERS).read_text("utf-8"))["provenance"].get("twin", "")
-        if of and Path(of).resolve() != twin.resolve():
-            raise TaccorlError(
-                f"{folder}: has the diagnosis of {of}, this one is of {twin}: give --out=diagnosis_{twin.stem}"
-            )
     if not (folder / PAGE).exists():
         return ""
-    return datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M")
+    told = json.loads((folder / NUMBERS).read_text("utf-8")) if (folder / NUMBERS).exists() else {}
+    twin = told.get("provenance", {}).get("twin", "")
+    made = datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone()
+    return f"{twin}{', ' * bool(twin)}{made:%Y-%m-%d %H:%M}"
 
 
 def as_json(report: Report) -> dict[str, Any]:

@@ -332,14 +332,13 @@ def check_against_twin(
             shift = plain
         elif _is_late(shift, period_s) and not _is_late(delay_between(*rows, period_s, changed(name)), period_s):
             shift = dataclasses.replace(plain, row_rms=0.0)  # other numbers explain it without a delay
+        hidden = HIDDEN * np.nanstd(rows[1] - rows[2])
         contrary = _leads(shift, period_s) and _is_late(plain, period_s)  # so friction looks beside a longer lag
         if contrary or shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
             why = f"look for the missing effect first, which leaves {plain.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
             findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
-        elif name not in uncertain and abs(shift.delay_s) / period_s * shift.row_rms > HIDDEN * np.nanstd(
-            rows[1] - rows[2]
-        ):
+        elif name not in uncertain and abs(shift.delay_s) / period_s * shift.row_rms > hidden:
             continue
         elif _leads(shift, period_s):
             effects = {} if name in uncertain else rivals(name)
