@@ -85,17 +85,9 @@ def check_measurements(
     progress: Callable[[str, str], None] = lambda name, text: None,
 ) -> dict[str, list[Finding]]:
     """Check several measurements; each joint must move in one of them. Also finds measurements that repeat another without
-    stating it.
-
-    Args:
-        joints: signals to be fitted.
-        accept: names of checks whose errors are known and become warnings.
-        limits, rates: as in ``check_measurement``.
-        progress: function that is called with (name of a measurement, text about the present check).
-
-    Returns:
-        Name of the measurement → its findings, worst first.
-    """
+    stating it, and copies. Returns name of the measurement → its findings, worst first. ``joints``: signals to be fitted;
+    ``accept``: names of checks whose errors are known and become warnings; ``limits``, ``rates``: as in ``check_measurement``;
+    ``progress`` is called with (name of a measurement, text about the present check)."""
     found = {}
     for k, m in enumerate(measurements, 1):
         place = f"recording {k} of {len(measurements)}, "
@@ -113,6 +105,12 @@ def check_measurements(
     for a, b in itertools.combinations(sound, 2):
         if not moves[a.name] & moves[b.name]:
             continue  # other joints: of a hundred recordings most pairs
+        if np.array_equal(a.measured, b.measured, equal_nan=True) and np.array_equal(
+            a.target, b.target, equal_nan=True
+        ):
+            text = f"{b.name} is {a.name}, number for number: no repeat, whose noise tells the floor, and nothing new. Remove it"
+            found[b.name].append(find("copied_recording", "", f"{text} (a simulation without noise repeats so, too)"))
+            continue
         told = b.name in (a.name, a.repeat_of) or a.name == b.repeat_of or (a.repeat_of and a.repeat_of == b.repeat_of)
         if not told:
             try:
@@ -158,6 +156,7 @@ def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> It
             yield m.name, find("slower_rows", signal, text, topic="rows")
 
 
+@check("copied_recording", "warning")
 @check("same_motion", "note")
 @check("same_commands", "warning")
 def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:

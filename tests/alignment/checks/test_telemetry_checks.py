@@ -792,7 +792,8 @@ def test_channels_of_a_recording_speak_for_themselves(clean):
 
 @pytest.mark.slow
 def test_an_untold_repeat_is_pointed_out(clean):
-    again = dataclasses.replace(sweep(0), name="again")
+    noise = np.random.default_rng(1).normal(0, 2e-5, clean.measured.shape)
+    again = dataclasses.replace(clean, name="again", measured=clean.measured + noise)
     other = dataclasses.replace(sweep(3), name="other")
     by = check_measurements([clean, again, other], joints=["left_joint5"])
     assert [f.check for f in by["again"]] == ["same_motion"] and "repeat_of: sweep" in by["again"][0].text
@@ -800,6 +801,8 @@ def test_an_untold_repeat_is_pointed_out(clean):
     assert [f.check for f in by["sweep"]] == ["not_judged"]  # what does not repeat, without repeats
     told = dataclasses.replace(again, repeat_of="sweep")
     assert check_measurements([clean, told]) == {"sweep": [], "again": []}
+    (f,) = check_measurements([clean, dataclasses.replace(told, measured=clean.measured)])["again"]
+    assert f.check == "copied_recording" and "again is sweep, number for number" in f.text
 
 
 def test_same_commands_with_another_answer_ask_about_gains_and_payload_not_for_repeat_of(clean):
