@@ -31,8 +31,8 @@ def verdict_section(v: Verdict) -> Section:
 
 
 def brief(f: Finding, v: Verdict, options: Sequence[str] = ()) -> Section:
-    """Lines of a terminal; a page has more. The verdict, numbers and command of what was added, reasons, and what to record where
-    that decides. ``options``: as in ``verdict``."""
+    """What a terminal shows of one part: the verdict, numbers and command of what was added, the confidence, and what to record
+    next where ties are left. report.html has more. ``options``: as in ``verdict``."""
     d, names = f.diagnosis, added(f.diagnosis)
     text: list[Value] = [Cell(v.finding, "bold")]
     text += [f"{f'{e.name} ' * (len(names) > 1)}{_in_twin(d)}: {_values(e)}" for e in d.effects if e.name in names]

@@ -183,9 +183,9 @@ def numbers_of(diagnosis: Path) -> Path:
 
 
 def check_folder(folder: Path, measurements: Path | None = None) -> str:
-    """Check that a report may be written into ``folder``; returns twin and date of the report that it will replace, empty if
-    there is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read.
-    Raises TaccorlError: another file has the report's name, the folder cannot be written, or it is that of the recordings."""
+    """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
+    is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read. Raises
+    TaccorlError: another file has the report's name, the folder cannot be written, or it is the folder of the recordings."""
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
         raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
@@ -194,10 +194,7 @@ def check_folder(folder: Path, measurements: Path | None = None) -> str:
     page.check_free([folder / PAGE, folder / NUMBERS], GENERATOR, "another folder")
     if not (folder / PAGE).exists():
         return ""
-    told = json.loads((folder / NUMBERS).read_text("utf-8")) if (folder / NUMBERS).exists() else {}
-    twin = told.get("provenance", {}).get("twin", "")
-    made = datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone()
-    return f"{twin}{', ' * bool(twin)}{made:%Y-%m-%d %H:%M}"
+    return datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M")
 
 
 def as_json(report: Report) -> dict[str, Any]:

@@ -234,7 +234,7 @@ def test_a_silent_camera_splits_exactly_there_and_losses_add_up(tmp_path: Path, 
     [
         ("success", (1.6, 2.1), [None, True]),
         pytest.param("failure", (1.6, 2.1), [None, False], marks=pytest.mark.slow),
-        # The end marker is at 3.9 s. Silent from 3.2 s, the last row is at 3.2 s; from 3.75 s, it is 0.15 s before the marker.
+        # The end marker is at 3.9 s. A channel without samples from 3.2 s on ends 0.7 s before it, one from 3.75 s on 0.15 s.
         pytest.param("success", (3.2, 9.0), [None], marks=pytest.mark.slow),
         ("success", (3.75, 9.0), [True]),
         ("success", (3.0, 3.5), [None]),  # what follows the gap is shorter than a second

@@ -85,8 +85,8 @@ class ControllerFit:
 
 
 def paper_loss(reported: np.ndarray, measured: np.ndarray) -> float:
-    """The paper's loss (eq. 9) [rad] of ``reported`` (T,) against ``measured`` (T,) angles [rad]: Σ |e_sim − e_real| + 0.1 Σ
-    |Δe_sim − Δe_real|; rows without a measurement (NaN) are left out. e = q − q*, and the targets cancel."""
+    """The paper's loss (eq. 9) [rad], Σ |e_sim − e_real| + 0.1 Σ |Δe_sim − Δe_real| over T rows, of the simulated angles
+    ``reported`` (T,) and ``measured`` (T,) [rad]. e = angle − target: the targets cancel. Rows with NaN are left out."""
     difference = reported - measured
     return float(np.nansum(np.abs(difference)) + RATE_WEIGHT * np.nansum(np.abs(np.diff(difference))))
 

@@ -72,7 +72,7 @@ class AxisConfig(DriveLaw):
     weight_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
-    """C in the torque S sin q + C cos q that holds the axis's own weight [N·m]; of a slide its weight [N], constant."""
+    """C [N·m] in the torque S sin q + C cos q that holds the weight of a turning axis at angle q; of a slide, its weight [N]."""
     payload_kg: float = 0.0
     """Mass that the axis carries [kg], unless a recording states another one; not part of ``inertia``."""
     lever_m: float = 0.0

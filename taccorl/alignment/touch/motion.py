@@ -80,8 +80,8 @@ class TouchMotion:
     _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
     def depth(self, offsets_m: tuple[tuple[float, float, float], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
-        """Depth δ [m] and depth rate δ̇ [m/s], each (T, P, R, C) float32, 0 without contact. ``offsets_m``: displacement (x, y,
-        z) of each of the P pads' taxels from the nominal position, in the pad's own frame [m]; empty: none."""
+        """Depth of the object in each taxel [m] and its rate [m/s], (T rows, P pads, R, C taxels) float32, 0 without contact.
+        ``offsets_m``: how far each pad's taxels lie from their nominal place, (x, y, z) in the pad's frame [m]; empty: 0."""
         if not any(any(offset) for offset in offsets_m):
             offsets_m = ()
         if offsets_m not in self._known:

@@ -242,8 +242,8 @@ class Diagnosis:
 
     @property
     def baseline(self) -> Literal["before", "fitted"]:
-        """Key of ``errors`` with which the result is compared: the smaller validation error without the added effects. What
-        hardly acts in validation recordings lowers only that of the refit."""
+        """Key of ``errors`` with which ``after`` is compared: ``before`` (numbers of the file) or ``fitted`` (refitted, no effect
+        added), by the smaller validation error; ``fitted`` too where effects take less than a tenth away from ``before``."""
         before, fitted, after = (self.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
         return "fitted" if fitted <= before or (self.names != self.present and 0.9 * before < after) else "before"
 

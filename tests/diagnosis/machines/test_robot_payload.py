@@ -299,9 +299,8 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
     low, high = payload.interval["mass_kg"]
     assert low <= SCARA_KG <= high and high - low < 0.03 and payload.mass_kg == pytest.approx(SCARA_KG, abs=0.01)
     for axis, at_m in zip("xy", SCARA_AT_M[:2], strict=True):
-        low, high = payload.interval[f"{axis}_m"]
-        # The inertia also hangs on the loops' timing, by 9 mm beyond the interval.
-        assert low - 0.01 <= at_m <= high + 0.01
+        low, high = payload.interval[f"{axis}_m"]  # hardly determined: the inertia also hangs on the loops' timing
+        assert low <= at_m <= high
     assert payload.z_m == 0.0 and "z_m" not in payload.interval, "no vertical axis feels its height"
     assert not lift.diagnosis.rivals.get("payload")
     assert elbow.diagnosis.errors["after"]["validation"] < 1.2 and not elbow.diagnosis.names

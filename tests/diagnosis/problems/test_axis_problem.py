@@ -190,7 +190,7 @@ def test_gains_that_nobody_knows_are_fitted_and_positions_alone_leave_the_inerti
 @pytest.mark.slow
 @pytest.mark.parametrize("weight_n", [0.0, 17.0])
 def test_dry_friction_of_a_slide_is_found_in_newtons_beside_its_weight(slide: Measurements, weight_n: float):
-    """The file states no weight. Under it the slide moves W / K_p lower, and the drive pushes with W more."""
+    """The slide carries a weight W that its file does not state: it stands W / K_p lower, and its drive pushes with W more."""
     fit, validation = (
         [dataclasses.replace(m, measured=m.measured - weight_n / KP, effort=m.effort + weight_n) for m in of]
         for of in (slide.fit, slide.validation)

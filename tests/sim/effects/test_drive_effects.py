@@ -1,4 +1,4 @@
-"""Where searches for effects of drives start, whose torque it is, and what holds when several act or a simulation begins."""
+"""Effects of drives: values at which a fit of them starts, what counts as torque of the motor, commands, and the first reset."""
 
 import numpy as np
 import pytest

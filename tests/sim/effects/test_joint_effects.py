@@ -1,4 +1,4 @@
-"""Effects on whole arms, grippers, one of several simulations and the chosen joints. Laws of one joint: test_joint_laws.py."""
+"""Effects act on the arms, grippers, joints and simulations that are chosen, only. test_joint_laws.py tests their equations."""
 
 import mujoco
 import numpy as np
