@@ -3,7 +3,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 names="mujoco mujoco-core glfw pyopengl gymnasium farama-notifications draccus mergedeep typing-inspect mypy-extensions toml daqp mink
-qpsolvers shapely zstandard lz4 mcap mcap-ros2-support lerobot termcolor einops jsonlines transformers tokenizers datasets dill multiprocess
+peft qpsolvers shapely zstandard lz4 mcap mcap-ros2-support lerobot termcolor einops jsonlines transformers tokenizers datasets dill multiprocess
 pytz rosbags ruamel-yaml"
 mkdir -p outputs/gpu/wheels
 wanted=()

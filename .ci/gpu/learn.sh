@@ -6,7 +6,7 @@ threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
 room=$((gpus * (${MEMORY_MB:-$(nvidia-smi --query-gpu=memory.total --format=csv,noheader,nounits | head -n 1)} / ${TRAINING_MB:-31000})))
 since() { echo "$1 $(($(date +%s) - $(cat /dev/shm/t0)))" >>/dev/shm/times; }
 trainings() { pgrep -fc '^[^ ]*python[^ ]* -m lerobot.scripts.lerobot_train'; }
-trap 'touch /dev/shm/done; kill $renicing' EXIT
+trap 'touch ${DONE:-/dev/shm/done}; kill $renicing' EXIT
 while sleep 2; do renice -n -15 -p $(pgrep -f lerobot_train); done >/dev/null 2>&1 &
 renicing=$!
 since start

@@ -7,7 +7,7 @@ if [ $# = 1 ]; then
   xz -3 -T0 -c "$1/warp/bin/warp.so" >outputs/warp_c/so
   split -n 2 -d outputs/warp_c/so outputs/warp_c/so.
   mv outputs/warp_c/so.00 outputs/warp_a/ && mv outputs/warp_c/so.01 outputs/warp_b/ && rm outputs/warp_c/so
-  PYTHONPATH=$1:. .venv/bin/python .ci/gpu/warp_kernels.py outputs/warp_kernels
+  for task in ${TASKS:-assembly_1}; do PYTHONPATH=$1:. .venv/bin/python .ci/gpu/warp_kernels.py outputs/warp_kernels "$task"; done
   tar cJf outputs/warp_c/kernels.tar.xz -C outputs/warp_kernels --exclude='*.cu' --exclude='*.o' .
   tar cJf outputs/warp_c/rest.tar.xz -C "$1" --exclude='*.so' --exclude=__pycache__ warp mujoco_warp
   exit

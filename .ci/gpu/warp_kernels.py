@@ -1,10 +1,12 @@
-"""``python .ci/gpu/warp_kernels.py OUT [arch]``: compile MuJoCo Warp's kernels of the twin for a GPU (sm_90), without a GPU.
+"""``python .ci/gpu/warp_kernels.py OUT [TASK [arch]]``: compile MuJoCo Warp's kernels of a twin for a GPU (sm_90) without one.
 
 A step is taken with launches that are only noted, and with a device that says it is a GPU; each module is then compiled into
-OUT/<version of Warp>, which WARP_CACHE_PATH=OUT names on the GPU machine: 82 kernels in 5 minutes on two busy cores.
+OUT/<version of Warp>, which WARP_CACHE_PATH=OUT names on the GPU machine: 82 kernels in 5 minutes on two busy cores. What is
+there, of another task, is kept.
 """
 
 import sys
+from pathlib import Path
 
 import warp as wp
 
@@ -49,7 +51,7 @@ import mujoco_warp as mjw  # noqa: E402
 from taccorl.sim import warp_batch  # noqa: E402
 from taccorl.sim.vector_env import TaccorlVectorEnv  # noqa: E402
 
-batch = TaccorlVectorEnv("assembly_1", 4, physics="warp:device=cpu", num_threads=2).sim.batch
+batch = TaccorlVectorEnv((sys.argv[2:] or ["assembly_1"])[0], 4, physics="warp:device=cpu", num_threads=2).sim.batch
 varied = [name for name in warp_batch.MODEL_FIELDS if warp_batch._varies(name) and batch.expanded(name) is not None]
 worlds = warp_batch._Worlds(warp_batch._for_warp(batch.model), 2048, batch.settings, varied)
 get_device = wp.get_device
@@ -62,5 +64,7 @@ noting, wp.get_device = False, get_device
 for number, (module, block_dim) in enumerate(noted.values()):
     module.get_module_hash(block_dim)
     options = module.resolve_options(wp.config, block_dim=block_dim)
-    module._compile(None, None, output_arch=int((sys.argv[2:] or ["90"])[0]), options=options)
+    arch = int((sys.argv[3:] or ["90"])[0])
+    if not any(Path(sys.argv[1]).glob(f"*/{module.get_module_identifier(block_dim)}/*.sm{arch}.cubin")):
+        module._compile(None, None, output_arch=arch, options=options)
     print(f"{number + 1} of {len(noted)}: {module.name}", flush=True)

@@ -4,9 +4,12 @@ Weights are random and observations made up: what is measured is time and memory
 """
 
 import gc
+import json
 import math
+import tempfile
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
@@ -102,6 +105,71 @@ def _training_rows(gpu: str) -> Iterator[Row]:
     )
 
 
+@benchmark("full_adapters")
+def full_adapters() -> Iterator[Row]:
+    """Benchmark of training steps of adapters (LoRA) of π0.5's full size in bfloat16 at batch 32, on one GPU and on all."""
+    import torch
+
+    if not torch.cuda.is_available():
+        print("  full_adapters needs a GPU: nothing measured")
+        return
+    yield from adapter_rows("full", 32, torch.cuda.get_device_name())
+
+
+def adapter_rows(backbone: str, rows: int, where: str, device: str = "cuda") -> Iterator[Row]:
+    """Time and memory of training steps of adapters and touch, as of ``lerobot-train --peft.method_type=LORA``, with ``rows``
+    on each GPU; the rate of all GPUs over that of one. On a CPU two processes stand for GPUs."""
+    import torch
+
+    per_gpu = {
+        n: _adapter_steps(n, backbone, rows, device) for n in (1, torch.cuda.device_count() if device == "cuda" else 2)
+    }
+    for n, (times_s, peak_gb) in per_gpu.items():
+        name = f"training step of adapters (LoRA), batch {rows}, {n} × {where}"
+        yield Row.of(times_s, name=name, unit="s")
+        yield Row.of([peak_gb], name=f"GPU memory of it, {n} × {where}", unit="GB", goal="< 80")
+    many = max(per_gpu)
+    if many > 1:
+        one_s = median(per_gpu[1][0])
+        yield Row.of(
+            [many * one_s / t for t in per_gpu[many][0]],
+            name=f"rows/s of it on {many} over one, {where}", unit="×", goal="≥ 1.7" if many == 2 else "",
+            rival="one, rows/s", rival_value=rows / one_s,
+        )  # fmt: skip
+
+
+def _adapter_steps(num: int, *arguments: Any) -> tuple[list[float], float]:
+    """Times [s] of ``REPEATS`` steps of the first of ``num`` processes, one on each GPU, and its memory [GB]."""
+    import torch.multiprocessing as mp
+
+    with tempfile.TemporaryDirectory() as folder:
+        mp.spawn(_adapter_process, (num, folder, *arguments), num)  # pyright: ignore[reportPrivateImportUsage]
+        return tuple(json.loads((Path(folder) / "found.json").read_text()))
+
+
+def _adapter_process(rank: int, num: int, folder: str, backbone: str, rows: int, device: str) -> None:
+    import torch
+    from torch.nn.parallel import DistributedDataParallel
+
+    cuda = device == "cuda"
+    if cuda:
+        torch.cuda.set_device(rank)
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = True
+    place = {"init_method": f"file://{folder}/store", "rank": rank, "world_size": num}
+    torch.distributed.init_process_group("nccl" if cuda else "gloo", **place)
+    policy = random_policy(backbone, device, tactile=True)
+    policy.config.base_checkpoint = "random weights"
+    adapted = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA"})
+    shared = DistributedDataParallel(adapted, find_unused_parameters=True) if num > 1 else adapted  # as Accelerate's
+    step, times_s = _training_step(policy, random_batch(rows, device, prompt_tokens=200), shared), []
+    for _ in range(REPEATS + 3):
+        times_s.append(_time_s(step, device))
+    peak_gb = torch.cuda.max_memory_allocated() / 1e9 if cuda else 0.0
+    if rank == 0:
+        (Path(folder) / "found.json").write_text(json.dumps((times_s[3:], peak_gb)))
+    torch.distributed.destroy_process_group()
+
+
 def random_policy(backbone: str, device: str, *, tactile: bool) -> Any:
     """A ``TactilePI05Policy`` with random weights for the robot's state, actions, pads and three cameras at 224 × 224."""
     import torch
@@ -170,8 +238,9 @@ def _contact_in_every_other(batch: dict[str, Any]) -> dict[str, Any]:
     return {**batch, "observation.tactile": touch}
 
 
-def _training_step(policy: Any, batch: dict[str, Any]) -> Callable[[], Any]:
-    """What ``update_policy`` of lerobot-train does: under autocast for the policy's dtype, numbers read for the log."""
+def _training_step(policy: Any, batch: dict[str, Any], called: Any = None) -> Callable[[], Any]:
+    """What ``update_policy`` of lerobot-train does: under autocast for the policy's dtype, numbers read for the log. ``called``:
+    the policy or what it is wrapped in."""
     import torch
 
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
@@ -181,7 +250,7 @@ def _training_step(policy: Any, batch: dict[str, Any]) -> Callable[[], Any]:
     def step() -> None:
         policy.train()
         with torch.autocast(policy.config.device, torch.bfloat16, enabled=bfloat16):
-            loss, _ = policy.forward(batch)
+            loss, _ = (called or policy)(batch)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimizer.step()

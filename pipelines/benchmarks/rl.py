@@ -107,7 +107,7 @@ def rollout_speed() -> Iterator[Row]:
 @benchmark("full_post_training")
 def full_post_training() -> Iterator[Row]:
     """Benchmark of π0.5's full size on one GPU: a decision of 128 environments and the paper's optimiser step of 512 decisions,
-    without the physics. Weights and observations are random: time and memory are measured."""
+    in micro-batches of 4, without the physics. Weights and observations are random: time and memory are measured."""
     import torch
 
     if not torch.cuda.is_available():
@@ -138,7 +138,7 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
     from taccorl.rl.settings import FlowSDESettings, PolicySettings, PPOSettings
 
     cuda = device.startswith("cuda")
-    micro_batch = min(16, num_envs)
+    micro_batch = min(4, num_envs)
     policy = random_policy(backbone, device, tactile=True)
     sde = FlowSDE(FlowSDESettings())
     actor = TactileFlowPolicy(policy, PolicySettings(), sde.num_steps)
@@ -200,4 +200,5 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
     yield Row.of([found[0]["first_ratio_error"]], name=f"largest |ratio − 1| before the first step, {label}", unit="1")
     if cuda:
         peak_gb = torch.cuda.max_memory_allocated() / 1e9
-        yield Row.of([peak_gb], name=f"GPU memory of it: weights, gradients, AdamW, activations, {label}", unit="GB")
+        name = f"GPU memory of it: weights, gradients, AdamW, activations, {label}"
+        yield Row.of([peak_gb], name=name, unit="GB", goal="< 80")

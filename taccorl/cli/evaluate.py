@@ -40,7 +40,17 @@ EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
 ROBOT_TRIALS = 20
 """Trials of a task on a robot, as in the paper."""
-_OF_TWIN = ("difficulty", "twin", "randomization", "pictures", "hide", "batch_size", "workers", "before_mate")
+_OF_TWIN = (
+    "difficulty",
+    "twin",
+    "randomization",
+    "pictures",
+    "hide",
+    "physics",
+    "batch_size",
+    "workers",
+    "before_mate",
+)
 """Options that configure the simulation, refused with a robot."""
 
 
@@ -89,6 +99,9 @@ class EvaluateConfig:
     arm is in its last subtask. Policies then get zeros (no contact, black pictures). Repeat the option for several."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
+    physics: str = "c"
+    """c: MuJoCo on the CPU; warp: MuJoCo Warp on a GPU (extra gpu), which cannot repeat an episode bit for bit: no failures are
+    saved. warp:device=cuda:1,contacts=128: settings."""
     batch_size: int | None = None
     """Number of environments at the same time; all episodes of a task if not given."""
     workers: int = 1
@@ -116,6 +129,8 @@ def main(argv: list[str]) -> int:
     given = given_names(argv)
     if config.robot and (useless := next((name for name in _OF_TWIN if name in given), None)):
         raise TaccorlError(f"--{useless} has no effect with --robot.type: remove it")
+    if config.physics != "c" and "failures" not in given:
+        config.failures = 0
     if config.robot and "episodes" not in given:
         config.episodes = ROBOT_TRIALS
     return run(config)
@@ -336,6 +351,9 @@ def _check_places(config: EvaluateConfig) -> None:
         raise TaccorlError(f"--workers={config.workers}: at least 1")
     if config.failures < 0:
         raise TaccorlError(f"--failures={config.failures}: at least 0")
+    if config.failures and config.physics != "c":
+        line = f"--failures={config.failures}: --physics={config.physics} cannot repeat an episode: give --failures=0"
+        raise TaccorlError(line)
     if config.before_mate < 0 or config.before_mate == 1:
         raise TaccorlError(f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared")
     if config.before_mate and config.policy.path is None:

@@ -17,6 +17,7 @@ from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.sim.vector_env import TaccorlVectorEnv
+from taccorl.sim.warp_batch import WarpSettings
 
 PAPER_EPISODES = 128
 """Number of scenes on which the paper evaluates every policy."""
@@ -45,6 +46,8 @@ class Scenes:
     the scene."""
     hidden: tuple[str, ...] = ()
     """What is hidden from policies, of ``HIDDEN``."""
+    physics: str = "c"
+    """``c``, or ``warp`` with ``WarpSettings``."""
     batch_size: int | None = None
     """Number of environments at the same time; None: all episodes in one batch. In a smaller last batch, a policy that draws
     noise gets other random numbers than in ``lerobot-eval``, which fills the batch with scenes that it discards."""
@@ -66,6 +69,7 @@ class Scenes:
             raise TaccorlError(f"--randomization={self.randomization:g}: a share of the task's reset ranges, 0 … 1")
         checked_pictures(self.pictures)
         checked_hidden(self.hidden)
+        WarpSettings.parse(self.physics)
 
     @property
     def seeds(self) -> range:
@@ -99,6 +103,7 @@ class Scenes:
             num_envs,
             difficulty=self.difficulty,
             twin=self.twin_config(),
+            physics=self.physics,
             images="on_request" if images else "never",
             randomization=self.randomization,
             num_threads=min(num_envs, num_threads or len(os.sched_getaffinity(0))),
