@@ -2,12 +2,12 @@
 # MuJoCo Warp against MuJoCo C. GPU 0 with the first half of the threads is C's, GPU 1 with the others Warp's: control steps and pictures
 # (pipelines.benchmarks), policies of /dev/shm/policies/TASK in 512 scenes, and, until SECOND of the machine's clock, PPO of the first
 # policy of learn.sh, which runs beside it.
-# Before it, for each TASK, with the parts of a policy that next.sh brought in outputs/carried: bash .ci/gpu/physics.sh unpack TASK.
+# Before it, for each TASK, with the parts of a policy that next.sh brought in FOLDER: bash .ci/gpu/physics.sh unpack TASK FOLDER.
 if [ "$1" = unpack ]; then
   to=${POLICIES:-/dev/shm/policies}/$2
   mkdir -p "$to"
-  tar xzf outputs/carried/*.tgz -C "$to" --strip-components=6
-  cat outputs/carried/policy_* | PYTHONPATH=/dev/shm/site python3 -c "import sys, zstandard; zstandard.ZstdDecompressor().copy_stream(sys.stdin.buffer, sys.stdout.buffer)" >"$to/model.safetensors"
+  tar xzf "$3"/learn*.tgz -C "$to" --strip-components=6
+  cat "$3"/policy_* | PYTHONPATH=/dev/shm/site python3 -c "import sys, zstandard; zstandard.ZstdDecompressor().copy_stream(sys.stdin.buffer, sys.stdout.buffer)" >"$to/model.safetensors"
   exit
 fi
 . /dev/shm/warp_env.sh
@@ -27,7 +27,7 @@ score() { # GPU NAME POLICY TASK OPTIONS
 }
 post_train() { # GPU NAME OPTIONS
   on "$1" python3 -m taccorl.cli.main post-train --config_path=configs/post_train/small.yaml --policy.path="$policy" --env.task=assembly_1 \
-    --anchor.weight=0 --rerun=false --save_freq=2 --keep_checkpoints=1 "${@:3}" --out="$out/$2" >"$out/score_$2.log" 2>&1
+    --anchor.weight=0 --noise_check=false --rerun=false --save_freq=2 --keep_checkpoints=1 "${@:3}" --out="$out/$2" >"$out/score_$2.log" 2>&1
   since "$2 ended: $?"
   cp "$out/$2/progress.jsonl" "$out/score_$2.jsonl"
 }
