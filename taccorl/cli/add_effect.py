@@ -73,11 +73,17 @@ def run(config: AddEffectConfig) -> int:
         lines = Section(text=[f"  {line}" for line in evidence])
         show(_changes(part, machine.numbers(part), mended.numbers(part)), lines)
     mended.save(out)
+    show(Section(text=[f"wrote {out}; next: {compare_words(made_by, config.twin, None if config.in_place else out)}"]))
+    return 0
+
+
+def compare_words(made_by: list[str], twin: Path | None, against: Path | None) -> str:
+    """Command that compares ``twin``, and ``against`` beside it, with the recordings of the diagnosis whose words ``made_by``
+    are."""
     words = made_by[2:3] or ["YOUR_RECORDINGS"]
     words += [w for w in made_by if w.startswith(("--spec=", "--columns=", "--accept="))]
-    words += [f"--twin={config.twin}"] * (config.twin is not None) + [f"--against={out}"] * (not config.in_place)
-    show(Section(text=[f"wrote {out}; next: {shlex.join(['taccorl', 'compare', *words])}"]))
-    return 0
+    words += [f"--twin={twin}"] * (twin is not None) + [f"--against={against}"] * (against is not None)
+    return shlex.join(["taccorl", "compare", *words])
 
 
 def _place(config: AddEffectConfig) -> Path:

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.add_effect import compare_words
 from taccorl.cli.measured import PartsConfig, far_off, refuse_long, replayed
 from taccorl.cli.parse import command, verb
 from taccorl.report.section import Section
@@ -173,6 +174,7 @@ def _next(
         done = [name for name in names if name in mended.effects]
         done += [f"{c.name} of {part} {c.was} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
         yield f"wrote {path}: {', '.join([*done, *whole]) or 'refitted numbers, no effect'}; {mended.saved_words}"
+        yield f"next: {compare_words(command('diagnose', config, 'measurements'), config.twin, path)}"
         for f in found:
             yield from (
                 f"{f.part}: {doubt}" for doubt in (may_stand_in(f.diagnosis), untested_words(f.diagnosis)) if doubt

@@ -169,6 +169,8 @@ def checked(
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
     show(*found_in_recordings({name: [f for f in own if not _waits(f)] for name, own in found.items()}))
     lines = [f"not read: {line}" for line in measurements.skipped]
+    if measurements.unlisted:
+        lines.append(f"not listed in measurements.yaml, used for the fit: {', '.join(measurements.unlisted)}")
     if wrong:
         lines.append(
             f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "

@@ -21,7 +21,7 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.envs import preprocess_observation
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.processor import NormalizerProcessorStep, ProcessorStep, UnnormalizerProcessorStep
+from lerobot.processor import DeviceProcessorStep, NormalizerProcessorStep, ProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 
 from taccorl.data.dataset import Dataset
@@ -72,12 +72,26 @@ def policy_batch(
     """Input of a policy, LeRobot key → tensor with N rows: LeRobot's conversion of an environment's ``observation`` of N
     environments, then the policy's own preprocessor. Pictures may be absent; ``PICTURES_CHANGED``, if it is there, is passed
     on. ``instructions``: (N,)."""
-    batch: dict[str, Any] = preprocess_observation(raw_names(observation))
+    steps = getattr(preprocessor, "steps", ())
+    device = next((step.tensor_device for step in steps if isinstance(step, DeviceProcessorStep)), torch.device("cpu"))
+    pictures = {key: observation[key] for key in IMAGE_KEYS.values() if key in observation}
+    numbers = {key: values for key, values in observation.items() if key not in pictures}
+    batch: dict[str, Any] = preprocess_observation(raw_names(numbers))
+    batch |= {key: pictures_on(device, values) for key, values in pictures.items()}
     batch["task"] = list(instructions)
     batch = preprocessor(batch)
     if PICTURES_CHANGED in observation:
         batch[PICTURES_CHANGED] = torch.from_numpy(observation[PICTURES_CHANGED])
     return batch
+
+
+def pictures_on(device: torch.device, pictures: np.ndarray) -> torch.Tensor:
+    """(N, 3, rows, columns) float32 from 0 to 1 on ``device``, of (N, rows, columns, 3) uint8: the numbers of LeRobot's
+    ``preprocess_observation``, which for three cameras of 224² takes 7 ms of a thread."""
+    channels_first = torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2).contiguous().to(torch.float32)
+    return channels_first.div_(
+        torch.tensor(255.0, device=device)
+    )  # by a plain number, CUDA multiplies with its inverse
 
 
 def policy_actions(

@@ -140,11 +140,6 @@ class Renderer:
         """Name and version of the OpenGL renderer, for provenance."""
         return self._canvas().driver
 
-    @property
-    def in_software(self) -> bool:
-        """Whether Mesa's processor driver draws, on all cores by itself."""
-        return "llvmpipe" in self.driver or "softpipe" in self.driver
-
     def close(self) -> None:
         """Free the OpenGL context. A later ``render`` makes a new one."""
         gl, self._gl, self._scratch = self._gl, None, None

@@ -1,6 +1,5 @@
 """Read-only accessors of N simulations: joint states, touch, images, and privileged poses and contacts for predicates."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 
 import mujoco
@@ -14,7 +13,7 @@ from taccorl.sim.controller import MotorEffort
 from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
 from taccorl.sim.effects.camera_past import place_past
 from taccorl.sim.pad import PadArray
-from taccorl.sim.rendering import Place, Renderer
+from taccorl.sim.rendering import Renderer
 from taccorl.sim.sensors import Noise, Sensor
 from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.task import Contact, Task
@@ -47,7 +46,7 @@ class SeenScene:
     _tcp_sites: dict[str, int]
     _touching: dict[str, np.ndarray]
     _mating: dict[tuple[str, str], tuple[int, int]]
-    _renderers: dict[tuple, list[Renderer]]
+    _renderers: dict[tuple, Renderer]
 
     @property
     def row_size(self) -> int:
@@ -114,7 +113,7 @@ class SeenScene:
                 if past:
                     place_past(data, past.positions[sim], past.time_s[sim], age_s)
 
-            pictures = self._drawn(same, size, ids, late if age_s else None)
+            pictures = self._renderer(same, size).render_batch(self.batch, ids, late if age_s else None)
             found |= {name: pictures[:, k] for k, name in enumerate(same)}
         return {name: self._given(name, found[name]) for name in names}
 
@@ -154,7 +153,7 @@ class SeenScene:
 
         found = {}
         for age_s, same in self._by_age(tuple(cameras)):
-            pictures = self._renderer_set(same, size)[0].render(placed(age_s), len(states))
+            pictures = self._renderer(same, size).render(placed(age_s), len(states))
             found |= {name: pictures[:, k] for k, name in enumerate(same)}
         return {name: self._given(name, found[name]) for name in cameras}
 
@@ -177,37 +176,15 @@ class SeenScene:
                 "a dataset require it: add it to the twin's cameras, or request no images"
             )
 
-    def _drawn(
-        self, cameras: tuple[str, ...], size: tuple[int, int], ids: np.ndarray | None, place: Place | None
-    ) -> np.ndarray:
-        """(n, cameras, rows, columns, 3) uint8 RGB. On a graphics card all threads draw, each in a context of its own."""
-        renderers, sims = self._renderer_set(cameras, size), np.arange(self.num_sims)
-        chosen = sims if ids is None else sims[ids]
-        out = np.empty((len(chosen), len(cameras), *size, 3), np.uint8)
-
-        def draw(start: int, end: int) -> None:
-            renderer = renderers.pop()
-            try:
-                out[start:end] = renderer.render_batch(self.batch, chosen[start:end], place)
-            finally:
-                renderers.append(renderer)
-
-        if len(chosen) < 2 or renderers[0].in_software:  # its own threads draw
-            draw(0, len(chosen))
-        else:
-            renderers += [Renderer(self.model, cameras, *size) for _ in range(self.blocks.num_threads - len(renderers))]
-            self.blocks.run(draw, len(chosen))
-        return out
-
-    def _renderer_set(self, cameras: tuple[str, ...], size: tuple[int, int]) -> list[Renderer]:
+    def _renderer(self, cameras: tuple[str, ...], size: tuple[int, int]) -> Renderer:
         if (cameras, size) not in self._renderers:
-            self._renderers[cameras, size] = [Renderer(self.model, cameras, *size)]
+            self._renderers[cameras, size] = Renderer(self.model, cameras, *size)
         return self._renderers[cameras, size]
 
     def close(self) -> None:
         """Free OpenGL contexts and threads."""
         self.blocks.close()
-        for renderer in itertools.chain.from_iterable(self._renderers.values()):
+        for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()
 

@@ -110,7 +110,7 @@ class Simulation(SeenScene):
         """(N, A) the newest action, clipped to the limits."""
         self.targets = np.zeros((num_sims, ROBOT.num_actions))
         """(N, A) the newest requested targets; effects may delay them on the way to the controllers."""
-        self._renderers: dict[tuple, list[Renderer]] = {}
+        self._renderers: dict[tuple, Renderer] = {}
         self._index()
 
     def _batch(self, num_threads: int, physics: str) -> Batch:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,9 @@ def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_wa
     d = json.loads(Path("found/report.json").read_text())["diagnoses"]["slide"]
     both = [e["effect"] for e in d["effects"]]
     assert sorted(both) == ["coulomb_friction", "viscous_friction"], text
+    printed = shlex.split(text.split("next: ")[1].splitlines()[0])
+    assert printed == ["taccorl", "compare", "bench", "--twin=drive.yaml", "--against=found/drive.yaml"]
+    assert said(*printed[1:], "--out=as_printed")[0] == 0
     stated = {tuple(sorted(o["added"])): o["errors"] for o in d["offers"]} | {tuple(sorted(both)): d["errors"]["after"]}
     for names in (both, both[::-1], both[:1], both[1:]):
         out = f"{'+'.join(names)}.yaml"

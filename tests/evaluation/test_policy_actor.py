@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from lerobot.envs import preprocess_observation
 from lerobot.scripts.lerobot_eval import rollout
 
 from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes, score
-from taccorl.evaluation.policy_actor import open_checkpoint
+from taccorl.evaluation.policy_actor import open_checkpoint, pictures_on
 from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
 from taccorl.lerobot_plugin.env import TaccorlEnvConfig
 from taccorl.lineage.manifest import seal_checkpoint
@@ -46,6 +48,13 @@ def facts(**changes: Any) -> PolicyFacts:
         pictures_in_use={"clear": "clear, their middle 95 %", "randomised": "crop 95 %"},
     )
     return dataclasses.replace(fitting, **changes)
+
+
+def test_pictures_become_the_numbers_of_lerobots_conversion() -> None:
+    pictures = np.arange(2 * 16 * 8 * 3, dtype=np.uint8).reshape(2, 16, 8, 3)
+    theirs = preprocess_observation({"pixels": {"front": pictures}, "agent_pos": np.zeros((2, 14))})
+    ours = pictures_on(torch.device("cpu"), pictures)
+    assert torch.equal(ours, theirs["observation.images.front"]) and ours.is_contiguous()
 
 
 def test_a_policy_that_fits_passes() -> None:
@@ -352,7 +361,7 @@ import torch
 torch.set_num_threads(1)
 from lineage.kill_points import survives
 import taccorl.lerobot_plugin
-from taccorl.evaluation.policy_actor import open_checkpoint
+from taccorl.evaluation.policy_actor import open_checkpoint, pictures_on
 folder = Path(sys.argv[1])
 opened = open_checkpoint(folder / "whole", "cpu")
 policy = opened.load(0).policy

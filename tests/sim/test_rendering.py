@@ -15,7 +15,6 @@ from taccorl.data.pictures import letterbox
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import CameraConfig, Intrinsics, add_cameras, bench_cameras, project
 from taccorl.sim.rendering import Renderer, style
-from taccorl.sim.vector_env import TaccorlVectorEnv
 from tests.fresh_python import fresh_python
 
 NAMES = ("front", "left_wrist", "right_wrist")
@@ -236,24 +235,6 @@ def test_a_batch_is_drawn_as_its_states_and_models_are(cluttered):
         assert np.array_equal(changed[2], renderer.render([data])[0])
     assert np.array_equal(changed[[0, 1, 3]], together[[0, 1, 3]])
     assert (changed[2, 0] != together[2, 0]).mean() > 0.05
-
-
-def test_threads_with_a_context_each_draw_what_one_draws(monkeypatch: pytest.MonkeyPatch):
-    envs = TaccorlVectorEnv("assembly_1", 9, num_threads=3, images="on_request")
-    try:
-        envs.reset(seed=0)
-        alone = envs.sim.render(NAMES, size=(48, 64))
-        assert len(envs.sim._renderer_set(NAMES, (48, 64))) == 1  # Mesa's own threads draw
-        monkeypatch.setattr(Renderer, "in_software", False)
-        together = envs.sim.render(NAMES, size=(48, 64))
-        some = envs.sim.render(NAMES, np.array([8, 1, 5, 7, 2, 0, 4, 6]), size=(48, 64))
-        assert len(envs.sim._renderer_set(NAMES, (48, 64))) == 3
-    finally:
-        envs.close()
-    for name in NAMES:
-        assert len({picture.tobytes() for picture in alone[name]}) == 9
-        np.testing.assert_array_equal(together[name], alone[name])
-        np.testing.assert_array_equal(some[name], alone[name][[8, 1, 5, 7, 2, 0, 4, 6]])
 
 
 def test_shadows_reflections_and_sites_are_not_drawn_and_the_model_is_left_alone():

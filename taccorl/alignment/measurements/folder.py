@@ -141,6 +141,8 @@ class Measurements:
     """Description of the rule of the division."""
     skipped: tuple[str, ...] = ()
     """Other entries of the folder that were not read, with the reason."""
+    unlisted: tuple[str, ...] = ()
+    """Recordings for the fit that ``measurements.yaml`` does not list, although it states the use of others."""
 
     @property
     def all(self) -> tuple[Measurement, ...]:
@@ -205,9 +207,10 @@ def read_measurements(
     else:
         named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
     every = index.validation_every * whole if validation_every is None else validation_every
-    return dataclasses.replace(
-        split(found, **named, validation_every=every, fit_needed=fit_needed), skipped=tuple(skipped)
-    )
+    divided = split(found, **named, validation_every=every, fit_needed=fit_needed)
+    states_uses = whole and not (validation or test) and any(note.use for note in index.recordings.values())
+    unlisted = tuple(m.name for m in divided.fit if states_uses and m.name not in index.recordings)
+    return dataclasses.replace(divided, skipped=tuple(skipped), unlisted=unlisted)
 
 
 def split(

@@ -67,6 +67,8 @@ def test_an_index_says_what_files_cannot(folder):
         ["sweep_10.csv"],
     )
     assert found.fit[1].repeat_of == "sweep_1.csv"
+    assert found.unlisted == ("sweep_1.csv",)
+    assert read_measurements(folder, validation=["sweep_10.csv"]).unlisted == ()
     (held,) = found.validation
     assert (held.kp, held.payload_kg) == ({"left_joint5": 40.0}, {"left": 0.5})
     assert held.payload_position_m == {"left": (0.01, 0.0, 0.2)}
