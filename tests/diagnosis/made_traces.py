@@ -6,7 +6,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.noise_floor import Estimate, SignalFloor
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.comparison.result import Comparison, Trace
+from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace
 
 RATE_HZ = 200.0
 FLOOR_RAD = 2e-4
@@ -51,6 +51,14 @@ def trace(residual: np.ndarray, position: np.ndarray, **fields: Any) -> Trace:
 def comparison(*traces: Trace, **fields: Any) -> Comparison:
     split = {"rule": "by hand", "fit": [], "validation": [t.recording for t in traces], "test": [], "skipped": []}
     return Comparison(**{"twin": "made twin", "effects": (), "traces": traces, "split": split} | fields)
+
+
+def touch_trace(measured: np.ndarray, replayed: np.ndarray, floor_count: float, **fields: Any) -> TouchTrace:
+    """Frames of pads (N, P, R, C) at 100 Hz, with one noise floor for all taxels."""
+    time_s = np.repeat(np.arange(len(measured))[:, None] / 100, measured.shape[1], axis=1)
+    own = {"recording": "press", "use": "validation", "pads": ("left_a", "left_b"), "origin": ORIGIN, "time_s": time_s}
+    floor = np.full(measured.shape[1:], floor_count)
+    return TouchTrace(**own | {"measured": measured, "replayed": replayed, "floor": floor} | fields)
 
 
 def alike(rng: np.random.Generator, size: int, time_s: float = 0.1) -> np.ndarray:

@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 import pytest
-from made_traces import FLOOR_RAD, ORIGIN, comparison, swing, trace
+from made_traces import FLOOR_RAD, ORIGIN, comparison, swing, touch_trace, trace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -97,16 +97,7 @@ def touch() -> TouchTrace:
     measured[50:150, 0, 10:20, 3:9] += 80
     replayed = np.zeros_like(measured)
     replayed[50:150, 0, 10:20, 3:9] = 100
-    return TouchTrace(
-        recording="press",
-        use="validation",
-        pads=("left_a", "left_b"),
-        time_s=np.tile((np.arange(200) / 100)[:, None], (1, 2)),
-        measured=measured,
-        replayed=replayed,
-        floor=np.full((2, 32, 12), 1.4),
-        origin=ORIGIN,
-    )
+    return touch_trace(measured, replayed, 1.4)
 
 
 def test_touch_figures(touch: TouchTrace):

@@ -198,10 +198,8 @@ def test_gains_that_moved_and_fits_that_did_not_converge_name_no_effect(nothing:
 
 
 def test_remarks_of_the_search_are_repeated_and_lower_the_confidence(one: Diagnosis):
-    d = dataclasses.replace(one)
     remark = "kp had to move from 151 to 41 N·m/rad (× 0.27)."
-    object.__setattr__(d, "remarks", (remark,))
-    v = verdict(PART, d)
+    v = verdict(PART, changed(one, remarks=(remark,)))
     assert (v.level, v.remarks) == ("moderate", (remark,))
 
 

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from made_traces import ORIGIN, touch_trace
 
-from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.cell_numbers import cell_errors, cell_lines, spread_words, summarised
 from taccorl.diagnosis.comparison.result import CellNumbers, Comparison, TouchTrace
 from taccorl.report.figures_touch import cell_maps
@@ -18,21 +18,9 @@ GAINS = np.array([[4.0, 5.0, 6.0, 7.0], [8.0, 0.0, 9.0, 10.0]])
 def trace(recording: str, error: np.ndarray) -> TouchTrace:
     """100 rows in which every cell is off by ± ``error`` (R, C)."""
     measured = error * np.where(np.arange(100) % 2, 1.0, -1.0)[:, None, None, None]
-    return TouchTrace(
-        recording=recording,
-        use="fit",
-        pads=("palm",),
-        time_s=np.arange(100)[:, None] / 100,
-        measured=measured,
-        replayed=np.zeros_like(measured),
-        floor=np.full((1, 2, 4), 0.5),
-        origin=Origin("surrogate", "a test"),
-        unit="count",
-        thirds=(),
-        load=np.ones_like(measured),
-        load_unit="N",
-        cells=CellNumbers(names=NAMES, gain=GAINS, offset=10 * GAINS),
-    )
+    cells = CellNumbers(names=NAMES, gain=GAINS, offset=10 * GAINS)
+    own = {"recording": recording, "use": "fit", "pads": ("palm",), "unit": "count", "thirds": (), "cells": cells}
+    return touch_trace(measured, 0 * measured, 0.5, load=np.ones_like(measured), load_unit="N", **own)
 
 
 def test_summary_has_the_median_the_middle_half_and_the_farthest_cells():
@@ -78,4 +66,4 @@ def test_maps_are_laid_out_as_the_grid_with_units_and_floor():
         np.testing.assert_allclose(np.asarray(picture), expected)
     texts = [a.get_title() for a in figure.axes] + [a.get_ylabel() for a in figure.axes]
     assert {"gain", "offset", "noise floor", "count/N", "count", "row"} <= set(texts)
-    assert "mended" in figure.get_suptitle() and any("a test" in text.get_text() for text in figure.texts)
+    assert "mended" in figure.get_suptitle() and any(str(ORIGIN) in text.get_text() for text in figure.texts)

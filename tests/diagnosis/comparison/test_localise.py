@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_traces import FLOOR_RAD, RATE_HZ, alike, comparison, swing, trace
+from made_traces import FLOOR_RAD, RATE_HZ, alike, comparison, swing, touch_trace, trace
 
-from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.localise import REGIMES, Cell, heat_map, motions_of, worst_regime
 from taccorl.diagnosis.comparison.localise_touch import phases, touch_heat_map
@@ -154,16 +153,7 @@ def press(residual_while: str | None = None) -> TouchTrace:
     shape = np.clip(np.minimum((time_s - 2.0) / 0.5, (5.0 - time_s) / 0.5), 0, 1)
     measured = np.zeros((1000, 2, 32, 12))
     measured[:, 0, 10:20, 3:9] = 120.0 * shape[:, None, None]
-    one = TouchTrace(
-        recording="press",
-        use="fit",
-        pads=("left_a", "left_b"),
-        time_s=np.tile(time_s[:, None], (1, 2)),
-        measured=measured,
-        replayed=measured.copy(),
-        floor=np.full((2, 32, 12), 1.3),
-        origin=Origin(text="made by arithmetic"),
-    )
+    one = touch_trace(measured, measured.copy(), 1.3, use="fit")
     if residual_while is not None:
         rows = phases(one, 0)[residual_while]
         one.replayed[rows, 0, 10:20, 3:9] -= 13.0
