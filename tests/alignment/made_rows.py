@@ -1,9 +1,10 @@
-"""Recordings made of arrays: of one signal, and of cells that a load presses."""
+"""Recordings made of arrays: of one signal, of one joint, and of cells that a load presses."""
 
 from typing import Any
 
 import numpy as np
 
+from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.measurements.measurement import Measurement
 
@@ -15,6 +16,20 @@ def of_signal(
     columns = {"target": target, "measured": measured} | {k: v for k, v in more.items() if isinstance(v, np.ndarray)}
     fields: dict[str, Any] = more | {key: values[:, None] for key, values in columns.items()}
     return Measurement(name=name, time_s=np.arange(len(target)) / rate_hz, signals=(signal,), units=(unit,), **fields)
+
+
+def of_joint(
+    name: str,
+    rate_hz: float,
+    target: np.ndarray,
+    measured: np.ndarray,
+    effort: np.ndarray | float = np.nan,
+    start: float = 0.0,
+) -> JointMotion:
+    """Targets, measured positions and efforts (T,) of a joint that no other one loads, from rest at ``start``."""
+    rows = {"target": target, "measured": measured, "effort": effort + np.zeros(len(target))}
+    time_s, still = np.arange(len(target)) / rate_hz, np.zeros(len(target))
+    return JointMotion(name=name, time_s=time_s, rate_hz=rate_hz, coupling_nm=still, start=start, **rows)
 
 
 def of_cells(

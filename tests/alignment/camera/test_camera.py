@@ -45,7 +45,7 @@ def fitted(camera: str) -> CameraFit:
 
 
 @pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
-def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
+def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off_and_held_out_frames_are_closer(camera: str):
     truth, fit = made(camera)[0], fitted(camera)
     angle_deg, distance_mm = drawn.pose_error(fit.offset, truth)
     assert fit.converged, fit.problems
@@ -53,11 +53,6 @@ def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
     assert angle_deg < 0.3
     assert distance_mm < 4.0
     assert (np.abs(fit.offset - truth) < fit.half_width).all()
-
-
-@pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
-def test_held_out_frames_are_closer_to_the_twin_afterwards(camera: str):
-    fit = fitted(camera)
     assert fit.num_held_out == 4  # the fourth and the eighth frame, and the two stages
     assert fit.num_frames + fit.num_held_out == 9
     assert fit.after_px < 0.4 * fit.before_px

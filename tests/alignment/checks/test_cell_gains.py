@@ -187,10 +187,6 @@ def test_a_probe_that_moves_within_or_between_recordings_is_seen_and_one_that_st
     assert own({name: place(2, 8, 14) for name in PEAKS_N}, shared=False) == []
     recordings = [presses(name, share=place(2, 8, 14)) for name in PEAKS_N]
     assert not any(f.check == "other_gain" for fs in found(recordings).values() for f in fs)
-
-
-def test_the_verdict_of_a_moving_probe_says_so():
-    recordings = [presses(name, share=place(2, 8, 14)) for name in PEAKS_N]
     d = CellsMachine(config()).diagnose("array", split(recordings)).diagnosis
     assert any("not shared alike" in text for text in d.remarks)
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from made_rows import of_signal
+from made_rows import of_joint, of_signal
 from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 from scipy.linalg import expm
 
@@ -21,7 +21,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, number
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
@@ -63,11 +63,16 @@ def typical(name: str, signal: str) -> Effect:
     return make_effect(name, **where, **values)
 
 
+def from_rest(signal: str, seconds: float = 3.0, **options: float) -> tuple[JointModel, JointMotion]:
+    """The twin's joint, and a chirp of it from where it stands still."""
+    model = JointModel(TWIN, signal)
+    return model, at_rest(joint_motion(chirp(signal, seconds, **options), TWIN, signal), model.gains)
+
+
 @pytest.mark.parametrize("joint", ROBOT.joints)
 def test_a_plain_joint_moves_as_in_mujoco(joint: str) -> None:
     signal = f"right_{joint}"
-    model = JointModel(TWIN, signal)
-    motion = at_rest(joint_motion(chirp(signal, 4.0), TWIN, signal), model.gains)
+    model, motion = from_rest(signal, 4.0)
     quick, exact = model.simulate(motion, model.gains), in_mujoco(motion, signal, model.gains)
     np.testing.assert_allclose(quick.reported, exact.reported, atol=1e-12)
     np.testing.assert_allclose(quick.effort, exact.effort, atol=1e-9)
@@ -109,8 +114,7 @@ def test_every_effect_of_joints_is_known_to_the_model() -> None:
 
 def test_effects_act_together_as_in_mujoco() -> None:
     signal = "left_joint5"
-    model = JointModel(TWIN, signal)
-    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    model, motion = from_rest(signal)
     at = {"arm": "left", "joints": ["joint5"]}
     together = [
         make_effect("coulomb_friction", torque_nm=0.3, **at),
@@ -128,8 +132,7 @@ def test_effects_act_together_as_in_mujoco() -> None:
 
 def test_a_command_that_comes_at_a_row_s_time_is_not_yet_in_its_effort() -> None:
     signal = "left_joint4"
-    model = JointModel(TWIN, signal)
-    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    model, motion = from_rest(signal)
     late = make_effect("command_delay", arm="left", joints=["joint4"], delay_s=0.03)
     plain, answer = model.simulate(motion, model.gains).effort, model.simulate(motion, model.gains, [late]).effort
     np.testing.assert_allclose(answer[6:], plain[:-6], atol=1e-3 * np.ptp(plain))
@@ -141,8 +144,7 @@ def test_effects_called_the_same_beside_a_torque_ff_give_the_same_positions() ->
     pairs = {tuple(sorted((a, b))) for a in effects for b in effects.get(a).same_with_torque_ff}
     assert pairs == {("asymmetric_friction", "coulomb_friction")}, "a further pair needs its own numbers below"
     assert all(a in effects.get(b).same_with_torque_ff for a, b in pairs | {(b, a) for a, b in pairs})
-    model = JointModel(TWIN, signal)
-    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    model, motion = from_rest(signal)
     both_ways = make_effect("coulomb_friction", torque_nm=0.3, **at)
     one_way = make_effect("asymmetric_friction", torque_nm=0.3, asymmetry=0.4, **at)
     shifted = model.gains._replace(torque_ff=model.gains.torque_ff + 0.3 * 0.4)
@@ -154,8 +156,7 @@ def test_effects_called_the_same_beside_a_torque_ff_give_the_same_positions() ->
 
 def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
     signal, at = "left_joint5", {"arm": "left", "joints": ["joint5"]}
-    model = JointModel(TWIN, signal)
-    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    model, motion = from_rest(signal)
     dry, bristles = (
         make_effect("coulomb_friction", torque_nm=0.3, **at),
         make_effect("presliding", presliding_rad=1e-3, **at),
@@ -250,20 +251,7 @@ class _Late(JointEffect):
     encoder reads 2 mrad too much."""
 
     name = "test_late"
-    late: float = dataclasses.field(
-        default=0.0,
-        metadata={
-            "parameter": {
-                "unit": "1",
-                "symbol": "n",
-                "absent": 0.0,
-                "low": 0.0,
-                "high": 1.0,
-                "typical": 1.0,
-                "source": "a test",
-            }
-        },
-    )
+    late: float = number("n", "1", 0.0, 1.0, (0.0, 1.0), "a test")
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> dict[str, np.ndarray]:
         return {"last": np.full((num_sims, 14), np.nan)}
@@ -283,8 +271,7 @@ class _Late(JointEffect):
 
 def test_an_effect_that_only_has_hooks_runs_in_mujoco() -> None:
     signal = "left_joint5"
-    model = JointModel(TWIN, signal)
-    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    model, motion = from_rest(signal)
     plain = model.simulate(motion, model.gains)
     late = model.simulate(motion, model.gains, [_Late(late=1.0, arm="left", joints=["joint5"])])
     # Where it starts it reports what was measured, so it stands 2 mrad lower and comes up from there within K_d / K_p.
@@ -293,9 +280,7 @@ def test_an_effect_that_only_has_hooks_runs_in_mujoco() -> None:
 
 
 def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
-    signal = "left_joint5"
-    model = JointModel(TWIN, signal)
-    slow = at_rest(joint_motion(chirp(signal, 3.0, rate_hz=30.0), TWIN, signal), model.gains)
+    model, slow = from_rest("left_joint5", rate_hz=30.0)
     late = _Late(late=1e-9, arm="left", joints=["joint5"])  # forces MuJoCo; it delays and shifts as above
     assert len(model.simulate(slow, model.gains).reported) == len(slow.target) == 90
     sent = model.simulate(slow, model.gains, [late])
@@ -390,25 +375,15 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
     # 95 kg, K_p 1e4 N/m, K_d 4e3 N s/m: overdamped, poles at −2.7 and −39.4 1/s.
     model = JointModel.axis("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", timestep_s=1e-4)
     time_s = np.arange(5000) / 1000
-    m = dataclasses.replace(
-        chirp("left_joint1", 10.0),
-        time_s=time_s,
-        **{name: np.zeros((5000, 1)) for name in ("measured", "velocity", "effort")},
-        target=np.full((5000, 1), 0.02),
-        signals=("slide",),
-        units=("m",),
-        quantum=np.zeros(1),
-    )
-    answer = model.simulate(joint_motion(m, None, "slide"), model.gains).reported
+    motion = joint_motion(of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m"), None, "slide")
+    answer = model.simulate(motion, model.gains).reported
     fast, slow = np.sort(np.roots([95.0, 4e3, 1e4]))
     expected = 0.02 * (1 - (slow * np.exp(fast * time_s) - fast * np.exp(slow * time_s)) / (slow - fast))
     np.testing.assert_allclose(answer, expected, atol=2e-5)
-    with_friction = model.simulate(
-        joint_motion(m, None, "slide"), model.gains, [make_effect("coulomb_friction", torque_nm=20)]
-    )
+    with_friction = model.simulate(motion, model.gains, [make_effect("coulomb_friction", torque_nm=20)])
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
     with pytest.raises(TaccorlError, match="test_late"):
-        model.simulate(joint_motion(m, None, "slide"), model.gains, [_Late(late=1.0)])
+        model.simulate(motion, model.gains, [_Late(late=1.0)])
 
 
 class _Geared(AxisJoint):
@@ -426,17 +401,7 @@ def test_a_rotor_on_a_stiff_gear_swings_as_its_two_masses_do() -> None:
     kp, kd, k, d = 6000.0, 190.0, 1e5, 150.0
     model = JointModel.of(_Geared("pan", 3.3, Gains(kp, kd, 0.0), "rad", 1e-3))
     target = np.where(np.arange(60) > 0, 0.01, 0.0)
-    motion = JointMotion(
-        name="step",
-        time_s=np.arange(60) / 200.0,
-        target=target,
-        measured=np.full(60, np.nan),
-        effort=np.full(60, np.nan),
-        coupling_nm=np.zeros(60),
-        start=0.0,
-        rate_hz=200.0,
-        pose=np.zeros(0),
-    )
+    motion = of_joint("step", 200.0, target, np.full(60, np.nan))
     gear = make_effect("joint_compliance", compliance_rad_per_nm=1 / k, damping_s=d / k)
     found = model.simulate(motion, model.gains, [gear]).reported
     rotor, link = np.array([-kp - k, -kd - d, k, d]) / 0.6, np.array([k, d, -k, -d]) / 2.7

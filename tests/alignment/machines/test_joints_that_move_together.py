@@ -5,10 +5,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from simulated_slide import robot_machine
 
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.measurement import Measurement
 
 ARM = """<mujoco><option timestep="0.0001" integrator="implicitfast"/><worldbody>
@@ -45,9 +45,7 @@ def steps(late_rows: int = 0) -> Measurement:
 
 def left(folder: Path, m: Measurement, name: str) -> np.ndarray:
     """(T,) error of the file's model of a joint [noise]."""
-    (folder / "arm.xml").write_text(ARM)
-    (folder / "robot.yaml").write_text(FILE)
-    model = JointModel(load_robot(folder / "robot.yaml"), name)
+    model = JointModel(robot_machine(folder, ARM, FILE).robot, name)
     seen = model.simulate(motion_of(m, name, model.joint), model.gains).reported
     return (seen - m.measured[:, NAMES.index(name)]) / NOISE_RAD
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from simulated_slide import logged
 
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel
@@ -67,14 +68,8 @@ def robot(folder: Path, text: str = ROBOT_YAML, model: str = TWO_LINKS) -> Robot
 def swept(**motions: np.ndarray) -> Measurement:
     """Joints at 200 Hz exactly where these angles (T,) are."""
     angles = np.column_stack(list(motions.values()))
-    return Measurement(
-        name="sweep",
-        time_s=np.arange(len(angles)) / 200,
-        target=angles,
-        measured=angles.copy(),
-        signals=tuple(motions),
-        units=("rad",) * len(motions),
-    )
+    rows = {"time_s": np.arange(len(angles)) / 200, "target": angles, "measured": angles.copy()}
+    return logged("sweep", tuple(motions), ("rad",) * len(motions), **rows)
 
 
 def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> None:
@@ -417,18 +412,6 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
          r'body upper.*inertia from mesh.*<inertial.*in <body name="upper">'),
         (("<mujoco>", "<mujoco"), "is not XML"),
         (("mujoco", "sdf"), "neither MJCF.*nor URDF"),
-    ],
-)  # fmt: skip
-def test_models_that_cannot_be_used_are_refused_with_what_to_write(
-    change: tuple[str, str], says: str, tmp_path: Path
-) -> None:
-    with pytest.raises(TaccorlError, match=says):
-        robot(tmp_path, model=TWO_LINKS.replace(*change))
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
         (("shoulder:", "sholder:"), r"robot\.yaml:4: joints → sholder: arm.xml has no joint 'sholder'.*shoulder"),
         (("model: arm.xml", "model: leg.xml"), r"robot\.yaml:2: model: no file 'leg.xml' beside it"),
         (("kp: 50.0", "kp: -50.0"), r"robot\.yaml:4.*kp"),
@@ -437,9 +420,11 @@ def test_models_that_cannot_be_used_are_refused_with_what_to_write(
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
     ],
 )  # fmt: skip
-def test_wrong_robot_files_are_refused_with_their_line(change: tuple[str, str], says: str, tmp_path: Path) -> None:
+def test_wrong_models_and_robot_files_are_refused_with_what_to_write(
+    change: tuple[str, str], says: str, tmp_path: Path
+) -> None:
     with pytest.raises(TaccorlError, match=says):
-        robot(tmp_path, ROBOT_YAML.replace(*change))
+        robot(tmp_path, *(text.replace(*change) for text in (ROBOT_YAML, TWO_LINKS)))
 
 
 @pytest.mark.parametrize("phase", [0.0, 1.0, 2.0, math.pi])

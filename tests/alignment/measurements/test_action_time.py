@@ -98,15 +98,6 @@ def test_action_and_state_are_as_far_apart_both_ways(both):
     assert ingested == pytest.approx(collected, abs=PART_OF_ROW)
 
 
-def test_one_row_off_is_caught(both):
-    collected = episode_lag_rows(both.collected)
-    arrays = both.ingested.arrays
-    in_force = np.concatenate([arrays[ACTION][:1], arrays[ACTION][:-1]])  # as ingest stored it before action_time
-    assert episode_lag_rows(dataclasses.replace(both.ingested, arrays=arrays | {ACTION: in_force})) == pytest.approx(
-        collected - 1, abs=PART_OF_ROW
-    )
-
-
 def test_the_arms_lag_as_the_checks_report_it_is_behind_the_command_in_force(both):
     # Without the row by which an action is ahead: the lag of the controller alone.
     for one, other in zip(arm_lags(both.collected).values(), arm_lags(both.ingested).values(), strict=True):

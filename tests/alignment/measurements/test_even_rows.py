@@ -1,9 +1,10 @@
 """Tables with jitter and lost rows come to an even grid; what was not measured stays NaN."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 
 from taccorl.alignment.checks.telemetry import check_measurement
 from taccorl.alignment.controller.joint_recording import joint_motion
@@ -21,14 +22,8 @@ def command(time_s: np.ndarray) -> np.ndarray:
 
 def table(time_s: np.ndarray, rows: np.ndarray) -> Measurement:
     """Rows stamped at ``time_s``; a command is of its row number, what is measured of its time."""
-    return Measurement(
-        name="jittery.csv",
-        time_s=time_s,
-        target=command(rows / RATE_HZ)[:, None],
-        measured=(command(time_s - 0.05) + 1e-7 * np.random.default_rng(9).normal(size=len(rows)))[:, None],
-        signals=("left_joint5",),
-        units=("rad",),
-    )
+    seen = command(time_s - 0.05) + 1e-7 * np.random.default_rng(9).normal(size=len(rows))
+    return replace(of_signal("jittery.csv", RATE_HZ, command(rows / RATE_HZ), seen, "left_joint5"), time_s=time_s)
 
 
 def test_even_rows_stay_bit_identical():
@@ -78,7 +73,7 @@ def test_three_lost_rows_are_a_gap_and_no_line():
 def test_a_command_that_changes_now_and_then_is_held_across_a_gap():
     rows = np.delete(np.arange(1200), [400, 401, 402])
     m = table(rows / RATE_HZ, rows)
-    even = even_rows(dataclasses.replace(m, target=np.where(rows < 403, 0.0, 0.2)[:, None]))
+    even = even_rows(replace(m, target=np.where(rows < 403, 0.0, 0.2)[:, None]))
     np.testing.assert_array_equal(even.target[:, 0], np.where(np.arange(1200) < 403, 0.0, 0.2))
 
 

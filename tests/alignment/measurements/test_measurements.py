@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from made_sweep import sweep
 
 from taccorl.alignment.measurements.folder import motions, read_measurements, split
@@ -224,14 +225,7 @@ def test_resampling_keeps_the_mean_time_of_everything():
 
 
 def test_a_recording_of_one_joint_becomes_one_of_the_robot():
-    m = Measurement(
-        name="one",
-        time_s=np.arange(3) / 200,
-        target=np.full((3, 1), 0.2),
-        measured=np.full((3, 1), 0.1),
-        signals=("left_joint5",),
-        units=("rad",),
-    )
+    m = of_signal("one", 200.0, np.full(3, 0.2), np.full(3, 0.1), "left_joint5")
     rest = np.arange(14.0)
     whole = m.on_robot(rest)
     assert whole.signals == ROBOT.action_names

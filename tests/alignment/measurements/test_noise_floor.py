@@ -101,9 +101,7 @@ def test_noise_and_rounding_add_as_squares(motion):
 
 def test_floor_is_above_zero_for_perfect_numbers(motion):
     target, _ = motion
-    perfect = Measurement(
-        name="p", time_s=np.arange(len(target)) / RATE_HZ, target=target, measured=np.tile(target[:1], (len(target), 1))
-    )
+    perfect = measured(target, np.tile(target[:1], (len(target), 1)), np.random.default_rng(0), 0.0)
     assert all(f.value > 0 for f in noise_floor([perfect]).values())
     assert noise_floor([perfect])["left_joint1"].used.method == "number"
 

@@ -361,16 +361,6 @@ def test_a_folder_of_everything_is_read_by_its_index(recorded, dataset, moved, t
     assert len(read_measurements(tmp_path).fit) == 3  # one shipped spec reads MCAP
 
 
-def test_replay_of_the_dataset_gives_the_dataset(dataset, moved):
-    (m,) = read_dataset(dataset)
-    moved.sim.reset([0])
-    twin = replay(moved.sim, m.target, 30.0, m.measured[0])
-    np.testing.assert_allclose(twin.reported, m.measured, atol=5e-5)
-    moved.sim.reset([0])
-    wrong = replay(moved.sim, m.target[1:], 30.0, m.measured[0])  # the action's own row: one row early
-    assert np.abs(wrong.reported - m.measured[:-1]).max() > 5e-3
-
-
 def test_rows_of_an_ingested_dataset_are_the_twins_and_tell_their_age():
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     rows = np.linspace(0, 1, 40)[:, None] * np.ones(14)
