@@ -109,21 +109,8 @@ def first_rows(motion: JointMotion, rows: int) -> JointMotion:
     whole = len(motion.time_s)
     if rows >= whole:
         return motion
-    names = (
-        "time_s",
-        "target",
-        "measured",
-        "effort",
-        "coupling_nm",
-        "carrying_nm",
-        "torque_ff_nm",
-        "supply",
-        "command_s",
-        "on",
-        "positions",
-    )
-    arrays = {name: getattr(motion, name) for name in names}
-    own = {name: a[: rows * (len(a) // whole)] for name, a in arrays.items() if a is not None}
+    columns = {f.name: getattr(motion, f.name) for f in dataclasses.fields(motion) if f.name != "pose"}
+    own = {name: a[: rows * (len(a) // whole)] for name, a in columns.items() if isinstance(a, np.ndarray)}
     return dataclasses.replace(motion, **own)
 
 
