@@ -32,6 +32,14 @@ def of_joint(
     return JointMotion(name=name, time_s=time_s, rate_hz=rate_hz, coupling_nm=still, start=start, **rows)
 
 
+def play(values: np.ndarray, half_width: float, start: float = 0.0) -> np.ndarray:
+    """(T,) what stands still until ``values`` (T,) are ``half_width`` away, and is then taken along."""
+    at, found = start, np.empty(len(values))
+    for k, value in enumerate(values.tolist()):
+        at = found[k] = min(max(at, value - half_width), value + half_width)
+    return found
+
+
 def of_cells(
     name: str, rate_hz: float, load: np.ndarray, readings: np.ndarray, names: tuple[str, ...] = ("thumb",), **more: Any
 ) -> CellMeasurement:

@@ -106,16 +106,8 @@ def measured(
     if quantum_rad:
         seen = np.round(seen / quantum_rad) * quantum_rad
     rate_hz = fields.pop("rate_hz", RATE_HZ)
-    return Measurement(
-        **{
-            "name": "sweep",
-            "time_s": np.arange(len(target)) / rate_hz,
-            "target": target,
-            "measured": seen,
-            "origin": Origin(text="synthetic"),
-        }
-        | fields
-    )
+    rows = {"time_s": np.arange(len(target)) / rate_hz, "target": target, "measured": seen}
+    return Measurement(**{"name": "sweep", "origin": Origin(text="synthetic")} | rows | fields)
 
 
 def shifted(m: Measurement, rows: int) -> Measurement:

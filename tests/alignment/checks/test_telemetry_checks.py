@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_rows import of_signal
+from made_rows import of_signal, play
 from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
 from scipy.signal import lfilter
 
@@ -337,8 +337,7 @@ def test_a_common_delay_of_slow_motions_is_one_number_for_all_joints():
         fine = np.arange(-5.0, 18, 1e-3)
         wanted = 0.5 * np.tanh(2 * np.sin(0.5 * (fine - late_s) + phase))
         position = lfilter([1 - math.exp(-1e-3 / tau_s)], [1, -math.exp(-1e-3 / tau_s)], wanted - wanted[0]) + wanted[0]
-        for k in range(1, len(position)):  # dry friction: it stands until the target is 3 mrad away
-            position[k] = min(max(position[k - 1], position[k] - 3e-3), position[k] + 3e-3)
+        position = play(position, 3e-3, position[0])  # dry friction: it stands until the target is 3 mrad away
         return np.interp(time_s, fine, 0.5 * np.tanh(2 * np.sin(0.5 * fine + phase))), np.interp(time_s, fine, position)
 
     both = [[slow(late_s, tau_s, phase) for tau_s, phase in ((0.05, 0.0), (0.12, 1.3))] for late_s in (0.06, 0.0)]
@@ -551,16 +550,6 @@ def test_a_joint_at_rest_until_its_command_jumps_is_not_frozen(clean):
     assert "left_joint2" in found(dataclasses.replace(m, target=late)).get("saturated_channel", [])
 
 
-def stuck(m: Measurement, width: float) -> Measurement:
-    """A joint that dry friction holds until its target is ``width`` away: it stands still, then follows without a jump."""
-    values = m.measured[:, 1].copy()
-    at = values[0]
-    for k, goal in enumerate(m.target[:, 1]):
-        at = values[k] = min(max(at, goal - width), goal + width)
-    step = math.radians(0.001)
-    return with_column(m, "left_joint2", np.round(values / step) * step)
-
-
 def sticking_servo(hz: float, friction_nm: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(time_s, q, target) of a servo with J = 6 g m², K_p = 0.8 N·m/rad that sticks at each reversal, logged at 95 Hz with
     jitter in steps of 2π / 4096: equations of this test."""
@@ -653,9 +642,11 @@ def test_a_slide_is_checked_as_a_hinge_with_a_tenth_of_each_distance(clean, unit
     if fault == "frozen_channel":
         q[600:700] = q[600]
     noisy = np.minimum(q, top + 2e-4 * np.random.default_rng(0).normal(size=clean.num_rows))
-    sticks = stuck(clean, 0.06).measured[:, j]
+    sticks = play(clean.target[:, j], 0.06, clean.measured[0, j])  # by dry friction, until its target is 0.06 rad away
     q = {"saturated_channel": np.minimum(q, top), "sticking_joint": sticks, "noisy blocked": noisy}.get(fault, q)
-    m = dataclasses.replace(servo(clean.time_s, factor * q, factor * clean.target[:, j]), units=(unit,))
+    step = math.radians(0.001) * (fault in ("frozen_channel", "sticking_joint"))
+    q = np.round(q / step) * step if step else q
+    m = dataclasses.replace(servo(clean.time_s, factor * q, factor * clean.target[:, j], factor * step), units=(unit,))
     stands = "frozen_channel", "saturated_channel", "sticking_joint", "blocked"
     assert {c: on for c, on in found(m).items() if c in stands} == ({fault.split()[-1]: ["servo"]} if fault else {})
     severity = {f.severity for f in check_measurement(m) if f.check in stands}

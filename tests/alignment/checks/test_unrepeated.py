@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from made_rows import play
 
 from taccorl.alignment.checks.held_commands import find_dropped
 from taccorl.alignment.checks.telemetry import check_measurements
@@ -88,10 +89,7 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
     made = []
     for name, seed in (("a", 1), ("b", 2), ("c", 3)):
         m = recording(name, seed, omega=25.0)
-        link, motor = np.zeros(m.num_rows), m.measured[:, 0]
-        for k in range(1, m.num_rows):
-            link[k] = min(max(link[k - 1], motor[k] - 3e-3), motor[k] + 3e-3)
-        link += NOISE_RAD * np.random.default_rng(seed).normal(size=m.num_rows)
+        link = play(m.measured[:, 0], 3e-3) + NOISE_RAD * np.random.default_rng(seed).normal(size=m.num_rows)
         made.append(dataclasses.replace(m, measured=link[:, None]))
     dropped = find_dropped(made, 0)
     assert dropped is not None
@@ -104,8 +102,8 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
 def test_backlash_that_holds_a_joint_once_between_turns_is_not_called_dropped_commands(kp: float, kd: float):
     m = recording("a", 1)
     ones, none = np.ones(m.num_rows), np.zeros(m.num_rows)
-    play = make_effect("backlash", play_rad=5e-3).drive() or {}
-    drive = Drive(kp=kp, kd=kd, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(**play)
+    numbers = make_effect("backlash", play_rad=5e-3).drive() or {}
+    drive = Drive(kp=kp, kd=kd, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(**numbers)
     at = simulate(drive, m.target[:, 0], none, none, ones, ones, none, 0.0, 6, 1, 1 / 1200, 0.0)[0]
     at = at + NOISE_RAD / 10 * np.random.default_rng(1).normal(size=len(at))
     dropped = find_dropped([dataclasses.replace(m, measured=at[:, None])], 0)

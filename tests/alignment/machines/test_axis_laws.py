@@ -94,21 +94,18 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
     target, off = np.where(rows < 10, 0.0, 0.8), (rows >= 100) & (rows < 180)
     volts = np.where(rows < 50, 12.0, 8.0)
     inertia, weight = 0.02 + 0.3 * 0.15**2, 0.3 * 9.81 * 0.15
-    q = v = 0.0
-    truth = []
-    for k in rows:
-        truth.append(q)
-        for _ in range(round(1 / (RATE_HZ * DT_S))):
-            duty = min(max(6.0 * (target[k] - q), -1.0), 1.0)
-            torque = 0.0 if off[k] else (volts[k] * duty - 1.1 * v) / 4.0
-            v += DT_S * (torque - weight * math.sin(q)) / inertia
-            q += DT_S * v
+
+    def torque(k: int, q: float, v: float) -> float:
+        duty = min(max(6.0 * (target[k] - q), -1.0), 1.0)
+        return 0.0 if off[k] else (volts[k] * duty - 1.1 * v) / 4.0
+
+    truth = integrated(rows, torque, inertia, weight)
     m = dataclasses.replace(
         recording(target, payload_kg=0.3),
         supply_v=np.append(12.0, volts[:-1])[:, None],
         enabled=np.where(off, 0.0, 1.0)[:, None],
     )
-    assert np.abs(answer(SERVO, m).reported - np.array(truth)).max() < 5e-4
+    assert np.abs(answer(SERVO, m).reported - truth).max() < 5e-4
     assert answer(SERVO, m).effort[off] == pytest.approx(np.zeros(80))
     with pytest.raises(TaccorlError, match=r"made:.*supply voltage.*servo.*stated,.*law torque.*use"):
         torque_axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")

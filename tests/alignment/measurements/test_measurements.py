@@ -22,9 +22,16 @@ def names(measurements) -> list[str]:
     return [m.name for m in measurements]
 
 
+def of_one(words: str) -> str:
+    """An index that says this of one recording."""
+    return f"recordings: {{sweep_1.csv: {{{words}}}}}"
+
+
 def pressed(words: str) -> str:
-    """An index in which this was pressed in one recording."""
-    return f"recordings: {{sweep_1.csv: {{pressed: {{{words}}}}}}}"
+    return of_one(f"pressed: {{{words}}}")
+
+
+BALL = "shape: sphere, radius_m: 0.012, arm: left"
 
 
 TABLE = "t,left_joint5.q,left_joint5.q_target,left_joint5.tau\n" + "".join(f"{k / 200},0.1,0.2,4\n" for k in range(5))
@@ -92,48 +99,24 @@ def test_an_index_says_what_files_cannot(folder):
         ("recordings: {sweep_1.csv: {kp: {left_joint9: 3}}}", TaccorlError, "kp: no signal 'left_joint9'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint5: -3}}}", SpecError, "measurements.yaml:1: .*-3 is below 0"),
         ("recordings: {sweep_1.csv: {payload_kg: {middle: 1}}}", SpecError, "no arm 'middle'"),
-        (
-            "recordings: {sweep_1.csv: {payload_kg: {left: 1}, payload_position_m: {middle: [0, 0, 0.1]}}}",
-            SpecError,
-            "no arm 'middle'",
-        ),
-        (
-            "recordings: {sweep_1.csv: {payload_kg: {left: 1}, payload_position_m: {left: [0, 0, 168]}}}",
-            SpecError,
-            "is it in millimetres",
-        ),
-        ("recordings: {sweep_1.csv: {payload_position_m: {left: [0, 0, 0.1]}}}", TaccorlError, "holds no payload"),
+        (of_one("payload_kg: {left: 1}, payload_position_m: {middle: [0, 0, 0.1]}"), SpecError, "no arm 'middle'"),
+        (of_one("payload_kg: {left: 1}, payload_position_m: {left: [0, 0, 168]}"), SpecError, "is it in millimetres"),
+        (of_one("payload_position_m: {left: [0, 0, 0.1]}"), TaccorlError, "holds no payload"),
         ("columns: none.yaml", SpecError, "no file 'none.yaml' beside it"),
-        (
-            pressed("shape: spere, radius_m: 0.012, arm: left"),
-            SpecError,
-            r"yaml:1: .*pressed → shape: .*did you mean 'sphere'",
-        ),
-        (pressed("shape: sphere, radius_m: 0.012, arm: lft"), SpecError, "pressed → arm: .*did you mean 'left'"),
-        (
-            pressed("shape: sphere, radius: 0.012, arm: left"),
-            SpecError,
-            "unknown key 'radius'; did you mean 'radius_m'",
-        ),
+        (pressed(BALL.replace("sphere", "spere")), SpecError, r"yaml:1: .*pressed → shape: .*did you mean 'sphere'"),
+        (pressed(BALL.replace("left", "lft")), SpecError, "pressed → arm: .*did you mean 'left'"),
+        (pressed(BALL.replace("_m", "")), SpecError, "unknown key 'radius'; did you mean 'radius_m'"),
         (pressed("shape: sphere, radius_m: 0.012"), SpecError, "key 'arm' is missing"),
         (pressed("shape: sphere, radius_m: 12, arm: left"), SpecError, "12 m does not fit between .*millimetres"),
         (pressed("shape: sphere, radius_m: 0, arm: left"), SpecError, "radius_m: 0 is not above 0"),
         (pressed("shape: rod, radius_m: 0.008, arm: left"), SpecError, "a rod needs its length_m"),
-        (pressed("shape: sphere, radius_m: 0.012, length_m: 0.1, arm: left"), SpecError, "a sphere has no length_m"),
+        (pressed(f"{BALL}, length_m: 0.1"), SpecError, "a sphere has no length_m"),
+        (pressed(f"{BALL}, position_m: [0, 0]"), SpecError, "expected 3 values, found 2"),
+        (pressed(f"{BALL}, frame: hand"), SpecError, "'hand' is not one of 'tcp', 'world'"),
         (
-            pressed("shape: sphere, radius_m: 0.012, arm: left, position_m: [0, 0]"),
-            SpecError,
-            "expected 3 values, found 2",
-        ),
-        (
-            pressed("shape: sphere, radius_m: 0.012, arm: left, frame: hand"),
-            SpecError,
-            "'hand' is not one of 'tcp', 'world'",
-        ),
-        (
-            pressed("shape: sphere, radius_m: 0.012, arm: left"),
+            pressed(BALL),
             TaccorlError,
-            "yaml: recordings → sweep_1.csv → pressed:.*recording holds.*frames.*pads; record them,",
+            "yaml: recordings → sweep_1.csv → pressed:.*recording holds.*frames.*pads; record",
         ),
     ],
 )

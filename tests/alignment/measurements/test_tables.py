@@ -84,28 +84,22 @@ def test_semicolons_and_blank_lines(tmp_path):
 
 def test_a_column_s_zero_is_subtracted_before_its_factor(tmp_path):
     """512 counts are 0, 300 / 1024 ° a count: 522 counts are 2.93°. A pulse of 1500 µs is 0, 0.09° a µs."""
-    path = tmp_path / "run.csv"
-    path.write_text("t,adc,us\n0.00,512,1500\n0.02,522,1600\n")
-    q, target = (
-        "{column: adc, unit: deg, factor: 0.29296875, zero: 512}",
-        "{column: us, unit: deg, factor: 0.09, zero: 1500}",
-    )
-    (tmp_path / "columns.yaml").write_text(
-        f"time: {{column: t, unit: s}}\nsignals: {{a: {{q: {q}, q_target: {target}}}}}\n"
-    )
-    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    q = "{column: adc, unit: deg, factor: 0.29296875, zero: 512}"
+    signal = f"a: {{q: {q}, q_target: {{column: us, unit: deg, factor: 0.09, zero: 1500}}}}"
+    table = "t,adc,us\n0.00,512,1500\n0.02,522,1600\n"
+    path, columns = written(tmp_path, table, f"time: {{column: t, unit: s}}\nsignals: {{{signal}}}\n")
+    m = read_table(path, load_table_spec(columns))
     np.testing.assert_allclose(np.degrees(m.measured[:, 0]), [0.0, 2.9296875])
     np.testing.assert_allclose(np.degrees(m.target[:, 0]), [0.0, 9.0])
 
 
 def test_several_spaces_part_columns_as_one(tmp_path):
     """As logs of robot drivers have them, and tables aligned by blanks."""
-    path = tmp_path / "run.csv"
-    path.write_text("t  a.q   a.q_target \n0.00  1.5    2\n0.01  -1.5  2  \n0.02 1.0   2.5\n")
+    table = "t  a.q   a.q_target \n0.00  1.5    2\n0.01  -1.5  2  \n0.02 1.0   2.5\n"
     signal = "a: {q: {column: a.q, unit: rad}, q_target: {column: a.q_target, unit: rad}}"
     spec = f"separator: space\ntime: {{column: t, unit: s}}\nsignals: {{{signal}}}\n"
-    (tmp_path / "columns.yaml").write_text(spec)
-    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    path, columns = written(tmp_path, table, spec)
+    m = read_table(path, load_table_spec(columns))
     assert m.measured[:, 0].tolist() == [1.5, -1.5, 1.0] and m.target[:, 0].tolist() == [2.0, 2.0, 2.5]
     with pytest.raises(RecordingError, match="by space; write `separator: space`"):
         read_table(path)
@@ -279,25 +273,23 @@ def test_other_text_than_stated_is_named_with_the_way_out(tmp_path: Path, conten
 
 def test_supply_and_enabled_of_an_axis_are_read_and_a_robot_refuses_them(tmp_path: Path):
     """Ticks of 2π / 4096 rad, tenths of a volt, and a motor that is off in the last row."""
-    path = tmp_path / "swing.csv"
-    path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,1\n20,2248,2248,72,0\n")
-    (tmp_path / "columns.yaml").write_text(
+    table = "stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,1\n20,2248,2248,72,0\n"
+    spec = (
         "time: {column: stamp, unit: ms}\nsignals:\n  servo:\n    q: {column: pos, unit: rad, factor: 0.00153398}\n"
         "    q_target: {column: goal, unit: rad, factor: 0.00153398}\n    supply: {column: volts, unit: V, factor: 0.1}\n"
         '    enabled: {column: torque, unit: "1"}\n'
     )
-    m = read_table(path, load_table_spec(tmp_path / "columns.yaml"))
+    path, columns = written(tmp_path, table, spec)
+    m = read_table(path, load_table_spec(columns))
     np.testing.assert_allclose(m.supply_v[:, 0], [7.4, 7.3, 7.2])
     np.testing.assert_array_equal(m.enabled[:, 0], [1, 1, 0])
-    with pytest.raises(RecordingError, match=r"swing\.csv: row 2 .*servo\.enabled is 0\.5; write 0"):
-        path.write_text("stamp,pos,goal,volts,torque\n0,2048,2048,74,1\n10,2148,2248,73,0.5\n20,2248,2248,72,0\n")
-        read_table(path, load_table_spec(tmp_path / "columns.yaml"))
-    path.write_text("stamp,pos,goal,volts\n0,2048,2048,74\n10,2148,2248,73\n20,2248,2248,72\n")
+    with pytest.raises(RecordingError, match=r"run\.csv: row 2 .*servo\.enabled is 0\.5; write 0"):
+        read_table(written(tmp_path, table.replace("73,1", "73,0.5"), spec)[0], load_table_spec(columns))
+    less = "stamp,pos,goal,volts\n0,2048,2048,74\n10,2148,2248,73\n20,2248,2248,72\n"
     with pytest.raises(RecordingError, match="no column 'torque'"):
-        read_table(path, load_table_spec(tmp_path / "columns.yaml"))
-    columns = (tmp_path / "columns.yaml").read_text().replace('unit: "1"', 'unit: "1", if_missing: 1')
-    (tmp_path / "columns.yaml").write_text(columns)
-    np.testing.assert_array_equal(read_table(path, load_table_spec(tmp_path / "columns.yaml")).enabled, np.ones((3, 1)))
+        read_table(written(tmp_path, less, spec)[0], load_table_spec(columns))
+    written(tmp_path, less, spec.replace('unit: "1"', 'unit: "1", if_missing: 1'))
+    np.testing.assert_array_equal(read_table(path, load_table_spec(columns)).enabled, np.ones((3, 1)))
     for change, message in (
         ({}, "left_joint5 has a supply voltage"),
         ({"supply_v": np.empty(0)}, r"left_joint5 has a motor that is off at 0\.020 s"),
