@@ -1,8 +1,8 @@
 """A problem whose answers can be written down: a measurement is a sum of known signals, each effect adds one of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -40,16 +40,15 @@ class Ripple(Added):
         return np.sin(40.0 * t + seed)
 
 
-@dataclass(kw_only=True)
-class Bump(Added):
-    """In the first second only: its share of all blocks is small."""
+def kind(
+    name: str, signal: Callable[[np.ndarray, int], np.ndarray], base: type[Added] = Ripple, **more: Any
+) -> type[Added]:
+    """An effect with this ``signal`` of times (T,) and seed, and the numbers of ``base``."""
+    return dataclass(kw_only=True)(type(name, (base,), {"name": name, "signal": staticmethod(signal)} | more))
 
-    name: ClassVar = "bump"
-    strength: float = _strength()
 
-    @classmethod
-    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
-        return np.exp(-(((t - 0.6) / 0.1) ** 2))
+Bump = kind("bump", lambda t, seed: np.exp(-(((t - 0.6) / 0.1) ** 2)))
+"""In the first second only: its share of all blocks is small."""
 
 
 @dataclass(kw_only=True)
@@ -77,16 +76,8 @@ class Squire(Square):
         return Square.signal(t, seed) + 0.001 * np.sin(7.0 * t)
 
 
-@dataclass(kw_only=True)
-class Hidden(Added):
-    """As what the gain does: no recording shows it."""
-
-    name: ClassVar = "hidden"
-    strength: float = _strength()
-
-    @classmethod
-    def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
-        return drive(t, seed)
+Hidden = kind("hidden", lambda t, seed: drive(t, seed))
+"""As what the gain does: no recording shows it."""
 
 
 def drive(t: np.ndarray, seed: int) -> np.ndarray:

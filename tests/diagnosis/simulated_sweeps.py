@@ -52,17 +52,10 @@ def recorded(config: TwinConfig, target: np.ndarray, seed: int, **fields: Any) -
     done = replay(sim, np.concatenate([np.tile(target[:1], (rest, 1)), target]), RATE_HZ, start)
     rng = np.random.default_rng(1000 + seed)
     reported, effort = done.reported[rest:], done.effort[rest - 1 : -1]
-    return Measurement(
-        **{
-            "name": f"sweep_{seed}",
-            "time_s": np.arange(len(target)) / RATE_HZ,
-            "target": target,
-            "measured": reported + NOISE_RAD * rng.normal(size=reported.shape),
-            "effort": effort + 0.05 * rng.normal(size=effort.shape),
-            "origin": ORIGIN,
-        }
-        | fields
-    )
+    rows = {"time_s": np.arange(len(target)) / RATE_HZ, "target": target}
+    rows["measured"] = reported + NOISE_RAD * rng.normal(size=reported.shape)
+    rows["effort"] = effort + 0.05 * rng.normal(size=effort.shape)
+    return Measurement(**{"name": f"sweep_{seed}", "origin": ORIGIN} | rows | fields)
 
 
 def sweeps(config: TwinConfig, signals: tuple[str, ...] = (SIGNAL,), seconds: float = 6.0) -> Measurements:

@@ -115,10 +115,8 @@ def test_one_cell_alone_is_for_cells_with_loads_of_their_own():
     assert [p.name for p in found.planned] == ["taps"]
 
 
-def test_rivals_must_be_two_and_act_on_the_sensor(pressed):
+def test_rivals_must_act_on_the_sensor(pressed):
     case, known = pressed
-    with pytest.raises(TaccorlError, match="two or more"):
-        planned(case, known, "taxel_creep", of=("taps",))
     with pytest.raises(TaccorlError, match="coulomb_friction"):
         planned(case, known, "taxel_creep", "coulomb_friction", of=("taps",))
 

@@ -41,21 +41,8 @@ def targets(p: Planned) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def twins() -> Plan:
-    return planned("coulomb_friction", "asymmetric_friction", gains="fitted")
-
-
-@pytest.fixture(scope="module")
 def frictions() -> Plan:
     return planned("viscous_friction", "coulomb_friction", gains="commanded")
-
-
-@pytest.mark.slow
-def test_effects_that_are_one_by_algebra_are_hopeless_on_every_motion(twins):
-    pair = "coulomb_friction | asymmetric_friction"
-    assert twins.hopeless == (pair,)
-    assert len(twins.planned) == len(LIBRARY)
-    assert all(p.discrimination[pair] < SAME for p in twins.planned)
 
 
 @pytest.mark.slow
@@ -68,20 +55,15 @@ def test_two_frictions_are_told_apart_and_the_best_motion_comes_first(frictions)
 
 
 @pytest.mark.slow
-def test_free_gains_hide_what_commanded_ones_show(frictions):
-    """One motion alone with K_p and K_d free: K_d takes up the viscous one, and Coulomb's may be 0."""
-    assert planned("viscous_friction", "coulomb_friction", gains="fitted").planned[0].worst < SAME
-    assert frictions.planned[0].worst > TELLS
-
-
-@pytest.mark.slow
 def test_recordings_that_are_there_count(frictions):
-    """Viscous friction and K_d: with a chirp at hand, the chirp at twice the gain tells what it could not alone."""
+    """One motion alone with K_p and K_d free: K_d takes up the viscous one, and Coulomb's may be 0. With a chirp at hand, the
+    chirp at twice the gain tells what it could not alone."""
     known = Measurements((recorded(NOMINAL, CHIRP, 0, stated=False),))
     found = planned("viscous_friction", "coulomb_friction", gains="fitted", measurements=known)
     alone = planned("viscous_friction", "coulomb_friction", gains="fitted")
     stiffer = [next(p for p in of.planned if p.name == STIFFER_CHIRP.name) for of in (found, alone)]
     assert stiffer[0].worst > 10 * stiffer[1].worst
+    assert alone.planned[0].worst < SAME and frictions.planned[0].worst > TELLS
 
 
 @pytest.mark.slow
@@ -89,7 +71,9 @@ def test_three_rivals_are_three_pairs_and_the_worst_counts():
     found = planned("viscous_friction", "coulomb_friction", "asymmetric_friction", gains="commanded")
     assert all(len(p.discrimination) == 3 for p in found.planned)
     assert all(p.worst == min(p.discrimination.values()) for p in found.planned)
-    assert found.hopeless == ("coulomb_friction | asymmetric_friction",)
+    pair = "coulomb_friction | asymmetric_friction"  # one by algebra: hopeless on every motion
+    assert found.hopeless == (pair,) and len(found.planned) == len(LIBRARY)
+    assert all(p.discrimination[pair] < SAME for p in found.planned)
 
 
 @pytest.mark.parametrize("rivals", [(), ("backlash",), ("backlash", "backlash")])
@@ -104,9 +88,9 @@ def test_an_unknown_rival_is_refused_with_the_nearest_name():
 
 
 @pytest.mark.slow
-def test_every_target_keeps_the_joint_s_limits_and_rests_at_both_ends(frictions, twins):
+def test_every_target_keeps_the_joint_s_limits_and_rests_at_both_ends(frictions):
     rest = round(REST_S * 200)
-    for p in (*frictions.planned, *twins.planned):
+    for p in frictions.planned:
         assert ROBOT.action_low[COLUMN] <= targets(p).min() and targets(p).max() <= ROBOT.action_high[COLUMN]
         assert np.ptp(targets(p)[:rest]) == np.ptp(targets(p)[-rest:]) == 0.0
 
@@ -142,13 +126,6 @@ def test_a_constant_torque_moves_where_the_joint_rests_and_is_no_jerk_at_the_sta
         for c in (without, with_it)
     ]
     assert peaks[0] == pytest.approx(peaks[1], rel=0.05)
-
-
-@pytest.mark.slow
-def test_a_pair_is_hopeless_where_no_motion_may_be_made():
-    found = dataclasses.replace(planned("coulomb_friction", "viscous_friction"), planned=())
-    assert found.best("coulomb_friction | viscous_friction") == 0.0
-    assert found.hopeless == ("coulomb_friction | viscous_friction",)
 
 
 def test_an_imagined_recording_says_so_and_has_the_noise_that_was_asked_for():

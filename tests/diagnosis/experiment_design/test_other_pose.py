@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -49,9 +50,7 @@ RIVALS = (*FITTED,)
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Machine:
-    (tmp_path / "arm.xml").write_text(MODEL)
-    (tmp_path / "robot.yaml").write_text(FILE)
-    return load_machine(tmp_path / "robot.yaml")
+    return robot_machine(tmp_path, MODEL, FILE)
 
 
 def swung(machine: Machine, seed: int, hz: float) -> Measurement:
@@ -59,14 +58,8 @@ def swung(machine: Machine, seed: int, hz: float) -> Measurement:
     time_s = np.arange(1000) * 0.005
     moving = np.clip(time_s - 1.0, 0.0, None)
     target = np.column_stack([0.5 * np.sin(2 * np.pi * hz * moving) * np.clip(moving, 0, 1), np.zeros(1000)])
-    m = Measurement(
-        name=f"swing_{seed}",
-        time_s=time_s,
-        target=target,
-        measured=target.copy(),
-        signals=("pan", "lift"),
-        units=("rad", "rad"),
-    )
+    rows = {"time_s": time_s, "target": target, "measured": target.copy()}
+    m = logged(f"swing_{seed}", ("pan", "lift"), ("rad", "rad"), **rows)
     m.measured[:, 0] = machine.answer("pan", m).reported
     return dataclasses.replace(m, measured=m.measured + np.random.default_rng(seed).normal(0.0, 1e-4, target.shape))
 

@@ -146,7 +146,6 @@ def test_an_imagined_press_says_so_and_has_the_twin_s_noise():
 @pytest.mark.parametrize(
     ("rivals", "message"),
     [
-        (("touch_lag",), "two or more effects"),
         (("touch_lag", "backlash"), "backlash is not an effect of pads"),
         (("touch_lag", "touch_dely"), r"no effect 'touch_dely'.*touch_delay"),
         (("touch_lag", "taxel_gain_spread"), r"taxel_gain_spread.*these.*have:.*taxel_creep"),

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_rows import of_signal
+from simulated_slide import robot_machine
 
-from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.fit import fit, moved_by, over_own_scale
@@ -23,7 +23,7 @@ STEP_S = 1.0 / (ROW_HZ * STEPS)
 INERTIA, KP, DAMPING, FRICTION = 0.0435, 17.8, 0.6, 0.052
 COUNT = 2 * np.pi / 4096
 ROBOT = f"""kind: robot
-model: swing.xml
+model: arm.xml
 joints:
   swing: {{kp: {KP}, kd: 0.0, effects: [{{effect: viscous_friction, damping_nms_per_rad: {DAMPING}}},
     {{effect: coulomb_friction, torque_nm: {FRICTION}}}]}}
@@ -63,9 +63,7 @@ def simulated(sent: np.ndarray, late: np.ndarray, row_steps: int) -> np.ndarray:
 def fitted_delays(folder: Path, row_steps: int) -> tuple[np.ndarray, np.ndarray]:
     """(SEEDS,) true delays and (SEEDS, 3) fitted ones with the ends of their intervals [s], by the recordings' own clock. Rows
     are stamped as if each lasted STEPS steps."""
-    (folder / "swing.xml").write_text(MODEL)
-    (folder / "robot.yaml").write_text(ROBOT)
-    robot, rng = load_robot(folder / "robot.yaml"), np.random.default_rng(14)
+    robot, rng = robot_machine(folder, MODEL, ROBOT).robot, np.random.default_rng(14)
     late = rng.integers(300, 420, SEEDS)
     sent = np.stack([targets(rng) for _ in range(SEEDS * RECORDINGS)])
     seen = simulated(sent, np.repeat(late, RECORDINGS), row_steps)

@@ -23,17 +23,14 @@ def test_no_file_is_the_nominal_twin_and_a_file_without_kind_is_a_twin_of_the_pi
     assert nominal.units["left_joint1"] == "rad" and nominal.units["right_gripper"] == "m"
 
 
-def test_an_unknown_kind_is_refused_with_its_line(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("# my drive\nname: drive\nkind: axsi\n", "3: kind: .*'axsi'"), ("robot: {\n", "2: is not YAML")],
+)
+def test_an_unknown_kind_and_what_is_no_yaml_are_refused_with_their_line(tmp_path: Path, text: str, words: str):
     path = tmp_path / "drive.yaml"
-    path.write_text("# my drive\nname: drive\nkind: axsi\n")
-    with pytest.raises(SpecError, match=r"drive\.yaml:3: kind: there is no kind of machine 'axsi'"):
-        load_machine(path)
-
-
-def test_a_file_that_is_no_yaml_is_refused_with_its_line(tmp_path: Path):
-    path = tmp_path / "twin.yaml"
-    path.write_text("robot: {\n")
-    with pytest.raises(SpecError, match=r"twin\.yaml:2: is not YAML"):
+    path.write_text(text)
+    with pytest.raises(SpecError, match=rf"drive\.yaml:{words}"):
         load_machine(path)
 
 

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_rows import of_signal
+from simulated_slide import robot_machine
 
 from taccorl.alignment.checks.clock import FAR, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.checks.trial import Trial
-from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.cli.measured import far_off
@@ -94,9 +95,7 @@ def recording(
 
 
 def robot(folder: Path, drive: str) -> Robot:
-    (folder / "swing.xml").write_text(MODEL)
-    (folder / "robot.yaml").write_text(f"kind: robot\nmodel: swing.xml\njoints:\n  swing: {{{drive}}}\n")
-    return load_robot(folder / "robot.yaml")
+    return robot_machine(folder, MODEL, f"kind: robot\nmodel: arm.xml\njoints:\n  swing: {{{drive}}}\n").robot
 
 
 def fitted(made: Robot, measurements: Measurements, *names: str) -> tuple[JointProblem, Fit, float]:

@@ -19,6 +19,8 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 
 PLAIN = Case(robot="SCARA", joint="scara_2", hidden="", strength=1.0, seed=3, effort=False)
+TIME_S = np.arange(600) / 200
+SINE = np.column_stack([np.full(600, 0.4), -0.6 + 0.3 * np.sin(2 * np.pi * TIME_S) * np.clip(TIME_S - 0.5, 0, 1)])
 
 
 def scara(folder: Path) -> RobotMachine:
@@ -55,19 +57,14 @@ def test_names_are_the_users_and_mistakes_are_said_with_them(tmp_path: Path) -> 
         machine.select(("scara_2",), ["scara_1"], [])
     with pytest.raises(TaccorlError, match="has no pads"):
         machine.select(("scara_2",), [], ["left"])
-    assert machine.effect("gravity_mismatch", "scara_2", {"share": 0.9}) is None
     assert machine.effect("gravity_mismatch", "scara_2", {"share": 0.9}) is None  # its controller carries no weight
 
 
 def test_a_robot_that_lacks_nothing_is_replayed_to_its_noise_and_a_hidden_spring_is_not(tmp_path: Path) -> None:
-    time_s = np.arange(600) / 200
-    target = np.column_stack(
-        [np.full(600, 0.4), -0.6 + 0.3 * np.sin(2 * np.pi * time_s) * np.clip(time_s - 0.5, 0.0, 1.0)]
-    )
     errors = {}
     for hidden, strength in (("", 1.0), ("cable_spring", 0.1)):
         plant = Plant(dataclasses.replace(PLAIN, hidden=hidden, strength=strength))
-        made = Measurements((plant.record("sine", target, 1),))
+        made = Measurements((plant.record("sine", SINE, 1),))
         folder = tmp_path / (hidden or "plain")
         folder.mkdir()
         comparison = load_machine(plant.robot_file(folder)).compare(made)
@@ -79,11 +76,8 @@ def test_a_robot_that_lacks_nothing_is_replayed_to_its_noise_and_a_hidden_spring
 
 def test_known_numbers_of_a_robot_file_are_held_saved_and_checked(tmp_path: Path) -> None:
     plant = Plant(PLAIN)
-    time_s = np.arange(600) / 200
-    target = np.column_stack([np.full(600, 0.4), -0.6 + 0.3 * np.sin(2 * np.pi * time_s) * np.clip(time_s - 0.5, 0, 1)])
-    made = Measurements((plant.record("sine", target, 1),))
-    machine = load_machine(plant.robot_file(tmp_path))
-    assert isinstance(machine, RobotMachine)
+    made = Measurements((plant.record("sine", SINE, 1),))
+    machine = scara(tmp_path)
     weighed = make_effect("payload", mass_kg=0.25)
     config = machine.robot.config.joints["scara_2"]
     known = dataclasses.replace(config, effects=[weighed], known=("payload.mass_kg", "torque_ff"))

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 from made_rows import of_signal
+from simulated_slide import robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.regimes import regime_errors
-from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.fit import fit
@@ -18,18 +18,14 @@ from taccorl.report.figures import residual_along_variables
 MODEL = """<mujoco><worldbody><body name="cart"><inertial pos="0 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
 <joint name="x" type="slide" axis="1 0 0" range="-0.5 0.5"/></body></worldbody></mujoco>"""
 FILE = """kind: robot
-model: cart.xml
+model: arm.xml
 joints:
   x: {kp: 3000.0, kd: 150.0, rotor_inertia: 1.0, gains: GAINS}
 """
 
 
 def cart(folder: Path, gains: str) -> RobotMachine:
-    (folder / "cart.xml").write_text(MODEL)
-    (folder / "robot.yaml").write_text(FILE.replace("GAINS", gains))
-    made = load_machine(folder / "robot.yaml")
-    assert isinstance(made, RobotMachine)
-    return made
+    return robot_machine(folder, MODEL, FILE.replace("GAINS", gains))
 
 
 def sweep() -> Measurements:

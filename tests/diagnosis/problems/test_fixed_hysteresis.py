@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from made_rows import of_cells
+from made_rows import of_cells, play
 
 from taccorl.alignment.machines.cell_model import responses
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading, make_cells_effect
@@ -24,15 +24,6 @@ CONFIG = CellsConfig(
     load=Load(unit="N", rated=20.0),  # 1 in the unit reading is 2 N
     reading=Reading(unit="count", lowest=0.0, highest=1023.0),
 )
-
-
-def play(load_n: np.ndarray, half_width_n: float) -> np.ndarray:
-    """The load less a stop of ± ``half_width_n``: an element that slips at this force."""
-    out, stop = np.empty_like(load_n), 0.0
-    for k, step in enumerate(np.diff(load_n, prepend=0.0)):
-        stop = min(max(stop + step, -half_width_n), half_width_n)
-        out[k] = load_n[k] - stop
-    return out
 
 
 def layers(load_n: np.ndarray, share: float, *half_widths_n: float) -> np.ndarray:

@@ -269,15 +269,15 @@ def test_other_joints_and_other_effects_stay_as_they_are():
     assert all(kept is old for kept, old in zip(twin.effects, others, strict=False))
 
 
-def test_an_effect_of_an_arm_leaves_the_other_arm_its_own():
-    twin = TwinConfig(effects=[make_effect("payload", mass_kg=0.2, arm="both")])
-    add_effect(twin, make_effect("payload", mass_kg=0.5, arm="left"))
-    assert {tuple(e.acts_on()): vars(e)["mass_kg"] for e in twin.effects} == {("right",): 0.2, ("left",): 0.5}
-
-
-def test_an_effect_of_pads_leaves_the_other_pads_their_own():
-    twin = TwinConfig(effects=[make_effect("touch_lag", time_constant_s=0.02)])
-    add_effect(twin, make_effect("touch_lag", time_constant_s=0.05, pads=["left_a", "right_b"]))
-    found = {pad: vars(e)["time_constant_s"] for e in twin.effects for pad in e.acts_on()}
-    assert found == dict.fromkeys(ROBOT.pads, 0.02) | {"left_a": 0.05, "right_b": 0.05}
-    assert sum(len(e.acts_on()) for e in twin.effects) == len(ROBOT.pads)
+@pytest.mark.parametrize(
+    ("name", "number", "of_all", "where", "places"),
+    [
+        ("payload", "mass_kg", {"arm": "both"}, {"arm": "left"}, {"left": 0.5, "right": 0.2}),
+        ("touch_lag", "time_constant_s", {}, {"pads": ["left_a", "right_b"]},
+         dict.fromkeys(ROBOT.pads, 0.2) | {"left_a": 0.5, "right_b": 0.5}),
+    ],
+)  # fmt: skip
+def test_an_effect_of_an_arm_or_of_pads_leaves_the_others_their_own(name, number, of_all, where, places):
+    twin = TwinConfig(effects=[make_effect(name, **{number: 0.2}, **of_all)])
+    add_effect(twin, make_effect(name, **{number: 0.5}, **where))
+    assert sorted((p, vars(e)[number]) for e in twin.effects for p in e.acts_on()) == sorted(places.items())

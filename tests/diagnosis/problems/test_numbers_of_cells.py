@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from made_rows import of_cells
+from made_rows import of_cells, play
 
 from taccorl.alignment.checks.cell_readings import plateaus
 from taccorl.alignment.checks.cell_set import CellSet
@@ -101,11 +101,5 @@ def test_smooth_saturation_and_hysteresis_are_no_plateau():
     def saturated(load: np.ndarray) -> np.ndarray:
         return GAIN * (load / (1 + load / 2.0))[:, None] * SHARE
 
-    def with_play(load: np.ndarray) -> np.ndarray:
-        held, out = 0.0, np.zeros_like(load)
-        for k, x in enumerate(load):
-            held = out[k] = min(max(held, x - 0.5), x + 0.5)
-        return GAIN * out[:, None] * SHARE
-
-    for response in (saturated, with_play):
+    for response in (saturated, lambda load: GAIN * play(load, 0.5)[:, None] * SHARE):
         assert not list(plateaus(CellSet(CONFIG, recorded(response).all)))  # pyright: ignore[reportArgumentType]

@@ -212,26 +212,6 @@ def test_of_an_arm_that_presses_nothing_known_there_is_nothing_to_say():
 # words -----------------------------------------------------------------------------------------------------------------
 
 
-def evidence(**fields) -> Evidence:
-    return Evidence(
-        **{
-            "name": "touch_lag",
-            "values": {},
-            "base": {},
-            "explained": 0.5,
-            "fit_error": 1.0,
-            "validation_error": 1.1,
-            "gain": 0.8,
-            "score": 6.0,
-            "bic": 5000.0,
-            "at_bound": (),
-            "trouble": "",
-            "verdict": "",
-        }
-        | fields
-    )
-
-
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
@@ -248,4 +228,6 @@ def evidence(**fields) -> Evidence:
     ],
 )
 def test_evidence_in_words(fields: dict, words: str):
-    assert evidence_words(evidence(**fields)) == words
+    numbers = {"explained": 0.5, "fit_error": 1.0, "validation_error": 1.1, "gain": 0.8, "score": 6.0, "bic": 5000.0}
+    texts = {"name": "touch_lag", "trouble": "", "verdict": ""}
+    assert evidence_words(Evidence(values={}, base={}, at_bound=(), **texts, **numbers | fields)) == words

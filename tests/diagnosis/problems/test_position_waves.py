@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_rows import of_joint
 
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.diagnosis.problems.position_waves import position_waves
@@ -23,17 +24,8 @@ def motion(amplitude_rad: float, hz: float, seed: int) -> JointMotion:
     q = amplitude_rad * np.sin(w * t)
     effort = -INERTIA * w * w * q - WAVE_NM * np.sin(PERIODS * q + PHASE_RAD) + 0.01 * np.sign(np.cos(w * t))
     rng = np.random.default_rng(seed)
-    return JointMotion(
-        name="wheel",
-        time_s=t,
-        rate_hz=200.0,
-        target=np.zeros_like(t),
-        measured=q + NOISE_RAD * rng.standard_normal(len(t)),
-        effort=effort + 0.002 * rng.standard_normal(len(t)),
-        coupling_nm=np.zeros_like(t),
-        start=0.0,
-        pose=np.zeros(0),
-    )
+    measured = q + NOISE_RAD * rng.standard_normal(len(t))
+    return of_joint("wheel", 200.0, np.zeros_like(t), measured, effort + 0.002 * rng.standard_normal(len(t)))
 
 
 def test_the_strongest_wave_of_a_wheel_is_the_one_that_its_effort_works_against() -> None:

@@ -78,15 +78,11 @@ def test_a_sampled_loop_with_a_known_weight_is_no_effect_and_its_gains_are_found
 
 def test_a_twin_that_has_the_delay_starts_from_it_and_has_it_once():
     twin = TwinConfig(effects=[make_effect("speed_delay", arm="left", joints=["joint5"], delay_s=2e-3)])
-    problem = JointProblem(twin, SIGNAL, Measurements((recorded(twin, CHIRP, 0, effort=True),)), effort=True)
+    made = Measurements((recorded(twin, CHIRP, 0, effort=True),))
+    problem, bare = (JointProblem(config, SIGNAL, made, effort=True) for config in (twin, NOMINAL))
     assert problem.start["speed_delay_s"] == 2e-3
-    without = problem.simulate(problem.start | {"speed_delay_s": 0.0}, [], problem.fit[0])
-    np.testing.assert_array_equal(
-        without,
-        JointProblem(NOMINAL, SIGNAL, Measurements((recorded(twin, CHIRP, 0, effort=True),)), effort=True).simulate(
-            problem.start | {"speed_delay_s": 0.0}, [], problem.fit[0]
-        ),
-    )
+    start = problem.start | {"speed_delay_s": 0.0}
+    np.testing.assert_array_equal(*(p.simulate(start, [], problem.fit[0]) for p in (problem, bare)))
 
 
 def test_a_payload_whose_place_nobody_states_is_found_beside_the_gains():

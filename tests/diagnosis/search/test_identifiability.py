@@ -40,18 +40,15 @@ def test_viscous_friction_hides_in_a_fitted_gain_until_the_gain_is_changed(one_c
     assert two_gains.visible["viscous_friction"] > 4 * one_chirp.visible["viscous_friction"]
 
 
-def test_viscous_friction_is_seen_by_one_chirp_where_gains_are_commanded():
-    assert "viscous_friction" not in told(CHIRP, AGAIN, stated=True).invisible
-
-
 def test_an_offset_of_the_encoder_is_never_visible(one_chirp, two_gains):
     """q* − (q + b) with T_ref free: K_p b is a constant torque; the joint's start is read with the same offset."""
     assert "encoder_bias" in one_chirp.invisible and "encoder_bias" in two_gains.invisible
 
 
-def test_a_late_command_and_a_late_report_are_one_pair():
-    """A loop that hears late is one that tells late: the same motion, reported at the same time."""
+def test_with_commanded_gains_one_chirp_shows_viscous_friction_but_no_late_command_from_a_late_report():
+    """A loop that hears late is one that tells late: the same motion, reported at the same time. No gain lies on a ridge."""
     found = told(CHIRP, AGAIN, stated=True)
+    assert "viscous_friction" not in found.invisible and found.ridges == ()
     pairs = {frozenset(pair[:2]): pair[2] for pair in found.pairs}
     assert pairs[frozenset({"command_delay", "sensor_delay"})] == pytest.approx(1.0, abs=1e-4)
     assert not {"command_delay", "sensor_delay"} & set(found.invisible)
@@ -76,10 +73,6 @@ def test_stiff_and_damped_gains_lie_on_a_ridge_that_is_named(one_chirp):
     (ridge,) = one_chirp.ridges
     assert set(ridge[:2]) == {"kp", "kd"}
     assert ridge[2] > RIDGE
-
-
-def test_commanded_gains_lie_on_no_ridge():
-    assert told(CHIRP, AGAIN, stated=True).ridges == ()
 
 
 def test_an_effect_that_the_twin_has_is_not_asked_about(one_chirp):

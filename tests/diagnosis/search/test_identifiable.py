@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 from made_problem import MadeProblem
+from made_rows import of_joint
 
-from taccorl.alignment.controller.joint_model import JointModel, JointMotion
+from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.diagnosis.search.correlation import Rows
 from taccorl.diagnosis.search.fit import FINE, Fit, fit
@@ -76,25 +77,9 @@ def swept(loop_hz: float, filter_s: float, coulomb_nm: float) -> Recording:
     target = 0.3 * np.sin(angle) * np.clip(np.minimum(time_s - 0.3, 5.0 - time_s) / 0.5, 0.0, 1.0)
     measured = sampled_loop(target, loop_hz, filter_s, coulomb_nm)
     measured += NOISE_RAD * np.random.default_rng(0).standard_normal(len(time_s))
-    motion = JointMotion(
-        name="swept",
-        time_s=time_s,
-        rate_hz=RATE_HZ,
-        target=target,
-        measured=measured,
-        effort=np.full(len(time_s), np.nan),
-        coupling_nm=np.zeros(len(time_s)),
-        start=TRUTH["torque_ff"] / TRUTH["kp"],
-        pose=np.zeros(7),
-    )
-    return Recording(
-        name="swept",
-        time_s=time_s,
-        measured=measured[:, None],
-        floor=np.array([NOISE_RAD]),
-        channels=("left_joint5 [rad]",),
-        data=motion,
-    )
+    motion = of_joint("swept", RATE_HZ, target, measured, start=TRUTH["torque_ff"] / TRUTH["kp"])
+    numbers = {"measured": measured[:, None], "floor": np.array([NOISE_RAD]), "data": motion}
+    return Recording(name="swept", time_s=time_s, channels=("left_joint5 [rad]",), **numbers)
 
 
 def fitted(recording: Recording, *names: str) -> Fit:
@@ -150,14 +135,8 @@ def test_variance_of_a_ratio_is_that_of_the_difference_of_logarithms():
     rng = np.random.default_rng(1)
     common, apart = rng.standard_normal((2, 1500))
     # residual = 1e-3 common (f + k) + 10 apart (f − k): columns of the Jacobian by k, kd, T_ref, f
-    jacobian = np.column_stack(
-        [
-            1e-3 * common - 10.0 * apart,
-            rng.standard_normal(1500),
-            rng.standard_normal(1500),
-            1e-3 * common + 10.0 * apart,
-        ]
-    )
+    others = rng.standard_normal((2, 1500))
+    jacobian = np.column_stack([1e-3 * common - 10.0 * apart, *others, 1e-3 * common + 10.0 * apart])
     problem = OneJoint("coulomb_friction")
     frees = (*problem.base, problem.candidates["coulomb_friction"].frees[0])
     effect = make_effect("coulomb_friction", torque_nm=0.4, arm="left", joints=["joint5"])
