@@ -100,7 +100,6 @@ class MadeProblem(WithoutMaps):
         t, seed = recording.time_s, recording.data
         total = base["gain"] * drive(t, seed) + base["offset"]
         for effect in effects:
-            assert isinstance(effect, Added)
             total = total + vars(effect)["strength"] * effect.signal(t, seed)
         return total[:, None]
 

@@ -29,9 +29,7 @@ def logged(
 def robot_machine(folder: Path, model: str, file: str) -> RobotMachine:
     (folder / "arm.xml").write_text(model)
     (folder / "robot.yaml").write_text(file)
-    made = load_machine(folder / "robot.yaml")
-    assert isinstance(made, RobotMachine)
-    return made
+    return load_machine(folder / "robot.yaml")
 
 
 def simulated(

@@ -92,7 +92,6 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
         link = play(m.measured[:, 0], 3e-3) + NOISE_RAD * np.random.default_rng(seed).normal(size=m.num_rows)
         made.append(dataclasses.replace(m, measured=link[:, None]))
     dropped = find_dropped(made, 0)
-    assert dropped is not None
     assert dropped.found >= 6 + 4 * dropped.mirrored, "the check sees holds, or this test shows nothing"
     assert not dropped.certain
     assert "dropped_commands" not in said(made)
@@ -137,7 +136,6 @@ def test_the_first_recording_may_be_the_odd_one_and_of_two_nothing_tells_which_i
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
     m = recording("a", 3, drop=0.05, longest=4)
     dropped = find_dropped([m], 0)
-    assert dropped is not None
     assert dropped.certain
     assert 0.01 < dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
     findings = check_measurements([m])["a"]
@@ -155,7 +153,6 @@ def test_a_single_long_hold_is_found_where_it_was():
     m = recording("a", 0)
     measured = joint(applied, 200.0, np.random.default_rng(0))
     dropped = find_dropped([dataclasses.replace(m, measured=measured[:, None])], 0)
-    assert dropped is not None
     found = np.array(dropped.times_s["a"])
     near = [np.abs(found - row / 200.0).min() < 0.03 for row in truth]
     assert sum(near) >= 6  # one may lie where the sweep turns back

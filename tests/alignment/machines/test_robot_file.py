@@ -151,7 +151,6 @@ def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity:
     plain = robot(tmp_path, file)
     made = robot(tmp_path, file.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
     moved = moved_together(true, both)
-    assert moved is not None
     period_s = both.period_s * both.num_rows / len(moved.positions)
 
     def along(r: Robot, name: str) -> RobotJoint:

@@ -148,7 +148,6 @@ def test_touch_floor_of_every_taxel():
     counts[300:500] += 80  # a touch
     touch = Touch(time_s=np.repeat(np.arange(1000)[:, None] / 100, 4, axis=1), counts=counts, baseline=np.zeros(1536))
     floor = touch_floor([dataclasses.replace(sweep(0, seconds=1.0), touch=touch)])
-    assert floor is not None
     assert floor[:768].mean() == pytest.approx(math.sqrt(1.3**2 + 1 / 12), rel=0.05)
     np.testing.assert_allclose(floor[768:], 1 / math.sqrt(12))
 

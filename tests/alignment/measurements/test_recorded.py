@@ -148,7 +148,6 @@ def test_resolution_of_the_encoders_is_found(recorded):
 
 def test_touch_keeps_every_pad_s_own_time(recorded, moved):
     touch = recorded.touch
-    assert touch is not None
     assert touch.counts.shape[1] == 1536
     assert touch.time_s.shape == (len(touch.counts), 4)
     np.testing.assert_allclose(np.diff(touch.time_s[:, 0]), 0.01, atol=0.004)

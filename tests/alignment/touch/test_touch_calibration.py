@@ -65,7 +65,6 @@ def test_the_validation_recording_is_matched_up_to_the_noise(found: TouchCalibra
 
 def test_the_mended_twin_has_the_numbers(found: TouchCalibration) -> None:
     sensor = found.mended(CONFIG).sensor
-    assert isinstance(sensor, FlexiTacConfig)
     assert sensor.normal_stiffness_per_m == found.stiffness.value
     assert sensor.normal_damping_s_per_m == found.damping.value
     assert sensor.gain_count == FlexiTacConfig().gain_count

@@ -77,7 +77,6 @@ def as_measured(opening_m: np.ndarray, arms: np.ndarray, time_s: np.ndarray) -> 
     rows = np.tile(np.r_[arms, 0.07, arms, 0.07], (len(time_s), 1))
     rows[:, 13] = opening_m
     base = press(0)
-    assert base.touch is not None
     frames = base.touch.time_s[:, 0] < time_s[-1] - 0.02
     touch = dataclasses.replace(base.touch, time_s=base.touch.time_s[frames], counts=base.touch.counts[frames])
     return Measurement(name="rows", time_s=time_s, target=rows, measured=rows, touch=touch)

@@ -89,7 +89,6 @@ def test_known_payload_and_commanded_gains_are_those_of_the_recording(gripping):
     ratios = []
     for one in (m, known):
         score = compare(TwinConfig(), Measurements((one,))).score(SIGNAL, "position", "fit")
-        assert score is not None
         ratios.append(score.ratio)
     assert ratios[0] > 5
     assert ratios[1] < 1.5
@@ -125,7 +124,6 @@ def test_score_is_the_arithmetic_written_out():
     measured = np.where(np.isnan(residual), np.nan, position)
     one = trace(np.nan_to_num(residual), position, measured=measured)
     score = comparison(one).score("left_joint5", "position", "validation")
-    assert score is not None
     assert score.rmse == pytest.approx(3e-3)
     assert score.ratio == pytest.approx(3e-3 / FLOOR_RAD)  # 15
     assert score.nrmse == pytest.approx(3e-3 / np.nanstd(measured))

@@ -24,9 +24,7 @@ SINE = np.column_stack([np.full(600, 0.4), -0.6 + 0.3 * np.sin(2 * np.pi * TIME_
 
 
 def scara(folder: Path) -> RobotMachine:
-    machine = load_machine(Plant(PLAIN).robot_file(folder))
-    assert isinstance(machine, RobotMachine)
-    return machine
+    return load_machine(Plant(PLAIN).robot_file(folder))
 
 
 def test_a_saved_robot_is_loaded_as_the_same_with_effects_and_numbers(tmp_path: Path) -> None:
@@ -39,7 +37,6 @@ def test_a_saved_robot_is_loaded_as_the_same_with_effects_and_numbers(tmp_path: 
     path.parent.mkdir()
     added.save(path)
     again = load_machine(path)
-    assert isinstance(again, RobotMachine)
     assert again.effects == ("coulomb_friction",) and "arm:" not in path.read_text()  # nothing of the PiPER
     assert again.robot.config.joints == added.robot.config.joints
     assert again.robot.config.joints["scara_2"].position_age_s == 4e-4

@@ -196,7 +196,6 @@ def test_one_body_has_one_payload(tmp_path: Path) -> None:
     assert held_at_elbow.effect("payload", "yaw", {"mass_kg": 0.1}) is None, "yaw feels the elbow's"
     # Bounds of a search follow the robot: half of 0.15 + 0.1 m of links, or twice 0.1 m from the elbow to the centre of mass.
     payload = arm.effect("payload", "elbow", {"mass_kg": 0.1, "x_m": 0.18})
-    assert payload is not None
     ends = {p.name: (p.low, p.high) for p in payload.parameters()}
     assert ends["x_m"] == (-0.2, 0.2) and ends["mass_kg"] == (0.0, 1.5)
     assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(Payload) == {"y_m": 0.0}

@@ -129,7 +129,6 @@ def test_an_unbalance_is_of_hinges_only(tmp_path: Path) -> None:
     machine(tmp_path)
     (tmp_path / "arm.xml").write_text(MODEL.replace('name="lift" axis', 'name="lift" type="slide" axis'))
     robot = load_machine(tmp_path / "robot.yaml")
-    assert isinstance(robot, RobotMachine)
     assert robot.effect("unbalance", "lift", {"torque_nm": 1.0, "hangs_at_rad": 0.0}) is None
     assert robot.effect("unbalance", "pan", {"torque_nm": 1.0, "hangs_at_rad": 0.0}) is not None
     entry = "effort_after_target: true, effects: [{effect: unbalance, torque_nm: 1.0, hangs_at_rad: 0.0}]}"
@@ -154,7 +153,6 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
     torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
     level = turned("level", 0.3, 0.3, 6)
     down = tilt_like(robot.robot, "pan", [level], torque_nm, 0.0)
-    assert down is not None
     assert change_between_poses(robot.robot, "pan", [level, level], down) < 1e-6
     arms = [1.0, math.cos(0.9)]  # whose mean is 0.811: each is 0.189 from it
     change = change_between_poses(robot.robot, "pan", [level, raised], down)
@@ -165,9 +163,7 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
     leaning = RobotMachine(dataclasses.replace(robot.robot, config=leaning), "leaning")
     leaning.save(tmp_path / "leaning.yaml")
     loaded = load_machine(tmp_path / "leaning.yaml")
-    assert isinstance(loaded, RobotMachine)
     effect = robot.effect("unbalance", "pan", {"torque_nm": torque_nm, "hangs_at_rad": 0.0})
-    assert effect is not None
     loads = robot.with_additions([Addition("pan", [effect], {}, {})])
     errors = [replay_error(r, raised) for r in (loaded, loads, robot)]
     assert errors[0] < 1.5e-4 < 4e-4 < errors[1] and errors[2] > 4e-4
@@ -203,7 +199,6 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
     mended, _ = machine(tmp_path).mended(found)
     mended.save(tmp_path / "mended.yaml")
     written = load_machine(tmp_path / "mended.yaml")
-    assert isinstance(written, RobotMachine)
     assert found[0].diagnosis.names == ("unbalance",) and len(remarks) == 1
     if tilt_of_lift_rad:
         x, y, z = map(float, re.findall(r"gravity: \[(.*?)\]", remarks[0])[0].split(", "))

@@ -60,7 +60,6 @@ def test_a_log_of_position_and_force_alone_shows_the_friction(slide: Measurement
     assert not {"command_delay", "torque_saturation", "error_deadband", "encoder_scale"} & {*problem.candidates}
     recording = problem.fit[0]
     friction = problem.axis.effect_class("coulomb_friction")
-    assert friction is not None
     left = {}
     for force in (0.0, FRICTION_N):
         numbers: Any = {"torque_nm": force}

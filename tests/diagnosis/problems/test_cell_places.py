@@ -148,7 +148,6 @@ def test_presses_that_slide_or_are_elsewhere_are_named_and_not_used():
     for m, share, words in zip(
         measurements.validation, (1 / 3, 1 / 3), ("0 of them move", "1 of them move"), strict=True
     ):
-        assert isinstance(m, CellMeasurement)
         assert np.mean(m.place < 0) == pytest.approx(share, abs=0.01)
         (finding,) = [f for f in check_cells(CONFIG, [m], ())[m.name] if f.check == "other_places"]
         assert "1 presses are not used" in finding.text and words in finding.text

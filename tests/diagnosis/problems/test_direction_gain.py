@@ -117,7 +117,6 @@ def test_a_velocity_loop_has_another_speed_backwards(target: float) -> None:
     """q̇ = q̇* forwards and 0.6 q̇* backwards, K_d / J = 80 1/s after the start."""
     axis = AxisConfig(name="rod", unit="m", law="velocity", inertia=OIL_KG, kd=STIFF)
     cls = axis.effect_class("direction_gain")
-    assert cls is not None
     rest = moved("first", air(1.0), MASS_KG, (0.3, 1.1), 1)
     m = dataclasses.replace(rest, target=np.full_like(rest.target, target), target_kinds=("velocity",))
     numbers: dict[str, Any] = {"factor": 0.6}

@@ -58,7 +58,6 @@ def test_the_delay_is_fitted_where_something_tells_it_from_the_gains():
 def test_a_sampled_loop_with_a_known_weight_is_no_effect_and_its_gains_are_found():
     """A clean surrogate: 4 kHz, a filter of 0.9 ms; 1.2 ms late in all. Without the delay, gravity_mismatch is found."""
     case = draw_case((), 30015, design="chirp", sampled=True, loaded=True)
-    assert case.loop is not None
     problem = problem_of(case)
     found = diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start)
     assert found.status == "nothing_missing"
