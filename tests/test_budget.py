@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_682,
-    "tests": 57_065,
+    "tests": 57_107,
     "pipelines": 6_257,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -1,6 +1,8 @@
 """Recordings of one joint of the simulated twin, made by MuJoCo's own steps: what the one-joint model is held against."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -9,7 +11,7 @@ from taccorl.alignment.controller.arm_bench import of_joint
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion
-from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
 from taccorl.robots import ROBOT
@@ -23,6 +25,23 @@ REFERENCE_TWIN = TwinConfig(
     controller=ControllerConfig(kp_nm_per_rad=[500.0] * 6, kd_nms_per_rad=[50.0] * 6, torque_ff_nm=[0.0] * 6)
 )
 """The paper's reference simulator: knows nothing of the true gains."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AxisJoint(RigidJoint):
+    """A single axis: an inertia [kg·m²], or a mass [kg] on a slide with ``unit`` m, without weight."""
+
+    signal: str
+    inertia: float
+    gains: Gains
+    unit: Literal["rad", "m"] = "rad"
+    step_s: float = 1.0 / 1200.0
+
+    def timestep_s(self, motion: JointMotion) -> float:
+        return self.step_s
+
+    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        return Rigid(self.inertia)
 
 
 def chirp(

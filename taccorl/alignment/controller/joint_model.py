@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_numbers import Drive
 from taccorl.alignment.controller.joint_kernel import simulate_all
 from taccorl.alignment.controller.joint_motion import JointMotion
-from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid, RigidJoint, weighs
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, weighs
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
@@ -101,6 +101,10 @@ class _Sent(NamedTuple):
     added: np.ndarray
 
 
+Answers = dict[JointMotion, dict[tuple, tuple[np.ndarray, np.ndarray]]]
+"""Motion of a recording → the newest answers to its targets."""
+
+
 @dataclass(frozen=True)
 class JointResponse:
     """Simulated position and motor torque of the joint, one value for each row of the recording."""
@@ -127,24 +131,10 @@ class JointModel:
         model._set(joint)
         return model
 
-    @classmethod
-    def axis(
-        cls,
-        name: str,
-        inertia: float,
-        *,
-        gains: Gains,
-        unit: Literal["rad", "m"] = "rad",
-        timestep_s: float = 1.0 / 1200.0,
-    ) -> "JointModel":
-        """Model of a single axis: an inertia [kg·m²], or a mass [kg] on a slide with ``unit`` m, without weight. Effects act on
-        it by ``Effect.drive``, whatever joints they name; effects without one are rejected."""
-        return cls.of(AxisJoint(name, inertia, gains, unit, timestep_s))
-
     def _set(self, joint: RigidJoint) -> None:
         self.joint, self.signal, self.unit, self.gains = joint, joint.signal, joint.unit, joint.gains
         self._rigid: dict[tuple, Rigid] = {}
-        self._answers: dict[JointMotion, dict[tuple, tuple[np.ndarray, np.ndarray]]] = {}
+        self._answers: Answers = {}
 
     def simulate(
         self,
@@ -163,8 +153,7 @@ class JointModel:
         """Simulate the responses to the targets of each of ``motions``, from rest at its ``start``, with each of ``cases``, side
         by side. Their arrays are read-only. ``each_step``: give the response after each physics step, not only at the rows.
         Raises TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects."""
-        prepared = [self._prepared(case) for case in cases]
-        return [self._simulated(motion, prepared, each_step) for motion in motions]
+        return simulate_each([self] * len(cases), motions, cases, self._answers, each_step)
 
     def _prepared(self, case: "Numbers") -> "_Prepared":
         """Prepare what does not depend on the recording."""
@@ -178,59 +167,6 @@ class JointModel:
         numbers = _combined([*timing, ("the drive", known), *of_effects])
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
         return _Prepared(case, present, bodies, numbers if len(of_effects) == len(drives) else None)
-
-    def _simulated(self, motion: JointMotion, prepared: "Sequence[_Prepared]", each_step: bool) -> list[JointResponse]:
-        sent, parts, hold, step_s = self._sent(motion)
-        carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
-        kept = self._answers.setdefault(motion, {})
-        keys: list[tuple] = []
-        missing: dict[tuple[int, bool], dict[tuple, tuple[tuple, np.ndarray]]] = {}
-        for case, present, bodies, numbers in prepared:
-            kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
-            # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
-            gains = Gains(kp, kd - kp * (self.joint.position_age_s + case.age_s), case.gains.torque_ff)
-            if numbers is None:
-                keys.append((gains, *map(repr, present)))
-                if keys[-1] not in kept:
-                    kept[keys[-1]] = self.joint.in_mujoco(motion, gains, present, sent.target, parts, hold)
-                continue
-            body = self._body(motion, bodies)._asdict()
-            held_n = body.pop("weight_n")
-            drive = {**_ABSENT, **gains._asdict(), **body, **numbers}
-            weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
-            drive["gravity_sin"] += weight * case.lever.sin_m
-            drive["gravity_cos"] += weight * case.lever.cos_m
-            drive["effort_holds_weight"] = float(self.joint.effort_holds_weight)
-            late_s = self.joint.target_late_s
-            if drive["effort_after"] and late_s > 0.0:
-                # The force that answers a row's target acts once it has come, and is of the position then.
-                drive["effort_after"] = 1 + math.ceil(late_s * motion.rate_hz * parts - 1e-9)
-                drive["effort_age"] -= late_s
-            keys.append((*drive.values(), held_n, each_step, *map(repr, bodies)))
-            if keys[-1] in kept:
-                continue
-            geared = drive["backlash__play_rad"] > 0.0 or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
-            finer = math.ceil(step_s / GEAR_STEP_S - 1e-9) if geared and drive["midpoint"] > 0.0 else 1
-            loads = motion.coupling_nm + held_n + self.joint.moving_masses_nm(motion, bodies)
-            missing.setdefault((finer, geared), {})[keys[-1]] = (tuple(drive.values()), loads)
-        for (finer, _), those in missing.items():
-            drives, loads = zip(*those.values(), strict=True)
-            start = motion.start, hold * finer, parts, step_s / finer, motion.start_speed, int(each_step)
-            found = simulate_all(drives, sent.target, loads, carrying, *sent[1:], *start)
-            kept.update(zip(those, found, strict=True))
-        answers = [JointResponse(*kept[key]) for key in keys]
-        while len(kept) > min(KEPT, KEPT_ROWS // len(answers[0].reported)):
-            del kept[next(iter(kept))]
-        if self.joint.target_kind == "effort":
-            # What holds the model at the measured position is beyond the effort that drives it.
-            before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])
-            # What a row shows is of the part before it, whose target is half a part old.
-            slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
-            return [
-                JointResponse(answer.reported, answer.effort - before + one.case.gains.kp * slope + motion.effort)
-                for answer, one in zip(answers, prepared, strict=True)
-            ]
-        return answers
 
     def motor_nm(self, motion: JointMotion, answer: JointResponse) -> np.ndarray:
         """(T,) whole torque of the motor, the gravity compensation included, of a response without effects [N·m]."""
@@ -286,6 +222,84 @@ class JointModel:
         else:
             sent = _in_rows(motion, parts)
         return sent, parts, round(steps) // parts, step_s
+
+
+def simulate_each(
+    models: Sequence[JointModel],
+    motions: Sequence[JointMotion],
+    cases: Sequence[Numbers],
+    kept: Answers,
+    each_step: bool = False,
+) -> list[list[JointResponse]]:
+    """As ``JointModel.simulate_all``, of a model of its own for each of ``cases``: of one joint, with the same law and row rate.
+    ``kept``: the newest answers, for the next call."""
+    prepared = [model._prepared(case) for model, case in zip(models, cases, strict=True)]
+    return [_side_by_side(models, motion, prepared, kept.setdefault(motion, {}), each_step) for motion in motions]
+
+
+def _side_by_side(
+    models: Sequence[JointModel],
+    motion: JointMotion,
+    prepared: Sequence[_Prepared],
+    kept: dict[tuple, tuple[np.ndarray, np.ndarray]],
+    each_step: bool,
+) -> list[JointResponse]:
+    of_model = {model: model._sent(motion) for model in models}
+    carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
+    keys: list[tuple] = []
+    missing: dict[tuple, tuple[_Sent, dict[tuple, tuple[tuple, np.ndarray]]]] = {}
+    for model, (case, present, bodies, numbers) in zip(models, prepared, strict=True):
+        joint, (sent, parts, hold, step_s) = model.joint, of_model[model]
+        late_s = joint.target_late_s
+        when = late_s, parts, hold, step_s
+        kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
+        # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
+        gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
+        if numbers is None:
+            keys.append((*when, gains, *map(repr, present)))
+            if keys[-1] not in kept:
+                kept[keys[-1]] = joint.in_mujoco(motion, gains, present, sent.target, parts, hold)
+            continue
+        body = model._body(motion, bodies)._asdict()
+        held_n = body.pop("weight_n")
+        drive = {**_ABSENT, **gains._asdict(), **body, **numbers}
+        weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
+        drive["gravity_sin"] += weight * case.lever.sin_m
+        drive["gravity_cos"] += weight * case.lever.cos_m
+        drive["effort_holds_weight"] = float(joint.effort_holds_weight)
+        if drive["effort_after"] and late_s > 0.0:
+            # The force that answers a row's target acts once it has come, and is of the position then.
+            drive["effort_after"] = 1 + math.ceil(late_s * motion.rate_hz * parts - 1e-9)
+            drive["effort_age"] -= late_s
+        keys.append((*when, *drive.values(), held_n, each_step, *map(repr, bodies)))
+        if keys[-1] in kept:
+            continue
+        geared = drive["backlash__play_rad"] > 0.0 or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
+        finer = math.ceil(step_s / GEAR_STEP_S - 1e-9) if geared and drive["midpoint"] > 0.0 else 1
+        loads = motion.coupling_nm + held_n + joint.moving_masses_nm(motion, bodies)
+        missing.setdefault((finer, geared, *when), (sent, {}))[1][keys[-1]] = (tuple(drive.values()), loads)
+    for (finer, _, _, parts, hold, step_s), (sent, those) in missing.items():
+        drives, loads = zip(*those.values(), strict=True)
+        start = motion.start, hold * finer, parts, step_s / finer, motion.start_speed, int(each_step)
+        found = simulate_all(drives, sent.target, loads, carrying, *sent[1:], *start)
+        kept.update(zip(those, found, strict=True))
+    answers = [JointResponse(*kept[key]) for key in keys]
+    while len(kept) > min(KEPT, KEPT_ROWS // len(answers[0].reported)):
+        del kept[next(iter(kept))]
+    if models[0].joint.target_kind == "effort":
+        return [_holding(of_model[m], motion, one.case, a) for m, one, a in zip(models, prepared, answers, strict=True)]
+    return answers
+
+
+def _holding(
+    of: tuple[_Sent, int, int, float], motion: JointMotion, case: Numbers, answer: JointResponse
+) -> JointResponse:
+    """With the effort of a law effort: what holds the model at the measured position is beyond the effort that drives it."""
+    sent, parts, _, _ = of
+    before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])
+    # What a row shows is of the part before it, whose target is half a part old.
+    slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
+    return JointResponse(answer.reported, answer.effort - before + case.gains.kp * slope + motion.effort)
 
 
 @lru_cache(maxsize=32)

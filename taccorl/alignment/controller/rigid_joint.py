@@ -1,6 +1,6 @@
 """Rigid-body properties of one joint for the one-joint model: inertia, weight, and torque from the motion of other joints. Each
 kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), any robot of an MJCF or URDF file
-(``robot_joint``), and a single axis with an inertia (``AxisJoint``).
+(``robot_joint``), and an axis by itself (``machines.axis_file``).
 
 Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 """
@@ -8,7 +8,6 @@ Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 import math
 from abc import ABC
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import mujoco
@@ -209,25 +208,6 @@ class RigidJoint(ABC):
             f"{self.signal}: effects on a single axis are computed in the one-joint model, which does not have "
             f"{' and '.join(unknown or sorted(e.name for e in effects))}; remove it"
         )
-
-
-@dataclass(frozen=True)
-class AxisJoint(RigidJoint):
-    """A single axis: an inertia [kg·m²], or a mass [kg] on a slide with ``unit`` m, without weight."""
-
-    signal: str
-    inertia: float
-    """[kg·m²], or mass [kg]."""
-    gains: Gains
-    unit: Literal["rad", "m"] = "rad"
-    step_s: float = 1.0 / 1200.0
-    """Physics step [s]."""
-
-    def timestep_s(self, motion: JointMotion) -> float:
-        return self.step_s
-
-    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        return Rigid(self.inertia)
 
 
 # from MuJoCo -----------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ Laws and targets are those of ``drive_law``. A mass that a recording mounts on a
 weight m g l sin(q − q₀): ``payload_kg`` at ``lever_m``, and an arm of ``arm_kg``, a uniform rod of that length.
 """
 
+import copy
 import dataclasses
 import hashlib
 import math
@@ -181,7 +182,10 @@ class AxisConfig(DriveLaw):
         new |= self.law_numbers(base)
         if "inertia" in new:
             new["rotor_inertia"] = new["inertia"] * min(self.rotor_inertia / self.inertia, 1.0)
-        return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
+        changed = copy.copy(self)
+        for name, value in new.items():
+            object.__setattr__(changed, name, float(value))  # without the checks, which take as long as a simulation
+        return changed
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
         """Copy of the axis with these effects in addition; one of the same name is replaced, and one that is absent taken out."""

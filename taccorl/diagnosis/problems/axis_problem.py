@@ -21,9 +21,10 @@ import numpy as np
 
 from taccorl.alignment.checks.effort_time import law_error
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
-from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel, JointResponse
+from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel, JointResponse, Numbers, simulate_each
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.controller.lanes import LANES
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -33,7 +34,7 @@ from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, seen_in
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, holding
+from taccorl.diagnosis.search.problem import Candidate, Case, Free, Recording, Values, WithoutMaps, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -56,9 +57,11 @@ class AxisProblem(WithoutMaps):
     """Search problem of an axis. Channels: position, and effort if every recording has it, in the units of the axis. Raises
     TaccorlError as ``axis_motion``."""
 
+    at_once = LANES
+
     def __init__(self, axis: AxisConfig, measurements: Measurements) -> None:
         self.axis, self.signal = axis, axis.name
-        own = axis.made()
+        own, self._answers = axis.made(), {}
         self.present = tuple(e.name for e in own)
         self._bare = dataclasses.replace(axis, effects=(), known=())
         everything = measurements.all
@@ -109,9 +112,19 @@ class AxisProblem(WithoutMaps):
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone. NaN after the last measured
         row. ``effects``: in addition to those of the file that are not fitted."""
-        answer = simulated(self._bare.with_numbers(base), measured_part(recording), effects)
-        of = {"position": answer.reported, "effort": base.get(EFFORT_SCALE.name, 1.0) * answer.effort}
-        return whole_rows([of[kind] for kind in self._kinds], recording)
+        return self.simulate_all([(base, effects)], [recording])[0][0]
+
+    def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+        """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
+        models = [JointModel.of(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
+        numbers = [Numbers(model.gains, effects) for model, (_, effects) in zip(models, cases, strict=True)]
+        motions = [measured_part(recording) for recording in recordings]
+        scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
+        channels = slice(self._kinds[0] == "effort", 1 + self.effort)
+        return [
+            [whole_rows([a.reported, scale * a.effort][channels], r) for a, scale in zip(those, scales, strict=True)]
+            for those, r in zip(simulate_each(models, motions, numbers, self._answers), recordings, strict=True)
+        ]
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the forces of the motor."""

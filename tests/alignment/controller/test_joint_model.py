@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from made_rows import of_joint, of_signal
-from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
+from one_joint import HOME, TWIN, AxisJoint, at_rest, chirp, in_mujoco
 from scipy.linalg import expm
 
 from taccorl.alignment.controller import arm_bench, joint_model
@@ -16,7 +16,7 @@ from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.alignment.controller.joint_model import JointModel, Numbers
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
-from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
@@ -203,7 +203,7 @@ def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
 
 def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     """−K_d (q̇ − τ q̈) on a free mass: what the motor gives is J q̈, not (J − K_d τ) q̈, which is 5 % less here."""
-    joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-3)
+    joint = JointModel.of(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-3))
     time_s = np.arange(2000) * 1e-3
     target = 0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0)
     m = of_signal("made", 1000.0, target, np.zeros(2000), "mass")
@@ -216,7 +216,7 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
 
 def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_reports_the_limit() -> None:
     """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
-    joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-4)
+    joint = JointModel.of(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
     time_s = np.arange(200) * 1e-3
     m = of_signal("made", 1000.0, np.where(time_s > 0.0095, 1.0, 0.0), np.zeros(200), "mass")
     effects = [make_effect("speed_delay", delay_s=1.5e-3), make_effect("torque_saturation", torque_max_nm=1.0)]
@@ -373,7 +373,7 @@ def test_commanded_gains_scale_what_the_model_is_given() -> None:
 
 def test_a_sliding_axis_follows_its_closed_form() -> None:
     # 95 kg, K_p 1e4 N/m, K_d 4e3 N s/m: overdamped, poles at −2.7 and −39.4 1/s.
-    model = JointModel.axis("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", timestep_s=1e-4)
+    model = JointModel.of(AxisJoint("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", step_s=1e-4))
     time_s = np.arange(5000) / 1000
     motion = joint_motion(of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m"), None, "slide")
     answer = model.simulate(motion, model.gains).reported

@@ -44,6 +44,27 @@ def problem(slide: Measurements) -> AxisProblem:
     return AxisProblem(AXIS, slide)
 
 
+def test_cases_side_by_side_are_those_one_by_one(slide: Measurements):
+    """Also where inertia, gains, the delay of targets and effects differ; eight and more of them, some twice."""
+    made, friction = AxisProblem(AXIS, slide), AXIS.effect_class("coulomb_friction")
+    assert friction is not None
+    cases: list[Any] = []
+    for k in range(11):
+        base = made.start | {
+            "inertia": MASS_KG * (1 + 0.02 * (k % 7)),
+            "kp": KP * (1 - 0.01 * k),
+            "target_late_s": 2e-4 * (k % 3),
+        }
+        cases.append((base, [friction(torque_nm=3.0 * k)] if k % 2 else []))  # pyright: ignore[reportCallIssue]
+    cases += [cases[4], cases[9]]
+    recordings = [*made.fit, *made.validation]
+    together = made.simulate_all(cases, recordings)
+    for recording, those in zip(recordings, together, strict=True):
+        assert len({answer.tobytes() for answer in those}) == 11
+        for case, answer in zip(cases, those, strict=True):
+            np.testing.assert_array_equal(AxisProblem(AXIS, slide).simulate(*case, recording), answer)
+
+
 def without_target(m: Measurement) -> Measurement:
     """As a table with position and force alone is read; the force is the mean about the row's time, of which half a step of the
     target is missing before it acts."""

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from imagined_motions import NOISE_RAD, SIGNAL, recorded
+from one_joint import AxisJoint
 
 from taccorl.alignment.controller.arm_bench import AT_TCP
 from taccorl.alignment.controller.joint_model import JointModel
@@ -34,11 +35,11 @@ def problem_of(case: Case, *, effort: bool = False, design: str = "chirp") -> Jo
 def test_a_delay_of_the_loop_is_an_inertia_of_minus_kd_times_it():
     motion = joint_motion(recorded(NOMINAL, CHIRP, 0), None, SIGNAL)
     gains = Gains(150.0, 12.0, 0.0)
-    late = JointModel.axis(SIGNAL, 0.2, gains=gains).simulate(
+    late = JointModel.of(AxisJoint(SIGNAL, 0.2, gains=gains)).simulate(
         motion, gains, [make_effect("speed_delay", arm="left", joints=["joint5"], delay_s=2e-3)]
     )
-    light = JointModel.axis(SIGNAL, 0.2 - 12.0 * 2e-3, gains=gains).simulate(motion, gains)
-    plain = JointModel.axis(SIGNAL, 0.2, gains=gains).simulate(motion, gains)
+    light = JointModel.of(AxisJoint(SIGNAL, 0.2 - 12.0 * 2e-3, gains=gains)).simulate(motion, gains)
+    plain = JointModel.of(AxisJoint(SIGNAL, 0.2, gains=gains)).simulate(motion, gains)
     np.testing.assert_allclose(late.reported, light.reported, rtol=1e-12, atol=1e-15)
     assert np.abs(late.reported - plain.reported).max() > 1e-4
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_problem import MadeProblem
 from made_rows import of_joint
+from one_joint import AxisJoint
 
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -42,7 +43,7 @@ class OneJoint(MadeProblem):
 
     def __init__(self, *names: str) -> None:
         self.candidates: dict[str, Candidate] = {name: candidate(effects.get(name), SEEN) for name in names}
-        self.model = JointModel.axis("left_joint5", J_KGM2, gains=Gains(151.0, 12.0, 0.5))
+        self.model = JointModel.of(AxisJoint("left_joint5", J_KGM2, gains=Gains(151.0, 12.0, 0.5)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         gains = Gains(base.get("kp", TRUTH["kp"]), base.get("kd", TRUTH["kd"]), base["torque_ff"])
