@@ -73,15 +73,18 @@ def run(config: AddEffectConfig) -> int:
         lines = Section(text=[f"  {line}" for line in evidence])
         show(_changes(part, machine.numbers(part), mended.numbers(part)), lines)
     mended.save(out)
-    show(Section(text=[f"wrote {out}; next: {compare_words(made_by, config.twin, None if config.in_place else out)}"]))
+    against = None if config.in_place else out
+    show(Section(text=[f"wrote {out}; next: {compare_words(made_by, [a.part for a in added], config.twin, against)}"]))
     return 0
 
 
-def compare_words(made_by: list[str], twin: Path | None, against: Path | None) -> str:
+def compare_words(made_by: list[str], parts: list[str], twin: Path | None, against: Path | None) -> str:
     """Command that compares ``twin``, and ``against`` beside it, with the recordings of the diagnosis whose words ``made_by``
-    are."""
+    are; if it was of some joints, with those of ``parts``."""
     words = made_by[2:3] or ["YOUR_RECORDINGS"]
-    words += [w for w in made_by if w.startswith(("--spec=", "--columns=", "--accept="))]
+    words += [w for w in made_by if w.startswith(("--spec=", "--columns=", "--validation_every=", "--accept="))]
+    if any(w.startswith("--joints=") for w in made_by):
+        words.append(f"--joints=[{','.join(dict.fromkeys(parts))}]")
     words += [f"--twin={twin}"] * (twin is not None) + [f"--against={against}"] * (against is not None)
     return shlex.join(["taccorl", "compare", *words])
 

@@ -69,6 +69,7 @@ def run(config: CompareConfig) -> int:
     _check_outputs(config)
     from taccorl.diagnosis.comparison.result import origin_words
     from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.diagnosis.problems.joints import of_joints
     from taccorl.report.compared import cell_numbers, how_far, not_compared, where
     from taccorl.report.terminal import show
 
@@ -78,6 +79,8 @@ def run(config: CompareConfig) -> int:
     for name in config.joints:  # before the replays, which take minutes
         if name not in signals:
             raise TaccorlError(f"--joints: {name!r} is in no recording; {nearest(name, signals)}")
+    if config.joints:  # what is wrong with recordings of others holds nothing up
+        measurements = of_joints(measurements, config.joints)
     comparisons: list[Comparison] = []
 
     def replay() -> "Comparison":

@@ -174,7 +174,7 @@ def _next(
         done = [name for name in names if name in mended.effects]
         done += [f"{c.name} of {part} {c.was} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
         yield f"wrote {path}: {', '.join([*done, *whole]) or 'refitted numbers, no effect'}; {mended.saved_words}"
-        yield f"next: {compare_words(command('diagnose', config, 'measurements'), config.twin, path)}"
+        yield f"next: {compare_words(command('diagnose', config, 'measurements'), [f.part for f in found], config.twin, path)}"
         for f in found:
             yield from (
                 f"{f.part}: {doubt}" for doubt in (may_stand_in(f.diagnosis), untested_words(f.diagnosis)) if doubt

@@ -343,7 +343,9 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
 
 
 def _check_places(config: EvaluateConfig) -> None:
-    """Raises TaccorlError: something lies at ``out``, or a number is below its range."""
+    """Raises TaccorlError: something lies at ``out``, a number is below its range, or there is no such physics."""
+    from taccorl.sim.warp_batch import WarpSettings, open_device
+
     if not is_free(config.out) and not config.robot:
         text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
         raise TaccorlError(text)
@@ -351,9 +353,16 @@ def _check_places(config: EvaluateConfig) -> None:
         raise TaccorlError(f"--workers={config.workers}: at least 1")
     if config.failures < 0:
         raise TaccorlError(f"--failures={config.failures}: at least 0")
-    if config.failures and config.physics != "c":
+    warp = WarpSettings.parse(config.physics)
+    if warp is not None and config.workers > 1:
+        raise TaccorlError(
+            f"--workers={config.workers}: --physics={config.physics} runs all episodes in one process: remove it"
+        )
+    if warp is not None and config.failures:
         line = f"--failures={config.failures}: --physics={config.physics} cannot repeat an episode: give --failures=0"
         raise TaccorlError(line)
+    if warp is not None:
+        open_device(warp.device)  # before weights are loaded
     if config.before_mate < 0 or config.before_mate == 1:
         raise TaccorlError(f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared")
     if config.before_mate and config.policy.path is None:

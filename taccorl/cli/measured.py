@@ -170,7 +170,7 @@ def checked(
     show(*found_in_recordings({name: [f for f in own if not _waits(f)] for name, own in found.items()}))
     lines = [f"not read: {line}" for line in measurements.skipped]
     if measurements.unlisted:
-        lines.append(f"not listed in measurements.yaml, used for the fit: {', '.join(measurements.unlisted)}")
+        lines.append(f"not listed in measurements.yaml, taken as use: fit: {', '.join(measurements.unlisted)}")
     if wrong:
         lines.append(
             f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "

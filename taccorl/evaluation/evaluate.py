@@ -182,7 +182,8 @@ def read_stored(folder: Path, scenes: Scenes) -> Stored:
     ]
     if differing:
         raise TaccorlError(f"--against={folder}: was evaluated on other scenes: {'; '.join(differing)}")
-    name = f"{policy} ({folder})"
+    other = its.get("physics", "c")
+    name = f"{policy} ({folder}{f', physics {other}' * (other != scenes.physics)})"
     rows = [dataclasses.replace(row, policy=name) for row in read_rows(folder / ROWS_FILE) if row.policy == policy]
     return Stored(name, rows)
 

@@ -88,7 +88,7 @@ def _values(e: Effect) -> str:
 
 def _to_add(part: str, names: Sequence[str], options: Sequence[str]) -> str:
     pads = [f"--pads={part.removesuffix(' pads')}"] * part.endswith(" pads")
-    own = [option for option in options if not option.startswith("--measurements=")]
+    own = [option for option in options if not option.lstrip("'").startswith("--measurements=")]  # quoted for a shell
     return " ".join(["taccorl add-effect", ",".join(names), *pads, *own])
 
 

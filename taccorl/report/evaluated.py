@@ -107,6 +107,8 @@ class Evaluation:
         for s in summaries(self.rows):
             seen = ", randomised pictures" * (s.pictures == "randomised") + f", hidden: {s.hidden}" * bool(s.hidden)
             lines.append(f"{s.policy}, {s.task}{seen}: {s}")
+        if self.scenes.physics != "c":
+            lines.append(f"physics: MuJoCo Warp ({self.scenes.physics}), float32: not the episodes of MuJoCo C")
         return Section(
             text=[*lines, *(f"{task}, {' against '.join(self.names)}: {c}" for task, c in self.comparisons.items())]
         )

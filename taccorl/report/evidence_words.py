@@ -1,5 +1,6 @@
 """Texts of a diagnosis, the same in the terminal and on the page."""
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 
 from taccorl.diagnosis.search.fits import NEARLY
@@ -119,7 +120,7 @@ def excite_command(part: str, names: Sequence[str]) -> str:
     if part.endswith(" pads"):
         return f"taccorl excite --pads={part.removesuffix(' pads')} {effects}"
     if "_joint" in part or _all_of("joint", names):
-        return f"taccorl excite {part} {effects}"
+        return f"taccorl excite {shlex.quote(part)} {effects}"
     return f"taccorl excite {effects}" if _all_of("cells", names) else ""
 
 

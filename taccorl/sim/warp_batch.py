@@ -30,7 +30,7 @@ _ROWS = 16
 """MuJoCo Warp 4.0.0 pads rows of constraints to this, and reads beyond the others when more are needed (constraint.py,
 ``_regularize_constraint``): without padding it counts them, and ``overflow`` reports it."""
 _FEW = (16, 64)  # worlds whose memory is measured
-_WAY_OUT = "use --env.physics=c"
+_WAY_OUT = "use physics=c"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,15 +52,15 @@ class WarpSettings:
         if physics == "c":
             return None
         if kind != "warp":
-            raise TaccorlError(f"--env.physics={physics}: {nearest(physics, ('c', 'warp'))}")
+            raise TaccorlError(f"physics={physics}: {nearest(physics, ('c', 'warp'))}")
         values: dict[str, Any] = {}
         for option in filter(None, options.split(",")):
             key, _, value = option.partition("=")
             names = [f.name for f in dataclasses.fields(cls)]
             if key not in names:
-                raise TaccorlError(f"--env.physics={physics}: no setting {key!r}; {nearest(key, names)}")
+                raise TaccorlError(f"physics={physics}: no setting {key!r}; {nearest(key, names)}")
             if key != "device" and not (value.isdecimal() and int(value) > 0):
-                raise TaccorlError(f"--env.physics={physics}: {key}={value!r} is no whole number ≥ 1")
+                raise TaccorlError(f"physics={physics}: {key}={value!r} is no whole number ≥ 1")
             values[key] = value if key == "device" else int(value)
         return cls(**values)
 
@@ -89,7 +89,7 @@ def check_supported(model: mujoco.MjModel) -> None:
             mjw.put_model(_for_warp(model))
     except (NotImplementedError, ValueError) as error:
         what = ", ".join(sorted(set(re.findall(r"mj\w+", str(error))))) or error  # its lists name each actuator
-        raise Unsupported(f"--env.physics=warp: MuJoCo Warp does not support {what}; {_WAY_OUT}") from error
+        raise Unsupported(f"physics=warp: MuJoCo Warp does not support {what}; {_WAY_OUT}") from error
 
 
 def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -110,10 +110,10 @@ class WarpBatch(Batch):
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0, *, settings: WarpSettings) -> None:
         super().__init__(model, nsim, nthread)
         self.settings = settings
-        _open(settings.device)
+        open_device(settings.device)
         check_supported(model)
         if settings.constraints < model.nv:  # friction and limits alone
-            raise TaccorlError(f"--env.physics=warp:constraints={settings.constraints}: at least {model.nv} here")
+            raise TaccorlError(f"physics=warp:constraints={settings.constraints}: at least {model.nv} here")
         self._columns = {name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size}
         self._time_s = self.bind("time")
         self._world: _Worlds | None = None
@@ -137,14 +137,14 @@ class WarpBatch(Batch):
     def bind(self, name: str) -> np.ndarray:
         """As ``Batch.bind``: (N, …). Raises TaccorlError: MuJoCo Warp does not compute the field."""
         if name not in mjw.Data.__dataclass_fields__:
-            raise TaccorlError(f"--env.physics=warp: MuJoCo Warp has no field {name}; {_WAY_OUT}")
+            raise TaccorlError(f"physics=warp: MuJoCo Warp has no field {name}; {_WAY_OUT}")
         return super().bind(name)
 
     def expand(self, name: str) -> np.ndarray:
         """As ``Batch.expand``: (N, …). Raises TaccorlError: the field is the same in all of MuJoCo Warp's worlds."""
         if not _varies(name):
             raise TaccorlError(
-                f"--env.physics=warp: {name} must be the same in all worlds of MuJoCo Warp, but this twin varies it; {_WAY_OUT}"
+                f"physics=warp: {name} must be the same in all worlds of MuJoCo Warp, but this twin varies it; {_WAY_OUT}"
             )
         self._varied = None
         return super().expand(name)
@@ -261,7 +261,7 @@ class WarpBatch(Batch):
         peaks_mb = np.array([_peak_mb(lambda n=n: _Worlds(model, n, self.settings, []).run(1)) for n in _FEW])
         each_mb = np.diff(peaks_mb)[0] / np.diff(_FEW)[0]
         raise TaccorlError(
-            f"--env.physics=warp: {self.nsim} worlds do not fit the memory of {self.settings.device} ({fault}): about "
+            f"physics=warp: {self.nsim} worlds do not fit the memory of {self.settings.device} ({fault}): about "
             f"{free_mb / each_mb:.0f} fit, at {each_mb:.2g} MB each. Lower the number of environments, contacts or constraints"
         ) from fault
 
@@ -390,8 +390,8 @@ class _Worlds:
             if flag or needed[name] > have:
                 self._data.overflow.zero_()
                 return (
-                    f"--env.physics=warp: a world needs room for more than {have} {name} ({needed[name]} at the last step; "
-                    f"{kinds(flag).name or 'counted'}). Raise it: --env.physics=warp:{name}={2 * max(have, needed[name])}"
+                    f"physics=warp: a world needs room for more than {have} {name} ({needed[name]} at the last step; "
+                    f"{kinds(flag).name or 'counted'}). Raise it: physics=warp:{name}={2 * max(have, needed[name])}"
                 )
         return ""
 
@@ -434,7 +434,7 @@ def _varies(name: str) -> bool:
     return entry is not None and getattr(entry.type, "shape", ("",))[:1] == ("*",)
 
 
-def _open(device: str) -> None:
+def open_device(device: str) -> None:
     """Start Warp. Raises TaccorlError: the extra is not installed, or there is no such device."""
     require("gpu")
     wp.config.log_level = wp.LOG_ERROR
@@ -442,6 +442,6 @@ def _open(device: str) -> None:
     known = [str(d) for d in wp.get_devices()]
     if device not in known:
         raise TaccorlError(
-            f"--env.physics=warp: no device {device!r}; Warp finds {', '.join(known)}. It needs an NVIDIA GPU with a driver "
-            f"of the R580 series or newer: {_WAY_OUT}, or --env.physics=warp:device=cpu to try it slowly"
+            f"physics=warp: no device {device!r}; Warp finds {', '.join(known)}. It needs an NVIDIA GPU with a driver "
+            f"of the R580 series or newer: {_WAY_OUT}, or physics=warp:device=cpu to try it slowly"
         )

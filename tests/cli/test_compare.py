@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,13 @@ def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder: Path, 
 def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
     code, text = said(folder / "sweeps", "--joints=[right_joint1]")
     assert code == 2 and "'right_joint1'" in text and SIGNAL in text
+    whole = shutil.copytree(folder / "sweeps", folder / "also_broken")
+    still = next(p for p in sorted(whole.glob("*.csv"))).read_text().splitlines()
+    row = still[1].split(",", 1)[1]
+    (whole / "still.csv").write_text("\n".join([still[0], *(f"{line.split(',', 1)[0]},{row}" for line in still[1:])]))
+    assert said(whole)[0] == 1  # nothing moves in it
+    code, text = said(whole, f"--joints=[{SIGNAL}]")
+    assert code == 0 and "still.csv" not in text
 
 
 @pytest.mark.parametrize(

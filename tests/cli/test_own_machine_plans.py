@@ -243,12 +243,14 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said:
     diagnoses = {part: common | {"effects": [{"effect": name} | values]} for part, (name, values) in found.items()}
     (tmp_path / "d").mkdir()
     words = ["taccorl", "diagnose", "'my sweeps'", f"--twin={twin}", "--until=noise_floor", "--columns=c.yaml"]
+    words += ["--validation_every=3", "'--joints=[elbow,shoulder]'"]
     provenance = {"twin, SHA-256": load_machine(twin).digest(), "command": " ".join(words)}
     (tmp_path / "d" / "report.json").write_text(json.dumps({"provenance": provenance, "diagnoses": diagnoses}))
     found_by = f"--diagnosis={tmp_path / 'd'}"
     code, text = said("add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", found_by)
     both = tmp_path / "arm+viscous_friction+coulomb_friction.yaml"
-    words = f"next: taccorl compare 'my sweeps' --columns=c.yaml --twin={twin} --against={both}"
+    words = "next: taccorl compare 'my sweeps' --columns=c.yaml --validation_every=3 '--joints=[shoulder,elbow]' "
+    words += f"--twin={twin} --against={both}"
     assert code == 0 and words in text, text
     made = yaml.safe_load(both.read_text())["joints"]
     for part, (name, values) in found.items():

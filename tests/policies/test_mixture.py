@@ -76,7 +76,7 @@ def test_steps_behind_the_episodes_end_do_not_count(rows):
     torch.manual_seed(0)
     policy = TactilePI05Policy(tiny_config())
     torch.manual_seed(5)
-    errors, _ = policy.action_losses(rows)
+    errors, _, _ = policy._losses_and_fused(rows)
     torch.manual_seed(5)
     loss = policy.forward({**rows, "action_is_pad": pad})[0]
     wanted = [errors[b, : 10 - int(pad[b].sum()), :14].mean() for b in range(8)]

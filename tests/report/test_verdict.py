@@ -15,7 +15,7 @@ from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
-from taccorl.report.diagnosed import brief
+from taccorl.report.diagnosed import _to_add, brief
 from taccorl.report.evidence_words import excite_command, unit_words
 from taccorl.report.report import Report
 from taccorl.report.section import cell
@@ -316,9 +316,12 @@ def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_ref
 def test_what_to_record_is_a_command_for_joints_pads_and_cells_only():
     for part, names, command in (
         ("left_joint5", ("backlash", "cogging"), "taccorl excite left_joint5 --effects=backlash,cogging"),
+        ("ax x", ("backlash", "cogging"), "taccorl excite 'ax x' --effects=backlash,cogging"),
         ("left pads", ("touch_lag", "touch_delay"), "taccorl excite --pads=left --effects=touch_lag,touch_delay"),
         ("fingertip", ("touch_lag", "touch_delay"), "taccorl excite --effects=touch_lag,touch_delay"),
         ("camera", ("camera_pose", "camera_latency"), ""),
     ):
         assert excite_command(part, names) == command
+    quoted = _to_add("ax", ["backlash"], ["'--measurements=data set'", "'--twin=my robot.yaml'"])
+    assert quoted == "taccorl add-effect backlash '--twin=my robot.yaml'"
     assert unit_words("1") == "" and unit_words("s/m") == " s/m"

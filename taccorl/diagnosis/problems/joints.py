@@ -131,7 +131,8 @@ def of_joints(measurements: Measurements, signals: Sequence[str], *, touch: bool
         )
         for use in ("fit", "validation", "test")
     }
-    return dataclasses.replace(measurements, **sides)
+    unlisted = tuple(name for name in measurements.unlisted if name in [m.name for m in sides["fit"]])
+    return dataclasses.replace(measurements, **sides, unlisted=unlisted)
 
 
 def diagnose_joint(

@@ -153,7 +153,7 @@ class TactilePI05Policy(PI05Policy):
             self.rtc_processor.rtc_config = replace(theirs, max_guidance_weight=most, prefix_attention_schedule=how)
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
-        """Return the co-training loss (see ``mixture``) over ``action_losses``, and values for the log (name → float).
+        """Return the co-training loss (see ``mixture``) over ``_losses_and_fused``, and values for the log (name → float).
 
         A row's loss is the mean over its action steps except those beyond the episode's end (LeRobot's pi05 includes them).
         Without such steps, and with one domain, the loss equals LeRobot's flow-matching loss bit by bit. ``batch``: output of the
@@ -184,16 +184,9 @@ class TactilePI05Policy(PI05Policy):
         said: dict[str, Any] = dict(zip(told, torch.stack(list(told.values())).tolist(), strict=True))
         return loss, said
 
-    def action_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
-        """Return (B, H, 32) squared errors of the velocity at a random time, and (B,) bool contact (None: vision only) of the
-        rows of ``batch``.
-
-        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before."""
-        losses_BHA, contact_B, _ = self._losses_and_fused(batch)
-        return losses_BHA, contact_B
-
     def _losses_and_fused(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """``action_losses``; and the fusion's output (B, F), None for backbones without."""
+        """(B, H, 32) squared errors of the velocity at a random time; (B,) bool contact, None: vision only; and the fusion's
+        output (B, F), None for backbones without. Draws noise and time from torch's generator as LeRobot's pi05 does."""
         images, image_masks = self._preprocess_images(batch)
         images = self._tokens(images)
         actions = self.prepare_action(batch)
