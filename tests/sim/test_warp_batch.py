@@ -167,7 +167,7 @@ def test_an_effect_acts_as_in_mujoco_c(warp, name):
 def test_an_effect_that_mujoco_warp_lacks_is_refused_by_name(warp):
     effect = make_effect("integral_action", rate_per_s=0.5)
     others = [make_effect("coulomb_friction", torque_nm=0.4), make_effect("taxel_saturation", limit=4.0)]
-    with pytest.raises(TaccorlError, match=r"integral_action: .*does not support mjDYN_PID .*use physics=c"):
+    with pytest.raises(TaccorlError, match=r"integral_action: .*does not support mjDYN_PID; use physics=c"):
         Simulation(tasks.get("assembly_1")(), TwinConfig(effects=[*others, effect]), physics=ON_CPU)
 
 
