@@ -238,8 +238,8 @@ def _contact_in_every_other(batch: dict[str, Any]) -> dict[str, Any]:
 
 
 def _training_step(policy: Any, batch: dict[str, Any], called: Any = None) -> Callable[[], Any]:
-    """What ``update_policy`` of lerobot-train does: under autocast for the policy's dtype, numbers read for the log. ``called``:
-    the policy or what it is wrapped in."""
+    """One step as ``update_policy`` of lerobot-train makes it: in autocast for the policy's dtype; loss and gradient norm are
+    read for the log. ``called``: module whose forward is run, if it is not the policy itself but a wrapper (DDP)."""
     import torch
 
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())

@@ -79,8 +79,8 @@ def run(config: CompareConfig) -> int:
     for name in config.joints:  # before the replays, which take minutes
         if name not in signals:
             raise TaccorlError(f"--joints: {name!r} is in no recording; {nearest(name, signals)}")
-    if config.joints:  # what is wrong with recordings of others holds nothing up
-        measurements = of_joints(measurements, config.joints)
+    moved = of_joints(measurements, config.joints)  # what is wrong with recordings of others holds nothing up
+    measurements = moved if moved.all else measurements
     comparisons: list[Comparison] = []
 
     def replay() -> "Comparison":

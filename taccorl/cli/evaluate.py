@@ -343,7 +343,7 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
 
 
 def _check_places(config: EvaluateConfig) -> None:
-    """Raises TaccorlError: something lies at ``out``, a number is below its range, or there is no such physics."""
+    """Raises TaccorlError: something lies at ``out``, a number is below its range, or --physics cannot be used here."""
     from taccorl.sim.warp_batch import WarpSettings, open_device
 
     if not is_free(config.out) and not config.robot:

@@ -43,7 +43,7 @@ class Ripple(Added):
 def kind(
     name: str, signal: Callable[[np.ndarray, int], np.ndarray], base: type[Added] = Ripple, **more: Any
 ) -> type[Added]:
-    """An effect with this ``signal`` of times (T,) and seed, and the numbers of ``base``."""
+    """A new effect class called ``name``: it adds ``signal(times, seed)`` (T,) to a trace, and has the parameters of ``base``."""
     return dataclass(kw_only=True)(type(name, (base,), {"name": name, "signal": staticmethod(signal)} | more))
 
 

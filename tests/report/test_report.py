@@ -224,8 +224,8 @@ def test_heat_maps_are_of_the_twin_whose_gains_are_refitted(diagnosed: tuple[Joi
 
 
 def test_numbers_hold_the_diagnosis_and_first_those_that_are_identified(diagnosed: tuple[JointFinding, Path]):
-    """Efforts were recorded here: they fix the scale of the torques, and the absolute friction of 1 N·m is identified. No
-    residuals are among the numbers."""
+    """Recorded efforts determine the scale of the torques, so that the friction of 1 N·m is identified and not only its ratio
+    to K_p. No residuals are among the numbers."""
     finding, path = diagnosed
     content = (path.parent / NUMBERS).read_text()
     every = json.loads(content)

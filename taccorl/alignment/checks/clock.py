@@ -70,7 +70,7 @@ LATE_ROWS = 1.2
 """Least delay that is reported [rows]. A second pole (inertia over K_d) counts as delay, up to 5.7 ms at the twin's joints 2 and
 3, so that less is expected."""
 FITTING = 3.0
-"""A first-order lag describes a joint if it leaves an RMS error below this [noise floors], or as ``FITTING_ROWS`` says."""
+"""A first-order lag describes a joint if it leaves an RMS error below this [noise floors]; else see ``FITTING_ROWS``."""
 FITTING_ROWS = 0.05
 """A first-order lag also describes a joint if its residual is below this share of that of an offset of one row; the delay is
 then wrong by a sixth of a row at most."""

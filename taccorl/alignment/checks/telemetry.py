@@ -140,7 +140,7 @@ def _held_and_exchanged(m: Measurement, f: Finding, findings: Sequence[Finding])
 
 @check("slower_rows", "warning")
 def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> Iterator[tuple[str, Finding]]:
-    """Recordings with fewer rows a second than another one shows targets to arrive; ``rates``: command_hz or 0 (not stated)."""
+    """Find recordings with fewer rows a second than targets changed in another one; ``rates``: joint → stated command_hz or 0."""
     trials = [Trial(m) for m in sound]
     for signal in (signal for signal, hz in rates.items() if hz == 0.0):
         moved = [t.m for t in trials if signal in {t.m.signals[j] for j in t.moving}]

@@ -231,8 +231,8 @@ def simulate_each(
     kept: Answers,
     each_step: bool = False,
 ) -> list[list[JointResponse]]:
-    """As ``JointModel.simulate_all``, of a model of its own for each of ``cases``: of one joint, with the same law and row rate.
-    ``kept``: the newest answers, for the next call."""
+    """``JointModel.simulate_all`` in which case k has the model k: one joint with other numbers each, all with the same law.
+    ``kept``: newest responses of earlier calls, which are not simulated again; this call adds its own."""
     prepared = [model._prepared(case) for model, case in zip(models, cases, strict=True)]
     return [_side_by_side(models, motion, prepared, kept.setdefault(motion, {}), each_step) for motion in motions]
 
@@ -268,7 +268,7 @@ def _side_by_side(
         drive["gravity_cos"] += weight * case.lever.cos_m
         drive["effort_holds_weight"] = float(joint.effort_holds_weight)
         if drive["effort_after"] and late_s > 0.0:
-            # The force that answers a row's target acts once it has come, and is of the position then.
+            # A row's target arrives late_s after the row: the effort that it causes begins then, from the position at that time.
             drive["effort_after"] = 1 + math.ceil(late_s * motion.rate_hz * parts - 1e-9)
             drive["effort_age"] -= late_s
         keys.append((*when, *drive.values(), held_n, each_step, *map(repr, bodies)))

@@ -259,7 +259,7 @@ class TorqueSaturation(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Values at which fits start, {parameter: value}: 55 to 97 % of the most torque commanded, and the most measured."""
+        """Starts of fits, name → limit [N·m]: 55 to 97 % of the largest simulated motor torque; the largest measured one."""
         peak_nm = seen.get("peak_motor_nm", seen["peak_torque_nm"])
         values = [s * peak_nm for s in (0.55, 0.75, 0.88, 0.97)] + [seen[n] for n in ("peak_measured_nm",) if n in seen]
         return [{"torque_max_nm": cls.clipped("torque_max_nm", value)} for value in values]

@@ -64,7 +64,7 @@ def typical(name: str, signal: str) -> Effect:
 
 
 def from_rest(signal: str, seconds: float = 3.0, **options: float) -> tuple[JointModel, JointMotion]:
-    """The twin's joint, and a chirp of it from where it stands still."""
+    """Model of one joint of the nominal twin, and a chirp of ``seconds`` that begins with the joint at rest."""
     model = JointModel(TWIN, signal)
     return model, at_rest(joint_motion(chirp(signal, seconds, **options), TWIN, signal), model.gains)
 

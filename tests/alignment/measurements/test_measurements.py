@@ -23,7 +23,7 @@ def names(measurements) -> list[str]:
 
 
 def of_one(words: str) -> str:
-    """An index that says this of one recording."""
+    """Text of a measurements.yaml with the facts ``words`` about sweep_1.csv."""
     return f"recordings: {{sweep_1.csv: {{{words}}}}}"
 
 

@@ -134,7 +134,7 @@ def test_a_direction_that_the_recordings_leave_open_is_wide_and_no_trouble(monke
 
 
 Overtone = kind("overtone", lambda t, seed: Ripple.signal(t, seed) + 0.3 * np.sin(90.0 * t))
-"""Most of a ripple, and something that is not there."""
+"""The ripple's signal, plus a sine at 90 rad/s that no recording contains."""
 
 
 def test_a_round_goes_on_to_the_next_effect_when_the_best_one_is_refused():
