@@ -9,7 +9,7 @@ shows the chain on a CPU in minutes and learns nothing.
 
 ``--sources=[10,0]``: demonstrations that MimicGen makes of ten, and the expert's own: how many different grips a policy needs.
 ``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: learnt in the nominal twin, in the one that commands mend
-(surrogate ── diagnose --until=noise_floor), and in the surrogate, scored in it; ``--singly``: also in each effect alone.
+(surrogate ── diagnose --until=noise_floor), and in the surrogate, scored in it; ``--singly=true``: also in each effect alone.
 ``--scored_in=[late.yaml] --real=50 --sim_weight=[0,0.5,0.95]``: co-trained with 50 demonstrations of the surrogate.
 """
 
@@ -93,8 +93,8 @@ class LearnConfig:
     real: int = 0
     """Demonstrations of each of --scored_in, which stands for the robot, that are merged with those of the twin; without poses of
     the parts, which only a simulator knows."""
-    sim_weight: list[float] = field(default_factory=lambda: [0.5])
-    """α: weight of the twin's loss beside --real. 0: those of --real alone are learnt from."""
+    sim_weight: list[float] = field(default_factory=list)
+    """α: weight of the twin's loss beside --real, 0.5 if not given. 0: those of --real alone are learnt from."""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
@@ -190,7 +190,7 @@ def _check(config: LearnConfig) -> None:
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
     ones = ("executed", "episodes", "rows_per_picture", "workers", "scored")
     ones += ("batch_size", "physics_steps", "episode_length")
-    for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "sources": 0}).items():
+    for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "sources": 0, "real": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
         numbers = value if isinstance(value, list) else [least if value is None else value]
@@ -204,8 +204,12 @@ def _check(config: LearnConfig) -> None:
         raise SystemExit(f"{asked}: of which surrogate? Give its twin file as --scored_in=")
     if config.real and (config.singly or len(config.episodes) > 1):
         raise SystemExit(f"--real={config.real}: takes one number of --episodes, and no --singly")
-    if not config.sim_weight or not all(0 <= weight <= 1 for weight in config.sim_weight):
+    if not all(0 <= weight <= 1 for weight in config.sim_weight):
         raise SystemExit(f"--sim_weight={config.sim_weight}: shares of the loss, 0 … 1")
+    if config.sim_weight and not config.real:
+        raise SystemExit(
+            f"--sim_weight={config.sim_weight}: weights the twin's loss beside that of --real=50, or so many"
+        )
     try:
         for path in config.scored_in:
             load_twin(path)
@@ -291,24 +295,23 @@ def mended(config: LearnConfig, robot: Path) -> Path:
 
 def datasets(config: LearnConfig) -> Iterator[Made]:
     """Make the demonstrations of every combination, as far as they are not there."""
-    few, alone = dataclasses.replace(config, episodes=[config.real]), set[Path]()
+    few, there = dataclasses.replace(config, episodes=[config.real]), set[tuple[Path, float]]()
+    weights = (config.sim_weight or [0.5]) if config.real else []
     for (twin, robots), task, sources in itertools.product(_twins(config).items(), config.task, config.sources):
-        dataset, store = demonstrations(config, task, twin, sources)
         about = {"twin": named(twin) if twin else ""} | ({"sources": sources} if sources else {})
-        if not config.real:
-            yield Made(task, dataset, store, about, robots)
-        for robot, weight in itertools.product(filter(None, robots), config.sim_weight if config.real else []):
-            real, _ = demonstrations(few, task, robot, domain="surrogate")
-            both = real.with_name(f"{dataset.name if weight else 'nothing'}_and_{real.name}")
-            if both not in alone:
-                sim = [dataset] if weight else []
-                merged = MergeConfig(
-                    real=[real], sim=sim, out=both, store=store, pictures="cache", resolution=RESOLUTION
-                )
-                step(merge.run, merged)
-                mixed = {"real": config.real, "sim_weight": weight}
-                yield Made(task, both, store, (about if weight else {"twin": "", "demonstrations": 0}) | mixed, [robot])
-            alone |= set() if weight else {both}
+        many = None if weights == [0] else demonstrations(config, task, twin, sources)
+        if many and not config.real:
+            yield Made(task, *many, about, robots)
+        for robot, weight in itertools.product(filter(None, robots), weights):
+            real, store = demonstrations(few, task, robot, domain="surrogate")
+            sim = [many[0]] if many and weight else []
+            both = real.with_name(f"{sim[0].name if sim else 'nothing'}_and_{real.name}")
+            if (both, weight) not in there:
+                frames: dict[str, Any] = {"pictures": "cache", "resolution": RESOLUTION}
+                step(merge.run, MergeConfig(real=[real], sim=sim, out=both, store=store, **frames))
+                mixed = {"real": config.real, "sim_weight": weight} | ({} if sim else {"twin": "", "demonstrations": 0})
+                yield Made(task, both, store, about | mixed, [robot])
+            there.add((both, weight))
 
 
 def demonstrations(

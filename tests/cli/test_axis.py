@@ -262,12 +262,14 @@ def test_a_file_of_another_axis_is_refused(bench: Path, said: Any, tmp_path: Pat
     assert code != 0 and message in text
 
 
-def test_efforts_of_other_gains_name_these_and_no_effect(bench: Path, said: Any, tmp_path: Path):
+@pytest.mark.parametrize("in_the_file", [False, True])
+def test_efforts_of_other_gains_name_these_and_no_effect(bench: Path, said: Any, tmp_path: Path, in_the_file: bool):
     shutil.copytree(bench / "bench", tmp_path / "bench")
-    gains = {"kp": {"slide": 2 * KP}, "kd": {"slide": KD}}
+    gains: dict[str, Any] = {} if in_the_file else {"kp": {"slide": 2 * KP}, "kd": {"slide": KD}}
     index = {"one.csv": gains, "again.csv": gains | {"repeat_of": "one.csv"}, "held.csv": gains | {"use": "validation"}}
     (tmp_path / "bench" / "measurements.yaml").write_text(json.dumps({"recordings": index}))
-    words = ("diagnose", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}", f"--out={tmp_path / 'd'}", FEW)
+    (tmp_path / "drive.yaml").write_text(FILE.replace(f"kp: {KP}", f"kp: {2 * KP if in_the_file else KP}"))
+    words = ("diagnose", tmp_path / "bench", f"--twin={tmp_path / 'drive.yaml'}", f"--out={tmp_path / 'd'}", FEW)
     code, text = said(*words)
     assert code == 1 and re.search("slide: not diagnosed: .*`kp: (3.[89]|4)[0-9.]*e.04`", text) and "lacks" not in text
     assert "slide lacks" in said(*words, "--accept=other_gains")[1]

@@ -5,13 +5,18 @@ import json
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipelines import learn
 from taccorl.data.dataset import Dataset
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
+from taccorl.training.cotrain import origins_of
+
+LATE = "configs/surrogates/late.yaml"
 
 
 @pytest.mark.slow
@@ -43,6 +48,21 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     assert commands == ["collect", "collect", "augment", "execute"]  # which find what they made; no training
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_demonstrations_of_a_surrogate_are_merged_as_the_robot_s(tmp_path: Path) -> None:
+    words = ["--small", f"--scored_in=[{LATE}]", "--twins=[nominal,surrogate]", "--real=1", "--sim_weight=[0,0.5]"]
+    alone, mixed, other = learn.main([*words, "--episodes=1", f"--out={tmp_path}"])  # of the surrogate alone: once
+    about = [json.loads((one.scores[0] / "settings.json").read_text()) for one in (alone, mixed, other)]
+    assert [(a["demonstrations"], a["real"], a["sim_weight"]) for a in about] == [(0, 1, 0), (1, 1, 0.5), (1, 1, 0.5)]
+    assert [a["twin"].rpartition("_")[0] for a in about] == ["", "", "late"]
+    assert [TactilePI05Config.from_pretrained(one.policy).sim_weight for one in (alone, mixed)] == [0, 0.5]
+    assert [origin.domain for origin in origins_of(Dataset(mixed.dataset))] == ["surrogate", "twin"]
+    poses = Dataset(mixed.dataset).episode(0).arrays[PARTS_KEY], Dataset(mixed.dataset).episode(1).arrays[PARTS_KEY]
+    assert np.isnan(poses[0]).all() and np.isfinite(poses[1]).all()
+    assert PARTS_KEY not in Dataset(alone.dataset).info["features"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -56,6 +76,11 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
         (["--twins=[mended]"], "of which surrogate"),
         (["--singly=true"], "--singly: of which surrogate"),
         (["--scored_in=[no_such.yaml]"], "no_such.yaml"),
+        (["--real=5"], "--real=5: of which surrogate"),
+        (["--real=-1"], "real=-1: at least 0"),
+        ([f"--scored_in=[{LATE}]", "--real=5", "--episodes=[1,2]"], "one number of --episodes"),
+        (["--sim_weight=[0.5]"], r"beside that of --real=50"),
+        (["--sim_weight=[0.5,2]"], r"sim_weight=\[0.5, 2.0\]: .*0 … 1"),
     ],
 )
 def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:

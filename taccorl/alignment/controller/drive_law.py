@@ -22,6 +22,7 @@ V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measuremen
 ``NAME.enabled`` is 0 the motor neither drives nor brakes.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -275,3 +276,12 @@ class DriveLaw:
                 f"{m.name}: a supply voltage of {signal} is stated, but law {self.law} does not use it; remove it"
             )
         return np.nan_to_num(np.append(volts[1:], volts[-1]) / self.supply_v, nan=1.0)
+
+
+def with_gains(m: Measurement, laws: Mapping[str, DriveLaw]) -> Measurement:
+    """``m`` with the gains that the ``laws`` of its signals state, where its own statement has none."""
+    stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
+    for name, law in laws.items():
+        for key in law.gain_names:
+            stated[key].setdefault(name, m.gain_scale.get(name, 1.0) * getattr(law, key))
+    return dataclasses.replace(m, kp=stated["kp"], kd=stated["kd"])

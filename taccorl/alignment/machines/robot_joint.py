@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from taccorl.alignment.controller.drive_law import with_gains
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings, beside_model, moved_by_others, resting
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -239,12 +240,7 @@ class RobotJoint(RigidJoint):
                     f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, but according to the robot file the "
                     "controller compensates the weight; cut the recording there"
                 )
-        stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
-        for name, joint in self._robot.config.joints.items():
-            if joint.gains == "commanded":
-                for key in joint.gain_names:
-                    stated[key].setdefault(name, m.gain_scale.get(name, 1.0) * getattr(joint, key))
-        m = dataclasses.replace(m, kp=stated["kp"], kd=stated["kd"])
+        m = with_gains(m, {n: joint for n, joint in self._robot.config.joints.items() if joint.gains == "commanded"})
         if m.signals == names:
             return m
         kinds = tuple(m.target_kind(name) if name in m.signals else "position" for name in names)

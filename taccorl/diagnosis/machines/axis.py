@@ -15,6 +15,7 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_fit
 from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
 from taccorl.alignment.checks.telemetry import least_motion
+from taccorl.alignment.controller.drive_law import with_gains
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, Use
@@ -85,7 +86,9 @@ class Axis(Machine):
             self._check_signal(m)
             wrong = [*_beyond_limits(config, m), *beyond_effort(config, m, config.name, file)]
             found[m.name] = wrong or _wrong_inertia(config, m, fit)
-        check_effort_time(config, measurements.all, found, config.name, file)
+        stated = {config.name: config} if config.gains == "commanded" else {}
+        every = [with_gains(m, stated) for m in measurements.all]
+        check_effort_time(config, every, found, config.name, file)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:

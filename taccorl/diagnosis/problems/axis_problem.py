@@ -171,8 +171,9 @@ class AxisProblem(WithoutMaps):
         else:
             within, numbers = 1.0, {}
         if axis.target_kind == "position":
-            high = max(TIMING_S, axis.target_late_s)
-            found.append(Free(name="target_late_s", unit="s", start=axis.target_late_s, low=0.0, high=high, scale=1e-4))
+            at = axis.target_late_s
+            late = Free(name="target_late_s", unit="s", start=at, low=0.0, high=max(TIMING_S, at), scale=1e-4)
+            found.append(dataclasses.replace(late, unless="command_delay"))
         if self.effort and axis.loop_hz and axis.kd and axis.law != "pwm":
             high = max(FILTER_PERIODS / axis.loop_hz, axis.speed_late_s)
             found.append(Free(name="speed_late_s", unit="s", start=axis.speed_late_s, low=0.0, high=high, scale=1e-4))

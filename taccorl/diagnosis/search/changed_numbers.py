@@ -31,18 +31,22 @@ STATED = {
 }
 """Always fitted number that a file can state → group of numbers that are judged together. Not here: gains that nobody knows and
 that are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
+NEGLIGIBLE = 0.01
+"""A number that the added effects bring back to within this share of the file's value is not named. A choice."""
 OF_LOOP = ("loop_s", "speed_delay_s")
 """Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 
 
 def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Changed, ...]:
     """Numbers of the file whose refit explains a part of the error of the twin as it was: before an effect was added, unless the
-    added ones bring them back into their 95 % intervals; and beside the added ones. ``names``: effects that may be missing."""
+    added ones bring them back into their 95 % intervals or near it (``NEGLIGIBLE``); and beside the added ones. ``names``: effects that may be missing."""
     found: dict[str, Changed] = {}
     intervals = model.intervals()
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
+            if fit is not model:
+                moved = [f for f in moved if not _near(fits.given[f.name], model.values[f.name])]
             of_drive = frees[0].name in (*STATED, *OF_LOOP)
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
@@ -55,6 +59,10 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
                 )
                 found.setdefault(name, own)
     return tuple(found.values())
+
+
+def _near(stated: float, fitted: float) -> bool:
+    return abs(fitted - stated) <= NEGLIGIBLE * abs(stated)
 
 
 def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:

@@ -306,6 +306,17 @@ def test_targets_that_were_computed_for_one_delay_are_not_used_for_another(slide
     assert np.median((first - later)[moving] / np.gradient(first)[moving]) == pytest.approx(0.4, abs=0.02)
 
 
+def test_a_delay_of_commands_is_not_shared_with_the_lateness_of_targets(slide: Measurements):
+    """Both delay the target; beside the effect the lateness stays as the file has it, 0."""
+    problem = AxisProblem(dataclasses.replace(AXIS, kd=4.0 * KD, known=("kp", "kd", "inertia")), slide)
+    (recording, *_), candidate = problem.fit, problem.candidates["command_delay"]
+    measured = problem.simulate(problem.start, [candidate.make({"command_delay.delay_s": 8e-3})], recording)
+    start = problem.start | {"command_delay.delay_s": 7.5e-3, "target_late_s": 4e-4}
+    recordings = [dataclasses.replace(recording, measured=measured)]
+    found = best_fit(problem, recordings, ("command_delay",), [start], 30).values
+    assert found["command_delay.delay_s"] == pytest.approx(8e-3, abs=1e-6) and found["target_late_s"] == 0.0
+
+
 def of_a_sampled_loop(
     speed_rows: int,
     friction_n: Callable[[float], float] = lambda speed: FRICTION_N,
