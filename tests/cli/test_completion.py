@@ -5,7 +5,6 @@ import importlib
 import shutil
 import subprocess
 import typing
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +28,7 @@ LAST_WORD = {  # prints what the shell offers for the last of these words
 
 
 @pytest.mark.parametrize("verb", CONFIGS)
-def test_options_read_from_source_are_those_of_the_config(verb: str) -> None:
+def test_options_read_from_source_are_those_of_the_config(verb):
     kind = getattr(importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}"), CONFIGS[verb])
     expected = {"config_path"}
     for field, hint in typing.get_type_hints(kind).items():
@@ -42,16 +41,14 @@ def test_options_read_from_source_are_those_of_the_config(verb: str) -> None:
     }
 
 
-def test_the_script_is_made_without_any_library() -> None:
+def test_the_script_is_made_without_any_library():
     heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml', 'taccorl.cli.collect'}"
     code = f"import sys; from taccorl.cli.main import main; main(['completion', 'bash']); print({heavy} & set(sys.modules))"
     assert fresh_python("-c", code).stdout.splitlines()[-1] == "set()"
 
 
 @pytest.mark.parametrize("shell", LAST_WORD)
-def test_a_shell_offers_verbs_options_words_and_files(
-    shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_shell_offers_verbs_options_words_and_files(shell, tmp_path, capsys):
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed")
     assert main(["completion", shell]) == 0
@@ -71,7 +68,7 @@ def test_a_shell_offers_verbs_options_words_and_files(
     assert "a file.mcap" in offered("taccorl", "check", "a").replace("\\", "")
 
 
-def test_every_verb_has_options_or_words() -> None:
+def test_every_verb_has_options_or_words():
     for group in VERBS.values():
         for verb in group:
             assert (verb == "completion") != bool(options_of(verb)), verb

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -34,7 +33,7 @@ HELP = {
 TACCORL = [sys.executable, "-m", "taccorl.cli.main"]
 
 
-def test_the_list_names_every_verb_and_needs_no_library() -> None:
+def test_the_list_names_every_verb_and_needs_no_library():
     heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml'}"
     code = f"import sys; from taccorl.cli.main import main; main([]); print({heavy} & set(sys.modules) or 'light')"
     done = fresh_python("-c", code)
@@ -48,7 +47,7 @@ def test_the_list_names_every_verb_and_needs_no_library() -> None:
 
 
 @pytest.mark.parametrize(("stated", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
-def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(stated: dict[str, str], threads: str):
+def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(stated, threads):
     code = (
         "import atexit, os; atexit.register(lambda: print(os.environ['OPENBLAS_NUM_THREADS']));"
         "from taccorl.cli.main import main; main()"
@@ -58,23 +57,23 @@ def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(s
 
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])
-def test_the_list_is_no_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_is_no_error(words, capsys):
     assert main(words) == 0
     assert "usage: taccorl <verb>" in capsys.readouterr().out
 
 
-def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_the_packages(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"taccorl {taccorl.__version__}\n"
 
 
 @pytest.mark.parametrize(("typo", "meant"), [("ingst", "ingest"), ("chekc", "check"), ("veiw", "view")])
-def test_an_unknown_verb_names_the_nearest(typo: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_verb_names_the_nearest(typo, meant, capsys):
     assert main([typo, "x"]) == 2
     assert capsys.readouterr().err == f"taccorl: no verb {typo!r}; did you mean {meant!r}?\n"
 
 
-def test_help_names_every_registered_task_but_the_empty_bench(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_every_registered_task_but_the_empty_bench(capsys):
     from taccorl.sim.task import tasks
 
     with pytest.raises(SystemExit):
@@ -83,7 +82,7 @@ def test_help_names_every_registered_task_but_the_empty_bench(capsys: pytest.Cap
     assert {name for name in tasks if f" {name}" in shown} == set(tasks) - {"bench"}
 
 
-def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys):
     verbs = {verb for group in VERBS.values() for verb in group} - {"lineage", "completion", "task"}
     assert verbs | {
         f"{v} {second}" for v, words in SECOND_WORDS.items() for second in words if v != "completion"
@@ -100,7 +99,7 @@ def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys: py
     assert number <= 120
 
 
-def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_what_options_with_choices_are(capsys):
     """draccus overlooks the docstrings of Literal fields, also of those in a config within a config."""
     for verb, option, text in (
         ("diagnose", "--until {one,noise_floor}", "find the most likely missing effect of each joint"),
@@ -131,9 +130,7 @@ def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[
         (KeyboardInterrupt(), 130, "taccorl ingest: stopped; what was finished is kept"),  # in its store
     ],
 )
-def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
-    raised: BaseException, code: int, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(raised, code, words, monkeypatch, capsys):
     def fail(argv: Any) -> int:
         raise raised
 
@@ -165,7 +162,7 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
         (("lineage", "explain", "nope"), "taccorl lineage explain: "),
     ],
 )
-def test_a_refused_command_makes_no_store(words: tuple[str, ...], named: str, tmp_path: Path, said: Any) -> None:
+def test_a_refused_command_makes_no_store(words, named, tmp_path, said):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     code, shown = said(*words)
@@ -174,7 +171,7 @@ def test_a_refused_command_makes_no_store(words: tuple[str, ...], named: str, tm
 
 
 @pytest.mark.parametrize("words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")])
-def test_a_reader_that_goes_away_is_no_error_message(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_reader_that_goes_away_is_no_error_message(words, tmp_path):
     from tests.recordings.stand_in import StandInConfig, write_mcap
 
     write_mcap(tmp_path / "a.mcap", StandInConfig(duration_s=2.0, camera_size=(96, 128)))

@@ -97,7 +97,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("plain", {"sim_weight": 0.95}, r"sim_weight=0\.95: dataset local/plain.*no observation\.is_sim.*taccorl merge --real=…"),
     ],
 )  # fmt: skip
-def test_what_a_training_cannot_be_begun_with(place: Path, dataset: str, settings: dict, said: str) -> None:
+def test_what_a_training_cannot_be_begun_with(place, dataset, settings, said):
     with pytest.raises(TaccorlError, match=said):
         policy_for(place / dataset, **settings)
 
@@ -110,7 +110,7 @@ def test_what_a_training_cannot_be_begun_with(place: Path, dataset: str, setting
         ("blind", r"local/blind.*has no observation\.tactile"),
     ],
 )  # fmt: skip
-def test_what_a_checkpoint_cannot_be_trained_on_with(place: Path, dataset: str, said: str) -> None:
+def test_what_a_checkpoint_cannot_be_trained_on_with(place, dataset, said):
     with pytest.raises(TaccorlError, match=said):
         goes_on(place / "checkpoint", place / dataset)
 
@@ -137,8 +137,8 @@ def earlier_checkpoint(place: Path) -> Path:
 
 @pytest.mark.parametrize("checkpoint", ["checkpoint", "earlier_checkpoint"])
 def test_joints_in_another_order_than_the_checkpoints_are_refused_with_both_orders(
-    place: Path, earlier_checkpoint: Path, checkpoint: str
-) -> None:
+    place, earlier_checkpoint, checkpoint
+):
     with pytest.raises(TaccorlError) as error:
         goes_on(place / checkpoint, place / "moved")
     said = str(error.value)
@@ -146,15 +146,13 @@ def test_joints_in_another_order_than_the_checkpoints_are_refused_with_both_orde
     assert goes_on(place / checkpoint, place / "plain").config.joint_names["observation.state"] == list(NAMES)
 
 
-def test_a_state_in_another_order_is_refused_too(place: Path, earlier_checkpoint: Path) -> None:
+def test_a_state_in_another_order_is_refused_too(place, earlier_checkpoint):
     with pytest.raises(TaccorlError, match=r"elements of observation\.state are in another order"):
         goes_on(place / "checkpoint", place / "moved_state")
     assert goes_on(earlier_checkpoint, place / "moved_state").config.joint_names["observation.state"] == list(SWAPPED)
 
 
-def test_a_dataset_without_names_is_warned_about_and_the_checkpoint_keeps_its_own(
-    place: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_dataset_without_names_is_warned_about_and_the_checkpoint_keeps_its_own(place, caplog):
     policy = goes_on(place / "checkpoint", place / "unnamed")
     assert caplog.text.count("is not known") == 2
     assert policy.config.joint_names == {"action": list(NAMES), "observation.state": list(NAMES)}
@@ -162,7 +160,7 @@ def test_a_dataset_without_names_is_warned_about_and_the_checkpoint_keeps_its_ow
         assert getattr(policy_for(place / "unnamed").config, key) is None
 
 
-def test_grouped_names_are_compared_one_by_one() -> None:
+def test_grouped_names_are_compared_one_by_one():
     config, meta = TactilePI05Config(**TINY, tactile=False), of_names({"motors": list(NAMES)})
     config.action_feature_names = ["motors"]  # as LeRobot's make_policy sets it
     config.match_dataset(meta)
@@ -189,9 +187,7 @@ def of_names(names: Any) -> Any:
         ("plain", (), ""),
     ],
 )
-def test_lerobot_train_refuses_other_joints_and_missing_cameras(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dataset: str, words: tuple[str, ...], said: str
-) -> None:
+def test_lerobot_train_refuses_other_joints_and_missing_cameras(place, tmp_path, monkeypatch, dataset, words, said):
     """The command itself, up to the first step of the training."""
     from lerobot.scripts import lerobot_train
 
@@ -227,7 +223,7 @@ def test_lerobot_train_refuses_other_joints_and_missing_cameras(
         lerobot_train.main()
 
 
-def test_the_ways_out_lead_out(place: Path) -> None:
+def test_the_ways_out_lead_out(place):
     assert not policy_for(place / "blind", tactile=False).config.tactile
     assert policy_for(place / "short", tactile_history=5).config.tactile_history == 5
     assert policy_for(place / "short", tactile_history=3, tactile_stride=3).config.window_rows == 7
@@ -240,7 +236,7 @@ def test_the_ways_out_lead_out(place: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_share_of_simulated_rows_is_counted_where_statistics_have_lost_it(place: Path, tmp_path: Path) -> None:
+def test_the_share_of_simulated_rows_is_counted_where_statistics_have_lost_it(place, tmp_path):
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
     path = tmp_path / "both/meta/stats.json"
     stats = json.loads(path.read_text())
@@ -254,7 +250,7 @@ def test_the_share_of_simulated_rows_is_counted_where_statistics_have_lost_it(pl
 
 
 @pytest.mark.slow
-def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_said(place: Path, tmp_path: Path) -> None:
+def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_said(place, tmp_path):
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
     policy_for(tmp_path / "both").save_pretrained(tmp_path / "co_trained")
 
@@ -266,7 +262,7 @@ def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_sai
 
 
 @pytest.mark.slow
-def test_one_domain_left_by_a_choice_of_episodes_is_noticed(place: Path, tmp_path: Path) -> None:
+def test_one_domain_left_by_a_choice_of_episodes_is_noticed(place, tmp_path):
     """As ``--dataset.episodes=[0]`` of a merged dataset: the share p is that of the rows that are read."""
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
     dataset = read_fast(tmp_path / "both", episodes=[2])

@@ -1,7 +1,6 @@
 """Files that ask for more than a machine has, or for files that are not theirs: one recording refused, the others read."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +55,7 @@ def virtual(file: h5py.File, name: str) -> None:
         (virtual, (OTHER, "virtual dataset", "not opened")),
     ],
 )
-def test_a_dataset_that_must_not_be_read_costs_its_own_recording_only(
-    make: Callable[[h5py.File, str], Any], facts: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_dataset_that_must_not_be_read_costs_its_own_recording_only(make, facts, tmp_path):
     folder = tmp_path / "in"
     write(folder / "episode_0.hdf5")
     with h5py.File(write(folder / "episode_1.hdf5"), "a") as file:
@@ -72,7 +69,7 @@ def test_a_dataset_that_must_not_be_read_costs_its_own_recording_only(
     assert all(fact in refused["reason"] for fact in facts)
 
 
-def test_rows_that_were_never_written_are_no_zeros(tmp_path: Path) -> None:
+def test_rows_that_were_never_written_are_no_zeros(tmp_path):
     path = write(tmp_path / "e.hdf5")
     with h5py.File(path, "a") as file:
         del file["action"]
@@ -82,7 +79,7 @@ def test_rows_that_were_never_written_are_no_zeros(tmp_path: Path) -> None:
     assert reader.damage[0].reason == "/action, rows 30 to 39 cannot be read (never written)"
 
 
-def test_a_thousand_million_rows_are_refused_at_once(tmp_path: Path) -> None:
+def test_a_thousand_million_rows_are_refused_at_once(tmp_path):
     path = tmp_path / "e.hdf5"
     with h5py.File(path, "w") as file:
         file.create_dataset("action", (10**9, 14), "f4", chunks=(1000, 14))[:1000] = 1.0
@@ -95,9 +92,7 @@ def test_a_thousand_million_rows_are_refused_at_once(tmp_path: Path) -> None:
     assert time.monotonic() - begin_s < 5
 
 
-def test_a_recording_that_needs_too_much_memory_does_not_end_the_batch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_that_needs_too_much_memory_does_not_end_the_batch(tmp_path, monkeypatch):
     path = write(tmp_path / "e.hdf5")
 
     def too_much(*_: Any) -> None:

@@ -69,9 +69,7 @@ def entry_of(path: Path, spec: RecordingSpec) -> dict[str, Any]:
     return ingest_one(job)
 
 
-def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_its_place(
-    bag: Path, spec: RecordingSpec
-) -> None:
+def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_its_place(bag, spec):
     clean = entry_of(bag, spec)
     assert not [f for f in clean["episodes"][0]["findings"] if f["severity"] != "note"]
     # Sample 302 lies between row 45 (sample 300) and row 46 (sample 306.7): no row shows it.
@@ -97,7 +95,7 @@ def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_
         assert fact in finding["text"]
 
 
-def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(bag: Path, spec: RecordingSpec) -> None:
+def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(bag, spec):
     path = db3_of(bag)
     with sqlite3.connect(path) as connection:
         ((number, log_ns),) = connection.execute("SELECT id, timestamp FROM messages WHERE id = 20")
@@ -108,7 +106,7 @@ def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(ba
     assert f"row {number} missing from index timestamp_idx" in entry["reason"]
 
 
-def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag: Path, spec: RecordingSpec) -> None:
+def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag, spec):
     sec, nanosec = divmod(START_NS + 300 * 5_000_000, 10**9)
     old = struct.pack("<iI", sec, nanosec)
     change(db3_of(bag), old, struct.pack("<iI", sec ^ 1 << 28, nanosec))
@@ -118,9 +116,7 @@ def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag: Pa
     assert entry_of(bag, spec)["outcome"] == "quarantined"
 
 
-def test_the_report_and_the_screen_say_that_a_bag_has_no_checksums(
-    bag: Path, spec: RecordingSpec, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_and_the_screen_say_that_a_bag_has_no_checksums(bag, spec, tmp_path, capsys):
     entry = entry_of(bag, spec)
     assert "SQLite" in entry["unprotected"] and "no checksums" in entry["unprotected"]
     assert main(["ingest", str(bag), f"--spec={tmp_path / 'spec.yaml'}", "--dry_run=true"]) == 0
@@ -134,7 +130,7 @@ def unprotected(path: Path, name: str, spec: str) -> str:
     return reader.unprotected
 
 
-def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path: Path) -> None:
+def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path):
     path = write_hdf5(tmp_path / "e.hdf5")
     with h5py.File(path, "a") as file:
         for name, options in (("action", {"fletcher32": True}), ("observations/qpos", {"compression": "gzip"})):
@@ -154,7 +150,7 @@ def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path: Path) -> N
     assert damage.reason.startswith("/action, rows 31 to 61 cannot be read")
 
 
-def test_mcap_without_crcs_is_called_unprotected_and_with_them_not(tmp_path: Path) -> None:
+def test_mcap_without_crcs_is_called_unprotected_and_with_them_not(tmp_path):
     path = tmp_path / "a.mcap"
     for options, is_protected in (
         ({}, True),

@@ -31,9 +31,7 @@ LEANING = {"torque_nm": 0.5, "asymmetry": 0.3}
         ("stribeck_friction", STRIBECK, 0.4, 0.7, 0.5 + 0.5 * np.exp(-16.0), 0.02),
     ],
 )
-def test_a_steady_sweep_takes_the_torque_of_the_law(
-    name: str, values: dict[str, float], speed: float, seconds: float, torque_nm: float, rel: float
-) -> None:
+def test_a_steady_sweep_takes_the_torque_of_the_law(name, values, speed, seconds, torque_nm, rel):
     motion = drive(start(on_joint5(name, **values)), seconds, lambda t: speed * t)
     assert motion["v"][-1] == pytest.approx(speed, rel=0.02)
     assert asked_nm(motion)[-1] == pytest.approx(torque_nm, rel=rel)
@@ -72,9 +70,7 @@ def balance(torque_nm: Callable[[float], float], goal: float) -> float:
         ({"coulomb_friction": {"torque_nm": 0.5}}, -0.02, lambda q: -0.5, 3e-5),
     ],
 )
-def test_a_joint_rests_where_the_drive_balances_the_law(
-    effects: dict[str, dict[str, float]], offset: float, torque_nm: Callable[[float], float], tolerance: float
-) -> None:
+def test_a_joint_rests_where_the_drive_balances_the_law(effects, offset, torque_nm, tolerance):
     motion = drive(start(*(on_joint5(name, **values) for name, values in effects.items())), 2.0, lambda t: offset)
     goal = motion["u"][-1] + TORQUE_FF / KP
     assert motion["q"][-1] == pytest.approx(balance(torque_nm, goal), abs=tolerance)
@@ -96,9 +92,7 @@ def test_a_joint_rests_where_the_drive_balances_the_law(
         ("asymmetric_friction", LEANING, -0.4, -1.1 * 0.05 / KP, -0.9 * 0.05 / KP),
     ],
 )
-def test_friction_at_rest_holds_up_to_its_break_away(
-    name: str, values: dict[str, float], torque_nm: float, least: float, most: float
-) -> None:
+def test_friction_at_rest_holds_up_to_its_break_away(name, values, torque_nm, least, most):
     motion = drive(start(on_joint5(name, **values)), 1.0, lambda t: torque_nm / KP)
     assert least < motion["q"][-1] - HOME < most
     if least < 0 < most:
@@ -113,9 +107,7 @@ def test_friction_at_rest_holds_up_to_its_break_away(
         ("encoder_eccentricity", {"amplitude_rad": 0.05, "phase_rad": 0.6}, lambda q: q + 0.05 * np.sin(q + 0.6)),
     ],
 )
-def test_an_encoder_settles_the_arm_where_it_reads_the_target_and_reports_that_it_is_there(
-    name: str, values: dict[str, float], reads: Callable[[float], float]
-) -> None:
+def test_an_encoder_settles_the_arm_where_it_reads_the_target_and_reports_that_it_is_there(name, values, reads):
     sim = start(on_joint5(name, **values))
     assert sim.proprioception()[0, COLUMN] == pytest.approx(HOME, abs=1e-12)
     motion = drive(sim, 1.5, lambda t: 0.05)
