@@ -68,14 +68,6 @@ class Intrinsics:
             cy_px=(self.cy_px + 0.5) * down - 0.5,
         )
 
-    def letterboxed(self, rows: int, columns: int) -> "Intrinsics":
-        """Intrinsics after ingest's letterbox: scaled into ``rows`` × ``columns`` with the aspect kept, and moved by the
-        black bars."""
-        window = letterbox_window((self.rows, self.columns), (rows, columns))
-        inner = self.scaled(window.rows, window.columns)
-        moved = {"cx_px": inner.cx_px + window.left, "cy_px": inner.cy_px + window.top}
-        return dataclasses.replace(inner, rows=rows, columns=columns, **moved)
-
     @property
     def vertical_fov_rad(self) -> float:
         """Angle between the top and the bottom edge, for a centred principal point [rad]."""

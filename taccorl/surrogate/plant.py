@@ -111,8 +111,6 @@ class Drive(NamedTuple):
     """Half width of the dead band of the position error [rad]."""
     integral: float = 0.0
     """r in K_p r ∫ e dt [1/s]."""
-    gravity_carried: float = 1.0
-    """Factor on the gravity compensation."""
     loop_steps: int = 0
     """Number of integration steps between two samples of a sampled loop; 0: the velocity loop is continuous."""
     velocity_filter: float = 0.0

@@ -6,7 +6,6 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -196,9 +195,6 @@ class ScriptedWindow:
 
     def held(self, codes: Iterable[int]) -> set[int]:
         return set()
-
-    def locked(self) -> Any:
-        return nullcontext()
 
     def close(self) -> None:
         self.script = iter(())
