@@ -46,14 +46,10 @@ class Intrinsics:
 
     rows: int
     columns: int
-    fx_px: float
-    """Focal length along the columns [pixels]."""
-    fy_px: float
-    """Focal length along the rows [pixels]."""
-    cx_px: float
-    """Column of the principal point; 0 is the centre of the leftmost pixel."""
-    cy_px: float
-    """Row of the principal point; 0 is the centre of the topmost pixel."""
+    fx_px: float  # Focal length along the columns [pixels]
+    fy_px: float  # Focal length along the rows [pixels]
+    cx_px: float  # Column of the principal point; 0 is the centre of the leftmost pixel
+    cy_px: float  # Row of the principal point; 0 is the centre of the topmost pixel
 
     def scaled(self, rows: int, columns: int) -> "Intrinsics":
         """Intrinsics of the same view in a picture of ``rows`` × ``columns`` pixels: a pixel centre c moves to (c + ½)·s − ½, as

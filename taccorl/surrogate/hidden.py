@@ -25,22 +25,14 @@ from taccorl.surrogate.plant import Change, Values
 class Scale:
     """Reference values of the joint under test (gains, inertia, torque, speed, centre), by which effects are sized."""
 
-    kp: float
-    """K_p [N·m/rad]."""
-    kd: float
-    """K_d [N·m·s/rad]."""
-    inertia: float
-    """Inertia, rotor included [kg·m²]."""
-    torque: float
-    """Largest torque of the drive in the recordings, weight included [N·m]."""
-    speed: float
-    """Highest speed of the chirp's target [rad/s]."""
-    centre: float
-    """Angle about which the joint is moved [rad]."""
-    sweep: float = 0.35
-    """Amplitude of the chirp [rad]."""
-    reach: float = 0.35
-    """Largest distance from that angle in the recordings [rad]."""
+    kp: float  # K_p [N·m/rad]
+    kd: float  # K_d [N·m·s/rad]
+    inertia: float  # Inertia, rotor included [kg·m²]
+    torque: float  # Largest torque of the drive in the recordings, weight included [N·m]
+    speed: float  # Highest speed of the chirp's target [rad/s]
+    centre: float  # Angle about which the joint is moved [rad]
+    sweep: float = 0.35  # Amplitude of the chirp [rad]
+    reach: float = 0.35  # Largest distance from that angle in the recordings [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,21 +44,17 @@ class Kind:
     severity."""
     values: Callable[[float, Scale, Values], Values]
     """Function (severity, scale, shape) → parameters, with the registry's names if it has the effect."""
-    plant: Callable[[Values], Change]
-    """Function from these parameters to the change of the plant."""
+    plant: Callable[[Values], Change]  # Function from these parameters to the change of the plant
     shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
     """Function that draws parameters which determine the effect's form, not its strength."""
     joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
     """Numbers of the joints, 1 to 6, on which it can be seen."""
-    stiff: bool = True
-    """Whether it can be seen on drives that are as stiff and as damped as the paper's."""
-    registered: bool = True
-    """True: the effect is in the registry."""
+    stiff: bool = True  # Whether it can be seen on drives that are as stiff and as damped as the paper's
+    registered: bool = True  # True: the effect is in the registry
     near: tuple[str, ...] = ()
     """For kinds outside the registry: effects of the registry with nearly the same consequences, which a diagnosis may name
     instead."""
-    whole_arm: bool = False
-    """True: the effect acts on every joint of the arm under test."""
+    whole_arm: bool = False  # True: the effect acts on every joint of the arm under test
 
 
 @dataclass(frozen=True, kw_only=True)
