@@ -64,9 +64,7 @@ def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:
         learn.main(words)
 
 
-def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_in_each_of_its_effects_alone(
-    tmp_path: Path,
-) -> None:
+def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_in_each_of_its_effects_alone(tmp_path):
     friction = [
         {"effect": "coulomb_friction", "arm": arm, "joints": ["joint1"], "torque_nm": 2} for arm in ("left", "right")
     ]
@@ -100,9 +98,7 @@ TWIN = Origin("twin", "MuJoCo twin, not a robot")
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 @pytest.mark.parametrize("cache", ["none", "host"])
-def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(
-    cache: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(cache, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     words = ["--small", f"--out={tmp_path}", f"--cache={cache}"]

@@ -128,9 +128,7 @@ def unusual_front() -> CameraConfig:
     ("shape", "radius_m"), [((224, 224), 0.008), ((480, 640), 0.005), ((96, 130), 0.012), ((150, 96), 0.012)]
 )
 @pytest.mark.parametrize("front", [bench_cameras()[0], unusual_front()], ids=["nominal", "measured"])
-def test_a_point_lands_on_the_pixel_that_the_pinhole_model_says(
-    shape: tuple[int, int], radius_m: float, front: CameraConfig
-):
+def test_a_point_lands_on_the_pixel_that_the_pinhole_model_says(shape, radius_m, front):
     cameras = (front, *bench_cameras()[1:])
     model = spots(cameras, radius_m)
     data = mujoco.MjData(model)

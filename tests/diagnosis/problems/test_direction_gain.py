@@ -95,9 +95,7 @@ def found_in(axis: AxisConfig, force: Force, mass_kg: float, friction_n: tuple[f
         pytest.param(OIL, oil, OIL_KG, 0.6, marks=pytest.mark.slow),
     ],
 )
-def test_the_gain_of_a_cylinder_that_differs_by_direction_is_found(
-    axis: AxisConfig, force: Callable[[float], Force], mass_kg: float, factor: float
-) -> None:
+def test_the_gain_of_a_cylinder_that_differs_by_direction_is_found(axis, force, mass_kg, factor):
     found = found_in(axis, force(factor), mass_kg)
     assert found.names == ("direction_gain",) and not found.rivals and found.status == "at_floor"
     assert found.errors["fitted"]["validation"] > 5.0
