@@ -25,8 +25,7 @@ from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Polic
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import center_and_scale
 from taccorl.training import reading
 
-Touch = dict[str, tuple[str, tuple[int, ...]]]
-"""Feature → its type and shape."""
+Touch = dict[str, tuple[str, tuple[int, ...]]]  # Feature → its type and shape
 LAYOUTS: dict[str, tuple[int, str | None, Touch]] = {
     "leflexitac": (6, "video", {"observation.tactile.primary": ("float32", (12, 32))}),
     "anyskin": (

@@ -368,8 +368,7 @@ def made(change: Change, target: np.ndarray, kp: float = 5.0) -> np.ndarray:
     return np.column_stack([run.angle[::5, 0], run.effort[::5, 0]])
 
 
-SLOW = 0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0])
-"""0.1 rad/s."""
+SLOW = 0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0])  # 0.1 rad/s
 
 
 def test_gains_that_differ_by_direction_hold_a_spring_differently():

@@ -25,8 +25,7 @@ from taccorl.data.spec import RecordingSpec, load_recording_spec
 from taccorl.errors import RecordingError
 
 JOINTS = [f"joint{j}" for j in range(1, 7)]
-NUM = 600
-"""3 s of joints at 200 Hz: 0.3 sin(t + 1.001 j), at most 0.3 rad/s."""
+NUM = 600  # 3 s of joints at 200 Hz: 0.3 sin(t + 1.001 j), at most 0.3 rad/s
 
 
 def angle(k: int, j: int) -> float:

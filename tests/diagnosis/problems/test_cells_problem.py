@@ -296,8 +296,7 @@ CONFIG = CellsConfig(
 )
 SHARE = np.array([1.0, 0.25, 0.5, 0.125, 1.0, 0.5])
 """(K,) share of the load that each cell bears, over that of the first."""
-GAIN = 200.0
-"""Count per N that the cell bears."""
+GAIN = 200.0  # Count per N that the cell bears
 
 
 def ramps(seed: int) -> np.ndarray:

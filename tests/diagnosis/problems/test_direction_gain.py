@@ -25,8 +25,7 @@ AIR = AxisConfig(name="rod", unit="m", inertia=25.0, kp=KP, kd=KD, limits=LIMITS
 OIL = AxisConfig(
     name="rod", unit="m", law="cascade", inertia=OIL_KG, kp=PER_S, kd=STIFF, limits=LIMITS, effort_limit=5000.0
 )
-Force = Callable[[float, float], float]
-"""(error of the position [m], speed [m/s]) → force [N]."""
+Force = Callable[[float, float], float]  # (error of the position [m], speed [m/s]) → force [N]
 
 
 def air(factor: float) -> Force:
