@@ -10,6 +10,7 @@ shows the chain on a CPU in minutes and learns nothing.
 ``--sources=[10,0]``: demonstrations that MimicGen makes of ten, and the expert's own: how many different grips a policy needs.
 ``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: learnt in the nominal twin, in the one that commands mend
 (surrogate ── diagnose --until=noise_floor), and in the surrogate, scored in it; ``--singly``: also in each effect alone.
+``--scored_in=[late.yaml] --real=50 --sim_weight=[0,0.5,0.95]``: co-trained with 50 demonstrations of the surrogate.
 """
 
 import dataclasses
@@ -23,11 +24,12 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import yaml
 
@@ -42,12 +44,14 @@ from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.cli.parse import command, shared_fields
 from taccorl.cli.surrogate import SurrogateConfig
+from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.episodes.sources.mimicgen.spec import mimic_spec_path
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
 from taccorl.sim.effects.added import present
+from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.task import CLEARANCES_M, tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
@@ -86,6 +90,11 @@ class LearnConfig:
     singly: bool = False
     """Also score what is learnt in the nominal twin there, and in twins that have one effect, or one other section, of each of
     --scored_in alone: which of them costs how many points."""
+    real: int = 0
+    """Demonstrations of each of --scored_in, which stands for the robot, that are merged with those of the twin; without poses of
+    the parts, which only a simulator knows."""
+    sim_weight: list[float] = field(default_factory=lambda: [0.5])
+    """α: weight of the twin's loss beside --real. 0: those of --real alone are learnt from."""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
@@ -123,6 +132,19 @@ class LearnConfig:
     """Folder of everything: the demonstrations are shared by all runs there, a policy's folder is named after its settings."""
 
 
+class Made(NamedTuple):
+    """Demonstrations to learn from."""
+
+    task: str
+    dataset: Path
+    store: Path
+    """Folder of the store: intermediate results, decoded frames among them."""
+    about: dict[str, Any]
+    """Of what they are: twin, sources, real, sim_weight."""
+    robots: list[Path | None]
+    """Twins to score in."""
+
+
 class Learned(NamedTuple):
     """A policy that a run made."""
 
@@ -130,7 +152,6 @@ class Learned(NamedTuple):
     """Folder pretrained_model."""
     dataset: Path
     store: Path
-    """Folder of the store: intermediate results, decoded frames among them."""
     scores: list[Path]
     """Folders of the scores."""
 
@@ -138,16 +159,14 @@ class Learned(NamedTuple):
 def main(words: list[str]) -> list[Learned]:
     config = parsed(LearnConfig, chosen(words, SMALL), "python -m pipelines.learn")
     _check(config)  # before hours of demonstrations
-    scored = _twins(config)
     gpus: queue.Queue[str] = queue.Queue()
     for gpu in (names := _gpus()):
         gpus.put(gpu)
     with ThreadPoolExecutor(2 * len(names)) as pool:  # one policy learns on a GPU while another is scored
         runs = []
-        for (twin, robots), task, sources in itertools.product(scored.items(), config.task, config.sources):
-            made = demonstrations(config, task, twin, sources)
+        for made in datasets(config):
             each = itertools.product(config.seeds, config.episodes, config.pictures, config.sensors)
-            runs += [pool.submit(_learned, config, task, made, settings, robots, gpus) for settings in each]
+            runs += [pool.submit(_learned, config, made, settings, gpus) for settings in each]
         learned = [run.result() for run in runs]
     table = _table([score for one in learned for score in one.scores])
     (config.out / "scores.md").write_text(table, encoding="utf-8")
@@ -180,9 +199,13 @@ def _check(config: LearnConfig) -> None:
                 "" if most == math.inf else f", at most {most}, the chunk_size of {config.train}"
             )
             raise SystemExit(f"--{name}={value}: {ends}")
-    if not config.scored_in and ({"mended", "surrogate"} & {*config.twins} or config.singly):
-        asked = "--singly" if config.singly else f"--twins={config.twins}"
+    if not config.scored_in and ({"mended", "surrogate"} & {*config.twins} or config.singly or config.real):
+        asked = "--singly" if config.singly else f"--real={config.real}" if config.real else f"--twins={config.twins}"
         raise SystemExit(f"{asked}: of which surrogate? Give its twin file as --scored_in=")
+    if config.real and (config.singly or len(config.episodes) > 1):
+        raise SystemExit(f"--real={config.real}: takes one number of --episodes, and no --singly")
+    if not config.sim_weight or not all(0 <= weight <= 1 for weight in config.sim_weight):
+        raise SystemExit(f"--sim_weight={config.sim_weight}: shares of the loss, 0 … 1")
     try:
         for path in config.scored_in:
             load_twin(path)
@@ -266,9 +289,38 @@ def mended(config: LearnConfig, robot: Path) -> Path:
     return done.with_suffix(".unfinished").rename(done)
 
 
-def demonstrations(config: LearnConfig, task: str, made_in: Path | None, sources: int = 0) -> tuple[Path, Path]:
+def datasets(config: LearnConfig) -> Iterator[Made]:
+    """Make the demonstrations of every combination, as far as they are not there."""
+    few, alone = dataclasses.replace(config, episodes=[config.real]), set[Path]()
+    for (twin, robots), task, sources in itertools.product(_twins(config).items(), config.task, config.sources):
+        dataset, store = demonstrations(config, task, twin, sources)
+        about = {"twin": named(twin) if twin else ""} | ({"sources": sources} if sources else {})
+        if not config.real:
+            yield Made(task, dataset, store, about, robots)
+        for robot, weight in itertools.product(filter(None, robots), config.sim_weight if config.real else []):
+            real, _ = demonstrations(few, task, robot, domain="surrogate")
+            both = real.with_name(f"{dataset.name if weight else 'nothing'}_and_{real.name}")
+            if both not in alone:
+                sim = [dataset] if weight else []
+                merged = MergeConfig(
+                    real=[real], sim=sim, out=both, store=store, pictures="cache", resolution=RESOLUTION
+                )
+                step(merge.run, merged)
+                mixed = {"real": config.real, "sim_weight": weight}
+                yield Made(task, both, store, (about if weight else {"twin": "", "demonstrations": 0}) | mixed, [robot])
+            alone |= set() if weight else {both}
+
+
+def demonstrations(
+    config: LearnConfig,
+    task: str,
+    made_in: Path | None,
+    sources: int = 0,
+    domain: Literal["twin", "surrogate"] = "twin",
+) -> tuple[Path, Path]:
     """Make the demonstrations of a task in a twin, if they are not there: the expert's own, or MimicGen's of ``sources`` of them.
-    Returns the dataset's folder and the store."""
+    ``domain``: surrogate, if the twin stands for the robot: other scenes, no poses of the parts. Returns the dataset's folder and
+    the store."""
     folder, store, end = config.out / task, config.out / "store", f"_mimicgen_{sources}" if sources else ""
     if made_in is not None and _is_folder(made_in):
         files = sorted(made_in.glob("*.yaml"))
@@ -280,6 +332,8 @@ def demonstrations(config: LearnConfig, task: str, made_in: Path | None, sources
         step(merge.run, MergeConfig(sim=parts, out=folder / both, store=store, pictures="cache", resolution=RESOLUTION))
         return folder / both, store
     name, whole = ("", TwinConfig()) if made_in is None else (f"_{named(made_in)}", load_twin(made_in))
+    is_robot = domain == "surrogate"
+    end += "_as_robot" * is_robot
     twin = folder / f"twin_of_{config.physics_steps}_steps{name}.yaml"
     dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps{name}{end}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -296,7 +350,10 @@ def demonstrations(config: LearnConfig, task: str, made_in: Path | None, sources
         pictures="cache",
         resolution=RESOLUTION,
         rows_per_picture=config.rows_per_picture,
-        part_poses=True,
+        part_poses=not is_robot,
+        domain=domain,
+        origin=f"twin {made_in}, not a robot" if is_robot else TWIN_ORIGIN.text,
+        seed=int(is_robot),
         engine=LocalEngine(workers=config.workers),
     )
     try:
@@ -325,27 +382,20 @@ def demonstrations(config: LearnConfig, task: str, made_in: Path | None, sources
     return dataset, store
 
 
-def _learned(
-    config: LearnConfig,
-    task: str,
-    made: tuple[Path, Path],
-    settings: tuple[int, int, str, str],
-    robots: list[Path | None],
-    gpus: "queue.Queue[str]",
-) -> Learned:
-    """Train a policy on a GPU that is free, and score it in each of ``robots``."""
-    (dataset, store), (seed, episodes, pictures, sensors) = made, settings
-    words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}", f"--seed={seed}"]
+def _learned(config: LearnConfig, made: Made, settings: tuple[int, int, str, str], gpus: "queue.Queue[str]") -> Learned:
+    """Train a policy on a GPU that is free, and score it in each of ``made.robots``."""
+    seed, episodes, pictures, sensors = settings
+    words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={made.store}", f"--seed={seed}"]
     changes = RANDOMISED if pictures == "randomised" else []
     words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors], *changes]
     if episodes < max(config.episodes):
         words.append(f"--dataset.episodes={json.dumps(list(range(episodes)))}")
-    if "observation.is_sim" in (dataset / "meta" / "info.json").read_text(encoding="utf-8"):
-        words.append("--policy.sim_weight=1")  # merged of several twins: no row is real
-    training = Training(config.train, dataset, [*words, *config.train_options], config.out / task)
-    twin, _, sources = dataset.name.partition("_steps")[2].partition("_mimicgen_")
-    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed, "twin": twin[1:]}
-    about |= {"sources": int(sources)} if sources else {}
+    features = (made.dataset / "meta" / "info.json").read_text(encoding="utf-8")
+    if "observation.is_sim" in features:  # without real rows: merged of several twins
+        words.append(f"--policy.sim_weight={made.about.get('sim_weight', 1):g}")
+    words += [] if PARTS_KEY in features else ["--policy.pose_loss=0"]
+    training = Training(config.train, made.dataset, [*words, *config.train_options], config.out / made.task)
+    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed} | made.about
     gpu = gpus.get()
     try:
         if words := training.command():
@@ -353,9 +403,9 @@ def _learned(
             _logged([sys.executable, "-m", module, *words[1:]], training.folder.with_suffix(".log"), gpu, about)
     finally:
         gpus.put(gpu)
-    cells = itertools.product(config.difficulty, config.executed, config.hide, robots)
-    scores = [_scored(config, (task, pictures), training, about, cell, gpu) for cell in cells]
-    return Learned(training.policy, dataset, store, scores)
+    cells = itertools.product(config.difficulty, config.executed, config.hide, made.robots)
+    scores = [_scored(config, (made.task, pictures), training, about, cell, gpu) for cell in cells]
+    return Learned(training.policy, made.dataset, made.store, scores)
 
 
 def _scored(
@@ -418,6 +468,7 @@ def _row(score: Path) -> str:
     low, high = (100 * end for end in one["interval_95"])
     executed, hidden = score.name.split("_")[3], ", ".join(scenes["hidden"]) or "–"
     made = f"{about['demonstrations']}{' of {sources} sources'.format(**about) if 'sources' in about else ''}"
+    made += " + {real} of the surrogate, α = {sim_weight:g}".format(**about) if "real" in about else ""
     cells = [scenes["tasks"][0], about["sensors"], made, about["seed"]]
     cells += [scenes["pictures"], scenes["difficulty"], executed, hidden, f"{one['successes']} of {one['n']}"]
     took = one["median_success_s"]

@@ -5,6 +5,7 @@ policy and set of scenes; of the rows follow docs/results.md and docs/transfer.p
 ``--take=FOLDER`` takes scores that were made elsewhere. Hours on a GPU.
 """
 
+import itertools
 import json
 import subprocess
 import sys
@@ -52,6 +53,10 @@ PARTS = {
     "transfer": [
         f"--scored_in=[configs/surrogates/{r}.yaml] --twins={_FOUR} --episodes=1200 {_SHORT} {_SEEDS}" for r in ROBOTS
     ],
+    "cotrained": [
+        f"--scored_in=[configs/surrogates/{r}.yaml] --real=50 --sim_weight=[0,0.5,0.95] --episodes=1200 {_SHORT} {_SEEDS}"
+        for r in ROBOTS
+    ],
 }
 """Part of the tables → command-line arguments of each call of ``pipelines.learn`` that measures it."""
 PAPER = {
@@ -59,6 +64,8 @@ PAPER = {
     "cameras": {"after co-training": (42, 12, 39, 39), "after RL": (50, 54, 77, 61)},
 }
 """Sensors → stage → completed [%] in simulation, of ``TASKS``: the paper's Table 1, π0.5 and 128 environments."""
+PAPER_REAL = "real-only 35 %, co-trained (α = 0.5) 45 %, after RL 95 %"
+"""The paper's Table 2, assembly_1 with touch: of a robot."""
 Rows = list[dict[str, Any]]
 
 
@@ -67,7 +74,7 @@ class PaperTablesConfig:
     """Parts to run, and scores to take."""
 
     only: list[str] = field(default_factory=list)
-    """Parts to run: imitation, randomised, grips, transfer."""
+    """Parts to run: imitation, randomised, grips, transfer, cotrained."""
     page: bool = False
     """Run nothing."""
     take: list[Path] = field(default_factory=list)
@@ -143,10 +150,11 @@ def share(rows: Rows) -> str:
 def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
+    mixed = _grouped([row for row in rows if "real" in row], "scored_in", "real", "sim_weight")
     own = _grouped([row for row in seen if PLAIN.items() <= row.items() and "sources" not in row], "task", "sensors")
     harder = [row for row in seen if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])]
     cells = _grouped(harder, "task", "pictures", "demonstrations", "difficulty", "executed", "sensors")
-    table_1, table_2, table_3, table_4, table_5 = [], [], [], [], []
+    table_1, table_2, table_3, table_4, table_5, table_6 = [], [], [], [], [], []
     for k, task in enumerate(TASKS):
         for sensors, text in SENSORS.items():
             paper = "; ".join(f"{stage[k]} %" for stage in PAPER[sensors].values())
@@ -165,6 +173,13 @@ def page(rows: Rows) -> str:
     for stage, text in STAGES.items():
         for (robot, _), of in transfer(seen, stage).items():
             table_4.append((robot, text, share(of["nominal"]), share(of["mended"]), gain(of)))
+    for robot, real in sorted({key[:2] for key in mixed}):
+        name = robot.rpartition("_")[0]
+        weights = [mixed[robot, real, weight] for weight in (0, 0.5, 0.95)]
+        n = max(row["demonstrations"] for row in itertools.chain(*weights))
+        alone = transfer(seen).get((name, n), {})
+        shares = [*weights, alone.get("nominal", []), alone.get("mended", [])]
+        table_6.append((f"{name}: {real}, {n}", *map(share, shares)))
     return f"""# The paper's tables, by simulation
 
 Written by `python -m pipelines.paper_tables` of `docs/results.jsonl` (commit, seed, scenes). **Simulated**: a small π0.5 from
@@ -203,7 +218,15 @@ scored ([settings](training.md#post-training-ppo-in-the-twin)).
 
 {_table("surrogate | PPO | in: nominal | in: mended | mended − nominal", sorted(table_4, key=lambda row: row[0]))}
 
-**Not run**: PPO after other policies, with exploration noise and from base; α, β; Table 2; other cells that say so.
+## Table 2 and α: demonstrations of the surrogate beside those of the nominal twin
+
+assembly_1, cameras and touch, scored in the surrogate; the loss is α · the twin's + (1 − α) · the surrogate's.
+The paper, of a robot: {PAPER_REAL}.
+
+{_table("surrogate: its, the twin's | α = 0: its own | α = 0.5 | α = 0.95 | α = 1: nominal twin | mended twin", table_6)}
+
+**Not run**: PPO after other policies, with exploration noise and from base; β; Table 2 in other surrogates and after PPO;
+other cells that say so.
 """
 
 
@@ -229,7 +252,7 @@ def transfer(rows: Rows, stage: str = "") -> dict[tuple[str, int], dict[str, Row
     """(surrogate, demonstrations) → twin of the demonstrations → rows; where both the nominal and the mended one were tried.
     ``stage``: of ``STAGES``, for rows of post-training."""
     found: dict[tuple[str, int], dict[str, Rows]] = defaultdict(lambda: defaultdict(list))
-    scored = (row for row in rows if row["scored_in"] and row.get("stage", "") == stage)
+    scored = (row for row in rows if row["scored_in"] and row.get("stage", "") == stage and "real" not in row)
     for row in sorted(scored, key=lambda row: (row["scored_in"], -row["demonstrations"], row["seed"])):
         kind = (row["twin"] or "nominal").partition("_")[0]
         key = row["scored_in"].rpartition("_")[0], row["demonstrations"]

@@ -14,18 +14,17 @@ begun=0
 for ((k = 1; k <= $#; k++)); do
   words=(--out=/dev/shm/learn_$k ${!k})
   # The demonstrations, then how many policies learn from them. Twins that commands made of a surrogate come from mended/.
-  python3 -c "import itertools, shutil, sys
+  python3 -c "import shutil, sys
 from pathlib import Path
 
-from pipelines.learn import LearnConfig, _twins, demonstrations, named, parsed
+from pipelines.learn import LearnConfig, datasets, named, parsed
 
 config = parsed(LearnConfig, sys.argv[1:], 'learn')
 for robot in config.scored_in:
     found = config.out / 'surrogates' / named(robot)
     found.mkdir(parents=True, exist_ok=True)
     shutil.copy(f'.ci/gpu/mended/mended_{robot.stem}.yaml', found)
-made = [demonstrations(config, *each) for each in itertools.product(config.task, _twins(config), config.sources)]
-print(len(made) * len(config.seeds) * len(config.episodes) * len(config.pictures) * len(config.sensors))" "${words[@]}" --workers="$threads" >"/dev/shm/made_$k.log" 2>&1
+print(len(list(datasets(config))) * len(config.seeds) * len(config.episodes) * len(config.pictures) * len(config.sensors))" "${words[@]}" --workers="$threads" >"/dev/shm/made_$k.log" 2>&1
   since "$k made: $?"
   n=$(tail -n 1 "/dev/shm/made_$k.log")
   [[ "$n" =~ ^[0-9]+$ ]] || continue

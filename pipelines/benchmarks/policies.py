@@ -156,7 +156,7 @@ def _adapter_process(rank: int, num: int, folder: str, backbone: str, rows: int,
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = True
     place = {"init_method": f"file://{folder}/store", "rank": rank, "world_size": num}
     torch.distributed.init_process_group("nccl" if cuda else "gloo", **place)
-    policy = random_policy(backbone, device, tactile=True)
+    policy = random_policy(backbone, device, tactile=True, gradient_checkpointing=True)  # as configs/cotrain
     policy.config.base_checkpoint = "random weights"
     adapted = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA"})
     shared = DistributedDataParallel(adapted, find_unused_parameters=True) if num > 1 else adapted  # as Accelerate's
@@ -169,7 +169,7 @@ def _adapter_process(rank: int, num: int, folder: str, backbone: str, rows: int,
     torch.distributed.destroy_process_group()
 
 
-def random_policy(backbone: str, device: str, *, tactile: bool) -> Any:
+def random_policy(backbone: str, device: str, *, tactile: bool, **settings: Any) -> Any:
     """A ``TactilePI05Policy`` with random weights for the robot's state, actions, pads and three cameras at 224 × 224."""
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
@@ -186,6 +186,7 @@ def random_policy(backbone: str, device: str, *, tactile: bool) -> Any:
         tactile_format=TactileFormat("flexitac_v2", ROBOT.pads, *ROBOT.pad.shape, "fixed_scale", 1 / 75),
         input_features={**known["input_features"], TACTILE: PolicyFeature(FeatureType.STATE, (ROBOT.num_taxels,))},
         output_features=known["output_features"],
+        **settings,
     )
     torch.manual_seed(0)
     with torch.device(device):

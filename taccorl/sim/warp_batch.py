@@ -93,9 +93,10 @@ def check_supported(model: mujoco.MjModel) -> None:
 
 
 def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
-    """``model`` without the flag that MuJoCo Warp does not know: it never resets a diverged world by itself."""
-    model = copy.copy(model)
-    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    """``model`` without the flag that MuJoCo Warp does not know (it never resets a diverged world by itself), and with the one by
+    which its boxes collide as in MuJoCo C (``mjc_BoxBox``); without it their normals are those of another algorithm."""
+    model, flags = copy.copy(model), mujoco.mjtDisableBit
+    model.opt.disableflags = model.opt.disableflags & ~int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_NATIVECCD)
     return model
 
 

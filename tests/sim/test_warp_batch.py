@@ -51,13 +51,15 @@ def test_parts_in_hands_move_as_in_mujoco_c(warp):
         ours.step(goal)
         c.step(goal)
     assert np.abs(parts(c) - before).max() > 1e-3  # otherwise standing still would pass
-    np.testing.assert_allclose(parts(ours), parts(c), rtol=0, atol=3e-6)
+    free, mating_m = np.abs(parts(ours) - parts(c)).max((1, 2))
+    assert free < 1e-6 and mating_m < 1e-5  # 2e-5 with the normals of another collision of boxes
     assert np.median(np.abs(ours.arrays["qpos"] - c.arrays["qpos"])) < 1e-6
     np.testing.assert_array_equal(ours.arrays["time"], c.arrays["time"])
     np.testing.assert_array_equal(ours.pads_touching("plug"), c.pads_touching("plug"))
     np.testing.assert_allclose(ours.touch(), c.touch(), rtol=0, atol=2)
     assert c.touch().max() > 50
-    np.testing.assert_allclose(ours.effort(), c.effort(), rtol=0, atol=0.02)
+    free, mating_nm = np.abs(ours.effort() - c.effort()).max(1)
+    assert free < 1e-3 and mating_nm < 0.1
 
 
 @pytest.mark.slow
