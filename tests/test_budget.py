@@ -25,7 +25,7 @@ MOST_LINES = {
     "taccorl/training": 1_570,
     "taccorl/views": 2_638,
     "tests": 56_515,
-    "pipelines": 6_167,
+    "pipelines": 6_242,
 }
 MOST_LINES_OF_A_FILE = 500
 
