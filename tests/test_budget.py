@@ -19,12 +19,12 @@ MOST_LINES = {
     "taccorl/rl": 2_479,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
-    "taccorl/sim": 9_226,
+    "taccorl/sim": 9_227,
     "taccorl/surrogate": 3_543,
     "taccorl/tasks": 2_508,
     "taccorl/training": 1_570,
     "taccorl/views": 2_638,
-    "tests": 56_515,
+    "tests": 56_517,
     "pipelines": 6_242,
 }
 MOST_LINES_OF_A_FILE = 500
