@@ -32,16 +32,16 @@ from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # no
 ROWS = Path("docs/diagnosis_study.jsonl")
 FIRST_SEED = 110000
 PAIRS = (
-    ("coulomb_friction", "command_delay"),
-    ("coulomb_friction", "gravity_mismatch"),
-    ("backlash", "coulomb_friction"),
-    ("cogging", "command_lag"),
-    ("quadratic_drag", "sensor_delay"),
-    ("load_friction", "torque_lag"),
-    ("cable_spring", "coulomb_friction"),
-    ("stribeck_friction", "joint_compliance"),
-    ("error_deadband", "command_delay"),
-    ("slew_limit", "coulomb_friction"),
+    "coulomb_friction+command_delay",
+    "coulomb_friction+gravity_mismatch",
+    "backlash+coulomb_friction",
+    "cogging+command_lag",
+    "quadratic_drag+sensor_delay",
+    "load_friction+torque_lag",
+    "cable_spring+coulomb_friction",
+    "stribeck_friction+joint_compliance",
+    "error_deadband+command_delay",
+    "slew_limit+coulomb_friction",
 )
 Jobs = list[study.Job]
 
@@ -51,26 +51,26 @@ def _seeds(first: int, n: float) -> range:
 
 
 STUDIES: dict[str, Callable[[int, float], Jobs]] = {
-    "pack": lambda first, n: study.single("pack", REGISTERED, _seeds(first, n)),
-    "chirp": lambda first, n: study.single("chirp", REGISTERED, _seeds(first, n)),
-    "pairs": lambda first, n: study.pairs("pack", PAIRS, _seeds(first + 1000, n)),
+    "pack": lambda first, n: study.jobs("single", "pack", REGISTERED, _seeds(first, n)),
+    "chirp": lambda first, n: study.jobs("single", "chirp", REGISTERED, _seeds(first, n)),
+    "pairs": lambda first, n: study.jobs("pairs", "pack", PAIRS, _seeds(first + 1000, n)),
     "none": lambda first, n: [
-        *study.nothing("chirp", _seeds(first, 11 * n)),
-        *study.nothing("pack", _seeds(first, 5.5 * n)),
+        *study.jobs("none", "chirp", [""], _seeds(first, 11 * n)),
+        *study.jobs("none", "pack", [""], _seeds(first, 5.5 * n)),
     ],
-    "loop": lambda first, n: study.loop("chirp", _seeds(first + 3500, 2 * n)),
+    "loop": lambda first, n: study.jobs("loop", "chirp", [""], _seeds(first + 3500, 2 * n)),
     "outside": lambda first, n: [
-        *study.removed("chirp", OUTSIDE, _seeds(first + 2000, n / 2)),
-        *study.removed("pack", OUTSIDE, _seeds(first + 2500, n / 2)),
+        *study.jobs("removed", "chirp", OUTSIDE, _seeds(first + 2000, n / 2)),
+        *study.jobs("removed", "pack", OUTSIDE, _seeds(first + 2500, n / 2)),
     ],
-    "removed": lambda first, n: study.removed("chirp", REGISTERED, _seeds(first + 2000, n / 5)),
+    "removed": lambda first, n: study.jobs("removed", "chirp", REGISTERED, _seeds(first + 2000, n / 5)),
     "dropped": lambda first, n: [
-        *study.dropped("chirp", _seeds(first + 3000, 3 * n)),
-        *study.dropped("pack", _seeds(first + 3000, 3 * n)),
+        *study.jobs("dropped", "chirp", ["dropped_commands"], _seeds(first + 3000, 3 * n)),
+        *study.jobs("dropped", "pack", ["dropped_commands"], _seeds(first + 3000, 3 * n)),
     ],
-    "touch": lambda first, n: study.touch(REGISTERED_TOUCH, _seeds(first, n / 2)),
-    "touch_none": lambda first, n: study.nothing("press", _seeds(first, n)),
-    "touch_outside": lambda first, n: study.removed("press", OUTSIDE_TOUCH, _seeds(first + 2000, n / 2)),
+    "touch": lambda first, n: study.jobs("touch", "press", REGISTERED_TOUCH, _seeds(first, n / 2)),
+    "touch_none": lambda first, n: study.jobs("none", "press", [""], _seeds(first, n)),
+    "touch_outside": lambda first, n: study.jobs("removed", "press", OUTSIDE_TOUCH, _seeds(first + 2000, n / 2)),
 }
 """Name → cases, from the first seed and the number of seeds."""
 EVERY_JOBS = 40

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw
+from PIL.ImageFont import load_default as font
 
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.machines.piper import PiperTwin
@@ -21,7 +22,6 @@ from taccorl.surrogate.cases import draw_case
 from taccorl.surrogate.recordings import recordings
 from taccorl.tasks.experts import tasks_with_expert
 from taccorl.views.colors import PAD_COLORS, heat
-from taccorl.views.contact_sheet import font
 
 VIEWS = (ROBOT.cameras[0], ROBOT.cameras[-1])
 MOMENTS = (0.0, 0.4, 0.75, 1.0)  # shares of the episode

@@ -171,15 +171,13 @@ def _poses(camera: str, size: tuple[int, int], what: str) -> Iterator[Row]:
                 rivals.append(pose_error(pnp(view, joints, known_points(view, truth, joints, rng)), truth))
     for k, (unit, goal) in enumerate((("°", "≤ 0.3"), ("mm", "≤ 4"))):
         values = [error[k] for error in errors]
-        yield Row.of(
-            values,
-            by=max,
-            name=f"{camera}, {what}, from 2.7° and 25 mm off, 12 frames, surrogate: largest error of the pose",
-            unit=unit,
-            goal=goal,
-            rival="PnP, ten points a frame found to 1 px" if rivals else "",
-            rival_value=max(error[k] for error in rivals) if rivals else None,
+        name = f"{camera}, {what}, from 2.7° and 25 mm off, 12 frames, surrogate: largest error of the pose"
+        by_pnp = (
+            {"rival": "PnP, ten points a frame found to 1 px", "rival_value": max(e[k] for e in rivals)}
+            if rivals
+            else {}
         )
+        yield Row.of(values, by=max, name=name, unit=unit, goal=goal, **by_pnp)
     yield Row.of(held, name=f"{camera}, {what}, surrogate: outlines off held-out edges, median of fits", unit="px")
     yield Row.of(times, name=f"{camera}, {what}: one calibration", unit="CPU-s")
 

@@ -9,14 +9,14 @@ import dataclasses
 import io
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from statistics import median
 
 import mujoco
 import numpy as np
 
 from pipelines.benchmarks import cameras as camera_benchmarks  # noqa: F401, registers its rows
-from pipelines.benchmarks.rows import Row, against_reference, benchmark
+from pipelines.benchmarks.rows import Row, against_reference, benchmark, cpu_times_s
 from taccorl.alignment.controller import arm_bench
 from taccorl.alignment.controller.identification import PAPER_BOUNDS, REFERENCE, identify_controller
 from taccorl.alignment.controller.joint_model import JointModel
@@ -75,26 +75,9 @@ def in_mujoco(
     )[0]
 
 
-def _cpu_ms(work: Callable[[], object], repeats: int) -> list[float]:
-    work()
-    times = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        work()
-        times.append((time.process_time() - begin) * 1e3)
-    return times
-
-
-def _of_mujoco(name: str, times_ms: list[float], rival_ms: float) -> Row:
-    shares = [100 * t / rival_ms for t in times_ms]
-    return Row.of(
-        shares,
-        name=name,
-        unit="% of MuJoCo's",
-        goal="≤ 3",
-        rival="MuJoCo, the arm with this joint alone, ms",
-        rival_value=rival_ms,
-    )
+def _of_mujoco(name: str, times_s: list[float], rival_s: float) -> Row:
+    shares, rival = [100 * t / rival_s for t in times_s], "MuJoCo, the arm with this joint alone, ms"
+    return Row.of(shares, name=name, unit="% of MuJoCo's", goal="≤ 3", rival=rival, rival_value=1e3 * rival_s)
 
 
 @benchmark("joint_model")
@@ -112,11 +95,11 @@ def joint_model() -> Iterator[Row]:
             effect = make_effect(name, **{p.name: p.typical for p in cls.parameters()})
             known += [effect] * (effect.drive() is not None)
     replace = dataclasses.replace  # a model keeps the responses to a recording: each is simulated with a copy
-    plain = _cpu_ms(lambda: model.simulate(replace(motion), gains), 20)
-    rival = _cpu_ms(lambda: in_mujoco(motion, signal, gains, config), 5)
+    plain = cpu_times_s(lambda: model.simulate(replace(motion), gains), 20)
+    rival = cpu_times_s(lambda: in_mujoco(motion, signal, gains, config), 5)
     yield _of_mujoco("one joint, 10 s at 200 Hz, 12 000 physics steps, CPU", plain, median(rival))
-    costs = [median(_cpu_ms(lambda e=e: model.simulate(replace(motion), gains, [e]), 5)) for e in known]
-    dearest = _cpu_ms(lambda: model.simulate(replace(motion), gains, [known[costs.index(max(costs))]]), 20)
+    costs = [median(cpu_times_s(lambda e=e: model.simulate(replace(motion), gains, [e]), 5)) for e in known]
+    dearest = cpu_times_s(lambda: model.simulate(replace(motion), gains, [known[costs.index(max(costs))]]), 20)
     yield _of_mujoco(f"the same with the most expensive of {len(known)} effects of joints, CPU", dearest, median(rival))
     away = [
         float(
@@ -160,15 +143,8 @@ def controller_sysid() -> Iterator[Row]:
     yield against_reference("controller of one joint from a 10 s sweep", cost, "≤ 300,000")
     if rival_cost:
         yield against_reference(f"the same by {rival}", rival_cost)
-    yield Row.of(
-        ratio,
-        by=max,
-        name="K_d / K_p off by, worst of six joints",
-        unit="%",
-        goal="≤ 1",
-        rival=rival,
-        rival_value=max(rival_ratio) if rival_ratio else None,
-    )
+    name, worst = "K_d / K_p off by, worst of six joints", max(rival_ratio) if rival_ratio else None
+    yield Row.of(ratio, by=max, name=name, unit="%", goal="≤ 1", rival=rival, rival_value=worst)
     yield Row.of(kp_off, by=max, name="K_p off by, worst of six joints", unit="%")
 
 

@@ -36,14 +36,8 @@ def expert_rows() -> Iterator[Row]:
         n = len(score.outcomes)
         rate = score.success_rate
         failures = ", ".join(f"{count} {name}" for name, count in score.failures.items()) or "no failures"
-        yield Row(
-            name=f"{task}: success, {failures}",
-            value=100 * rate,
-            unit="%",
-            goal="≥ 90",
-            n=n,
-            spread=100 * (rate * (1 - rate) / n) ** 0.5,
-        )
+        name, spread_pc = f"{task}: success, {failures}", 100 * (rate * (1 - rate) / n) ** 0.5
+        yield Row(name=name, value=100 * rate, unit="%", goal="≥ 90", n=n, spread=spread_pc)
         yield against_reference(
             f"{task}: cost of an episode of {mean(score.duration_s):.1f} s with {mean(score.corrections):.1f} "
             "corrections, without pictures",

@@ -1,4 +1,4 @@
-"""Evaluate a task's expert: success rate, cost, contact forces. All simulated."""
+"""Evaluate a task's expert: success, cost, contact forces. All simulated."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -17,18 +17,21 @@ from taccorl.tasks.experts import expert_of
 
 @dataclass
 class Score:
-    """Success, cost and contact forces of a number of episodes of one task."""
+    """Success, cost and contact forces of a number of episodes, or of attempts to generate one, of one task."""
 
     outcomes: list[str] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
     """CPU time of each episode [s], without pictures."""
     duration_s: list[float] = field(default_factory=list)
+    """Duration of each episode; of generated ones, of those that succeeded [s]."""
     corrections: list[int] = field(default_factory=list)
     """Number of corrections by touch in each episode."""
     penetration_m: list[float] = field(default_factory=list)
     """Deepest penetration between mating parts in each episode [m]."""
     force_n: list[float] = field(default_factory=list)
     """Largest force between mating parts in each episode [N]."""
+    broken: int = 0
+    """Number of generated episodes whose actions, in a new simulation, end in another state or without reaching the goal."""
 
     @property
     def success_rate(self) -> float:
@@ -36,8 +39,8 @@ class Score:
 
     @property
     def failures(self) -> dict[str, int]:
-        """Name of a failure category, such as ``timeout`` or ``dropped`` → number of episodes that ended so."""
-        return dict(Counter(o for o in self.outcomes if o != "success"))
+        """Failure category, such as ``timeout`` or ``dropped`` → number of episodes that ended so, the most frequent first."""
+        return dict(Counter(o for o in self.outcomes if o != "success").most_common())
 
 
 def score_expert(

@@ -1,12 +1,11 @@
 """Evaluate a generation: yield under all acceptance criteria, cost, and whether kept episodes are reproduced. All simulated."""
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipelines.benchmarks.expert_score import Score
 from taccorl.episodes.sources.mimicgen.attempt import Attempts, Generated
 from taccorl.episodes.sources.mimicgen.source import Source, SourcePool
 from taccorl.episodes.sources.mimicgen.spec import MimicSpec
@@ -16,24 +15,6 @@ from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
-
-
-@dataclass
-class Score:
-    """Yield, failures and cost of a number of attempts."""
-
-    outcomes: list[str] = field(default_factory=list)
-    cpu_s: list[float] = field(default_factory=list)
-    """CPU time of the physics of each attempt, failed ones included [s]."""
-    duration_s: list[float] = field(default_factory=list)
-    """Duration of each successful episode [s]."""
-    broken: int = 0
-    """Number of kept attempts whose stored actions end in another state, or without reaching the goal, in a new simulation."""
-
-    @property
-    def failures(self) -> dict[str, int]:
-        """Failure category → number of attempts, the most frequent first."""
-        return dict(Counter(o for o in self.outcomes if o != "success").most_common())
 
 
 def score_generation(

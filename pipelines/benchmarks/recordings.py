@@ -8,12 +8,12 @@ import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from typing import Any
+from typing import Any, NamedTuple
 
-from pipelines.benchmarks.rows import Row, benchmark, spread
+from pipelines.benchmarks.rows import Row, benchmark
 from pipelines.benchmarks.run import ROOT
 from taccorl.data.spec import data_specs_folder, load_recording_spec
 from taccorl.lineage.processes import cpu_s
@@ -30,8 +30,7 @@ KILLS = ("tests/end_to_end/test_interrupted.py", "-n", "2")
 """Command-line arguments of pytest with which three benchmarks choose the tests that they run."""
 
 
-@dataclass(frozen=True)
-class Cost:
+class Cost(NamedTuple):
     """Measured cost of one piece of work: CPU time and wall time."""
 
     cpu_s: float
@@ -92,32 +91,18 @@ def _ingest_rows(label: str, path: Path, spec: Any, folder: Path, goal: str) -> 
     per_cpu = [rows / cost.cpu_s for rows, cost in ours]
     rival = [RIVAL_ROWS / cost.cpu_s for cost in theirs]
     ratios = [a / b for a, b in zip(per_cpu, rival, strict=True)]
-    speed = [rows / 30 / cost.wall_s for rows, cost in ours]
-    default_rate = mean([RIVAL_ROWS / cost.wall_s for cost in theirs])
-    yield Row(
-        name=f"rows per CPU-second over LeRobot's default writer, {label}", value=mean(ratios), unit="×", goal=goal,
-        rival="LeRobot default, rows/CPU-s, same frames, without decoding", rival_value=mean(rival), n=REPEATS,
-        spread=spread(ratios),
-    )  # fmt: skip
     wall = [(r / c.wall_s) / (RIVAL_ROWS / t.wall_s) for (r, c), t in zip(ours, theirs, strict=True)]
-    yield Row(
-        name=f"rows per second (wall) over LeRobot's default writer, {label}", value=mean(wall), unit="×", goal=goal,
-        rival="LeRobot default, rows/s", rival_value=default_rate, n=REPEATS, spread=spread(wall),
-    )  # fmt: skip
-    yield Row(
-        name=f"speed, {label}", value=mean(speed), unit="× real time", goal="≥ 1.5", n=REPEATS, spread=spread(speed)
-    )
-    yield Row(
-        name=f"rows per CPU-second, {label}", value=mean(per_cpu), unit="rows/CPU-s", n=REPEATS, spread=spread(per_cpu)
-    )
-    yield Row(
-        name=f"parsing, {label}",
-        value=mean(parsing),
-        unit="% of CPU time",
-        goal="< 5",
-        n=REPEATS,
-        spread=spread(parsing),
-    )
+    default_rate = mean([RIVAL_ROWS / cost.wall_s for cost in theirs])
+    stock = "LeRobot default, rows/CPU-s, same frames, without decoding"
+    rows_of = partial(Row.of, by=mean)
+    name = f"rows per CPU-second over LeRobot's default writer, {label}"
+    yield rows_of(ratios, name=name, unit="×", goal=goal, rival=stock, rival_value=mean(rival))
+    name, stock = f"rows per second (wall) over LeRobot's default writer, {label}", "LeRobot default, rows/s"
+    yield rows_of(wall, name=name, unit="×", goal=goal, rival=stock, rival_value=default_rate)
+    speed = [rows / 30 / cost.wall_s for rows, cost in ours]
+    yield rows_of(speed, name=f"speed, {label}", unit="× real time", goal="≥ 1.5")
+    yield rows_of(per_cpu, name=f"rows per CPU-second, {label}", unit="rows/CPU-s")
+    yield rows_of(parsing, name=f"parsing, {label}", unit="% of CPU time", goal="< 5")
 
 
 def _our_ingest(path: Path, spec: Any, folder: Path) -> tuple[int, Cost]:
@@ -177,10 +162,11 @@ def ingest_memory() -> Iterator[Row]:
     peaks = {}
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
         folder = Path(name)
-        native = _native_spec(folder / "data_specs")
-        importing = _peak_mb(
-            [sys.executable, "-c", "import lerobot.datasets.lerobot_dataset, lerobot.datasets.aggregate"]
+        native, imports = (
+            _native_spec(folder / "data_specs"),
+            "lerobot.datasets.lerobot_dataset, lerobot.datasets.aggregate",
         )
+        importing = _peak_mb([sys.executable, "-c", f"import {imports}"])
         for duration_s in (RECORDING_S, LONG_RECORDING_S):
             recording = _stand_in(folder / f"recording_{duration_s:g}.mcap", duration_s)
             command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(recording), f"--spec={native}"]
@@ -188,21 +174,22 @@ def ingest_memory() -> Iterator[Row]:
             peaks[duration_s] = _peak_mb(command)
             recording.unlink()
     for duration_s, peak in peaks.items():
-        yield Row.of(
-            [peak],
-            name=f"peak memory, {duration_s:g} s at 3 × 480×640",
-            unit="MB",
-            goal="< 1000",
-            rival="import of LeRobot alone",
-            rival_value=importing,
-        )
+        name, rival = f"peak memory, {duration_s:g} s at 3 × 480×640", "import of LeRobot alone"
+        yield Row.of([peak], name=name, unit="MB", goal="< 1000", rival=rival, rival_value=importing)
+
+
+def _used(command: list[str], stderr: int | None = None) -> tuple[int, resource.struct_rusage]:
+    """Exit status of a command, and what it used."""
+    env = {**os.environ, "HF_HUB_OFFLINE": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, env=env)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return process.returncode, usage
 
 
 def _peak_mb(command: list[str]) -> float:
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, "HF_HUB_OFFLINE": "1"})
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0, command
+    code, usage = _used(command)
+    assert code == 0, command
     return usage.ru_maxrss / 1000
 
 
@@ -211,7 +198,7 @@ def corruption() -> Iterator[Row]:
     """Benchmark that runs the corruption suites: 31 planned cases (tests/end_to_end/test_corruption.py), and files with random
     damage in four formats (test_random_damage.py)."""
     suite = _pytest(*CORRUPTION)
-    yield _share("cases in their right outcome", suite.passed, suite.total, "≥ 100")
+    yield _share("cases in their right outcome", sum(suite.cases.values()), len(suite.cases), "≥ 100")
     found = _pytest(*DAMAGE).properties
     kinds = list(dict.fromkeys(name.partition(": ")[0] for name in found))
     files, wrong = (sum(found[f"{kind}: {name}"] for kind in kinds) for name in ("files", "wrong"))
@@ -236,17 +223,13 @@ def _share(name: str, part: int, of: int, goal: str = "") -> Row:
     return Row(name=name, value=100 * part / of, unit="%", goal=goal, n=of, spread=0.0)
 
 
-@dataclass(frozen=True)
-class _Suite:
+class _Suite(NamedTuple):
     """Result of running tests."""
 
-    passed: int
-    total: int
-    """Number of tests that ran."""
     properties: dict[str, int]
     """What the tests recorded."""
     cases: dict[str, bool]
-    """Test → whether it passed."""
+    """Test that ran → whether it passed."""
 
 
 def _pytest(*words: str) -> _Suite:
@@ -255,12 +238,11 @@ def _pytest(*words: str) -> _Suite:
         command = [sys.executable, "-m", "pytest", "-q", *words, f"--junitxml={result}"]
         subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
         suite = ElementTree.parse(result).getroot()[0]
-        total = int(suite.get("tests", 0)) - int(suite.get("skipped", 0))
-        failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
-        properties = {p.attrib["name"]: int(p.attrib["value"]) for p in suite.iter("property")}
-        failures = ("failure", "error")
-        cases = {c.attrib["name"]: all(c.find(f) is None for f in failures) for c in suite.iter("testcase")}
-        return _Suite(total - failed, total, properties, cases)
+    properties = {p.attrib["name"]: int(p.attrib["value"]) for p in suite.iter("property")}
+    outcomes = {c.attrib["name"]: {part.tag for part in c} for c in suite.iter("testcase")}
+    return _Suite(
+        properties, {k: not tags & {"failure", "error"} for k, tags in outcomes.items() if "skipped" not in tags}
+    )
 
 
 @benchmark("start_up")
@@ -277,20 +259,11 @@ def start_up() -> Iterator[Row]:
             ("taccorl check on a recording", check, "Python with NumPy", "import numpy", "< 9"),
         ):
             bare = [sys.executable, "-c", code]
-            pairs = [(_children_cpu_s(words), _children_cpu_s(bare)) for _ in range(7)][2:]
-            ratios = [ours / theirs for ours, theirs in pairs]
-            yield Row.of(
-                ratios,
-                name=label,
-                unit=f"× {rival}",
-                goal=goal,
-                rival=f"{rival}, CPU-s",
-                rival_value=median([theirs for _, theirs in pairs]),
-            )
+            pairs = [(_cpu_s(words), _cpu_s(bare)) for _ in range(7)][2:]
+            ratios, bare_s = [ours / theirs for ours, theirs in pairs], median([theirs for _, theirs in pairs])
+            yield Row.of(ratios, name=label, unit=f"× {rival}", goal=goal, rival=f"{rival}, CPU-s", rival_value=bare_s)
 
 
-def _children_cpu_s(command: list[str]) -> float:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+def _cpu_s(command: list[str]) -> float:
+    usage = _used(command, subprocess.DEVNULL)[1]
+    return usage.ru_utime + usage.ru_stime

@@ -64,6 +64,16 @@ def spread(values: Sequence[float]) -> float:
     return (max(values) - min(values)) / 2
 
 
+def cpu_times_s(work: Callable[[], object], repeats: int) -> list[float]:
+    """CPU-seconds of each of ``repeats`` calls after one that is not measured."""
+    times = []
+    for _ in range(1 + repeats):
+        before = time.process_time()
+        work()
+        times.append(time.process_time() - before)
+    return times[1:]
+
+
 def reference_step_s(repeats: int = 3) -> float:
     """CPU-seconds of one step of the reference loop, median of ``repeats`` loops: a chain of 12 links that swings in MuJoCo.
 
@@ -80,28 +90,20 @@ def reference_step_s(repeats: int = 3) -> float:
     option = '<option timestep="0.001" integrator="implicitfast"/>'
     chain = "".join(links) + "</body>" * REFERENCE_LINKS
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{chain}</worldbody></mujoco>")
-    times = []
-    for _ in range(repeats):
+
+    def swing() -> None:
         data = mujoco.MjData(model)
         data.qpos[:] = 0.1
-        before = time.process_time()
         mujoco.mj_step(model, data, nstep=REFERENCE_STEPS)
-        times.append(time.process_time() - before)
-    return median(times) / REFERENCE_STEPS
+
+    return median(cpu_times_s(swing, repeats)) / REFERENCE_STEPS
 
 
 def against_reference(name: str, cpu_s: Sequence[float], goal: str = "") -> Row:
     """Row with the costs just measured, in steps of the reference loop, which is measured in the same run."""
     step_s = reference_step_s()
-    steps = [cost / step_s for cost in cpu_s]
-    return Row.of(
-        steps,
-        name=name,
-        unit="reference steps",
-        goal=goal,
-        rival="one reference step, µs CPU",
-        rival_value=1e6 * step_s,
-    )
+    rival = {"rival": "one reference step, µs CPU", "rival_value": 1e6 * step_s}
+    return Row.of([cost / step_s for cost in cpu_s], name=name, unit="reference steps", goal=goal, **rival)
 
 
 def meets(value: float, goal: str) -> bool | None:

@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 
 from pipelines.benchmarks.grip_rig import gripped, in_hand_m, rest, shake
-from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
+from pipelines.benchmarks.rows import Row, against_reference, benchmark, cpu_times_s
 from taccorl.errors import TaccorlError
-from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
 from taccorl.sim.pad import OneSim, PadArray
 from taccorl.sim.rendering import Renderer
@@ -24,19 +23,9 @@ NUM_SIMS = 128
 REPEATS = 7
 
 
-def _cpu_s(work: Callable[[], object], repeats: int = REPEATS) -> list[float]:
-    work()
-    times = []
-    for _ in range(repeats):
-        before = cpu_s()
-        work()
-        times.append(cpu_s() - before)
-    return times
-
-
 def _in_turns(*works: Callable[[], object], repeats: int = REPEATS) -> list[list[float]]:
     """CPU-seconds of each, measured in turns, because a scene's cost drifts and so does a shared machine."""
-    times = [[_cpu_s(work, 1)[0] for work in works] for _ in range(repeats)]
+    times = [[cpu_times_s(work, 1)[0] for work in works] for _ in range(repeats)]
     return [list(column) for column in zip(*times, strict=True)]
 
 
@@ -80,23 +69,16 @@ def twin_speed() -> Iterator[Row]:
         f"≤ {1e5 / 300 / step_ms:.0f}",
     )
     shares = [b / f for f, b in zip(full, bare, strict=True)]
-    yield Row.of(
-        shares,
-        name="share of a bare Batch.step loop's speed",
-        unit="1",
-        goal="≥ 0.9",
-        rival="Batch.step, env steps/CPU-s",
-        rival_value=NUM_SIMS / median(bare),
-    )
-    touch = [t / NUM_SIMS for t in _cpu_s(lambda: sim.pads.touch(sim.batch))]
+    rival = {"rival": "Batch.step, env steps/CPU-s", "rival_value": NUM_SIMS / median(bare)}
+    yield Row.of(shares, name="share of a bare Batch.step loop's speed", unit="1", goal="≥ 0.9", **rival)
+    touch = [t / NUM_SIMS for t in cpu_times_s(lambda: sim.pads.touch(sim.batch), REPEATS)]
     # Its goal is the share of a control step, below: memory bounds both, and a step of the reference loop stays in the cache.
-    name = (
-        f"touch, depth and rate of {len(ROBOT.pads)} × {ROBOT.pad.num_taxels} taxels, per env in a batch of {NUM_SIMS}"
-    )
-    yield Row(name=name, value=1e6 * median(touch), unit="µs/env", n=len(touch), spread=1e6 * spread(touch))
+    taxels = f"{len(ROBOT.pads)} × {ROBOT.pad.num_taxels} taxels"
+    name = f"touch, depth and rate of {taxels}, per env in a batch of {NUM_SIMS}"
+    yield Row.of([1e6 * t for t in touch], name=name, unit="µs/env")
     alone, goal_alone = holding(1)
     alone.step(goal_alone)
-    single = [1e6 * t / 20 for t in _cpu_s(lambda: [alone.pads.touch(alone.batch) for _ in range(20)])]
+    single = [1e6 * t / 20 for t in cpu_times_s(lambda: [alone.pads.touch(alone.batch) for _ in range(20)], REPEATS)]
     yield Row.of(single, name="touch of a single env, not in a batch", unit="µs")
     share = [100 * t / (median(full) / NUM_SIMS) for t in touch]
     yield Row.of(share, name="touch", unit="% of a control step", goal="≤ 10")
@@ -124,24 +106,13 @@ def grip() -> Iterator[Row]:
     yield Row.of(creeps, name="creep of a 40 g part at 10 N", unit="mm/s", goal="≤ 0.02")
     for swing_rad, goal in ((0.06, "≤ 1"), (0.2, "")):
         slips = [shake(*gripped(mass_kg, 10.0), swing_rad=swing_rad) * 1e3 for mass_kg in (0.04, 0.07, 0.1)]
-        yield Row.of(
-            slips,
-            by=max,
-            name=f"slip in a 3 s shake of {swing_rad:g} rad at 10 N, largest of 40, 70 and 100 g",
-            unit="mm",
-            goal=goal,
-        )
+        name = f"slip in a 3 s shake of {swing_rad:g} rad at 10 N, largest of 40, 70 and 100 g"
+        yield Row.of(slips, by=max, name=name, unit="mm", goal=goal)
     for pads, goal in (("sprung", "≤ 5"), ("rigid", "")):
         peaks = [_peak_reading(mass_kg, pads) for mass_kg in (0.04, 0.1, 0.3)]
         differs = 100 * (max(peaks) - min(peaks)) / min(peaks)
-        yield Row(
-            name=f"reading at 10 N, 40 → 300 g, {pads} pads: largest over smallest",
-            value=differs,
-            unit="%",
-            goal=goal,
-            n=len(peaks),
-            spread=0.0,
-        )
+        name = f"reading at 10 N, 40 → 300 g, {pads} pads: largest over smallest"
+        yield Row(name=name, value=differs, unit="%", goal=goal, n=len(peaks), spread=0.0)
 
 
 def _peak_reading(mass_kg: float, pads: str) -> float:
@@ -161,7 +132,7 @@ def pictures() -> Iterator[Row]:
     names = [camera.name for camera in sim.config.cameras]
     for size, goal in ((224, "≤ 600"), (96, "")):
         with Renderer(sim.model, names, size, size) as renderer:
-            times = _cpu_s(lambda r=renderer: r.render_batch(sim.batch), 30)
+            times = cpu_times_s(lambda r=renderer: r.render_batch(sim.batch), 30)
             driver = renderer.driver
         name = f"three {size}² pictures of a task with {sim.model.ngeom} geoms, {driver.split('(')[0].strip()}"
         yield against_reference(name, times, goal)
@@ -183,9 +154,5 @@ def tiled_pictures() -> Iterator[Row]:
             rates.append(NUM_SIMS * len(names) / (time.perf_counter() - before))
         driver = renderer.driver
     software = "llvmpipe" in driver or "softpipe" in driver
-    yield Row.of(
-        rates,
-        name=f"96² views tiled, {driver.split('(')[0].strip()}",
-        unit="images/s (wall)",
-        goal="" if software else "≥ 10000",
-    )
+    name, goal = f"96² views tiled, {driver.split('(')[0].strip()}", "" if software else "≥ 10000"
+    yield Row.of(rates, name=name, unit="images/s (wall)", goal=goal)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.benchmarks.rows import Row, benchmark, spread
+from pipelines.benchmarks.rows import Row, benchmark
 from taccorl.robots import ROBOT
 
 EPISODES, EPISODE_ROWS = 2, 128
@@ -39,12 +39,10 @@ def loading_speed() -> Iterator[Row]:
             ours, stock = figures[FastReader][1:], figures[DatasetReader][1:]
             ratios = [a / b for a, b in zip(ours, stock, strict=True)]
             shown = f"{label} ({backend})" if cameras else label
-            yield Row(
-                name=f"rows per second over LeRobot's reader, {shown}, H = {HORIZON}, L = {HISTORY}, {WORKERS} workers",
-                value=mean(ratios), unit="×", goal=goal, rival="LeRobot, rows/s", rival_value=mean(stock), n=EPOCHS,
-                spread=spread(ratios),
-            )  # fmt: skip
-            yield Row(name=f"rows per second, {shown}", value=mean(ours), unit="rows/s", n=EPOCHS, spread=spread(ours))
+            name = f"rows per second over LeRobot's reader, {shown}, H = {HORIZON}, L = {HISTORY}, {WORKERS} workers"
+            rival = {"rival": "LeRobot, rows/s", "rival_value": mean(stock)}
+            yield Row.of(ratios, by=mean, name=name, unit="×", goal=goal, **rival)
+            yield Row.of(ours, by=mean, name=f"rows per second, {shown}", unit="rows/s")
             if cameras:
                 yield from _cached(root, Path(name) / "store", mean(stock))
 
@@ -66,15 +64,9 @@ def _cached(root: Path, store: Path, stock: float) -> Iterator[Row]:
     finally:
         reading._requested = None
     ratios = [figure / stock for figure in figures]
-    yield Row.of(
-        ratios,
-        by=mean,
-        name=f"rows per second over LeRobot's reader, 3 × {CACHED_PX}² frames cached ({place}), H = {HORIZON}, L = {HISTORY}",
-        unit="×",
-        goal="≥ 15",
-        rival="LeRobot, rows/s",
-        rival_value=stock,
-    )
+    frames = f"3 × {CACHED_PX}² frames cached ({place})"
+    name = f"rows per second over LeRobot's reader, {frames}, H = {HORIZON}, L = {HISTORY}"
+    yield Row.of(ratios, by=mean, name=name, unit="×", goal="≥ 15", rival="LeRobot, rows/s", rival_value=stock)
 
 
 def _write(root: Path, cameras: int) -> Path:

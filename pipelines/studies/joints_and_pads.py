@@ -5,19 +5,20 @@ hidden in it. Rows of any number of machines and sessions add up in one file; ``
 ``pipelines/diagnosis_page.py`` writes the page.
 """
 
+import contextlib
 import dataclasses
 import math
 import time
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
+from taccorl.alignment.checks.unrepeated import check_repeatability
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.touch_problem import TouchProblem
+from taccorl.diagnosis.search.identifiable import identifiable_numbers, identified_value
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import effects as registry
@@ -207,35 +208,16 @@ def told(found: Diagnosis) -> dict[str, Any]:
 def numbers(found: Diagnosis, truth: Mapping[str, float], *, commanded: bool, effort: bool) -> dict[str, list[float]]:
     """Identifiable number → value, 95 % interval, truth. Effects that are not hidden have no truth; theirs are not here."""
     out = {}
-    for name, value, low, high, true in _identified(found, truth, commanded=commanded, effort=effort):
-        out[name] = [_short(v) for v in (value, low, high, true)]
+    for n in identifiable_numbers(found.after, commanded, effort):
+        with contextlib.suppress(KeyError):
+            true = identified_value(n.name, truth)
+            out[n.name] = [_short(v) for v in (n.value, n.low, n.high, true)]
     return out
-
-
-def _identified(
-    found: Diagnosis, truth: Mapping[str, float], *, commanded: bool, effort: bool
-) -> Iterable[tuple[str, float, float, float, float]]:
-    """Numbers as ``taccorl.diagnosis.search.identifiable`` has them; without that module every fitted number as it is."""
-    module = "taccorl.diagnosis.search.identifiable"
-    if find_spec(module) is None:
-        for name, (low, high) in found.intervals.items():
-            if name in truth:
-                yield name, found.after.values[name], low, high, truth[name]
-        return
-    identifiable = import_module(module)
-    for n in identifiable.identifiable_numbers(found.after, commanded, effort):
-        try:
-            yield n.name, n.value, n.low, n.high, identifiable.identified_value(n.name, truth)
-        except KeyError:
-            continue
 
 
 def findings(measurements: Sequence[Measurement], signal: str) -> list[str]:
     """Findings of the recordings alone: ``dropped_commands``, ``does_not_repeat``."""
-    module = "taccorl.alignment.checks.unrepeated"
-    if find_spec(module) is None:
-        return []
-    found = import_module(module).check_repeatability(measurements)
+    found = check_repeatability(measurements)
     said = {f.check for _, f in found if f.severity != "note" and f.feature == signal}
     return sorted(said & {"dropped_commands", "does_not_repeat"})
 
@@ -294,40 +276,12 @@ def inside(row: dict[str, Any], *, hidden_only: bool = False) -> list[bool]:
     return [held[name] for name in held if not hidden_only or name.startswith(own)]
 
 
-def single(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
-    """One hidden effect each."""
-    return [Job(study="single", hidden=(n,), seed=s, design=design) for s in seeds for n in names]
-
-
-def touch(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
-    """One hidden effect of the pads each, press–hold–release."""
-    return [Job(study="touch", hidden=(n,), seed=s, design="press") for s in seeds for n in names]
-
-
-def dropped(design: str, seeds: Sequence[int]) -> list[Job]:
-    """Nothing but lost commands."""
-    return [Job(study="dropped", hidden=("dropped_commands",), seed=s, design=design) for s in seeds]
-
-
-def nothing(design: str, seeds: Sequence[int]) -> list[Job]:
-    """No hidden effect."""
-    return [Job(study="none", hidden=(), seed=s, design=design) for s in seeds]
-
-
-def loop(design: str, seeds: Sequence[int]) -> list[Job]:
-    """No hidden effect but a sampled loop, which efforts show."""
-    return [Job(study="loop", hidden=(), seed=s, design=design) for s in seeds]
-
-
-def removed(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
-    """One hidden effect that was removed from the search's registry."""
-    return [
-        Job(study="removed", hidden=(n,), seed=s, design=design, without=(n,) if n in registry else ())
-        for s in seeds
-        for n in names
+def jobs(study: str, design: str, hidden: Sequence[str], seeds: Sequence[int]) -> list[Job]:
+    """A case for each seed and each of ``hidden``: an effect, two joined by +, or nothing (""). In the study ``removed`` the
+    search does not know them."""
+    made = [
+        Job(study=study, hidden=tuple(filter(None, h.split("+"))), seed=s, design=design) for s in seeds for h in hidden
     ]
-
-
-def pairs(design: str, couples: Sequence[tuple[str, str]], seeds: Sequence[int]) -> list[Job]:
-    """Two hidden effects at once, each drawn as a single one is: both of them are there to be found."""
-    return [Job(study="pairs", hidden=c, seed=s, design=design) for s in seeds for c in couples]
+    if study != "removed":
+        return made
+    return [dataclasses.replace(job, without=tuple(h for h in job.hidden if h in registry)) for job in made]

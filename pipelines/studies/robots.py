@@ -1,9 +1,9 @@
 """Is the search right on robots other than the PiPER? Simulated robots of ``studies.foreign``, one hidden effect or none each.
 
-``python -m pipelines.studies.robots rows.jsonl`` runs the cases that the file lacks and counts all; ``make bench
-ONLY=robots`` runs a small sample. Exact: the hidden effect is the one that is added first, pairs that no angle tells apart
-counted as one. Named: it is that, or named with it as a tie, a rival or a near-twin by nature. Silent: nothing hidden, and no
-effect is added. Material: the validation error, always fitted numbers refitted, is at least 1.5 noise floors.
+``python -m pipelines.studies.robots rows.jsonl`` runs the cases that the file lacks and counts all. Exact: the hidden effect
+is the one that is added first, pairs that no angle tells apart counted as one. Named: it is that, or named with it as a tie,
+a rival or a near-twin by nature. Silent: nothing hidden, and no effect is added. Material: the validation error, always
+fitted numbers refitted, is at least 1.5 noise floors.
 """
 
 import json

@@ -36,26 +36,19 @@ class ChannelTiming:
 
     channel: str
     feature: str
-    align: str
-    """Rule by which its samples are assigned to rows (``MappingSpec.align``)."""
+    align: str  # Rule by which its samples are assigned to rows (``MappingSpec.align``)
     rate_hz: float
-    gaps: int
-    """Intervals longer than 1.5 median intervals."""
+    gaps: int  # Intervals longer than 1.5 median intervals
     longest_gap_s: float
     age_median_s: float
     """Median age of the samples that the rows show [s]; ``age_max_s``: the largest. Row time − sample time; for ``action`` the
     time of the next row − sample time."""
     age_max_s: float
-    duplicates: int = 0
-    """Number of samples that repeat the time of an earlier one."""
-    out_of_order: int = 0
-    """Number of samples that are older than the one before them in the file."""
-    zero_stamps: int = 0
-    """Number of samples that were dropped because their stamp is 0."""
-    skipped: dict[str, int] = field(default_factory=dict)
-    """Reason → number of messages that give the channel no sample."""
-    nominal_hz: float = 0.0
-    """Rate that the recording spec states for the channel [Hz]; 0 if it states none."""
+    duplicates: int = 0  # Number of samples that repeat the time of an earlier one
+    out_of_order: int = 0  # Number of samples that are older than the one before them in the file
+    zero_stamps: int = 0  # Number of samples that were dropped because their stamp is 0
+    skipped: dict[str, int] = field(default_factory=dict)  # Reason → number of messages that give the channel no sample
+    nominal_hz: float = 0.0  # Rate that the recording spec states for the channel [Hz]; 0 if it states none
 
 
 @dataclass(frozen=True)
@@ -74,20 +67,15 @@ class Arm:
 class Episode:
     """One episode, cut and aligned: T rows at ``spec.fps``, and facts about its origin."""
 
-    name: str
-    """Name for messages and titles: recording and episode."""
+    name: str  # Name for messages and titles: recording and episode
     spec: DatasetSpec
-    start_ns: int
-    """Time of row 0 on the recording's clock [ns]."""
-    arrays: dict[str, np.ndarray]
-    """Feature key → (T, size): every feature of the episode that is not a video."""
+    start_ns: int  # Time of row 0 on the recording's clock [ns]
+    arrays: dict[str, np.ndarray]  # Feature key → (T, size): every feature of the episode that is not a video
     pictures: Callable[[], Iterator[Pictures]]
     """Calling it streams the T rows' pictures from the start, for the video features of ``picture_keys``."""
     picture_keys: tuple[str, ...]
-    instruction: str
-    """Sentence that the policy reads."""
-    success: bool | None = None
-    """True or False as the operator's marker states; None without a marker."""
+    instruction: str  # Sentence that the policy reads
+    success: bool | None = None  # True or False as the operator's marker states; None without a marker
     origin: Origin = UNSTATED
     timing: tuple[ChannelTiming, ...] = ()
     picture_rows: dict[str, np.ndarray] = field(default_factory=dict)
@@ -95,10 +83,8 @@ class Episode:
     dataset."""
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
     """Tactile key → (K,) counts of the untouched pad that were subtracted from the readings."""
-    videos: dict[str, Video] = field(default_factory=dict)
-    """Video key → file, where the episode comes from a dataset."""
-    stages: tuple[tuple[int, str], ...] = ()
-    """(first row, name) of the task's stages, where known."""
+    videos: dict[str, Video] = field(default_factory=dict)  # Video key → file, where the episode comes from a dataset
+    stages: tuple[tuple[int, str], ...] = ()  # (first row, name) of the task's stages, where known
     provenance: dict[str, object] = field(default_factory=dict)
     """Facts about how the episode was made, as JSON values: recording, simulation …"""
     findings: tuple[Finding, ...] = ()

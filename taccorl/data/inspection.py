@@ -36,23 +36,18 @@ class TopicSummary:
     topic: str
     type: TopicType
     num_messages: int
-    first_ns: int
-    """Log time of the first message [ns]; ``last_ns``: of the last one."""
+    first_ns: int  # Log time of the first message [ns]; ``last_ns``: of the last one
     last_ns: int
     rate_hz: float
     """1 / median interval of the topic's own stamps, or of log times if it has none [Hz]; 0 with fewer than two messages."""
     longest_gap_s: float
-    num_gaps: int
-    """Intervals longer than 1.5 median intervals."""
-    stamped: bool
-    """True if its messages have a header stamp."""
+    num_gaps: int  # Intervals longer than 1.5 median intervals
+    stamped: bool  # True if its messages have a header stamp
     skew_s: float
     """Median of log time − header stamp [s], and 0.99 quantile of the distance from it; 0 without a header."""
     skew_p99_s: float
-    repeated: int
-    """Number of messages with the stamp of an earlier one."""
-    zero_stamps: int
-    """Number of messages whose stamp is 0, on a topic where other stamps are times."""
+    repeated: int  # Number of messages with the stamp of an earlier one
+    zero_stamps: int  # Number of messages whose stamp is 0, on a topic where other stamps are times
     names: tuple[str, ...] = ()
     """Names of the values: the ``name`` list of its messages (a topic with several such lists has a summary for each), the
     type's, or paths such as ``force.x`` in a wrench."""
@@ -66,8 +61,7 @@ class TopicSummary:
     """Name of the shipped sensor whose pad frames have the same type and size; None if there is none."""
     counts: tuple[str, tuple[int, ...]] | None = None
     """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind."""
-    unusable: int = 0
-    """Number of the topic's messages that hold no names or no values, which give no sample."""
+    unusable: int = 0  # Number of the topic's messages that hold no names or no values, which give no sample
     first: Any = field(default=None, repr=False, compare=False)
     """First message with these names, where the topic has joint states."""
     misfit: str = ""

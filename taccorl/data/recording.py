@@ -298,14 +298,10 @@ class Channel:
 
     name: str
     spec: ChannelSpec
-    log_ns: np.ndarray
-    """(N,) int64 log times [ns]."""
-    stamp_ns: np.ndarray | None
-    """(N,) int64 header stamps [ns]; None if the messages have no header."""
-    values: np.ndarray | None
-    """(N, size) numbers; None for pictures."""
-    place: np.ndarray
-    """(N,) int64 number of each message among all that were read, in the order of the file."""
+    log_ns: np.ndarray  # (N,) int64 log times [ns]
+    stamp_ns: np.ndarray | None  # (N,) int64 header stamps [ns]; None if the messages have no header
+    values: np.ndarray | None  # (N, size) numbers; None for pictures
+    place: np.ndarray  # (N,) int64 number of each message among all that were read, in the order of the file
     skipped: dict[str, int] = field(default_factory=dict)
     """Reason → number of messages of the topic that give this channel no sample."""
 

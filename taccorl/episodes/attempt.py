@@ -70,19 +70,14 @@ class Attempt:
     outcome: str
     """``success``; a failure category of the task; ``timeout``, ``diverged``; ``unfinished`` (neither success nor failure); one
     of ``CAUSES``; ``error``; ``crashed`` or ``hung`` of its process; or what its kind of attempt adds."""
-    reason: str = ""
-    """Explanation of the outcome; empty if there is none."""
+    reason: str = ""  # Explanation of the outcome; empty if there is none
     name: str = ""
-    recorder: EpisodeRecorder | None = None
-    """Recorder with the rows, if the attempt has rows."""
-    provenance: dict[str, Any] = field(default_factory=dict)
-    """How the episode was simulated, for its provenance."""
-    source_digest: str = ""
-    """Digest of the dataset from which the episode was made."""
+    recorder: EpisodeRecorder | None = None  # Recorder with the rows, if the attempt has rows
+    provenance: dict[str, Any] = field(default_factory=dict)  # How the episode was simulated, for its provenance
+    source_digest: str = ""  # Digest of the dataset from which the episode was made
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     """Name → further array of the attempt, stored as NAME.npy beside entry.json."""
-    facts: dict[str, Any] = field(default_factory=dict)
-    """Further keys of entry.json."""
+    facts: dict[str, Any] = field(default_factory=dict)  # Further keys of entry.json
 
     @property
     def rows(self) -> int:

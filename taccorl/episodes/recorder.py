@@ -84,18 +84,13 @@ class EpisodeRecorder:
     """Steps simulation 0 and records the rows of an episode. Make a new one after each reset."""
 
     sim: Simulation
-    spec: DatasetSpec
-    """Data spec of the rows, from ``row_spec``."""
-    sensor_rng: np.random.Generator | None = None
-    """Random generator of the pads' noise; None: a noiseless sensor."""
+    spec: DatasetSpec  # Data spec of the rows, from ``row_spec``
+    sensor_rng: np.random.Generator | None = None  # Random generator of the pads' noise; None: a noiseless sensor
     dense: bool = False
     """True: also keep a trajectory at 200 Hz, from which a recording in the format of the drivers is made."""
-    rows: list[dict[str, np.ndarray]] = field(default_factory=list)
-    """Recorded rows: feature → value."""
-    physics_s: float = 0.0
-    """Wall time of the physics in all steps so far [s]."""
-    touch_s: float = 0.0
-    """Wall time of touch in all steps so far [s]."""
+    rows: list[dict[str, np.ndarray]] = field(default_factory=list)  # Recorded rows: feature → value
+    physics_s: float = 0.0  # Wall time of the physics in all steps so far [s]
+    touch_s: float = 0.0  # Wall time of touch in all steps so far [s]
 
     def __post_init__(self) -> None:
         self._dense = DenseRecorder(self.sim) if self.dense else None

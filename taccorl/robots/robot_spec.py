@@ -88,52 +88,32 @@ class PadLayout:
 class CameraMount:
     """Nominal mount of one colour camera of the robot: body, position, direction, model."""
 
-    name: str
-    """Name of the camera, as in the dataset's key ``observation.images.<name>``."""
-    body: str = "world"
-    """Body to which the camera is fixed."""
-    model: str
-    """Name of its imager in ``taccorl.sim.cameras.COLOR_SENSORS``."""
-    position_m: tuple[float, float, float]
-    """Optical centre in the body's frame [m]."""
-    look_at_m: tuple[float, float, float]
-    """Point in the body's frame that appears in the middle of the picture [m]."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction in the body's frame that points up in the picture."""
+    name: str  # Name of the camera, as in the dataset's key ``observation.images.<name>``
+    body: str = "world"  # Body to which the camera is fixed
+    model: str  # Name of its imager in ``taccorl.sim.cameras.COLOR_SENSORS``
+    position_m: tuple[float, float, float]  # Optical centre in the body's frame [m]
+    look_at_m: tuple[float, float, float]  # Point in the body's frame that appears in the middle of the picture [m]
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction in the body's frame that points up in the picture
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSpec:
     """A robot of equal arms with a two-finger gripper each. State and action have the same numbers in the same order."""
 
-    arms: tuple[str, ...]
-    """Names of the arms; they are the prefixes of the names of everything on an arm."""
-    joints: tuple[str, ...]
-    """Names of one arm's joints without the arm's prefix, base to hand."""
-    links: tuple[Link, ...]
-    """Links of one arm, base to hand: link k is moved by joint k."""
-    kp_nm_per_rad: tuple[float, ...]
-    """K_p of each joint's controller [N·m/rad], in τ = K_p (q* − q) − K_d q̇ + T_ref."""
-    kd_nms_per_rad: tuple[float, ...]
-    """K_d of each joint's controller [N·m·s/rad]."""
-    torque_ff_nm: tuple[float, ...]
-    """T_ref of each joint's controller [N·m]."""
-    fingers: tuple[str, ...]
-    """Names of the fingers of one gripper; each finger has a pad."""
-    finger_stroke_m: float
-    """Travel of each finger [m]."""
-    finger_from_hand_m: float
-    """Distance of the fingers' origin from the hand's origin, along the hand's z axis [m]."""
-    tcp_from_hand_m: float
-    """Distance of the TCP from the hand's origin, along the hand's z axis [m]."""
-    grip_force_max_n: float
-    """Greatest closing force of each finger [N]."""
-    pad: PadLayout
-    """Taxels of every pad."""
-    pad_thickness_m: float
-    """Height of the taxels above the finger [m]."""
-    camera_mounts: tuple[CameraMount, ...]
-    """Cameras, in the order of the dataset's keys."""
+    arms: tuple[str, ...]  # Names of the arms; they are the prefixes of the names of everything on an arm
+    joints: tuple[str, ...]  # Names of one arm's joints without the arm's prefix, base to hand
+    links: tuple[Link, ...]  # Links of one arm, base to hand: link k is moved by joint k
+    kp_nm_per_rad: tuple[float, ...]  # K_p of each joint's controller [N·m/rad], in τ = K_p (q* − q) − K_d q̇ + T_ref
+    kd_nms_per_rad: tuple[float, ...]  # K_d of each joint's controller [N·m·s/rad]
+    torque_ff_nm: tuple[float, ...]  # T_ref of each joint's controller [N·m]
+    fingers: tuple[str, ...]  # Names of the fingers of one gripper; each finger has a pad
+    finger_stroke_m: float  # Travel of each finger [m]
+    finger_from_hand_m: float  # Distance of the fingers' origin from the hand's origin, along the hand's z axis [m]
+    tcp_from_hand_m: float  # Distance of the TCP from the hand's origin, along the hand's z axis [m]
+    grip_force_max_n: float  # Greatest closing force of each finger [N]
+    pad: PadLayout  # Taxels of every pad
+    pad_thickness_m: float  # Height of the taxels above the finger [m]
+    camera_mounts: tuple[CameraMount, ...]  # Cameras, in the order of the dataset's keys
 
     @property
     def hand(self) -> str:

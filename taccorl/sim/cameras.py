@@ -46,14 +46,10 @@ class Intrinsics:
 
     rows: int
     columns: int
-    fx_px: float
-    """Focal length along the columns [pixels]."""
-    fy_px: float
-    """Focal length along the rows [pixels]."""
-    cx_px: float
-    """Column of the principal point; 0 is the centre of the leftmost pixel."""
-    cy_px: float
-    """Row of the principal point; 0 is the centre of the topmost pixel."""
+    fx_px: float  # Focal length along the columns [pixels]
+    fy_px: float  # Focal length along the rows [pixels]
+    cx_px: float  # Column of the principal point; 0 is the centre of the leftmost pixel
+    cy_px: float  # Row of the principal point; 0 is the centre of the topmost pixel
 
     def scaled(self, rows: int, columns: int) -> "Intrinsics":
         """Intrinsics of the same view in a picture of ``rows`` × ``columns`` pixels: a pixel centre c moves to (c + ½)·s − ½, as
@@ -67,14 +63,6 @@ class Intrinsics:
             cx_px=(self.cx_px + 0.5) * right - 0.5,
             cy_px=(self.cy_px + 0.5) * down - 0.5,
         )
-
-    def letterboxed(self, rows: int, columns: int) -> "Intrinsics":
-        """Intrinsics after ingest's letterbox: scaled into ``rows`` × ``columns`` with the aspect kept, and moved by the
-        black bars."""
-        window = letterbox_window((self.rows, self.columns), (rows, columns))
-        inner = self.scaled(window.rows, window.columns)
-        moved = {"cx_px": inner.cx_px + window.left, "cy_px": inner.cy_px + window.top}
-        return dataclasses.replace(inner, rows=rows, columns=columns, **moved)
 
     @property
     def vertical_fov_rad(self) -> float:

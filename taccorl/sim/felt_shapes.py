@@ -42,53 +42,36 @@ class ShapeTables(NamedTuple):
     A *seam* is a rectangle in a face of a solid: it encloses a place where another solid of the same part touches or cuts the
     face. Where the nearest point lies in one, the depth is that within the whole part."""
 
-    geom: np.ndarray
-    """(G,) ids of the geoms."""
-    kind: np.ndarray
-    """(G,) code of the kind."""
+    geom: np.ndarray  # (G,) ids of the geoms
+    kind: np.ndarray  # (G,) code of the kind
     radius_m: np.ndarray
     """(G,) radius of capsules and cylinders along z; ``half_m`` is half their length, 0 of a sphere."""
     half_m: np.ndarray
-    faces: np.ndarray
-    """(G, 2) index of the shape's first face, and of its last + 1."""
-    normals: np.ndarray
-    """(F, 3) outward unit normals of the faces."""
+    faces: np.ndarray  # (G, 2) index of the shape's first face, and of its last + 1
+    normals: np.ndarray  # (F, 3) outward unit normals of the faces
     offsets_m: np.ndarray
     """(F,) offset of each face: n · p of its points. Faces at a seam lie a little further out, so that no point falls between two
     solids."""
-    covered: np.ndarray
-    """(F,) bool: other solids of the part cover the whole face."""
-    seams: np.ndarray
-    """(G, 2) index of the shape's first seam, and of its last + 1."""
-    seam_face: np.ndarray
-    """(R,) index of the face that contains the seam, among those of its solid."""
+    covered: np.ndarray  # (F,) bool: other solids of the part cover the whole face
+    seams: np.ndarray  # (G, 2) index of the shape's first seam, and of its last + 1
+    seam_face: np.ndarray  # (R,) index of the face that contains the seam, among those of its solid
     seam_axes: np.ndarray
     """(R, 2, 3) axes of the seam's rectangle; ``seam_centres_m`` and ``seam_halves_m`` (R, 2) lie along them."""
     seam_centres_m: np.ndarray
     seam_halves_m: np.ndarray
-    surface: np.ndarray
-    """(G,) index of the surface of the shape's part; −1 if no other solid covers any of its faces."""
-    body_from_geom: np.ndarray
-    """(G, 3, 4) pose of the shape in its body's frame."""
-    own_pieces: np.ndarray
-    """(U, 2) index of the surface's first piece, and of its last + 1; ``own_edges`` likewise."""
+    surface: np.ndarray  # (G,) index of the surface of the shape's part; −1 if no other solid covers any of its faces
+    body_from_geom: np.ndarray  # (G, 3, 4) pose of the shape in its body's frame
+    own_pieces: np.ndarray  # (U, 2) index of the surface's first piece, and of its last + 1; ``own_edges`` likewise
     own_edges: np.ndarray
     pieces: np.ndarray
     """(Q, 8): normal, offset, and centre and radius² of a sphere around each piece. The first belongs to no surface."""
-    side_normals: np.ndarray
-    """(Q, E, 3) outward unit normal of each side of a piece."""
-    side_offsets_m: np.ndarray
-    """(Q, E) offset of each side: n · p of its points."""
-    edges: np.ndarray
-    """(M, 6): start and vector of each edge."""
-    cell_origin_m: np.ndarray
-    """(U, 3) corner of the surface's grid of cells [m]."""
-    cell_size_m: np.ndarray
-    """(U,) side of a cell [m]."""
-    cell_counts: np.ndarray
-    """(U, 3) number of cells along x, y, z."""
-    first_cell: np.ndarray
-    """(U,) index of the surface's first cell."""
+    side_normals: np.ndarray  # (Q, E, 3) outward unit normal of each side of a piece
+    side_offsets_m: np.ndarray  # (Q, E) offset of each side: n · p of its points
+    edges: np.ndarray  # (M, 6): start and vector of each edge
+    cell_origin_m: np.ndarray  # (U, 3) corner of the surface's grid of cells [m]
+    cell_size_m: np.ndarray  # (U,) side of a cell [m]
+    cell_counts: np.ndarray  # (U, 3) number of cells along x, y, z
+    first_cell: np.ndarray  # (U,) index of the surface's first cell
     cell_pieces: np.ndarray
     """(C, 2) index of the cell's first entry in ``piece_list``, and of its last + 1; ``cell_edges`` likewise for edges."""
     cell_edges: np.ndarray

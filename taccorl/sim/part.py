@@ -116,18 +116,13 @@ class Part:
     """One rigid part: its solids, and the grasp and mating poses for experts and predicates, all in the part's own frame."""
 
     name: str
-    solids: list[Solid]
-    """Solids of which it consists; those of one part may touch."""
-    clamped: bool = False
-    """True: fixed to the bench (a mocap body); False: free."""
+    solids: list[Solid]  # Solids of which it consists; those of one part may touch
+    clamped: bool = False  # True: fixed to the bench (a mocap body); False: free
     table_from_part: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) pose of the part when it rests on a table whose top is z = 0."""
-    mate: Mate | None = None
-    """Leading end that goes into another part's hole; None: it has none."""
-    holes: Mapping[str, Hole] = field(default_factory=dict)
-    """Name → hole for another part's mate."""
-    grasps: Mapping[str, Grasp] = field(default_factory=dict)
-    """Name → way to grip the part."""
+    mate: Mate | None = None  # Leading end that goes into another part's hole; None: it has none
+    holes: Mapping[str, Hole] = field(default_factory=dict)  # Name → hole for another part's mate
+    grasps: Mapping[str, Grasp] = field(default_factory=dict)  # Name → way to grip the part
     seats: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Kind of another part → pose (4, 4) in this part's frame at which it is placed at reset."""
 
@@ -145,14 +140,10 @@ class Part:
 class Fit(NamedTuple):
     """Pose error of a mate (the leading end of a part) relative to a hole, each array with the leading shape (…) of the poses."""
 
-    depth_m: np.ndarray
-    """Depth of the mate in the hole [m], positive inside."""
-    lateral_m: np.ndarray
-    """Distance of the two axes at the mate's leading end [m]."""
-    tilt_rad: np.ndarray
-    """Angle between the two axes [rad]."""
-    turn_rad: np.ndarray
-    """Angle about the axis to the nearest rotation that looks the same [rad]; 0 for a round part."""
+    depth_m: np.ndarray  # Depth of the mate in the hole [m], positive inside
+    lateral_m: np.ndarray  # Distance of the two axes at the mate's leading end [m]
+    tilt_rad: np.ndarray  # Angle between the two axes [rad]
+    turn_rad: np.ndarray  # Angle about the axis to the nearest rotation that looks the same [rad]; 0 for a round part
 
 
 def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_turns: int | None) -> Fit:

@@ -31,16 +31,11 @@ class Surface:
 
     The surface point nearest to an inner point is its projection on a piece, or on an edge at which the part is concave."""
 
-    corners_m: np.ndarray
-    """(Q, E, 3) corners of each piece; the last corner is repeated up to E."""
-    normals: np.ndarray
-    """(Q, 3) outward unit normal of each piece."""
-    side_normals: np.ndarray
-    """(Q, E, 3) unit normal of each side of a piece, outward, in the piece's plane."""
-    side_offsets_m: np.ndarray
-    """(Q, E) offset of each side: n · p of its points."""
-    edges_m: np.ndarray
-    """(M, 2, 3) start and end of each edge."""
+    corners_m: np.ndarray  # (Q, E, 3) corners of each piece; the last corner is repeated up to E
+    normals: np.ndarray  # (Q, 3) outward unit normal of each piece
+    side_normals: np.ndarray  # (Q, E, 3) unit normal of each side of a piece, outward, in the piece's plane
+    side_offsets_m: np.ndarray  # (Q, E) offset of each side: n · p of its points
+    edges_m: np.ndarray  # (M, 2, 3) start and end of each edge
 
     @functools.cached_property
     def cells(self) -> "Cells":

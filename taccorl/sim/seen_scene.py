@@ -190,18 +190,16 @@ class SeenScene:
 
     def poses(self, body: str) -> np.ndarray:
         """World-from-body poses (N, 4, 4) of ``body`` in N simulations."""
-        k = self._body(body)
-        pose = np.zeros((self.num_sims, 4, 4))
-        pose[:, :3, :3] = self.arrays["xmat"][:, k].reshape(-1, 3, 3)
-        pose[:, :3, 3], pose[:, 3, 3] = self.arrays["xpos"][:, k], 1.0
-        return pose
+        return self._placed("", self._body(body))
 
     def tcp(self, arm: str) -> np.ndarray:
         """World-from-TCP poses (N, 4, 4) of an arm in N simulations: z = approach direction, y = closing direction."""
-        k = self._tcp_sites[arm]
+        return self._placed("site_", self._tcp_sites[arm])
+
+    def _placed(self, kind: str, k: int) -> np.ndarray:
         pose = np.zeros((self.num_sims, 4, 4))
-        pose[:, :3, :3] = self.arrays["site_xmat"][:, k].reshape(-1, 3, 3)
-        pose[:, :3, 3], pose[:, 3, 3] = self.arrays["site_xpos"][:, k], 1.0
+        pose[:, :3, :3] = self.arrays[f"{kind}xmat"][:, k].reshape(-1, 3, 3)
+        pose[:, :3, 3], pose[:, 3, 3] = self.arrays[f"{kind}xpos"][:, k], 1.0
         return pose
 
     def velocities(self, body: str) -> np.ndarray:

@@ -42,14 +42,10 @@ _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat")
 class Snapshot:
     """Complete state of some simulations, from which they continue bit-exactly; one row per simulation."""
 
-    physics: np.ndarray
-    """(n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start."""
-    judge: dict[str, np.ndarray]
-    """Name of each of the judge's counters → (n, …)."""
-    seeds: np.ndarray
-    """(n,) seeds of the reset draws, which determine friction and masses."""
-    memory: dict[str, np.ndarray]
-    """Name → (n, …): requested targets, and the memory of effects."""
+    physics: np.ndarray  # (n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start
+    judge: dict[str, np.ndarray]  # Name of each of the judge's counters → (n, …)
+    seeds: np.ndarray  # (n,) seeds of the reset draws, which determine friction and masses
+    memory: dict[str, np.ndarray]  # Name → (n, …): requested targets, and the memory of effects
     scene: np.ndarray
     """(n,) ``scene_digest`` of the scenes: only simulations of the same task, difficulty, twin and randomisation accept the
     snapshot."""

@@ -28,42 +28,28 @@ _ZERO, _TINY = np.float32(0), np.float32(_TINY_M)
 class FeltGeoms(NamedTuple):
     """What a model tells of the G geoms that pads can detect, in the order of ``ShapeTables``."""
 
-    geom: np.ndarray
-    """(G,) ids of the geoms."""
-    body: np.ndarray
-    """(G,) ids of the geoms' bodies."""
-    feels: np.ndarray
-    """(P, G) bool: the pad can detect the geom."""
-    bound_m: np.ndarray
-    """(G,) radius of the bounding sphere [m]; infinite for a plane."""
-    centre_m: np.ndarray
-    """(G, 3) centre of the bounding box [m]."""
-    extent_m: np.ndarray
-    """(G, 3) half the sides of the bounding box [m]."""
+    geom: np.ndarray  # (G,) ids of the geoms
+    body: np.ndarray  # (G,) ids of the geoms' bodies
+    feels: np.ndarray  # (P, G) bool: the pad can detect the geom
+    bound_m: np.ndarray  # (G,) radius of the bounding sphere [m]; infinite for a plane
+    centre_m: np.ndarray  # (G, 3) centre of the bounding box [m]
+    extent_m: np.ndarray  # (G, 3) half the sides of the bounding box [m]
 
 
 class Pads(NamedTuple):
     """The P pads of one model, as tables for compiled code; P' of them are sprung, K taxels each."""
 
-    site: np.ndarray
-    """(P,) id of the site that is the taxel frame."""
-    box: np.ndarray
-    """(P,) id of the pad's geom, a box."""
-    finger: np.ndarray
-    """(P,) id of the body that holds the site."""
-    plate: np.ndarray
-    """(P,) id of the body that holds the box."""
-    sprung: np.ndarray
-    """(P',) indices of the sprung pads."""
+    site: np.ndarray  # (P,) id of the site that is the taxel frame
+    box: np.ndarray  # (P,) id of the pad's geom, a box
+    finger: np.ndarray  # (P,) id of the body that holds the site
+    plate: np.ndarray  # (P,) id of the body that holds the box
+    sprung: np.ndarray  # (P',) indices of the sprung pads
     plate_point_m: np.ndarray
     """(P', 3) a point of the undeformed surface in the box's frame; ``plate_normal`` (P', 3) is its normal."""
     plate_normal: np.ndarray
-    root: np.ndarray
-    """(nbody,) root body of each body's kinematic tree."""
-    half_m: np.ndarray
-    """(3,) half the sides of the taxels' rectangle [m]."""
-    grid: np.ndarray
-    """(3, K) float32 rows x, y, 1."""
+    root: np.ndarray  # (nbody,) root body of each body's kinematic tree
+    half_m: np.ndarray  # (3,) half the sides of the taxels' rectangle [m]
+    grid: np.ndarray  # (3, K) float32 rows x, y, 1
 
 
 class Fields(NamedTuple):

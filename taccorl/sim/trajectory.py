@@ -17,20 +17,14 @@ SAMPLE_HZ = 200  # piper_ros publishes joint states at 200 Hz (data_specs/record
 class Trajectory:
     """T samples of one simulation at exact times, 200 a second; ``targets[k]`` is the command in force from ``time_s[k]`` on."""
 
-    time_s: np.ndarray
-    """(T,) since the episode began."""
-    qpos: np.ndarray
-    """(T, nq) true positions, in MuJoCo's order."""
-    qvel: np.ndarray
-    """(T, nv) true velocities, in MuJoCo's order."""
-    mocap: np.ndarray
-    """(nmocap, 7) poses of clamped bodies; they do not move."""
+    time_s: np.ndarray  # (T,) since the episode began
+    qpos: np.ndarray  # (T, nq) true positions, in MuJoCo's order
+    qvel: np.ndarray  # (T, nv) true velocities, in MuJoCo's order
+    mocap: np.ndarray  # (nmocap, 7) poses of clamped bodies; they do not move
     reported: np.ndarray
     """(T, 14) joint angles [rad] and gripper openings [m] as the encoders report them, at exactly ``time_s``."""
-    targets: np.ndarray
-    """(T, 14) commanded targets [rad, m]."""
-    reading: np.ndarray
-    """(T, 4, 32, 12) float32 readings of the pads before gain, noise and rounding."""
+    targets: np.ndarray  # (T, 14) commanded targets [rad, m]
+    reading: np.ndarray  # (T, 4, 32, 12) float32 readings of the pads before gain, noise and rounding
     effort: np.ndarray
     """(T, 14) motor torque of joints [N·m] and closing force of the gripper's motor [N], in the physics step before the
     sample."""

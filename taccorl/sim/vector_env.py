@@ -63,16 +63,11 @@ def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
 class Chunk:
     """Result of a chunk of actions: observation, rewards, and which environments ended."""
 
-    observation: Observation
-    """Observation after the chunk; of an episode that ended, the first one of the next episode."""
-    reward: np.ndarray
-    """(N,) sum of the rewards in the chunk: 1 where the task succeeded within it."""
-    terminated: np.ndarray
-    """(N,) bool: succeeded or failed within the chunk."""
-    truncated: np.ndarray
-    """(N,) bool: ran out of time within the chunk."""
-    num_steps: np.ndarray
-    """(N,) number of executed actions; a finished episode executes none."""
+    observation: Observation  # Observation after the chunk; of an episode that ended, the first one of the next episode
+    reward: np.ndarray  # (N,) sum of the rewards in the chunk: 1 where the task succeeded within it
+    terminated: np.ndarray  # (N,) bool: succeeded or failed within the chunk
+    truncated: np.ndarray  # (N,) bool: ran out of time within the chunk
+    num_steps: np.ndarray  # (N,) number of executed actions; a finished episode executes none
     tactile: np.ndarray
     """(N, H, 1536) int16 counts above baseline after every control step, for policies that read a history."""
     info: dict[str, Any]

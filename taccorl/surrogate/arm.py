@@ -28,16 +28,11 @@ _BALL_RADIUS_M = 0.02  # of a payload
 class Bodies(NamedTuple):
     """Links 1 to 6 as arrays; hand, fingers, pads and payload are part of link 6."""
 
-    turn: np.ndarray
-    """(6, 3, 3) rotation parent-from-link at joint angle 0."""
-    origin: np.ndarray
-    """(6, 3) origin of each link in its parent's frame [m]."""
-    mass: np.ndarray
-    """(6,) masses [kg]."""
-    moment: np.ndarray
-    """(6, 3) first moment: mass times centre of mass, in the link's frame [kg·m]."""
-    inertia: np.ndarray
-    """(6, 3, 3) inertia about the link's origin [kg·m²]."""
+    turn: np.ndarray  # (6, 3, 3) rotation parent-from-link at joint angle 0
+    origin: np.ndarray  # (6, 3) origin of each link in its parent's frame [m]
+    mass: np.ndarray  # (6,) masses [kg]
+    moment: np.ndarray  # (6, 3) first moment: mass times centre of mass, in the link's frame [kg·m]
+    inertia: np.ndarray  # (6, 3, 3) inertia about the link's origin [kg·m²]
 
 
 def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, float, float, float], ...] = ()) -> Bodies:

@@ -64,39 +64,26 @@ _GEARED = ("backlash", "joint_compliance")
 class Case:
     """One surrogate robot: the joint under test, its drive and hidden effects, and the twin with which its user starts."""
 
-    seed: int
-    """Seed of everything that is drawn."""
-    signal: str
-    """Joint under test, such as ``left_joint5``."""
+    seed: int  # Seed of everything that is drawn
+    signal: str  # Joint under test, such as ``left_joint5``
     gains: tuple[float, float, float]
     """True K_p [N·m/rad], K_d [N·m·s/rad], T_ref [N·m] of its drive, converted to those of a continuous controller
     (``sampled_loop``)."""
-    hidden: tuple[Hidden, ...]
-    """The hidden effects; empty if there are none."""
+    hidden: tuple[Hidden, ...]  # The hidden effects; empty if there are none
     twin: TwinConfig
     """Twin with which the user starts: without the hidden effects, and with wrong gains if they are unknown."""
-    gains_known: bool
-    """True: K_p and K_d are stated in the recordings, and the drive really has them."""
-    room: Room
-    """Range of motion of the joint under test."""
-    pose: tuple[float, ...]
-    """(6,) pose of the arm under test [rad], with its joint in the middle."""
-    floor_rad: float
-    """Expected noise floor [rad]: from the sensor, and from disturbances through the drive."""
-    left_floors: float = 0.0
-    """Error that the hidden effects cause after a refit of K_p, K_d and T_ref [floors]."""
-    design: str = "pack"
-    """Motions of the fit recordings: ``chirp`` or ``pack``."""
-    loop: SampledLoop | None = None
-    """Timing of the sampled loop; None: the velocity loop is continuous."""
-    loop_floors: float = 0.0
-    """Error that the loop's sampling alone causes after a refit of the gains [floors]."""
+    gains_known: bool  # True: K_p and K_d are stated in the recordings, and the drive really has them
+    room: Room  # Range of motion of the joint under test
+    pose: tuple[float, ...]  # (6,) pose of the arm under test [rad], with its joint in the middle
+    floor_rad: float  # Expected noise floor [rad]: from the sensor, and from disturbances through the drive
+    left_floors: float = 0.0  # Error that the hidden effects cause after a refit of K_p, K_d and T_ref [floors]
+    design: str = "pack"  # Motions of the fit recordings: ``chirp`` or ``pack``
+    loop: SampledLoop | None = None  # Timing of the sampled loop; None: the velocity loop is continuous
+    loop_floors: float = 0.0  # Error that the loop's sampling alone causes after a refit of the gains [floors]
     payload_kg: float = 0.0
     """Known mass that is held in every recording [kg]; a design may have further recordings with a payload."""
-    payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M
-    """True position of held masses in link 6's frame [m]."""
-    colour_s: float = 0.0
-    """Time constant of the encoder's noise [s]; 0: white noise."""
+    payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M  # True position of held masses in link 6's frame [m]
+    colour_s: float = 0.0  # Time constant of the encoder's noise [s]; 0: white noise
 
     @property
     def name(self) -> str:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import fftconvolve, lfilter
 
 from taccorl.alignment.machines.cell_model import of_file
 from taccorl.alignment.machines.cell_tables import CellMeasurement
@@ -47,17 +48,14 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "taxel_threshold": lambda rng: {"threshold": _between(rng, 0.15, 1.0)},
     "taxel_hysteresis": lambda rng: {"half_width": _between(rng, 0.02, 0.15)},
     "taxel_play": lambda rng: {"half_width": _between(rng, 0.05, 0.6)},
-    "taxel_creep": lambda rng: {
-        "share": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.05, 0.4),
-        "time_constant_s": _between(rng, 0.3, 4.0),
-    },
+    "taxel_creep": lambda rng: {"share": _either(rng, 0.05, 0.4), "time_constant_s": _between(rng, 0.3, 4.0)},
     "touch_lag": lambda rng: {"time_constant_s": _between(rng, 0.02, 0.15)},
     "touch_delay": lambda rng: {"delay_s": _between(rng, 0.02, 0.1)},
-    "baseline_drift": lambda rng: {"rate_per_min": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.1, 1.0)},
-    "taxel_log_creep": lambda rng: {"share": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.02, 0.08)},
+    "baseline_drift": lambda rng: {"rate_per_min": _either(rng, 0.1, 1.0)},
+    "taxel_log_creep": lambda rng: {"share": _either(rng, 0.02, 0.08)},
     "taxel_temperature": lambda rng: {
-        "gain_per_k": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.003, 0.02),
-        "zero_per_k": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.01, 0.1),
+        "gain_per_k": _either(rng, 0.003, 0.02),
+        "zero_per_k": _either(rng, 0.01, 0.1),
     },
     "taxel_crosstalk": lambda rng: {"share": _between(rng, 0.05, 0.4)},
     "taxel_ghosting": lambda rng: {"share": _between(rng, 0.005, 0.05)},
@@ -73,6 +71,11 @@ Knots = tuple[tuple[float, float], ...]
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
     """Evenly on a logarithmic scale."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _either(rng: np.random.Generator, low: float, high: float) -> float:
+    """The same of either sign."""
+    return float(rng.choice([-1.0, 1.0])) * _between(rng, low, high)
 
 
 def _presses(*each: tuple[float, float, float], rest_s: float = 3.0) -> Knots:
@@ -317,9 +320,7 @@ def _boltzmann(pressed: np.ndarray, share: float) -> np.ndarray:
     """Every step of the load adds 1 + a log₁₀(1 + t / 0.06 s) times itself (Boltzmann's superposition)."""
     kernel = 1.0 + share * np.log10(1.0 + np.arange(len(pressed)) * MILLISECOND / 0.06)
     steps = np.diff(pressed, axis=0, prepend=0.0)
-    size = 2 * len(pressed)
-    product = np.fft.rfft(steps, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
-    return np.maximum(np.fft.irfft(product, size, axis=0)[: len(pressed)], 0.0)
+    return np.maximum(fftconvolve(steps, kernel[:, None], axes=0)[: len(pressed)], 0.0)
 
 
 def _rounded(load: np.ndarray) -> np.ndarray:
@@ -333,7 +334,6 @@ def _rounded(load: np.ndarray) -> np.ndarray:
 def _coloured(rng: np.random.Generator, rows: int, cells: int) -> np.ndarray:
     """(T, K) of standard deviation 1 that is correlated over 0.1 s."""
     keep = math.exp(-1 / (0.1 * RATE_HZ))
-    drawn, out = rng.standard_normal((rows, cells)), np.zeros((rows, cells))
-    for k in range(1, rows):
-        out[k] = keep * out[k - 1] + math.sqrt(1 - keep**2) * drawn[k]
-    return out
+    drawn = rng.standard_normal((rows, cells))
+    drawn[0] = 0.0
+    return lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], drawn, axis=0)

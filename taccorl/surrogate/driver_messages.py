@@ -1,7 +1,7 @@
 """Messages of the robot's drivers: ROS 2 types as rosbag2 stores them in MCAP files. A message is a dict shaped like its type."""
 
 import functools
-import struct
+from collections import Counter
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -62,41 +62,6 @@ ROS2_DEFINITIONS = {
 """ROS type → definition of its message, with those of nested types."""
 
 
-def joint_state_cdr(message: Message) -> bytes:
-    """Serialise a JointState to CDR: the same bytes as ``serialize_dynamic``, in a sixth of its time, because more than half of
-    a recording's messages are joint states.
-
-    Numbers lie at multiples of their size, counted from behind the four bytes that say little-endian CDR."""
-    header = message["header"]
-    body = bytearray(struct.pack("<iI", header["stamp"]["sec"], header["stamp"]["nanosec"]))
-    body += _names_cdr(header["frame_id"], tuple(message["name"]))
-    for key in ("position", "velocity", "effort"):
-        values = message[key]
-        body += bytes(-len(body) % 4) + struct.pack("<I", len(values))
-        if values:
-            body += bytes(-len(body) % 8) + struct.pack(f"<{len(values)}d", *values)
-    return b"\0\1\0\0" + bytes(body)
-
-
-@functools.lru_cache
-def _names_cdr(frame_id: str, names: tuple[str, ...]) -> bytes:
-    """Frame and names; they begin at a multiple of 8."""
-    body = bytearray(_string_cdr(frame_id))
-    body += bytes(-len(body) % 4) + struct.pack("<I", len(names))
-    for name in names:
-        body += bytes(-len(body) % 4) + _string_cdr(name)
-    return bytes(body)
-
-
-def _string_cdr(text: str) -> bytes:
-    data = text.encode() + b"\0"
-    return struct.pack("<I", len(data)) + data
-
-
-Encoder = Callable[[Message], bytes]
-"""Function that serialises the messages of one type."""
-
-
 class MessageWriter:
     """Writes messages to an MCAP writer, opening a channel when a topic first appears."""
 
@@ -104,10 +69,9 @@ class MessageWriter:
     """Profile of the file."""
 
     def __init__(self, writer: Writer) -> None:
-        self.writer = writer
-        self._types: dict[str, tuple[int, str, Encoder]] = {}
-        self._channels: dict[str, tuple[int, Encoder]] = {}
-        self._counts: dict[str, int] = {}
+        self.writer, self._counts = writer, Counter[str]()
+        self._channels: dict[str, tuple[int, Callable[[Message], bytes]]] = {}
+        self._types = functools.cache(self._register)
 
     def write(self, topic: str, ros_type: str, message: Message | bytes, log_ns: int) -> None:
         """Write one message; a message given as bytes is written unchanged.
@@ -117,21 +81,15 @@ class MessageWriter:
             log_ns: log time [ns].
         """
         if topic not in self._channels:
-            if ros_type not in self._types:
-                self._types[ros_type] = self.register(ros_type)
-            schema_id, encoding, encode = self._types[ros_type]
-            self._channels[topic] = self.writer.register_channel(topic, encoding, schema_id), encode
-            self._counts[topic] = 0
+            schema_id, encode = self._types(ros_type)
+            self._channels[topic] = self.writer.register_channel(topic, MessageEncoding.CDR, schema_id), encode
         channel_id, encode = self._channels[topic]
         self._counts[topic] += 1
         data = message if isinstance(message, bytes) else encode(message)
         self.writer.add_message(channel_id, log_ns, data, publish_time=log_ns, sequence=self._counts[topic])
 
-    def register(self, ros_type: str) -> tuple[int, str, Encoder]:
-        """Write the schema of a type; returns its id, the encoding of its messages, and their encoder."""
+    def _register(self, ros_type: str) -> tuple[int, Callable[[Message], bytes]]:
+        """Write the schema of a type; returns its id and the encoder of its messages."""
         text = ROS2_DEFINITIONS[ros_type]
         schema_id = self.writer.register_schema(ros_type, SchemaEncoding.ROS2, text.encode())
-        if ros_type == SERVICE_EVENT:
-            return schema_id, MessageEncoding.CDR, lambda _: b""
-        encode = joint_state_cdr if ros_type == JOINT_STATE else serialize_dynamic(ros_type, text)[ros_type]
-        return schema_id, MessageEncoding.CDR, encode
+        return schema_id, bytes if ros_type == SERVICE_EVENT else serialize_dynamic(ros_type, text)[ros_type]

@@ -48,32 +48,20 @@ class DriverConfig:
     """Contents of a recording, and how arms and drivers behave. "Jitter" is the standard deviation of a normal draw; a latency
     adds its magnitude."""
 
-    duration_s: float = 6.0
-    """Duration of the recording [s]."""
-    seed: int = 0
-    """Seed of everything that is random."""
-    instruction: str = "insert the test tube into the rack"
-    """Task text of every episode."""
-    camera_size: tuple[int, int] = (480, 640)
-    """Rows and columns of pictures."""
-    jpeg_quality: int = 85
-    """JPEG quality of pictures, 0 … 100."""
+    duration_s: float = 6.0  # Duration of the recording [s]
+    seed: int = 0  # Seed of everything that is random
+    instruction: str = "insert the test tube into the rack"  # Task text of every episode
+    camera_size: tuple[int, int] = (480, 640)  # Rows and columns of pictures
+    jpeg_quality: int = 85  # JPEG quality of pictures, 0 … 100
     compression: Literal["none", "lz4", "zstd"] = "lz4"
     """Compression of MCAP chunks. The pictures are JPEG, which does not become smaller, so that a fast method suffices."""
-    chunk_size_bytes: int = 1 << 20
-    """Size of an MCAP chunk before compression [bytes]."""
-    camera_stamp_jitter_s: float = 0.0006
-    """Standard deviation of the time of a picture from its tick [s]."""
-    camera_latency_s: float = 0.030
-    """Log time − stamp of pictures [s]."""
-    camera_latency_jitter_s: float = 0.004
-    """σ of the normal number whose absolute value is added to it [s]."""
-    camera_loss_probability: float = 0.004
-    """Probability that a picture is lost."""
-    joint_latency_s: float = 0.0012
-    """Log time − stamp of joint messages [s]."""
-    joint_latency_jitter_s: float = 0.0004
-    """σ of the normal number whose absolute value is added to it [s]."""
+    chunk_size_bytes: int = 1 << 20  # Size of an MCAP chunk before compression [bytes]
+    camera_stamp_jitter_s: float = 0.0006  # Standard deviation of the time of a picture from its tick [s]
+    camera_latency_s: float = 0.030  # Log time − stamp of pictures [s]
+    camera_latency_jitter_s: float = 0.004  # σ of the normal number whose absolute value is added to it [s]
+    camera_loss_probability: float = 0.004  # Probability that a picture is lost
+    joint_latency_s: float = 0.0012  # Log time − stamp of joint messages [s]
+    joint_latency_jitter_s: float = 0.0004  # σ of the normal number whose absolute value is added to it [s]
     joint_repeat_probability: float = 0.02
     """Probability that a joint message repeats the last values and stamp, because the driver's loop at 200 Hz found no new CAN
     frame."""
@@ -81,12 +69,9 @@ class DriverConfig:
     """Time until the first command on CAN [s]; before it, messages have stamp 0 and zeros."""
     pad_latency_s: float = 0.004
     """Time from the end of a scan to the end of the host's read [s]; the latter is the only time that a pad message has."""
-    pad_latency_jitter_s: float = 0.0005
-    """σ of the normal number whose absolute value is added to it [s]."""
-    pad_noise_counts: float = 1.3
-    """Standard deviation of the noise of each taxel and frame [counts]."""
-    pad_gain_spread: float = 0.10
-    """Standard deviation of the taxels' gains, relative to their mean."""
+    pad_latency_jitter_s: float = 0.0005  # σ of the normal number whose absolute value is added to it [s]
+    pad_noise_counts: float = 1.3  # Standard deviation of the noise of each taxel and frame [counts]
+    pad_gain_spread: float = 0.10  # Standard deviation of the taxels' gains, relative to their mean
 
 
 class Marks(NamedTuple):
@@ -142,17 +127,12 @@ class CameraPictures(Protocol):
 class Event(NamedTuple):
     """One message to be written to the file."""
 
-    log_s: float
-    """Log time, since the start of the recording [s]."""
-    sampled_s: float
-    """True time of what the message shows [s]."""
+    log_s: float  # Log time, since the start of the recording [s]
+    sampled_s: float  # True time of what the message shows [s]
     topic: str
-    ros_type: str
-    """Name of its ROS type."""
-    message: messages.Message | bytes
-    """Its fields, or its bytes as they are written."""
-    tick: int = 0
-    """Number of the picture, counting lost ones."""
+    ros_type: str  # Name of its ROS type
+    message: messages.Message | bytes  # Its fields, or its bytes as they are written
+    tick: int = 0  # Number of the picture, counting lost ones
 
 
 def as_piper_publishes(joints: np.ndarray) -> np.ndarray:

@@ -25,22 +25,14 @@ from taccorl.surrogate.plant import Change, Values
 class Scale:
     """Reference values of the joint under test (gains, inertia, torque, speed, centre), by which effects are sized."""
 
-    kp: float
-    """K_p [N·m/rad]."""
-    kd: float
-    """K_d [N·m·s/rad]."""
-    inertia: float
-    """Inertia, rotor included [kg·m²]."""
-    torque: float
-    """Largest torque of the drive in the recordings, weight included [N·m]."""
-    speed: float
-    """Highest speed of the chirp's target [rad/s]."""
-    centre: float
-    """Angle about which the joint is moved [rad]."""
-    sweep: float = 0.35
-    """Amplitude of the chirp [rad]."""
-    reach: float = 0.35
-    """Largest distance from that angle in the recordings [rad]."""
+    kp: float  # K_p [N·m/rad]
+    kd: float  # K_d [N·m·s/rad]
+    inertia: float  # Inertia, rotor included [kg·m²]
+    torque: float  # Largest torque of the drive in the recordings, weight included [N·m]
+    speed: float  # Highest speed of the chirp's target [rad/s]
+    centre: float  # Angle about which the joint is moved [rad]
+    sweep: float = 0.35  # Amplitude of the chirp [rad]
+    reach: float = 0.35  # Largest distance from that angle in the recordings [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,21 +44,17 @@ class Kind:
     severity."""
     values: Callable[[float, Scale, Values], Values]
     """Function (severity, scale, shape) → parameters, with the registry's names if it has the effect."""
-    plant: Callable[[Values], Change]
-    """Function from these parameters to the change of the plant."""
+    plant: Callable[[Values], Change]  # Function from these parameters to the change of the plant
     shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
     """Function that draws parameters which determine the effect's form, not its strength."""
     joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
     """Numbers of the joints, 1 to 6, on which it can be seen."""
-    stiff: bool = True
-    """Whether it can be seen on drives that are as stiff and as damped as the paper's."""
-    registered: bool = True
-    """True: the effect is in the registry."""
+    stiff: bool = True  # Whether it can be seen on drives that are as stiff and as damped as the paper's
+    registered: bool = True  # True: the effect is in the registry
     near: tuple[str, ...] = ()
     """For kinds outside the registry: effects of the registry with nearly the same consequences, which a diagnosis may name
     instead."""
-    whole_arm: bool = False
-    """True: the effect acts on every joint of the arm under test."""
+    whole_arm: bool = False  # True: the effect acts on every joint of the arm under test
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +147,18 @@ def _drive(**fields: float) -> Change:
     return Change(drive=fields)
 
 
+def _one(
+    parameter: str,
+    field: str,
+    severity: Callable[[Scale], tuple[float, float]],
+    size: Callable[[Scale], float] = lambda c: 1.0,
+    **rest: Any,
+) -> Kind:
+    """The kind with one parameter, its severity times ``size``, which is a field of the drive."""
+    values, plant = lambda s, c, shape: {parameter: s * size(c)}, lambda v: _drive(**{field: v[parameter]})
+    return Kind(severity=severity, values=values, plant=plant, **rest)
+
+
 def _encoder_wave(v: Values) -> Change:
     waves = v.get("periods", 1.0)
     return _drive(encoder_wave=v["amplitude_rad"], encoder_waves=waves, encoder_phase=v["phase_rad"])
@@ -166,11 +166,7 @@ def _encoder_wave(v: Values) -> Change:
 
 KINDS: dict[str, Kind] = {
     # friction
-    "viscous_friction": Kind(
-        severity=_range(0.02, 1.0),
-        values=lambda s, c, shape: {"damping_nms_per_rad": s * c.kd},
-        plant=lambda v: _drive(viscous=v["damping_nms_per_rad"]),
-    ),
+    "viscous_friction": _one("damping_nms_per_rad", "viscous", _range(0.02, 1.0), lambda c: c.kd),
     "coulomb_friction": Kind(
         severity=_SLIP,
         values=lambda s, c, shape: {"torque_nm": s * c.kp},
@@ -193,16 +189,8 @@ KINDS: dict[str, Kind] = {
         values=lambda s, c, shape: {"torque_nm": s * c.kp, "asymmetry": shape["sign"] * shape["asymmetry"]},
         plant=lambda v: _drive(coulomb=v["torque_nm"], asymmetry=v["asymmetry"]),
     ),
-    "load_friction": Kind(
-        severity=_range(0.005, 0.5),
-        values=lambda s, c, shape: {"share": s},
-        plant=lambda v: _drive(load_share=v["share"]),
-    ),
-    "quadratic_drag": Kind(
-        severity=_range(0.01, 1.0),
-        values=lambda s, c, shape: {"drag_nms2_per_rad2": s * c.kd / c.speed},
-        plant=lambda v: _drive(quadratic=v["drag_nms2_per_rad2"]),
-    ),
+    "load_friction": _one("share", "load_share", _range(0.005, 0.5)),
+    "quadratic_drag": _one("drag_nms2_per_rad2", "quadratic", _range(0.01, 1.0), lambda c: c.kd / c.speed),
     "position_dependent_friction": Kind(
         severity=_SLIP,
         shape=_uniform(place=(-0.6, 0.6), width_rad=(0.05, 0.3)),
@@ -212,8 +200,6 @@ KINDS: dict[str, Kind] = {
             "width_rad": shape["width_rad"],
         },
         plant=lambda v: _drive(spot=v["torque_nm"], spot_angle=v["angle_rad"], spot_width=v["width_rad"]),
-        registered="position_dependent_friction" in effects,
-        near=("coulomb_friction", "stribeck_friction"),
     ),
     # bodies and torques that hang on the angle
     "end_stop": Kind(
@@ -224,15 +210,8 @@ KINDS: dict[str, Kind] = {
             "stiffness_nm_per_rad": shape["stiffness"] * c.kp,
         },
         plant=lambda v: _drive(stop=v["stiffness_nm_per_rad"], stop_angle=v["angle_rad"]),
-        registered="end_stop" in effects,
-        near=("torque_saturation", "cable_spring"),
     ),
-    "armature": Kind(
-        severity=_range(0.02, 3.0),
-        values=lambda s, c, shape: {"added_kgm2": s * c.inertia},
-        plant=lambda v: _drive(motor_inertia=v["added_kgm2"]),
-        stiff=False,
-    ),
+    "armature": _one("added_kgm2", "motor_inertia", _range(0.02, 3.0), lambda c: c.inertia, stiff=False),
     "gravity_mismatch": Kind(
         severity=_range(0.005, 1.0),
         shape=_signed(),
@@ -265,49 +244,24 @@ KINDS: dict[str, Kind] = {
         plant=lambda v: _drive(cogging=v["torque_nm"], cogging_periods=v["periods"], cogging_phase=v["phase_rad"]),
     ),
     # the command's way
-    "command_delay": Kind(
-        severity=_range(5e-4, 0.1),
-        values=lambda s, c, shape: {"delay_s": s},
-        plant=lambda v: _drive(delay=v["delay_s"]),
-    ),
-    "command_lag": Kind(
-        severity=_range(1e-3, 0.2),
-        values=lambda s, c, shape: {"time_constant_s": s},
-        plant=lambda v: _drive(lag=v["time_constant_s"]),
-    ),
+    "command_delay": _one("delay_s", "delay", _range(5e-4, 0.1)),
+    "command_lag": _one("time_constant_s", "lag", _range(1e-3, 0.2)),
     "slew_limit": Kind(
         severity=_range(0.02, 0.85),
         values=lambda s, c, shape: {"speed_rad_per_s": (1.0 - s) * c.speed},
         plant=lambda v: _drive(slew=v["speed_rad_per_s"]),
     ),
-    "velocity_feedforward": Kind(
-        severity=_range(0.02, 1.0),
-        values=lambda s, c, shape: {"share": s},
-        plant=lambda v: _drive(feedforward=v["share"]),
-    ),
+    "velocity_feedforward": _one("share", "feedforward", _range(0.02, 1.0)),
     "dropped_commands": Kind(
         severity=_range(0.01, 0.1),
         values=lambda s, c, shape: {"probability": s},
         plant=lambda v: Change(dropped=v["probability"]),
-        registered="dropped_commands" in effects,
     ),
     # the loop
-    "error_deadband": Kind(
-        severity=_range(2e-4, 0.05),
-        values=lambda s, c, shape: {"width_rad": s},
-        plant=lambda v: _drive(deadband=v["width_rad"]),
-    ),
-    "integral_action": Kind(
-        severity=_range(0.02, 5.0),
-        values=lambda s, c, shape: {"rate_per_s": s},
-        plant=lambda v: _drive(integral=v["rate_per_s"]),
-    ),
-    "torque_lag": Kind(
-        severity=lambda c: (2e-4, 0.5 * c.kd / c.kp),  # from K_d / K_p on it would oscillate
-        values=lambda s, c, shape: {"time_constant_s": s},
-        plant=lambda v: _drive(torque_lag=v["time_constant_s"]),
-        stiff=False,
-    ),
+    "error_deadband": _one("width_rad", "deadband", _range(2e-4, 0.05)),
+    "integral_action": _one("rate_per_s", "integral", _range(0.02, 5.0)),
+    # From K_d / K_p on it would oscillate.
+    "torque_lag": _one("time_constant_s", "torque_lag", lambda c: (2e-4, 0.5 * c.kd / c.kp), stiff=False),
     "torque_scale": Kind(
         severity=_range(0.02, 0.5),
         shape=_signed(),
@@ -327,8 +281,6 @@ KINDS: dict[str, Kind] = {
         values=lambda s, c, shape: {"stall_nm": shape["stall"] * c.torque, "no_load_rad_per_s": c.speed / s},
         plant=lambda v: _drive(stall=v["stall_nm"], no_load=v["no_load_rad_per_s"]),
         stiff=False,
-        registered="torque_speed_limit" in effects,
-        near=("torque_saturation", "quadratic_drag"),
     ),
     "torque_fade": Kind(
         severity=_range(5e-4, 0.049),
@@ -336,13 +288,8 @@ KINDS: dict[str, Kind] = {
         plant=lambda v: _drive(fade=v["rate_per_min"] / 60.0),
     ),
     # the gear
-    "backlash": Kind(
-        severity=_range(3e-4, 0.03),
-        values=lambda s, c, shape: {"play_rad": s},
-        plant=lambda v: _drive(play=v["play_rad"]),
-        joints=(1, 2, 3),  # behind it there must be more than the rotor
-        stiff=False,
-    ),
+    # Behind it there must be more than the rotor.
+    "backlash": _one("play_rad", "play", _range(3e-4, 0.03), joints=(1, 2, 3), stiff=False),
     "joint_compliance": Kind(
         severity=_range(0.005, 2.0),
         shape=_uniform(damping_s=(0.001, 0.004)),
@@ -376,10 +323,10 @@ KINDS: dict[str, Kind] = {
         plant=lambda v: Change(report_delay_s=v["delay_s"]),
     ),
     # outside the registry
-    "loop_delay": Kind(
-        severity=lambda c: (1e-4, 0.5 * c.inertia / c.kd),  # from about J / K_d on it would oscillate
-        values=lambda s, c, shape: {"delay_s": s},
-        plant=lambda v: _drive(loop_delay=v["delay_s"]),
+    "loop_delay": _one(  # from about J / K_d on it would oscillate
+        "delay_s",
+        "loop_delay",
+        lambda c: (1e-4, 0.5 * c.inertia / c.kd),
         stiff=False,
         registered=False,
         near=("torque_lag",),

@@ -39,126 +39,73 @@ Values = dict[str, float]
 class Drive(NamedTuple):
     """Parameters of drive, gear and friction of the joint under test, in rad, N·m, s. By default effects are absent."""
 
-    kp: float
-    """K_p [N·m/rad]."""
-    kd: float
-    """K_d [N·m·s/rad]."""
-    torque_ff: float
-    """T_ref [N·m]."""
+    kp: float  # K_p [N·m/rad]
+    kd: float  # K_d [N·m·s/rad]
+    torque_ff: float  # T_ref [N·m]
     # friction
-    viscous: float = 0.0
-    """Coefficient of viscous friction [N·m·s/rad]."""
-    quadratic: float = 0.0
-    """c in the torque − c |v| v [N·m·s²/rad²]."""
-    coulomb: float = 0.0
-    """Dry friction [N·m]."""
-    asymmetry: float = 0.0
-    """a in the factor 1 ± a on the dry friction, + upwards."""
-    stribeck: float = 0.0
-    """Torque that stiction adds to ``coulomb`` [N·m]."""
-    stribeck_speed: float = 0.05
-    """Speed at which stiction has fallen to 1/e [rad/s]."""
-    presliding: float = 3e-5
-    """Deflection of the bristles at the break-away torque [rad]."""
-    load_share: float = 0.0
-    """Dry friction per torque through the joint."""
+    viscous: float = 0.0  # Coefficient of viscous friction [N·m·s/rad]
+    quadratic: float = 0.0  # c in the torque − c |v| v [N·m·s²/rad²]
+    coulomb: float = 0.0  # Dry friction [N·m]
+    asymmetry: float = 0.0  # a in the factor 1 ± a on the dry friction, + upwards
+    stribeck: float = 0.0  # Torque that stiction adds to ``coulomb`` [N·m]
+    stribeck_speed: float = 0.05  # Speed at which stiction has fallen to 1/e [rad/s]
+    presliding: float = 3e-5  # Deflection of the bristles at the break-away torque [rad]
+    load_share: float = 0.0  # Dry friction per torque through the joint
     angle_share: float = 0.0
     """Relative variation of the friction torque with the angle, with two periods per turn (not in the registry)."""
-    angle_phase: float = 0.0
-    """Phase of that variation [rad]."""
-    spot: float = 0.0
-    """Friction torque that a tight spot adds in its middle [N·m]."""
-    spot_angle: float = 0.0
-    """Angle of the tight spot's middle [rad]."""
-    spot_width: float = 0.1
-    """w in its shape exp(−(q / w)²) [rad]."""
+    angle_phase: float = 0.0  # Phase of that variation [rad]
+    spot: float = 0.0  # Friction torque that a tight spot adds in its middle [N·m]
+    spot_angle: float = 0.0  # Angle of the tight spot's middle [rad]
+    spot_width: float = 0.1  # w in its shape exp(−(q / w)²) [rad]
     # torques that hang on the angle
-    stop: float = 0.0
-    """Stiffness of an end stop [N·m/rad], on the far side of ``stop_angle`` from the start."""
-    stop_angle: float = 0.0
-    """Angle at which the end stop begins [rad]."""
-    cogging: float = 0.0
-    """Amplitude of the cogging torque [N·m]."""
-    cogging_periods: float = 12.0
-    """Its periods per turn."""
-    cogging_phase: float = 0.0
-    """Its phase [rad]."""
-    spring: float = 0.0
-    """Stiffness of a spring at the joint [N·m/rad]."""
-    spring_rest: float = 0.0
-    """Angle at which that spring is relaxed [rad]."""
-    hysteresis: float = 0.0
-    """Largest torque of a magnetic hysteresis (Bouc–Wen) [N·m] (not in the registry)."""
-    hysteresis_width: float = 0.05
-    """Travel after which the hysteresis torque is reached [rad]."""
-    hung_inertia: float = 0.0
-    """Inertia that is coupled to the link by a spring [kg·m²] (not in the registry)."""
-    hung_rad_per_s: float = 30.0
-    """Natural frequency of the inertia ``hung_inertia`` on its spring [rad/s]."""
-    hung_damping: float = 0.05
-    """Damping ratio of the inertia ``hung_inertia`` on its spring."""
+    stop: float = 0.0  # Stiffness of an end stop [N·m/rad], on the far side of ``stop_angle`` from the start
+    stop_angle: float = 0.0  # Angle at which the end stop begins [rad]
+    cogging: float = 0.0  # Amplitude of the cogging torque [N·m]
+    cogging_periods: float = 12.0  # Its periods per turn
+    cogging_phase: float = 0.0  # Its phase [rad]
+    spring: float = 0.0  # Stiffness of a spring at the joint [N·m/rad]
+    spring_rest: float = 0.0  # Angle at which that spring is relaxed [rad]
+    hysteresis: float = 0.0  # Largest torque of a magnetic hysteresis (Bouc–Wen) [N·m] (not in the registry)
+    hysteresis_width: float = 0.05  # Travel after which the hysteresis torque is reached [rad]
+    hung_inertia: float = 0.0  # Inertia that is coupled to the link by a spring [kg·m²] (not in the registry)
+    hung_rad_per_s: float = 30.0  # Natural frequency of the inertia ``hung_inertia`` on its spring [rad/s]
+    hung_damping: float = 0.05  # Damping ratio of the inertia ``hung_inertia`` on its spring
     # setpoint
-    delay: float = 0.0
-    """Delay of commands [s]."""
-    lag: float = 0.0
-    """Time constant of a low-pass on commands [s]."""
-    slew: float = math.inf
-    """Largest rate of change of the command [rad/s]."""
-    feedforward: float = 0.0
-    """Factor on the feed-forward K_d q̇*."""
+    delay: float = 0.0  # Delay of commands [s]
+    lag: float = 0.0  # Time constant of a low-pass on commands [s]
+    slew: float = math.inf  # Largest rate of change of the command [rad/s]
+    feedforward: float = 0.0  # Factor on the feed-forward K_d q̇*
     # loop
-    deadband: float = 0.0
-    """Half width of the dead band of the position error [rad]."""
-    integral: float = 0.0
-    """r in K_p r ∫ e dt [1/s]."""
-    gravity_carried: float = 1.0
-    """Factor on the gravity compensation."""
+    deadband: float = 0.0  # Half width of the dead band of the position error [rad]
+    integral: float = 0.0  # r in K_p r ∫ e dt [1/s]
     loop_steps: int = 0
     """Number of integration steps between two samples of a sampled loop; 0: the velocity loop is continuous."""
-    velocity_filter: float = 0.0
-    """Time constant of the low-pass of the velocity in a sampled loop [s]."""
-    loop_delay: float = 0.0
-    """Delay from the encoder to the torque, for position and velocity [s] (not in the registry)."""
-    torque_lag: float = 0.0
-    """Time constant with which the motor's torque follows the controller's [s]."""
-    torque_max: float = math.inf
-    """Largest torque of the motor [N·m]."""
+    velocity_filter: float = 0.0  # Time constant of the low-pass of the velocity in a sampled loop [s]
+    loop_delay: float = 0.0  # Delay from the encoder to the torque, for position and velocity [s] (not in the registry)
+    torque_lag: float = 0.0  # Time constant with which the motor's torque follows the controller's [s]
+    torque_max: float = math.inf  # Largest torque of the motor [N·m]
     stall: float = math.inf
     """Torque of the motor at rest [N·m]; when it drives, the torque falls linearly with the speed to 0 at ``no_load``."""
-    no_load: float = math.inf
-    """Speed at which a driving motor has no torque [rad/s]."""
-    torque_scale: float = 1.0
-    """Factor from the controller's torque to the motor's."""
-    one_way: float = 0.0
-    """Share by which torques upwards are larger, and downwards smaller (not in the registry)."""
+    no_load: float = math.inf  # Speed at which a driving motor has no torque [rad/s]
+    torque_scale: float = 1.0  # Factor from the controller's torque to the motor's
+    one_way: float = 0.0  # Share by which torques upwards are larger, and downwards smaller (not in the registry)
     sag: float = 0.0
     """Sag of the supply voltage: torques are divided by 1 + this times the motor's power [1/W] (not in the registry)."""
-    sag_time: float = 0.05
-    """Time constant of the sag [s]."""
-    fade: float = 0.0
-    """Rate at which the torque fades [1/s]."""
-    warm_up: float = 0.0
-    """Rate at which the friction torque falls as grease warms up [1/s] (not in the registry)."""
+    sag_time: float = 0.05  # Time constant of the sag [s]
+    fade: float = 0.0  # Rate at which the torque fades [1/s]
+    warm_up: float = 0.0  # Rate at which the friction torque falls as grease warms up [1/s] (not in the registry)
     # gear
-    motor_inertia: float = 0.01
-    """Inertia of the rotor at the joint [kg·m²]."""
-    play: float = 0.0
-    """Width of the whole play of the gear [rad]."""
-    compliance: float = 0.0
-    """Deflection of the gear per torque [rad/(N·m)]; 0: stiff."""
-    compliance_damping: float = 0.002
-    """Damping of the gear divided by its stiffness [s]."""
+    motor_inertia: float = 0.01  # Inertia of the rotor at the joint [kg·m²]
+    play: float = 0.0  # Width of the whole play of the gear [rad]
+    compliance: float = 0.0  # Deflection of the gear per torque [rad/(N·m)]; 0: stiff
+    compliance_damping: float = 0.002  # Damping of the gear divided by its stiffness [s]
     # encoder in the loop
-    encoder_scale: float = 1.0
-    """Factor of the reported angle."""
-    encoder_bias: float = 0.0
-    """Offset of the reported angle [rad]."""
-    encoder_wave: float = 0.0
-    """Amplitude of the encoder's sinusoidal error [rad]."""
+    encoder_scale: float = 1.0  # Factor of the reported angle
+    encoder_bias: float = 0.0  # Offset of the reported angle [rad]
+    encoder_wave: float = 0.0  # Amplitude of the encoder's sinusoidal error [rad]
     encoder_waves: float = 1.0
     """Periods of the encoder's error per turn: 1 for an eccentric disc, other values are not in the registry."""
-    encoder_phase: float = 0.0
-    """Its phase [rad]."""
+    encoder_phase: float = 0.0  # Its phase [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,20 +147,13 @@ def changed(drive: Drive, changes: list[Change]) -> Drive:
 class Arm(NamedTuple):
     """The arm and its six drives; that of the joint under test is described by its ``Drive``."""
 
-    bodies: Bodies
-    """True rigid bodies."""
-    believed: Bodies
-    """Rigid bodies with which the controller computes the gravity compensation."""
-    carried: float
-    """Share of the weight computed from ``believed`` that the controller compensates, 0 … 1."""
-    armature: np.ndarray
-    """(6,) rotor inertias [kg·m²]."""
-    kp: np.ndarray
-    """(6,) K_p of the drives [N·m/rad]; that of the joint under test is not used."""
-    kd: np.ndarray
-    """(6,) K_d of the drives [N·m·s/rad]; as for ``kp``."""
-    torque_ff: np.ndarray
-    """(6,) T_ref of the drives [N·m]; as for ``kp``."""
+    bodies: Bodies  # True rigid bodies
+    believed: Bodies  # Rigid bodies with which the controller computes the gravity compensation
+    carried: float  # Share of the weight computed from ``believed`` that the controller compensates, 0 … 1
+    armature: np.ndarray  # (6,) rotor inertias [kg·m²]
+    kp: np.ndarray  # (6,) K_p of the drives [N·m/rad]; that of the joint under test is not used
+    kd: np.ndarray  # (6,) K_d of the drives [N·m·s/rad]; as for ``kp``
+    torque_ff: np.ndarray  # (6,) T_ref of the drives [N·m]; as for ``kp``
 
 
 class Run(NamedTuple):

@@ -58,18 +58,14 @@ class Press:
     """One recording to be made: an object at a position, and a depth over time."""
 
     name: str
-    knots: tuple[tuple[float, float], ...]
-    """(time [s], penetration [m]), connected by straight lines."""
-    shape: str = "sphere"
-    """Shape of the object, a key of ``RADIUS_M``."""
-    x_m: float = 0.0
-    """Position of the object's centre along x of the TCP's frame [m]."""
+    knots: tuple[tuple[float, float], ...]  # (time [s], penetration [m]), connected by straight lines
+    shape: str = "sphere"  # Shape of the object, a key of ``RADIUS_M``
+    x_m: float = 0.0  # Position of the object's centre along x of the TCP's frame [m]
     z_m: float = 0.0
     """Position of the object's centre along z of the TCP's frame [m]; the rod lies across the pads, along x."""
     wiggle_m: float = 0.0
     """Amplitude of a vibration at 2.3 Hz, with 0.6 of it at 5.1 Hz, that is added to the penetration [m]."""
-    repeat_of: str | None = None
-    """Name of the press that it repeats; None if it is no repeat."""
+    repeat_of: str | None = None  # Name of the press that it repeats; None if it is no repeat
 
 
 def _presses(
@@ -119,20 +115,13 @@ TEST = (Press(name="test_task", knots=(*_TASK, *_TASK_END), x_m=0.0015, z_m=0.00
 class TouchCase:
     """Surrogate pads of one arm with their hidden effects."""
 
-    seed: int
-    """Seed of everything that is drawn."""
-    arm: str
-    """Name of the arm."""
-    k_n: float
-    """True k_n [reading per m]."""
-    k_d: float
-    """True k_d [reading per m/s]."""
-    hidden: tuple[Hidden, ...]
-    """The hidden effects; empty if there are none."""
-    twin: TwinConfig
-    """Twin of the user, with wrong k_n and k_d."""
-    left_floors: float = 0.0
-    """Error on press and ramp after a refit of k_n, k_d and zero, in floors of a 50 ms row."""
+    seed: int  # Seed of everything that is drawn
+    arm: str  # Name of the arm
+    k_n: float  # True k_n [reading per m]
+    k_d: float  # True k_d [reading per m/s]
+    hidden: tuple[Hidden, ...]  # The hidden effects; empty if there are none
+    twin: TwinConfig  # Twin of the user, with wrong k_n and k_d
+    left_floors: float = 0.0  # Error on press and ramp after a refit of k_n, k_d and zero, in floors of a 50 ms row
 
     @property
     def name(self) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from scipy.signal import lfilter
 
 from taccorl.errors import TaccorlError, nearest
 
@@ -117,7 +118,8 @@ def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarra
             after, share = np.minimum(before + 1, len(reading) - 1), np.clip(at - before, 0.0, 1.0)[:, None]
             return reading[before] * (1 - share) + reading[after] * share
         case "touch_lag":
-            return _follow(reading, MILLISECOND / values["time_constant_s"])
+            rate = MILLISECOND / values["time_constant_s"]
+            return _low_pass(reading, rate / (1.0 + 0.5 * rate))  # the trapezoidal rule
         case "rate_softening":
             return reading / (1.0 + values["per_mps"] * np.abs(rate_mps))
     raise AssertionError(name)
@@ -147,36 +149,16 @@ def _bouc_wen(reading, low, high):
     return out
 
 
-@numba.njit(cache=True)
-def _chain(reading, share, time_constant_s):
+def _chain(reading: np.ndarray, share: float, time_constant_s: float) -> np.ndarray:
     """Two springs with dampers in a row, of 0.8 and 1.25 times the time constant; Heun's steps."""
-    out = np.empty_like(reading)
-    fast, slow = 1e-3 / (0.8 * time_constant_s), 1e-3 / (1.25 * time_constant_s)
-    for k in range(reading.shape[1]):
-        one, two, before = 0.0, 0.0, 0.0
-        for m in range(reading.shape[0]):
-            f = reading[m, k]
-            middle = 0.5 * (f + before)
-            one += fast * (middle - one) * (1.0 - 0.5 * fast)
-            two += slow * (middle - two) * (1.0 - 0.5 * slow)
-            before = f
-            out[m, k] = max(f + 0.5 * share * (one + two), 0.0)
-    return out
+    rates = (MILLISECOND / (factor * time_constant_s) for factor in (0.8, 1.25))
+    crept = sum(_low_pass(reading, rate * (1.0 - 0.5 * rate)) for rate in rates)
+    return np.maximum(reading + 0.5 * share * crept, 0.0)
 
 
-@numba.njit(cache=True)
-def _follow(reading, rate):
-    """First order, the trapezoidal rule."""
-    out = np.empty_like(reading)
-    keep = (1.0 - 0.5 * rate) / (1.0 + 0.5 * rate)
-    for k in range(reading.shape[1]):
-        smooth, before = 0.0, 0.0
-        for m in range(reading.shape[0]):
-            f = reading[m, k]
-            smooth = keep * smooth + (1.0 - keep) * 0.5 * (f + before)
-            before = f
-            out[m, k] = smooth
-    return out
+def _low_pass(reading: np.ndarray, rate: float) -> np.ndarray:
+    """First order from 0: each step goes ``rate`` of the way to the mean of a reading and the one before."""
+    return lfilter([0.5 * rate, 0.5 * rate], [1.0, rate - 1.0], reading, axis=0)
 
 
 def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:

@@ -4,14 +4,17 @@ Rows are instants, spread over the episode, one of them where touch is strongest
 """
 
 import itertools
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from PIL import Image
 
 from taccorl.data.episode import Episode, Pictures
 from taccorl.views.colors import ARM_COLORS, CONTACT_COLOR, LINE_COLORS, NOISE_COLOR, PAD_COLORS, heat
@@ -41,6 +44,11 @@ GATE_COLORS = {True: CONTACT_COLOR, False: (203, 213, 225)}
 STAGE_COLORS = ((147, 197, 253), (153, 246, 228), (253, 224, 71), (216, 180, 254), (251, 207, 232), (190, 242, 100))
 
 
+Color = tuple[int, int, int]
+Mark = tuple[str, float, Color]
+"""Name, value and colour of a horizontal line."""
+
+
 @dataclass(frozen=True)
 class Line:
     """One curve of a plot: name, values, colour and width."""
@@ -48,7 +56,7 @@ class Line:
     name: str
     values: np.ndarray
     """(T,) value at each row."""
-    color: tuple[int, int, int]
+    color: Color
     width: int = 2
 
 
@@ -86,19 +94,55 @@ def draw_sheet(episode: Episode) -> tuple[Image.Image, Layout]:
     """Draw the sheet; returns the picture and the positions of its elements."""
     pads, plots = pads_of(episode), _plots(episode)
     layout = _arrange(episode, pads, list(plots))
-    image = Image.new("RGB", layout.size, PAPER)
-    draw = ImageDraw.Draw(image)
-    _draw_head(draw, episode, layout)
-    _draw_cells(image, draw, episode, pads, layout)
+    sheet = _Sheet(layout)
+    _draw_head(sheet, episode)
+    _draw_labels(sheet, episode, pads)
     if pads:
-        _draw_scale(image, draw, pads, layout)
+        _draw_scale(sheet, pads)
     for title, box in layout.plots.items():
+        axes = sheet.axes(box)
+        axes.set_xlim(0, episode.num_rows / episode.spec.fps)
         if title in plots:
-            _draw_plot(image, draw, title, box, plots[title], _marks(title, pads))
+            _draw_plot(axes, episode, title, plots[title], _marks(title, pads))
         else:
-            _draw_lane(draw, episode, pads, title, box)
-    _draw_time_axis(draw, episode, layout)
+            _draw_lane(axes, episode, pads, title)
+        for row in layout.instants:
+            axes.axvline((row + 0.5) / episode.spec.fps, color=_rgb(SOFT), lw=0.8, ls=":")
+        axes.spines[:].set_visible(False)
+        last = title == list(layout.plots)[-1]
+        axes.tick_params(labelsize=9, labelcolor=_rgb(SOFT), labelbottom=last, length=0)
+        axes.set_xlabel("time since the first row [s]; dotted: the instants above" * last, color=_rgb(SOFT))
+    image = sheet.image()
+    _paste_pictures(image, episode, pads, layout)
     return image, layout
+
+
+class _Sheet:
+    """A figure with one unit a pixel, from the upper left."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout, (self.width, self.height) = layout, layout.size
+        self.figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100)
+        FigureCanvasAgg(self.figure)
+
+    def text(self, x: float, y: float, text: str, color: Color, size: float, **how: Any) -> None:
+        """Write ``text`` with its upper left corner at (x, y) unless ``how`` says otherwise; ``size`` in pixels."""
+        place = x / self.width, 1 - y / self.height
+        self.figure.text(*place, text, **{"color": _rgb(color), "fontsize": 0.72 * size, "va": "top", **how})
+
+    def axes(self, box: tuple[float, float, float, float]) -> Axes:
+        """Axes that fill left, top, right, bottom."""
+        (left, top, right, bottom), w, h = box, self.width, self.height
+        return self.figure.add_axes((left / w, 1 - bottom / h, (right - left) / w, (bottom - top) / h))
+
+    def image(self) -> Image.Image:
+        canvas = FigureCanvasAgg(self.figure)
+        canvas.draw()
+        return Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
+
+
+def _rgb(color: Color) -> tuple[float, ...]:
+    return tuple(c / 255 for c in color)
 
 
 def _arrange(episode: Episode, pads: list[Pad], titles: list[str]) -> Layout:
@@ -149,44 +193,40 @@ def _plots(episode: Episode) -> dict[str, list[Line]]:
     return plots
 
 
-def _marks(title: str, pads: list[Pad]) -> list[tuple[str, float, tuple[int, int, int]]]:
+def _marks(title: str, pads: list[Pad]) -> list[Mark]:
     """Horizontal lines of a plot: what untouched taxels may show, and where contact begins."""
     if "peak" in title:
-        sensor = pads[0].sensor
-        return [
-            (f"noise floor {sensor.noise_count:g}", sensor.noise_count, NOISE_COLOR),
-            (f"contact {pads[0].gate_count:.3g}", pads[0].gate_count, CONTACT_COLOR),
-        ]
+        noise, gate = pads[0].sensor.noise_count, pads[0].gate_count
+        return [(f"noise floor {noise:g}", noise, NOISE_COLOR), (f"contact {gate:.3g}", gate, CONTACT_COLOR)]
     if "sum" in title:  # taxels at or below the noise floor are not added: it is this plot's zero
         return [(f"noise floor: {pads[0].sensor.noise_count:g} a taxel", 0.0, NOISE_COLOR)]
     return []
 
 
-def _draw_head(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout) -> None:
+def _draw_head(sheet: _Sheet, episode: Episode) -> None:
     spec = episode.spec
-    draw.text((MARGIN, 18), episode.name, INK, font(26))
-    draw.text((MARGIN, 54), f"\u201c{episode.instruction}\u201d   outcome: {outcome(episode)}", INK, font(17))
+    sheet.text(MARGIN, 18, episode.name, INK, 26)
+    sheet.text(MARGIN, 54, f"\u201c{episode.instruction}\u201d   outcome: {outcome(episode)}", INK, 17)
     facts = f"{episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps; {spec.robot_type}; {spec.name}"
-    draw.text((MARGIN, 79), facts, SOFT, font(15))
-    text = f"data: {episode.origin}"
-    width = draw.textlength(text, font(17))
-    draw.rounded_rectangle((MARGIN, 102, MARGIN + width + 20, 128), 8, fill=ORIGIN_COLOR)
-    draw.text((MARGIN + 10, 105), text, PAPER, font(17))
+    sheet.text(MARGIN, 79, facts, SOFT, 15)
+    badge = {"boxstyle": "round,pad=0.35", "facecolor": _rgb(ORIGIN_COLOR), "edgecolor": "none"}
+    sheet.text(MARGIN + 8, 107, f"data: {episode.origin}", PAPER, 17, bbox=badge)
 
 
-def _draw_cells(
-    image: Image.Image, draw: ImageDraw.ImageDraw, episode: Episode, pads: list[Pad], layout: Layout
-) -> None:
-    for (n, name), (left, top, right, _) in layout.cells.items():
+def _draw_labels(sheet: _Sheet, episode: Episode, pads: list[Pad]) -> None:
+    for (n, name), (left, top, right, _) in sheet.layout.cells.items():
         if n == 0:
-            draw.text(((left + right) / 2, top - 8), name, INK, font(15), anchor="ms")
+            sheet.text((left + right) / 2, top - 8, name, INK, 15, ha="center", va="bottom")
     best = peak_row(pads) if pads else None
-    for n, row in enumerate(layout.instants):
+    for n, row in enumerate(sheet.layout.instants):
         top = HEAD_HEIGHT + 34 + n * (CELL_HEIGHT + GAP)
-        draw.text((MARGIN, top + 4), f"{row / episode.spec.fps:.2f} s", INK, font(20))
-        draw.text((MARGIN, top + 32), f"row {row}", SOFT, font(15))
+        sheet.text(MARGIN, top + 4, f"{row / episode.spec.fps:.2f} s", INK, 20)
+        sheet.text(MARGIN, top + 32, f"row {row}", SOFT, 15)
         if row == best:
-            draw.text((MARGIN, top + 54), "most touch", CONTACT_COLOR, font(15))
+            sheet.text(MARGIN, top + 54, "most touch", CONTACT_COLOR, 15)
+
+
+def _paste_pictures(image: Image.Image, episode: Episode, pads: list[Pad], layout: Layout) -> None:
     shown = dict(_pictures_at(episode, layout.instants))
     for (n, name), (left, top, right, bottom) in layout.cells.items():
         picture = next((p for key, p in shown.get(layout.instants[n], {}).items() if short_name(key) == name), None)
@@ -210,31 +250,21 @@ def _pictures_at(episode: Episode, rows: tuple[int, ...]) -> Iterator[tuple[int,
     yield from ((row, pictures) for row, pictures in stream if row in rows)
 
 
-def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, pads: list[Pad], layout: Layout) -> None:
-    sensor = pads[0].sensor
-    _, top, left, _ = layout.cells[0, pads[-1].name]
-    left, height = left + 2 * GAP, 2 * CELL_HEIGHT
-    bar = heat(np.repeat(np.linspace(1, 0, height)[:, None], 18, axis=1))
-    image.paste(Image.fromarray(bar), (left, top))
-    for count, text in (
-        (0, "0"),
-        (sensor.noise_count, f"{sensor.noise_count:g} noise"),
-        (pads[0].gate_count, f"{pads[0].gate_count:.3g} contact"),
-        (sensor.max_count / 2, f"{sensor.max_count / 2:g}"),
-        (sensor.max_count, f"{sensor.max_count}"),
-    ):
-        y = top + (height - 1) * (1 - count / sensor.max_count)
-        draw.line((left + 18, y, left + 23, y), INK)
-        draw.text((left + 27, y), text, INK, font(14), anchor="lm")
-    for n, word in enumerate(("counts", "above", "baseline")):
-        draw.text((left, top + height + 10 + 17 * n), word, SOFT, font(14))
+def _draw_scale(sheet: _Sheet, pads: list[Pad]) -> None:
+    sensor, (_, top, left, _) = pads[0].sensor, sheet.layout.cells[0, pads[-1].name]
+    axes = sheet.axes((left + 2 * GAP, top, left + 2 * GAP + 18, top + 2 * CELL_HEIGHT))
+    shades = heat(np.linspace(0, 1, 256)[:, None])
+    axes.imshow(shades, origin="lower", aspect="auto", extent=(0, 1, 0, sensor.max_count))
+    words = {0: "0", sensor.noise_count: f"{sensor.noise_count:g} noise"}
+    words |= {pads[0].gate_count: f"{pads[0].gate_count:.3g} contact"}
+    words |= {count: f"{count:g}" for count in (sensor.max_count / 2, sensor.max_count)}
+    axes.yaxis.tick_right()
+    axes.set_yticks(list(words), list(words.values()), fontsize=9)
+    axes.set_xticks([])
+    sheet.text(left + 2 * GAP, top + 2 * CELL_HEIGHT + 10, "counts\nabove\nbaseline", SOFT, 13)
 
 
-def _draw_lane(
-    draw: ImageDraw.ImageDraw, episode: Episode, pads: list[Pad], title: str, box: tuple[int, int, int, int]
-) -> None:
-    left, top, right, bottom = box
-    draw.text((left - 10, (top + bottom) / 2), title, INK, font(14), anchor="rm")
+def _draw_lane(axes: Axes, episode: Episode, pads: list[Pad], title: str) -> None:
     if title == "stage":
         rows, names = [row for row, _ in episode.stages], [name for _, name in episode.stages]
         order = list(dict.fromkeys(names))
@@ -244,102 +274,28 @@ def _draw_lane(
         rows = [0, *(np.flatnonzero(np.diff(gate)) + 1)]
         names, colors = ["contact" if gate[r] else "" for r in rows], [GATE_COLORS[bool(gate[r])] for r in rows]
         rule = f"{MIN_ACTIVE_TAXELS} taxel beyond {CONTACT_THRESHOLD}"
-        draw.text((right + 12, (top + bottom) / 2), rule, SOFT, font(14), anchor="lm")
+        axes.text(1.01, 0.5, rule, color=_rgb(SOFT), fontsize=9, va="center", transform=axes.transAxes)
     for start, end, name, color in zip(rows, [*rows[1:], episode.num_rows], names, colors, strict=True):
-        x0, x1 = (left + (right - left) * r / episode.num_rows for r in (start, end))
-        draw.rectangle((x0, top, x1 - 1, bottom), fill=color)
-        if draw.textlength(name, font(14)) < x1 - x0 - 6:
+        axes.axvspan(start / episode.spec.fps, end / episode.spec.fps, color=_rgb(color), lw=0)
+        if 8 * len(name) < axes.bbox.width * (end - start) / episode.num_rows:  # pixels
             ink = PAPER if color == CONTACT_COLOR else INK
-            draw.text((x0 + 5, (top + bottom) / 2), name, ink, font(14), anchor="lm")
+            axes.text(start / episode.spec.fps, 0.5, f" {name}", color=_rgb(ink), fontsize=9, va="center")
+    axes.set_ylabel(title, rotation=0, ha="right", va="center", fontsize=10)
+    axes.set_yticks([])
 
 
-def _draw_plot(
-    image: Image.Image,
-    draw: ImageDraw.ImageDraw,
-    title: str,
-    box: tuple[int, int, int, int],
-    lines: list[Line],
-    marks: list[tuple[str, float, tuple[int, int, int]]],
-) -> None:
-    left, top, right, bottom = box
-    width, height = right - left, bottom - top
+def _draw_plot(axes: Axes, episode: Episode, title: str, lines: list[Line], marks: list[Mark]) -> None:
     values = np.concatenate([line.values for line in lines])
-    ticks = nice_ticks(min(0.0, float(values.min())), max(float(values.max()), *(m[1] for m in marks), 1e-9))
-    low, high = ticks[0], ticks[-1]
-
-    def y_of(value: np.ndarray | float) -> np.ndarray:
-        return (height - 1) * (1 - (np.asarray(value, dtype=float) - low) / (high - low))
-
-    canvas = np.full((height, width, 3), 255, np.uint8)
-    for tick in ticks:
-        cv2.line(canvas, (0, round(float(y_of(tick)))), (width, round(float(y_of(tick)))), FAINT, 1)
-        draw.text((left - 8, top + float(y_of(tick))), f"{tick:g}", SOFT, font(13), anchor="rm")
-    for _, value, color in marks:
-        y = round(float(y_of(value)))
-        for x in range(0, width, 10):
-            cv2.line(canvas, (x, y), (x + 5, y), color, 1)
+    low, high = min(0.0, float(values.min())), max(float(values.max()), *(m[1] for m in marks), 1e-9)
+    ticks = MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(low, high)
+    axes.set_yticks(ticks)
+    axes.set_ylim(ticks[0], ticks[-1])
+    axes.grid(axis="y", color=_rgb(FAINT))
+    time_s = (np.arange(episode.num_rows) + 0.5) / episode.spec.fps
     for line in lines:
-        x = (np.arange(len(line.values)) + 0.5) * width / len(line.values)
-        points = np.stack([x, y_of(line.values)], axis=1)
-        fixed = np.round(points * 16).astype(np.int32)  # cv2: 4 bits behind the point
-        cv2.polylines(canvas, [fixed], False, line.color, line.width, cv2.LINE_AA, 4)
-    image.paste(Image.fromarray(canvas), (left, top))
-    draw.rectangle((left, top, right, bottom), outline=FAINT)
-    draw.text((left + 4, top - 5), title, INK, font(15), anchor="ls")
-    legend = [(line.name, line.color) for line in lines] + [(name, color) for name, _, color in marks]
-    _draw_legend(draw, legend, right, top)
-
-
-def _draw_legend(
-    draw: ImageDraw.ImageDraw, entries: list[tuple[str, tuple[int, int, int]]], left: int, top: int
-) -> None:
-    """One column, or two where one would be longer than the plot is high."""
-    columns = 1 if len(entries) <= 6 else 2
-    rows = math.ceil(len(entries) / columns)
-    step = min(19, PLOT_HEIGHT / rows)
-    for n, (name, color) in enumerate(entries):
-        x, y = left + 12 + (n // rows) * LEGEND_WIDTH / 2, top + 8 + step * (n % rows)
-        draw.rectangle((x, y - 2, x + 14, y + 2), fill=color)
-        draw.text((x + 21, y), name, INK, font(14 if step > 15 else 11), anchor="lm")
-
-
-def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout) -> None:
-    """Ticks in seconds below the last plot, and through all of them the instants shown above."""
-    if not layout.plots:
-        return
-    boxes = list(layout.plots.values())
-    left, _, right, bottom = boxes[-1]
-    end_s = episode.num_rows / episode.spec.fps
-    for tick in nice_ticks(0.0, end_s, most=9):
-        if tick <= end_s:
-            x = left + (right - left) * tick / end_s
-            draw.line((x, bottom, x, bottom + 6), INK)
-            draw.text((x, bottom + 9), f"{tick:g}", SOFT, font(14), anchor="mt")
-    draw.text(
-        ((left + right) / 2, bottom + 30),
-        "time since the first row [s]; dotted: the instants above",
-        SOFT,
-        font(14),
-        "mt",
-    )
-    for row in layout.instants:
-        x = left + (right - left) * (row + 0.5) / episode.num_rows
-        for y in range(boxes[0][1], bottom, 6):
-            draw.line((x, y, x, y + 2), SOFT)
-
-
-def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Return round numbers for an axis, ascending, at most ``most`` of them: the first at or below ``low``, the last at or above
-    ``high``."""
-    for exponent in range(math.floor(math.log10(high - low)) - 1, 300):
-        for step in (1.0, 2.0, 5.0):
-            size = step * 10.0**exponent
-            first, last = math.floor(low / size + 1e-9), math.ceil(high / size - 1e-9)
-            if last - first < most:
-                return [n * size for n in range(first, last + 1)]
-    raise ValueError(f"no ticks between {low} and {high}")
-
-
-def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font, which is the same on every machine; ``size`` in pixels."""
-    return ImageFont.load_default(size)  # Pillow's own: the same on every machine
+        axes.plot(time_s, line.values, color=_rgb(line.color), lw=0.72 * line.width, label=line.name)
+    for name, value, color in marks:
+        axes.axhline(value, color=_rgb(color), lw=0.72, ls="--", label=name)
+    axes.set_title(title, loc="left", fontsize=10, pad=3)
+    many = len(lines) + len(marks) > 6
+    axes.legend(loc=2, bbox_to_anchor=(1, 1.05), frameon=False, ncols=1 + many, fontsize=9 - 3 * many, handlelength=1)

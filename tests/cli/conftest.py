@@ -18,9 +18,7 @@ def place(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def said(
-    request: pytest.FixtureRequest, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Said:
+def said(request, place, monkeypatch, capsys):
     """Runs ``taccorl WORDS`` in ``place``; (exit code, all that was printed). A file with ``VERB`` runs that one, without
     ``IN_PLACE`` where the tests run; one with ``ONE_LINE`` gets what was printed in one line."""
     verb = getattr(request.module, "VERB", None)

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -52,9 +51,7 @@ def words(folder: Path) -> list[str]:
         ("undetermined", ["kd"], "its recordings do not determine kd;"),
     ],
 )
-def test_numbers_at_a_bound_or_undetermined_are_written_with_a_warning(
-    folder: Path, said: Any, tmp_path: Path, key: str, names: list[str], says: str
-):
+def test_numbers_at_a_bound_or_undetermined_are_written_with_a_warning(folder, said, tmp_path, key, names, says):
     report = json.loads((folder / "diagnosis" / "report.json").read_text())
     assert report["diagnoses"][SIGNAL][key] == []
     report["diagnoses"][SIGNAL][key] = names
@@ -65,7 +62,7 @@ def test_numbers_at_a_bound_or_undetermined_are_written_with_a_warning(
     assert f"warning: {SIGNAL}: {says}" in text if names else f"warning: {SIGNAL}: the fit ended" not in text
 
 
-def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said: Any, words: list[str]):
+def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder, said, words):
     before = (folder / "twin.yaml").read_bytes()
     code, text = said("coulomb_friction", *words)
     copy = folder / "twin+coulomb_friction.yaml"
@@ -100,7 +97,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
     assert code == 2 and "already exists; give another --out" in text
 
 
-def test_an_effect_that_was_tied_may_be_taken_instead(said: Any, words: list[str], tmp_path: Path):
+def test_an_effect_that_was_tied_may_be_taken_instead(said, words, tmp_path):
     code, text = said("asymmetric_friction", *words, f"--out={tmp_path / 'new.yaml'}")
     assert code == 0 and "noise floors with asymmetric_friction" in text
     (effect,) = load_twin(tmp_path / "new.yaml").effects
@@ -109,12 +106,12 @@ def test_an_effect_that_was_tied_may_be_taken_instead(said: Any, words: list[str
 
 
 @pytest.mark.parametrize("name", ["J3", "joint4", "left_joint4"])
-def test_the_joint_has_three_names(name: str, said: Any, words: list[str], tmp_path: Path):
+def test_the_joint_has_three_names(name, said, words, tmp_path):
     assert said("coulomb_friction", *words, f"--joints=[{name}]", f"--out={tmp_path / 'new.yaml'}")[0] == 0
     assert load_twin(tmp_path / "new.yaml").effects[0].acts_on() == [SIGNAL]
 
 
-def test_numbers_by_hand_need_no_diagnosis(said: Any, tmp_path: Path):
+def test_numbers_by_hand_need_no_diagnosis(said, tmp_path):
     out = tmp_path / "new.yaml"
     words = ["coulomb_friction", f"--diagnosis={tmp_path}", f"--out={out}", "--values={torque_nm: 0.4}"]
     assert said(*words)[0] == 2, "which joints?"
@@ -129,13 +126,13 @@ def test_numbers_by_hand_need_no_diagnosis(said: Any, tmp_path: Path):
     assert found == {("left_joint4",): (0.4, "by hand"), ("right_joint4",): (0.4, "by hand")}
 
 
-def test_an_effect_of_all_pads_by_hand(said: Any, tmp_path: Path):
+def test_an_effect_of_all_pads_by_hand(said, tmp_path):
     out = tmp_path / "new.yaml"
     assert said("touch_lag", f"--out={out}", "--values={time_constant_s: 0.03}")[0] == 0
     assert len(load_twin(out).effects[0].acts_on()) == 4
 
 
-def test_a_diagnosis_of_another_twin_is_refused(folder: Path, said: Any, tmp_path: Path):
+def test_a_diagnosis_of_another_twin_is_refused(folder, said, tmp_path):
     other = TwinConfig()
     other.controller.kp_nm_per_rad[0] += 1.0
     save_twin(other, tmp_path / "other.yaml")
@@ -155,20 +152,20 @@ def test_a_diagnosis_of_another_twin_is_refused(folder: Path, said: Any, tmp_pat
         (["touch_lag", "--joints=[joint4]", "--values={time_constant_s: 0.03}"], "is not an effect of joints"),
     ],
 )
-def test_what_cannot_be_added_is_refused(own: list[str], message: str, said: Any, words: list[str], tmp_path: Path):
+def test_what_cannot_be_added_is_refused(own, message, said, words, tmp_path):
     code, text = said(*own, *words, f"--out={tmp_path / 'new.yaml'}")
     assert code == 2 and message in text
     assert not (tmp_path / "new.yaml").exists()
 
 
 @pytest.mark.parametrize(("effect", "number"), [("coulomb_friction", "torque_nm: 0.4"), ("payload", "mass_kg: 0.2")])
-def test_without_a_diagnosis_the_way_out_is_said(effect: str, number: str, folder: Path, said: Any, tmp_path: Path):
+def test_without_a_diagnosis_the_way_out_is_said(effect, number, folder, said, tmp_path):
     words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
     code, text = said(effect, *words)
     assert code == 2 and "run `taccorl diagnose` first" in text and f"--values={{{number}}}" in text
 
 
-def test_in_place_changes_the_file_itself_and_nothing_else(folder: Path, said: Any, tmp_path: Path):
+def test_in_place_changes_the_file_itself_and_nothing_else(folder, said, tmp_path):
     path = tmp_path / "twin.yaml"
     path.write_bytes((folder / "twin.yaml").read_bytes())
     words = ["coulomb_friction", f"--diagnosis={folder / 'diagnosis'}", "--in_place=true"]

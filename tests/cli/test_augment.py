@@ -36,7 +36,7 @@ def report(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "new/meta/taccorl/collect_report.json").read_text())
 
 
-def test_the_result_keeps_yield_causes_and_grips(place: Path) -> None:
+def test_the_result_keeps_yield_causes_and_grips(place):
     told, dataset = report(place), Dataset(place / "new")
     assert dataset.num_episodes == told["episodes"] == told["outcomes"]["success"] == 1
     assert [entry["attempt"] for entry in told["entries"]] == list(range(told["attempts"]))
@@ -48,7 +48,7 @@ def test_the_result_keeps_yield_causes_and_grips(place: Path) -> None:
     assert "**Data: twin: MuJoCo twin, not a robot**" in card and f"{told['attempts']} attempt" in card
 
 
-def test_the_same_command_again_makes_nothing_anew(collected: Path, place: Path, said: Any) -> None:
+def test_the_same_command_again_makes_nothing_anew(collected, place, said):
     attempts = sorted((place / "store" / "mimicgen").iterdir())
     code, text = said("augment", f"--source={collected}", *WORDS)
     assert code == 0
@@ -60,7 +60,7 @@ def test_the_same_command_again_makes_nothing_anew(collected: Path, place: Path,
     assert sorted((place / "store" / "mimicgen").iterdir()) == attempts
 
 
-def test_of_each_cause_the_first_attempt_with_actions_can_be_viewed() -> None:
+def test_of_each_cause_the_first_attempt_with_actions_can_be_viewed():
     """A failed attempt is opened by its stored physics, which a failed second execution has too; without it by its result."""
     ended = [("dropped", 0), ("success", 9), ("force", 7), ("dropped", 5), ("force", 8), ("hung", 0), ("gate", 4)]
     entries = [{"attempt": k, "outcome": o, "rows": rows, "reason": f"why {k}"} for k, (o, rows) in enumerate(ended)]
@@ -75,9 +75,7 @@ def test_of_each_cause_the_first_attempt_with_actions_can_be_viewed() -> None:
 
 
 @pytest.mark.slow
-def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(
-    collected: Path, place: Path, said: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(collected, place, said, monkeypatch):
     monkeypatch.setattr(module, "_HUNDRED", 1)
     spec = yaml.safe_load(mimic_spec_path("assembly_2").read_text()) | {"gates": {"max_force_n": 0.5}}
     (place / "strict.yaml").write_text(yaml.safe_dump(spec))
@@ -95,9 +93,7 @@ def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(
     assert "force: " in episode.name
 
 
-def test_a_recording_without_simulator_state_is_refused_with_the_command_that_collects(
-    collected: Path, said: Any, tmp_path: Path
-) -> None:
+def test_a_recording_without_simulator_state_is_refused_with_the_command_that_collects(collected, said, tmp_path):
     shutil.copytree(collected, tmp_path / "real")
     path = tmp_path / "real" / "meta" / "info.json"  # as of a robot's recording
     info = json.loads(path.read_text())
@@ -110,16 +106,14 @@ def test_a_recording_without_simulator_state_is_refused_with_the_command_that_co
     assert "taccorl collect --task=assembly_2 --out=outputs/assembly_2" in text
 
 
-def test_what_the_twin_made_has_nothing_to_warn_of(collected: Path, place: Path, said: Any) -> None:
+def test_what_the_twin_made_has_nothing_to_warn_of(collected, place, said):
     for dataset in (collected, place / "new"):
         code, text = said("check", dataset)
         assert (code, "warning" in text, "error" in text) == (0, False, False), text
 
 
 @pytest.mark.parametrize("verb", ["augment", "merge"])
-def test_sources_with_one_flipped_byte_are_refused_by_name(
-    collected: Path, said: Any, tmp_path: Path, verb: str
-) -> None:
+def test_sources_with_one_flipped_byte_are_refused_by_name(collected, said, tmp_path, verb):
     shutil.copytree(collected, tmp_path / "flipped")
     (path,) = (tmp_path / "flipped" / "data").rglob("*.parquet")
     content = bytearray(path.read_bytes())
@@ -152,9 +146,7 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
         ((*WORDS, "--episodes=3"), "new is occupied: it holds augmented v4"),
     ],
 )
-def test_what_cannot_work_is_named_before_any_attempt(
-    words: tuple[str, ...], expected: str, collected: Path, place: Path, said: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_work_is_named_before_any_attempt(words, expected, collected, place, said, monkeypatch):
     monkeypatch.setattr(AugmentPlan, "run", lambda *_: pytest.fail("an attempt was made"))
     (place / "mine").mkdir(exist_ok=True)
     (place / "mine" / "work.txt").write_text("x")

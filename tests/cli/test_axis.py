@@ -5,7 +5,6 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +60,7 @@ def error(report: Path, use: str, kind: str) -> float:
     return next(s["rmse"] for s in found if (s["use"], s["kind"]) == (use, kind))
 
 
-def test_rows_that_all_stand_twice_are_named_and_not_compared(bench: Path, tmp_path: Path, said: Any) -> None:
+def test_rows_that_all_stand_twice_are_named_and_not_compared(bench, tmp_path, said):
     head, *rows = (bench / "bench" / "one.csv").read_text().splitlines()
     (tmp_path / "twice").mkdir()
     (tmp_path / "twice" / "one.csv").write_text("\n".join([head, *(row for row in rows for _ in range(2))]) + "\n")
@@ -88,7 +87,7 @@ def write_smooth(path: Path, seed: int, *, steps: bool = False) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_is_stated(tmp_path: Path, said: Any):
+def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_is_stated(tmp_path, said):
     (tmp_path / "bench").mkdir()
     for name, seed in (("one", 1), ("again", 2)):
         write_smooth(tmp_path / "bench" / f"{name}.csv", seed)
@@ -108,7 +107,7 @@ def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_i
 
 
 @pytest.mark.slow
-def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path, said: Any, tmp_path: Path):
+def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench, said, tmp_path):
     drive = bench / "drive.yaml"
     code, text = said("compare", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'before'}")
     assert code == 0 and "slide position" in text and "slide effort" in text
@@ -136,7 +135,7 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
 
 
 @pytest.mark.slow
-def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench: Path, said: Any, tmp_path: Path):
+def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench, said, tmp_path):
     """The file has 3 of 12 N. Held there, the rest of 9 N is missing."""
     drive, found = tmp_path / "drive.yaml", tmp_path / "found"
     drive.write_text(f"{FILE}effects: [{{effect: coulomb_friction, torque_nm: 3.0}}]\n")
@@ -171,9 +170,7 @@ def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench: Path, 
 
 
 @pytest.mark.slow
-def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_was_stated(
-    tmp_path: Path, said: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_was_stated(tmp_path, said, monkeypatch):
     """12 N of dry friction and 150 N·s/m; the file knows neither. Errors are of position and effort together."""
     monkeypatch.chdir(tmp_path)
     Path("bench").mkdir()
@@ -212,7 +209,7 @@ def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_wa
 
 
 def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_apart(
-    bench: Path, said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench, said, tmp_path, monkeypatch
 ):
     (tmp_path / "bench").mkdir()
     (tmp_path / "new").mkdir()
@@ -234,7 +231,7 @@ def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_a
     assert code == 2 and "one.csv" in text and "use: fit" in text
 
 
-def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any, tmp_path: Path):
+def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench, said, tmp_path):
     words = ["coulomb_friction", f"--twin={bench / 'drive.yaml'}", "--values={torque_nm: 3.0}"]
     assert said("add-effect", *words, f"--out={tmp_path / 'x.yaml'}")[0] == 0
     assert load_axis(tmp_path / "x.yaml").effects[0].values == {
@@ -256,16 +253,16 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any
         ("name: slide", "name: sled", "did you mean"),
     ],
 )
-def test_a_file_of_another_axis_is_refused(bench: Path, said: Any, tmp_path: Path, old: str, new: str, message: str):
+def test_a_file_of_another_axis_is_refused(bench, said, tmp_path, old, new, message):
     (tmp_path / "drive.yaml").write_text(FILE.replace(old, new))
     code, text = said("compare", bench / "bench", f"--twin={tmp_path / 'drive.yaml'}")
     assert code != 0 and message in text
 
 
 @pytest.mark.parametrize("in_the_file", [False, True])
-def test_efforts_of_other_gains_name_these_and_no_effect(bench: Path, said: Any, tmp_path: Path, in_the_file: bool):
+def test_efforts_of_other_gains_name_these_and_no_effect(bench, said, tmp_path, in_the_file):
     shutil.copytree(bench / "bench", tmp_path / "bench")
-    gains: dict[str, Any] = {} if in_the_file else {"kp": {"slide": 2 * KP}, "kd": {"slide": KD}}
+    gains = {} if in_the_file else {"kp": {"slide": 2 * KP}, "kd": {"slide": KD}}
     index = {"one.csv": gains, "again.csv": gains | {"repeat_of": "one.csv"}, "held.csv": gains | {"use": "validation"}}
     (tmp_path / "bench" / "measurements.yaml").write_text(json.dumps({"recordings": index}))
     (tmp_path / "drive.yaml").write_text(FILE.replace(f"kp: {KP}", f"kp: {2 * KP if in_the_file else KP}"))
@@ -275,7 +272,7 @@ def test_efforts_of_other_gains_name_these_and_no_effect(bench: Path, said: Any,
     assert "slide lacks" in said(*words, "--accept=other_gains")[1]
 
 
-def test_gains_per_degree_are_suspected_before_an_effect(bench: Path, said: Any, tmp_path: Path):
+def test_gains_per_degree_are_suspected_before_an_effect(bench, said, tmp_path):
     """kp 57.3 times too small lags by kd / kp = 2.9 s behind a sine of 0.6 Hz: nearly all of the motion is left."""
     (tmp_path / "degrees.yaml").write_text(FILE.replace(f"kp: {KP}", f"kp: {KP / 57.3}"))
     code, text = said("compare", bench / "bench", f"--twin={tmp_path / 'degrees.yaml'}")
@@ -287,7 +284,7 @@ def test_gains_per_degree_are_suspected_before_an_effect(bench: Path, said: Any,
     assert "gains: fitted" in text and "per degree" not in text
 
 
-def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_path: Path):
+def test_columns_with_a_factor_mend_sign_and_unit(bench, said, tmp_path):
     (tmp_path / "bench").mkdir()
     write(tmp_path / "bench" / "one.csv", 0.1, 0.6, 1, effort=-1e3)
     code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
@@ -301,7 +298,7 @@ def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_pa
     assert code == 0 and "slide effort" in text
 
 
-def test_a_stage_that_moves_by_a_millimetre_is_compared_and_one_that_stands_is_not(said: Any, tmp_path: Path):
+def test_a_stage_that_moves_by_a_millimetre_is_compared_and_one_that_stands_is_not(said, tmp_path):
     """± 0.9 mm are 9000 of the noise's 0.2 µm; 9 µm are 45."""
     (tmp_path / "drive.yaml").write_text(FILE)
     for name, amplitude_m in (("small", 0.9e-3), ("still", 4.5e-6)):
@@ -318,7 +315,7 @@ def test_a_stage_that_moves_by_a_millimetre_is_compared_and_one_that_stands_is_n
         assert code == 0 if name == "small" else "slide by less than 2e-05 m" in text
 
 
-def test_a_column_of_another_name_is_not_blamed_on_a_robot(bench: Path, said: Any, tmp_path: Path):
+def test_a_column_of_another_name_is_not_blamed_on_a_robot(bench, said, tmp_path):
     (tmp_path / "bench").mkdir()
     table = (bench / "bench" / "one.csv").read_text().replace("slide.", "slid.")
     (tmp_path / "bench" / "one.csv").write_text(table)

@@ -46,7 +46,7 @@ def table(folder: Path, name: str = "press.csv", **columns: np.ndarray) -> Path:
 
 
 @pytest.mark.slow
-def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said) -> None:
+def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping, said):
     sensor, presses, out = creeping / "taxel.yaml", creeping / "presses", creeping / "diagnosis"
     code, shown = said("compare", presses, f"--twin={sensor}", f"--out={creeping / 'compared'}")
     assert code == 0
@@ -82,7 +82,7 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said
         assert before[use] > 2.5 and after[use] < 1.2, (use, before, after)
 
 
-def test_the_next_press_is_planned_with_the_columns_of_recordings(creeping: Path, said, tmp_path: Path) -> None:
+def test_the_next_press_is_planned_with_the_columns_of_recordings(creeping, said, tmp_path):
     words = ["excite", f"--twin={creeping / 'taxel.yaml'}", f"--measurements={creeping / 'presses'}"]
     rivals = "--effects=taxel_creep,touch_lag"
     code, shown = said(*words, rivals, "--span=[0,12]", "--speed=40", "--num=2", f"--out={tmp_path / 'plan'}")
@@ -112,7 +112,7 @@ def test_the_next_press_is_planned_with_the_columns_of_recordings(creeping: Path
     assert not (tmp_path / "none").exists()
 
 
-def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path: Path, said) -> None:
+def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path, said):
     code, shown = said("surrogate", "--secret=3", "--cells=true", "--effects=[taxel_threshold]", "--out=made")
     assert code == 0 and "simulated, not a real one" in shown
     assert "taxel_threshold" not in (tmp_path / "made" / "sealed_truth.json").read_text()
@@ -123,7 +123,7 @@ def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path: Path, sai
     assert "--pads applies to robots" in said("surrogate", "--secret=3", "--cells=true", "--pads=left")[1]
 
 
-def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path: Path, said) -> None:
+def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path, said):
     (tmp_path / "taxel.yaml").write_text(SENSOR + "gain: [40]\noffset: [20]\n")
     code, _ = said("add-effect", "taxel_threshold", "--twin=taxel.yaml", "--values={threshold: 0.2}")
     assert code == 0
@@ -134,7 +134,7 @@ def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path: Pat
     assert code == 2 and "coulomb_friction is not an effect of a sensor of cells" in shown
 
 
-def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
+def test_a_file_is_written_as_it_is_read(tmp_path):
     path = tmp_path / "grid.yaml"
     path.write_text(
         "kind: cells\nrows: 2\ncolumns: 3\nload: {unit: kPa, rated: 50, shared: false}\nreading: {unit: kohm, falls: true}\n"
@@ -168,9 +168,7 @@ def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
         ("cells: [thumb]", "cellz: [thumb]", 2, "unknown key 'cellz'"),
     ],
 )
-def test_a_wrong_line_of_the_file_is_said_with_the_way_out(
-    tmp_path: Path, said, old: str, new: str, line: int, words: str
-) -> None:
+def test_a_wrong_line_of_the_file_is_said_with_the_way_out(tmp_path, said, old, new, line, words):
     table(tmp_path / "presses")
     (tmp_path / "taxel.yaml").write_text(SENSOR.replace(old, new))
     code, shown = said("compare", "presses", "--twin=taxel.yaml")
@@ -205,9 +203,7 @@ def held(values: np.ndarray, rows: int) -> np.ndarray:
         ({"force_n": held(LOAD_N + 0.01 * np.sin(17 * T_S), 10)}, "load_held: the load changes every 10 rows only"),
     ],
 )
-def test_a_wrong_recording_is_said_with_what_to_do_and_nothing_is_compared(
-    tmp_path: Path, said, columns, words: str
-) -> None:
+def test_a_wrong_recording_is_said_with_what_to_do_and_nothing_is_compared(tmp_path, said, columns, words):
     table(tmp_path / "presses", **columns)
     (tmp_path / "taxel.yaml").write_text(SENSOR)
     for verb in ("compare", "diagnose"):
@@ -216,7 +212,7 @@ def test_a_wrong_recording_is_said_with_what_to_do_and_nothing_is_compared(
         assert words in " ".join(shown.split())
 
 
-def test_another_rate_than_the_file_says_is_an_error_and_can_be_accepted(tmp_path: Path, said) -> None:
+def test_another_rate_than_the_file_says_is_an_error_and_can_be_accepted(tmp_path, said):
     table(tmp_path / "presses")
     (tmp_path / "taxel.yaml").write_text(SENSOR + "rate_hz: 1000\n")
     code, shown = said("compare", "presses", "--twin=taxel.yaml")
@@ -225,7 +221,7 @@ def test_another_rate_than_the_file_says_is_an_error_and_can_be_accepted(tmp_pat
     assert said("compare", "presses", "--twin=taxel.yaml", "--accept=other_rate")[0] == 0
 
 
-def test_the_cell_at_fault_is_named_and_no_fit_recording_is_called_sound(tmp_path: Path, said) -> None:
+def test_the_cell_at_fault_is_named_and_no_fit_recording_is_called_sound(tmp_path, said):
     (tmp_path / "taxel.yaml").write_text(SENSOR.replace("[thumb]", "[thumb, index]"))
     for name in ("one.csv", "two.csv"):
         table(tmp_path / "presses", name, index__reading=np.where(LOAD_N > 0.5, 1023, 20))
@@ -236,7 +232,7 @@ def test_the_cell_at_fault_is_named_and_no_fit_recording_is_called_sound(tmp_pat
     assert not any(line.startswith("ok") for line in shown.splitlines())
 
 
-def test_missing_and_unknown_columns_are_named(tmp_path: Path, said) -> None:
+def test_missing_and_unknown_columns_are_named(tmp_path, said):
     (tmp_path / "taxel.yaml").write_text(SENSOR)
     folder = tmp_path / "presses"
     folder.mkdir()
@@ -253,7 +249,7 @@ def test_missing_and_unknown_columns_are_named(tmp_path: Path, said) -> None:
     assert "time does not increase at row 3" in said("compare", "presses", "--twin=taxel.yaml")[1]
 
 
-def test_a_columns_file_gives_other_names_and_units(tmp_path: Path, said) -> None:
+def test_a_columns_file_gives_other_names_and_units(tmp_path, said):
     table(tmp_path / "ours")
     (tmp_path / "taxel.yaml").write_text(SENSOR)
     other = tmp_path / "theirs"

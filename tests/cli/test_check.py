@@ -31,7 +31,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---- recordings ----
 
 
-def test_a_sound_recording_is_ok(good: Path, said: Any) -> None:
+def test_a_sound_recording_is_ok(good, said):
     code, text = said(good, SPEC)
     assert code == 0
     assert text.count("ok  ") == 2, "the recording and its one episode"
@@ -39,7 +39,7 @@ def test_a_sound_recording_is_ok(good: Path, said: Any) -> None:
     assert "warning" not in text and "error" not in text
 
 
-def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path: Path, said: Any) -> None:
+def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path, said):
     path = record(tmp_path / "frozen.mcap", duration_s=4.0, frozen_camera="front")
     code, text = said(path, SPEC)
     assert (code, "frozen_picture" in text) == (1, True)
@@ -48,21 +48,21 @@ def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path: Pat
     assert (code, "frozen_picture" in text) == (0, False)
 
 
-def test_an_episode_that_the_operator_discarded_is_no_warning(tmp_path: Path, said: Any) -> None:
+def test_an_episode_that_the_operator_discarded_is_no_warning(tmp_path, said):
     path = record(tmp_path / "two.mcap", duration_s=4.0, episodes=2, outcomes=("discard", "success"))
     code, text = said(path, SPEC, "--pictures=false")
     assert code == 0
     assert "discarded by the operator" in text
 
 
-def test_pictures_that_do_not_decode_are_named_and_the_rest_is_checked(good: Path, tmp_path: Path, said: Any) -> None:
+def test_pictures_that_do_not_decode_are_named_and_the_rest_is_checked(good, tmp_path, said):
     code, text = said(garbled(good, tmp_path / "broken.mcap", [36]), SPEC)
     assert code == 1
     assert "broken_picture: front: 1 pictures do not decode, first at 1.2" in text
     assert "70 rows" in text
 
 
-def test_a_bad_file_in_a_folder_does_not_hide_the_others(good: Path, tmp_path: Path, said: Any) -> None:
+def test_a_bad_file_in_a_folder_does_not_hide_the_others(good, tmp_path, said):
     shutil.copy(good, tmp_path / "b.mcap")
     (tmp_path / "a.mcap").write_bytes(b"not a recording")
     code, text = said(tmp_path, SPEC, "--pictures=false")
@@ -74,7 +74,7 @@ def test_a_bad_file_in_a_folder_does_not_hide_the_others(good: Path, tmp_path: P
 # ---- datasets ----
 
 
-def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset: Path, said: Any) -> None:
+def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset, said):
     code, text = said(dataset)
     assert "episode 0: " in text and "episode 1: " in text
     assert "verified" in text and "files are as they were written" in " ".join(text.split())
@@ -82,14 +82,12 @@ def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset: Path, said: 
     assert "error" not in text
 
 
-def test_a_spec_of_another_format_for_a_dataset_is_refused_with_the_way_out(dataset: Path, said: Any) -> None:
+def test_a_spec_of_another_format_for_a_dataset_is_refused_with_the_way_out(dataset, said):
     code, text = said(dataset, SPEC)
     assert code == 2 and str(dataset) in text and SPEC in text and "Leave --spec out" in text
 
 
-def test_a_cut_video_is_an_error_and_the_other_episodes_are_still_checked(
-    dataset: Path, tmp_path: Path, said: Any
-) -> None:
+def test_a_cut_video_is_an_error_and_the_other_episodes_are_still_checked(dataset, tmp_path, said):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     video = next(copy.rglob("videos/observation.images.front/**/*.mp4"))
     os.truncate(video, video.stat().st_size // 2)
@@ -116,9 +114,7 @@ def flip_bit(path: Path) -> None:
         "meta/taccorl/episodes.json",
     ],
 )
-def test_one_bit_that_flipped_is_an_error_that_names_the_file(
-    pattern: str, dataset: Path, tmp_path: Path, said: Any
-) -> None:
+def test_one_bit_that_flipped_is_an_error_that_names_the_file(pattern, dataset, tmp_path, said):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     path = next(copy.glob(pattern))
     flip_bit(path)
@@ -127,7 +123,7 @@ def test_one_bit_that_flipped_is_an_error_that_names_the_file(
     assert "changed_file" in text and path.relative_to(copy).as_posix() in " ".join(text.split())
 
 
-def test_quick_reads_no_digest(dataset: Path, tmp_path: Path, said: Any) -> None:
+def test_quick_reads_no_digest(dataset, tmp_path, said):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     with next(copy.glob("videos/**/*.mp4")).open("ab") as file:
         file.write(b"0")
@@ -135,7 +131,7 @@ def test_quick_reads_no_digest(dataset: Path, tmp_path: Path, said: Any) -> None
     assert "changed_file" not in said(copy, "--pictures=false", "--quick=true")[1]
 
 
-def test_a_file_that_is_gone_is_an_error(dataset: Path, tmp_path: Path, said: Any) -> None:
+def test_a_file_that_is_gone_is_an_error(dataset, tmp_path, said):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     (copy / "meta" / "stats.json").unlink()
     code, text = said(copy, "--pictures=false")
@@ -143,7 +139,7 @@ def test_a_file_that_is_gone_is_an_error(dataset: Path, tmp_path: Path, said: An
 
 
 @pytest.mark.parametrize("how", ["digest of a file", "not JSON"])
-def test_a_damaged_manifest_is_an_error(how: str, dataset: Path, tmp_path: Path, said: Any) -> None:
+def test_a_damaged_manifest_is_an_error(how, dataset, tmp_path, said):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     path = copy / "meta" / "taccorl" / "manifest.json"
     if how == "not JSON":
@@ -157,7 +153,7 @@ def test_a_damaged_manifest_is_an_error(how: str, dataset: Path, tmp_path: Path,
     assert code >= 1 and "damaged_manifest" in text and "manifest.json" in " ".join(text.split())
 
 
-def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(dataset: Path, tmp_path: Path, said: Any) -> None:
+def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(dataset, tmp_path, said):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     (copy / "meta" / "taccorl" / "manifest.json").unlink()
     code, text = said(copy, "--pictures=false")
@@ -170,7 +166,7 @@ def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(dataset: Pa
 # ---- what is no recording ----
 
 
-def test_a_name_that_is_not_in_a_large_folder_does_not_list_it_all(tmp_path: Path, said: Any) -> None:
+def test_a_name_that_is_not_in_a_large_folder_does_not_list_it_all(tmp_path, said):
     for k in range(500):
         (tmp_path / f"{k:03d}.mcap").touch()
     (tmp_path / ".000.taccorl-lock").touch()
@@ -190,7 +186,7 @@ def odd_things(folder: Path) -> dict[str, Path]:
 
 @pytest.mark.parametrize("name", ["empty", "dir.mcap", "pipe.mcap", "dangling.mcap", "text.txt", "missing.mcap"])
 @pytest.mark.parametrize("with_spec", [True, False])
-def test_no_recording_is_one_clear_line_that_names_it(name: str, with_spec: bool, tmp_path: Path, said: Any) -> None:
+def test_no_recording_is_one_clear_line_that_names_it(name, with_spec, tmp_path, said):
     path = odd_things(tmp_path)[name]
     if name == "text.txt" and with_spec:
         code, text = said(path, SPEC)  # the spec names the reader, and the reader says what is wrong with the file
@@ -206,7 +202,7 @@ def test_no_recording_is_one_clear_line_that_names_it(name: str, with_spec: bool
         assert "nowhere.mcap" in text  # where the link leads
 
 
-def test_check_starts_without_torch_or_lerobot(good: Path) -> None:
+def test_check_starts_without_torch_or_lerobot(good):
     code = (
         "import sys; from taccorl.cli.main import main\n"
         f"main(['check', {str(good)!r}, {SPEC!r}, '--pictures=false'])\n"
@@ -215,9 +211,7 @@ def test_check_starts_without_torch_or_lerobot(good: Path) -> None:
     assert fresh_python("-c", code).stdout.splitlines()[-1] == "light"
 
 
-def test_a_file_that_needs_too_much_memory_is_a_finding(
-    tmp_path: Path, said: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_needs_too_much_memory_is_a_finding(tmp_path, said, monkeypatch):
     from taccorl.data import recording
 
     def too_much(*_: Any) -> None:

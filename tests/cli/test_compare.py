@@ -4,7 +4,6 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def row(text: str, signal: str, use: str) -> list[str]:
     return next(line.split() for line in text.splitlines() if line.startswith(signal) and use in line)
 
 
-def test_table_says_how_far_off_and_where(folder: Path, said: Any):
+def test_table_says_how_far_off_and_where(folder, said):
     code, text = said(f"--twin={folder / 'twin.yaml'}", f"--measurements={folder / 'sweeps'}")
     assert code == 0
     words = row(text, f"{SIGNAL} position", "validation")
@@ -53,7 +52,7 @@ def test_table_says_how_far_off_and_where(folder: Path, said: Any):
 
 
 @pytest.mark.slow
-def test_before_and_after_side_by_side_with_report_and_rerun_file(folder: Path, said: Any, tmp_path: Path):
+def test_before_and_after_side_by_side_with_report_and_rerun_file(folder, said, tmp_path):
     out, rrd = tmp_path / "report", tmp_path / "x.rrd"
     words = [folder / "sweeps", f"--twin={folder / 'twin.yaml'}", f"--against={folder / 'mended.yaml'}"]
     code, text = said(*words, f"--out={out}", f"--rerun={rrd}")
@@ -69,7 +68,7 @@ def test_before_and_after_side_by_side_with_report_and_rerun_file(folder: Path, 
     assert code == 0 and "replaced the report of" in text
 
 
-def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp_path: Path):
+def test_errors_of_the_data_stop_it_with_what_to_do(folder, said, tmp_path):
     good = sweeps(TwinConfig(), seconds=3.0)
     m = good.fit[0]
     early = {n: getattr(m, n)[:-3] for n in ("time_s", "target")} | {
@@ -84,7 +83,7 @@ def test_errors_of_the_data_stop_it_with_what_to_do(folder: Path, said: Any, tmp
 
 
 @pytest.mark.slow
-def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder: Path, said: Any, tmp_path: Path):
+def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder, said, tmp_path):
     good = sweeps(TwinConfig(), seconds=3.0)
     values = good.fit[0].measured.copy()
     j = good.fit[0].column(SIGNAL)
@@ -103,7 +102,7 @@ def test_an_error_can_be_accepted_by_name_and_stays_in_the_report(folder: Path, 
     assert code == 2 and "frozen_channel" in text
 
 
-def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
+def test_only_the_joints_that_were_asked_for(folder, said):
     code, text = said(folder / "sweeps", "--joints=[right_joint1]")
     assert code == 2 and "'right_joint1'" in text and SIGNAL in text
     whole = shutil.copytree(folder / "sweeps", folder / "also_broken")
@@ -128,15 +127,13 @@ def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
         ([], "missing --measurements="),
     ],
 )
-def test_what_cannot_be_done_is_said_before_any_work(
-    words: list[str], message: str, folder: Path, said: Any, tmp_path: Path
-):
+def test_what_cannot_be_done_is_said_before_any_work(words, message, folder, said, tmp_path):
     (tmp_path / "arm.urdf").touch()
     code, text = said(*[w.format(folder=folder, tmp=tmp_path) for w in words])
     assert code == 2 and message in text
 
 
-def test_somebody_else_s_page_is_left_alone(folder: Path, said: Any, tmp_path: Path):
+def test_somebody_else_s_page_is_left_alone(folder, said, tmp_path):
     (tmp_path / "report.html").write_text("mine")
     code, text = said(folder / "sweeps", f"--out={tmp_path}")
     assert code == 2 and "is not a report of taccorl" in text
@@ -157,7 +154,7 @@ def test_a_shift_of_a_joint_whose_pose_is_unknown_is_a_warning():
         assert check in late["a"][0].text
 
 
-def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys: pytest.CaptureFixture[str]) -> None:
+def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys):
     """elbow: judged by the onsets of another recording; wrist: by the replay of the same one; hand: by nothing."""
     joints = ("elbow", "wrist", "hand")
     findings = {"a.csv": [not_judged(name, "an offset of one row", f"why {name}", CLOCK) for name in joints]}
@@ -169,7 +166,7 @@ def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys: pytes
     assert len(lines) == 1 and "why hand" in lines[0] and "elbow" not in lines[0] and "wrist" not in lines[0]
 
 
-def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_not_judged_of_several_joints_is_one_line(capsys):
     late = [not_judged(name, "an offset of one row (5.0 ms)", f"why {name}") for name in ("elbow", "wrist")]
     other = not_judged("elbow", "what is not repeated", "no repeats")
     show(*found_in_recordings({"a.csv": [late[0], other], "b.csv": late}))  # recordings are counted, not findings
@@ -180,7 +177,7 @@ def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.Captur
 
 @pytest.mark.parametrize(("rows_late", "left"), [(3, 0), (0, 1)])
 @pytest.mark.parametrize("both_late", [0, 250])
-def test_a_late_answer_is_not_said_where_the_replay_is_as_late(rows_late: int, left: int, both_late: int) -> None:
+def test_a_late_answer_is_not_said_where_the_replay_is_as_late(rows_late, left, both_late):
     """The measurement comes 3 rows after its target; so does the replay, or it comes with it. Noise of 0.1 mrad.
     Both 250 rows later: the twin has the delay."""
     at, rng = np.arange(1200), np.random.default_rng(0)

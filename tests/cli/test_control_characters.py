@@ -4,7 +4,6 @@ import json
 import re
 from pathlib import Path
 
-import pytest
 import yaml
 from mcap.writer import Writer
 
@@ -33,15 +32,13 @@ def write(path: Path) -> Path:
     return path
 
 
-def test_printable_writes_out_what_a_terminal_would_obey() -> None:
+def test_printable_writes_out_what_a_terminal_would_obey():
     assert printable(f"a{RED}b\n{BACKWARDS}") == r"a\x1b[31mb\n\u202e"
     assert printable("Größe → 3 µm, 😀") == "Größe → 3 µm, 😀"
     assert printable("\udcff") == r"\udcff"  # a file name that is not UTF-8
 
 
-def test_what_inspect_prints_and_drafts_has_no_control_characters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_inspect_prints_and_drafts_has_no_control_characters(tmp_path, capsys):
     path = write(tmp_path / f"a{RED}.mcap")
     assert main(["ingest", "inspect", str(path)]) == 0
     assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
@@ -57,9 +54,7 @@ def test_what_inspect_prints_and_drafts_has_no_control_characters(
     assert r"# not used: /other\x1b[31m" in (tmp_path / "mine.yaml").read_text()
 
 
-def test_errors_reports_and_lists_of_what_is_not_read_have_none_either(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_errors_reports_and_lists_of_what_is_not_read_have_none_either(tmp_path, capsys):
     folder = tmp_path / "in"
     folder.mkdir()
     write(folder / f"a{RED}.mcap")

@@ -181,9 +181,7 @@ def test_what_is_not_there_is_said(words: list[str], message: str, made: Path, s
     ],
 )
 @pytest.mark.parametrize("verb", ["compare", pytest.param("diagnose", marks=pytest.mark.slow)])
-def test_a_wrong_object_is_an_error_with_a_way_out(
-    verb: str, change: dict, message: str, made: Path, said: Any, tmp_path: Path
-):
+def test_a_wrong_object_is_an_error_with_a_way_out(verb, change, message, made, said, tmp_path):
     presses = tmp_path / "presses"
     presses.mkdir()
     for name in ("01_press.mcap", "03_held.mcap"):

@@ -54,9 +54,7 @@ def test_a_wrong_kind_or_name_is_said_with_the_nearest(said) -> None:
 
 
 @pytest.mark.parametrize("kind", [pytest.param("joint", marks=pytest.mark.slow), "cells"])
-def test_a_written_example_passes_its_own_test_and_fails_it_once_its_law_is_broken(
-    said, tmp_path: Path, kind: str
-) -> None:
+def test_a_written_example_passes_its_own_test_and_fails_it_once_its_law_is_broken(said, tmp_path, kind):
     code, shown = said("effects", "new", "my_effect", "--out=mine.py", f"--for={kind}")
     assert code == 0
     assert 'my_effect = "mine"' in shown

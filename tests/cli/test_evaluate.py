@@ -96,9 +96,7 @@ def test_a_folder_that_is_no_checkpoint_is_named(said: Any, tmp_path: Path) -> N
     assert not (tmp_path / "outputs").exists()
 
 
-def test_without_opengl_failures_come_without_pictures(
-    said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_opengl_failures_come_without_pictures(said, tmp_path, monkeypatch):
     def fail(*_: Any) -> None:
         raise TaccorlError("no OpenGL here")
 

@@ -5,7 +5,6 @@ import json
 import re
 import shlex
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_folder(tmp_path_factory.mktemp("excite") / "sweeps", Measurements(tuple(made)), ROBOT.action_names)
 
 
-def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said: Any, tmp_path: Path):
+def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said, tmp_path):
     out = tmp_path / "plan"
     code, text = said(SIGNAL, "--effects=[command_lag,integral_action]", f"--out={out}", "--num=2")
     assert code == 0 and "wrote" in text and "0.2 mrad" in text
@@ -69,7 +68,7 @@ def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said: Any, tmp_path
 
 
 @pytest.mark.slow
-def test_what_nothing_tells_apart_is_said_with_exit_code_1(said: Any, tmp_path: Path):
+def test_what_nothing_tells_apart_is_said_with_exit_code_1(said, tmp_path):
     """The same positions by algebra; efforts show the one that holds more, and a hobby servo measures none."""
     rivals, twin = "--effects=[coulomb_friction,asymmetric_friction]", tmp_path / "servo.yaml"
     code, text = said(SIGNAL, rivals, f"--out={tmp_path / 'arm'}", "--num=1")
@@ -97,7 +96,7 @@ def suspected(folder: Path, part: str, base: dict[str, float], moved: str, /, **
 
 
 @pytest.mark.parametrize("moved", ["", "torque_ff"])
-def test_rivals_and_numbers_come_from_a_diagnosis(moved: str, said: Any, tmp_path: Path):
+def test_rivals_and_numbers_come_from_a_diagnosis(moved, said, tmp_path):
     numbers = {"coulomb_friction": {"torque_nm": 2.0}, "viscous_friction": {"damping_nms_per_rad": 3.0}}
     found = suspected(tmp_path, SIGNAL, {"torque_ff": 1.73, "kp": 151.1, "kd": 17.1}, moved, **numbers)
     folder_or_file = found / "report.json" if moved else found
@@ -108,7 +107,7 @@ def test_rivals_and_numbers_come_from_a_diagnosis(moved: str, said: Any, tmp_pat
     assert code == 0 and min(plan["motions"][0]["floors_apart"].values()) > 5.0
 
 
-def test_rivals_and_numbers_come_from_a_diagnosis_s_left_pads(said: Any, tmp_path: Path):
+def test_rivals_and_numbers_come_from_a_diagnosis_s_left_pads(said, tmp_path):
     base = {"k_n": 900.0, "k_d": 4.0, "zero_left_a": 0.0, "zero_left_b": 0.0}
     numbers = {"touch_delay": {"delay_s": 0.06}, "touch_lag": {"time_constant_s": 0.06}}
     found = suspected(tmp_path, "left pads", base, "", **numbers)
@@ -120,7 +119,7 @@ def test_rivals_and_numbers_come_from_a_diagnosis_s_left_pads(said: Any, tmp_pat
 
 
 @pytest.mark.slow
-def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps: Path, said: Any, tmp_path: Path):
+def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps, said, tmp_path):
     out = tmp_path / "plan"
     _, text = said(SIGNAL, RIVALS, f"--measurements={sweeps}", f"--out={out}", "--num=1")
     assert "noise floors (0.4" in text or "noise floors (0.39" in text
@@ -150,7 +149,7 @@ def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps
         ([], "missing --joint=left_joint5, or --pads=left for the pads of that arm"),
     ],
 )
-def test_what_cannot_be_done_is_said_and_nothing_written(words: list[str], message: str, said: Any, tmp_path: Path):
+def test_what_cannot_be_done_is_said_and_nothing_written(words, message, said, tmp_path):
     words = [w.format(tmp=tmp_path) for w in words]
     code, text = said(*words, f"--out={tmp_path / 'plan'}", f"--diagnosis={tmp_path}")
     assert code == 2 and message in text
@@ -158,7 +157,7 @@ def test_what_cannot_be_done_is_said_and_nothing_written(words: list[str], messa
 
 
 @pytest.mark.slow
-def test_a_table_of_the_joint_alone_is_enough(sweeps: Path, said: Any, tmp_path: Path):
+def test_a_table_of_the_joint_alone_is_enough(sweeps, said, tmp_path):
     one = write_folder(tmp_path / "one", read_measurements(sweeps), (SIGNAL,))
     code, text = said(SIGNAL, RIVALS, f"--measurements={one}", f"--out={tmp_path / 'plan'}", "--num=1")
     assert code == 0 and "wrote" in text and (tmp_path / "plan" / "plan.yaml").exists()
@@ -185,9 +184,7 @@ LAG = "{effect: touch_lag, time_constant_s: 0.02"
         ((), "my twin", "touch_lag", f"{CELLS}[{LAG}}}]\n"),
     ],
 )
-def test_a_rival_that_is_in_the_file_is_said_to_be_with_commands_that_run(
-    words: tuple[str, ...], part: str, name: str, text: str, said: Any, tmp_path: Path
-) -> None:
+def test_a_rival_that_is_in_the_file_is_said_to_be_with_commands_that_run(words, part, name, text, said, tmp_path):
     """What is in the file is fitted beside every rival: 0.00 floors apart on every motion, and the message said so of motions."""
     (tmp_path / "arm.xml").write_text(MODEL)
     twin, out = tmp_path / "my twin.yaml", tmp_path / "plan"
@@ -208,7 +205,7 @@ def test_a_rival_that_is_in_the_file_is_said_to_be_with_commands_that_run(
 
 
 @pytest.mark.slow
-def test_a_plan_tables_of_targets_and_what_to_say_of_them(said: Any, tmp_path: Path):
+def test_a_plan_tables_of_targets_and_what_to_say_of_them(said, tmp_path):
     out = tmp_path / "plan"
     code, text = said("--pads=right", OF_PADS, f"--out={out}", "--num=2")
     assert code == 0 and "right pads: noise floors (0.6 counts, a taxel's mean over 5 frames)" in text
@@ -236,7 +233,7 @@ def test_a_plan_tables_of_targets_and_what_to_say_of_them(said: Any, tmp_path: P
         assert opening.min() - target.min() == pytest.approx(10 * deepest, abs=3e-6), "20 kN/m on 2 kN/m"
 
 
-def test_what_only_one_truth_would_show_is_said(said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_only_one_truth_would_show_is_said(said, tmp_path, monkeypatch):
     monkeypatch.setattr(presses, "LIBRARY", (OF_NAME["long_hold"],))
     code, text = said("--pads=left", "--effects=taxel_creep,touch_lag", f"--out={tmp_path / 'plan'}")
     assert code == 0 and "taxel_creep | touch_lag: 0." in text and "wrote" in text, "a plan was written"

@@ -42,7 +42,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 # ---- ingest ----
 
 
-def test_the_command_of_the_readme_says_where_everything_is(good: Path, said: Any) -> None:
+def test_the_command_of_the_readme_says_where_everything_is(good, said):
     before = good.read_bytes()
     code, text = said(good, SPEC, "--out=outputs/my dataset")
     assert code == 0
@@ -59,14 +59,14 @@ def test_the_command_of_the_readme_says_where_everything_is(good: Path, said: An
     assert said(good, SPEC, "--out=./outputs/../outputs/my dataset")[0] == 0
 
 
-def test_without_a_spec_the_one_that_fits_is_chosen_and_named(good: Path, said: Any, tmp_path: Path) -> None:
+def test_without_a_spec_the_one_that_fits_is_chosen_and_named(good, said, tmp_path):
     code, text = said(good, "--dry_run=true")
     assert (code, "piper_flexitac_mcap, whose topics these are" in text) == (0, True)
     for verb, words in (("check", ["--pictures=false"]), ("view", [f"--save={tmp_path / 'x.rrd'}"])):
         assert main([verb, str(good), *words]) == 0, verb
 
 
-def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path: Path, said: Any, capsys: Any) -> None:
+def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path, said, capsys):
     path = write_hdf5(tmp_path / "own.hdf5", {"/qpos": np.zeros((40, 6)), "/command": np.zeros((40, 6))})
     for verb in ("ingest", "check", "view"):
         assert main([verb, str(path)]) != 0
@@ -75,7 +75,7 @@ def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path:
         assert "Traceback" not in error
 
 
-def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(good: Path, said: Any) -> None:
+def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(good, said):
     Path("out").mkdir()
     code, text = said(good, "--spec", "piper_flexitac_mcap", "--out", "out")
     assert (code, Path("out/meta/info.json").is_file()) == (0, True), text
@@ -96,9 +96,7 @@ def next_line(process: subprocess.Popen[str], word: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_watching_ingests_what_arrives_and_publishes_the_same_dataset_at_the_end(
-    good: Path, tmp_path: Path, said: Any, end: signal.Signals
-) -> None:
+def test_watching_ingests_what_arrives_and_publishes_the_same_dataset_at_the_end(good, tmp_path, said, end):
     folder = tmp_path / "recordings"
     folder.mkdir()
     process = watching(folder, "--out=watched", "--store=store")
@@ -133,7 +131,7 @@ def test_watching_ingests_what_arrives_and_publishes_the_same_dataset_at_the_end
         (("--out=there",), "there"),
     ],
 )
-def test_watching_refuses_at_once_what_could_not_end_well(words: tuple[str, ...], named: str, said: Any) -> None:
+def test_watching_refuses_at_once_what_could_not_end_well(words, named, said):
     Path("in").mkdir()
     Path("there").mkdir()
     Path("there/file").write_text("mine")
@@ -145,7 +143,7 @@ def test_watching_refuses_at_once_what_could_not_end_well(words: tuple[str, ...]
 
 
 @pytest.mark.parametrize("dry_run", ["true", "false"])
-def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run: str, tmp_path: Path, said: Any) -> None:
+def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run, tmp_path, said):
     (folder := tmp_path / "in").mkdir()
     write_mcap(folder / "degrees.mcap", StandInConfig(**SMALL, joints_in_degrees=True))
     (folder / "empty.mcap").touch()
@@ -181,9 +179,7 @@ def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run: str, tmp_path: Pa
         (("nowhere.mcap",), "nowhere.mcap: no such file or folder"),
     ],
 )
-def test_what_cannot_work_is_told_before_any_work(
-    words: tuple[str, ...], expected: str, good: Path, said: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_work_is_told_before_any_work(words, expected, good, said, monkeypatch):
     Path("file").write_text("x")
     Path("full").mkdir()
     Path("full/mine.txt").write_text("x")
@@ -202,7 +198,7 @@ def test_what_cannot_work_is_told_before_any_work(
 # ---- inspect ----
 
 
-def test_inspect_shows_channels_and_names_the_spec_that_fits(good: Path, said: Any) -> None:
+def test_inspect_shows_channels_and_names_the_spec_that_fits(good, said):
     code, text = said("inspect", good)
     assert code == 0
     for topic in PAD_TOPICS.values():
@@ -212,14 +208,14 @@ def test_inspect_shows_channels_and_names_the_spec_that_fits(good: Path, said: A
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_inspect_reads_a_dataset_too(dataset: Path, said: Any) -> None:
+def test_inspect_reads_a_dataset_too(dataset, said):
     code, text = said("inspect", dataset)
     assert code == 0
     assert "observation.tactile/left_a" in text
     assert "taccorl_lerobot" in text
 
 
-def test_names_that_look_like_markup_are_shown_as_they_are(good: Path, tmp_path: Path, said: Any) -> None:
+def test_names_that_look_like_markup_are_shown_as_they_are(good, tmp_path, said):
     path = tmp_path / "[red]a[" / "bold].mcap"  # rich would read "[/bold]" as a closing tag
     path.parent.mkdir()
     shutil.copy(good, path)
@@ -232,7 +228,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(good: Path, tmp_path:
 # ---- the draft ----
 
 
-def test_a_draft_never_overwrites(good: Path, said: Any) -> None:
+def test_a_draft_never_overwrites(good, said):
     for name in ("mine.yaml", "other_dataset.yaml"):  # either file of the pair
         Path(name).write_text("my work")
         code, text = said("inspect", good, f"--draft={name.replace('_dataset', '')}")
@@ -244,7 +240,7 @@ def test_a_draft_never_overwrites(good: Path, said: Any) -> None:
     assert code == 2 and not Path("elsewhere.yaml").exists()
 
 
-def test_a_draft_into_a_missing_folder_is_one_clear_line(good: Path, said: Any) -> None:
+def test_a_draft_into_a_missing_folder_is_one_clear_line(good, said):
     code, text = said("inspect", good, "--draft=nowhere/mine.yaml")
     assert code == 2
     assert "nowhere" in text.strip().splitlines()[-1]

@@ -1,7 +1,5 @@
 """``taccorl ingest inspect`` over folders, and over files of other people's kinds."""
 
-from pathlib import Path
-
 import pytest
 from edited import rewrite
 
@@ -12,7 +10,7 @@ from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, wri
 SMALL = StandInConfig(duration_s=2.0, camera_size=(96, 128))
 
 
-def test_one_bad_entry_of_a_folder_does_not_hide_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_bad_entry_of_a_folder_does_not_hide_the_others(tmp_path, capsys):
     write_mcap(tmp_path / "good.mcap", SMALL)
     (tmp_path / "v21/meta").mkdir(parents=True)
     (tmp_path / "v21/meta/info.json").write_text('{"codebase_version": "v2.1"}')
@@ -28,9 +26,7 @@ def test_one_bad_entry_of_a_folder_does_not_hide_the_others(tmp_path: Path, caps
     assert printed.count("zero.mcap: ") == 1
 
 
-def test_times_that_the_reader_made_up_are_not_shown_as_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_times_that_the_reader_made_up_are_not_shown_as_measured(tmp_path, capsys):
     write_cobot_magic_hdf5(tmp_path / "a.hdf5", SMALL)
     assert main(["ingest", "inspect", str(tmp_path / "a.hdf5")]) == 0
     printed = capsys.readouterr().out
@@ -39,7 +35,7 @@ def test_times_that_the_reader_made_up_are_not_shown_as_measured(
     assert row.split() == ["/observations/qpos", "float32", "60", "–", "–", "–", "–"]
 
 
-def test_what_is_wrong_comes_instead_of_a_spec_that_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_comes_instead_of_a_spec_that_fits(tmp_path, capsys):
     path = tmp_path / "a.mcap"
     write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), sim_time_stamps=True))
     main(["ingest", "inspect", str(path)])
@@ -50,9 +46,7 @@ def test_what_is_wrong_comes_instead_of_a_spec_that_fits(tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
-def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(
-    share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(share, tmp_path, capsys):
     path = tmp_path / "a.mcap"
     write_mcap(tmp_path / "known.mcap", SMALL)
     types = {CAMERA_TOPICS["front"]: "foxglove_msgs/msg/CompressedImage"}

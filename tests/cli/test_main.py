@@ -1,23 +1,25 @@
-"""The program as a whole: its list of verbs, its help, its exit codes."""
+"""The program as a whole: its list of verbs, its help, its exit codes, what shells complete without importing the verbs."""
 
+import dataclasses
 import importlib
 import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
+import typing
 from typing import Any
 
 import pytest
 
 import taccorl
 from taccorl.cli.check import CheckConfig
-from taccorl.cli.completion import SECOND_WORDS
+from taccorl.cli.completion import SECOND_WORDS, options_of
 from taccorl.cli.evaluate import EvaluateConfig
 from taccorl.cli.help import SHOWN
 from taccorl.cli.ingest import IngestConfig, InspectConfig
 from taccorl.cli.lineage import ExplainConfig, PruneConfig
 from taccorl.cli.main import VERBS, main
+from taccorl.cli.parse import _inner_names
 from taccorl.cli.view import ViewConfig
 from taccorl.errors import TaccorlError
 from tests.fresh_python import fresh_python
@@ -34,7 +36,7 @@ HELP = {
 TACCORL = [sys.executable, "-m", "taccorl.cli.main"]
 
 
-def test_the_list_names_every_verb_and_needs_no_library() -> None:
+def test_the_list_names_every_verb_and_needs_no_library():
     heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml'}"
     code = f"import sys; from taccorl.cli.main import main; main([]); print({heavy} & set(sys.modules) or 'light')"
     done = fresh_python("-c", code)
@@ -48,7 +50,7 @@ def test_the_list_names_every_verb_and_needs_no_library() -> None:
 
 
 @pytest.mark.parametrize(("stated", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
-def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(stated: dict[str, str], threads: str):
+def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(stated, threads):
     code = (
         "import atexit, os; atexit.register(lambda: print(os.environ['OPENBLAS_NUM_THREADS']));"
         "from taccorl.cli.main import main; main()"
@@ -58,23 +60,23 @@ def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(s
 
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])
-def test_the_list_is_no_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_is_no_error(words, capsys):
     assert main(words) == 0
     assert "usage: taccorl <verb>" in capsys.readouterr().out
 
 
-def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_the_packages(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"taccorl {taccorl.__version__}\n"
 
 
 @pytest.mark.parametrize(("typo", "meant"), [("ingst", "ingest"), ("chekc", "check"), ("veiw", "view")])
-def test_an_unknown_verb_names_the_nearest(typo: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_verb_names_the_nearest(typo, meant, capsys):
     assert main([typo, "x"]) == 2
     assert capsys.readouterr().err == f"taccorl: no verb {typo!r}; did you mean {meant!r}?\n"
 
 
-def test_help_names_every_registered_task_but_the_empty_bench(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_names_every_registered_task_but_the_empty_bench(capsys):
     from taccorl.sim.task import tasks
 
     with pytest.raises(SystemExit):
@@ -83,7 +85,7 @@ def test_help_names_every_registered_task_but_the_empty_bench(capsys: pytest.Cap
     assert {name for name in tasks if f" {name}" in shown} == set(tasks) - {"bench"}
 
 
-def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys):
     verbs = {verb for group in VERBS.values() for verb in group} - {"lineage", "completion", "task"}
     assert verbs | {
         f"{v} {second}" for v, words in SECOND_WORDS.items() for second in words if v != "completion"
@@ -100,7 +102,7 @@ def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys: py
     assert number <= 120
 
 
-def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_what_options_with_choices_are(capsys):
     """draccus overlooks the docstrings of Literal fields, also of those in a config within a config."""
     for verb, option, text in (
         ("diagnose", "--until {one,noise_floor}", "find the most likely missing effect of each joint"),
@@ -131,9 +133,7 @@ def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[
         (KeyboardInterrupt(), 130, "taccorl ingest: stopped; what was finished is kept"),  # in its store
     ],
 )
-def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
-    raised: BaseException, code: int, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(raised, code, words, monkeypatch, capsys):
     def fail(argv: Any) -> int:
         raise raised
 
@@ -165,7 +165,7 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
         (("lineage", "explain", "nope"), "taccorl lineage explain: "),
     ],
 )
-def test_a_refused_command_makes_no_store(words: tuple[str, ...], named: str, tmp_path: Path, said: Any) -> None:
+def test_a_refused_command_makes_no_store(words, named, tmp_path, said):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     code, shown = said(*words)
@@ -174,7 +174,7 @@ def test_a_refused_command_makes_no_store(words: tuple[str, ...], named: str, tm
 
 
 @pytest.mark.parametrize("words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")])
-def test_a_reader_that_goes_away_is_no_error_message(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_reader_that_goes_away_is_no_error_message(words, tmp_path):
     from tests.recordings.stand_in import StandInConfig, write_mcap
 
     write_mcap(tmp_path / "a.mcap", StandInConfig(duration_s=2.0, camera_size=(96, 128)))
@@ -184,3 +184,68 @@ def test_a_reader_that_goes_away_is_no_error_message(words: tuple[str, ...], tmp
     done = subprocess.run([*TACCORL, *given], stdout=write_end, stderr=subprocess.PIPE, text=True)
     os.close(write_end)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+CONFIGS = {
+    "augment": "AugmentConfig",
+    "evaluate": "EvaluateConfig",
+    "add-effect": "AddEffectConfig",
+    "post-train": "PostTrainConfig",
+    "view": "ViewConfig",
+}
+LAST_WORD = {  # prints what the shell offers for the last of these words
+    "bash": "source {script}; COMP_WORDS=({line}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1)); _taccorl 2>/dev/null; "
+    "printf '%s\\n' \"${{COMPREPLY[@]}}\"",
+    "fish": "source {script}; complete -C '{line}'",
+}
+
+
+@pytest.mark.parametrize("verb", CONFIGS)
+def test_options_read_from_source_are_those_of_the_config(verb):
+    kind = getattr(importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}"), CONFIGS[verb])
+    expected = {"config_path"}
+    for field, hint in typing.get_type_hints(kind).items():
+        inner = _inner_names(hint)
+        nested = {name for name in inner if not any(other.startswith(f"{name}.") for other in inner)}
+        expected |= {f"{field}.{name}" for name in nested} or {field}
+    assert set(options_of(verb)) == expected
+    assert {field.name for field in dataclasses.fields(kind)} == {
+        name.split(".")[0] for name in expected - {"config_path"}
+    }
+
+
+def test_the_script_is_made_without_any_library():
+    heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml', 'taccorl.cli.collect'}"
+    code = f"import sys; from taccorl.cli.main import main; main(['completion', 'bash']); print({heavy} & set(sys.modules))"
+    assert fresh_python("-c", code).stdout.splitlines()[-1] == "set()"
+
+
+@pytest.mark.parametrize("shell", LAST_WORD)
+def test_a_shell_offers_verbs_options_words_and_files(shell, tmp_path, capsys):
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    assert main(["completion", shell]) == 0
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out)
+    (tmp_path / "a file.mcap").touch()
+
+    def offered(*words: str) -> str:
+        flags = ["--norc"] if shell == "bash" else ["--no-config"]
+        command = [shell, *flags, "-c", LAST_WORD[shell].format(script=script, line=" ".join(words))]
+        return subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout.strip()
+
+    assert offered("taccorl", "colle").split()[0] == "collect"
+    assert offered("taccorl", "collect", "--epi").rstrip("=") == "--episodes"
+    assert offered("taccorl", "post-train", "--ppo.kl").rstrip("=") == "--ppo.kl_stop"
+    assert offered("taccorl", "lineage", "pru") == "prune"
+    assert "a file.mcap" in offered("taccorl", "check", "a").replace("\\", "")
+
+
+def test_every_verb_has_options_or_words():
+    for group in VERBS.values():
+        for verb in group:
+            assert (verb == "completion") != bool(options_of(verb)), verb
+
+
+def test_what_a_class_alone_knows_is_no_option():
+    assert "source.repeatable" not in options_of("collect")  # a ClassVar

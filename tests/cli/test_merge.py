@@ -136,9 +136,7 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_writte
         (("--real=blind", "--sim=twin", "--out=x"), "twin has observation.images.front, but blind does not: ingest"),
     ],
 )
-def test_what_cannot_work_is_named_and_nothing_is_left(
-    words: tuple[str, ...], expected: str, place: Path, said: Any
-) -> None:
+def test_what_cannot_work_is_named_and_nothing_is_left(words, expected, place, said):
     from tiny_dataset import write_tiny
 
     (place / "mine").mkdir(exist_ok=True)

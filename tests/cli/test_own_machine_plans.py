@@ -5,7 +5,6 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +48,7 @@ def swept(drive: Path, hidden: Axis, rows_early: int = 0) -> Measurement:
     return dataclasses.replace(m, measured=np.roll(m.measured, -rows_early, axis=0) + noise)
 
 
-def test_planned_motions_keep_range_speed_and_effort(drive: Path) -> None:
+def test_planned_motions_keep_range_speed_and_effort(drive):
     """0.3 m of stroke less 5 % at both ends; 80 % of 200 N, and 0.4 m/s."""
     g = ground(drive)
     assert g.room.wide_rad == pytest.approx((0.5 - MARGIN) * 0.3) and g.room.middle_rad == 0.0
@@ -68,7 +67,7 @@ def test_planned_motions_keep_range_speed_and_effort(drive: Path) -> None:
     assert made >= 4
 
 
-def test_a_velocity_law_gets_velocities_that_sum_to_the_motion(tmp_path: Path) -> None:
+def test_a_velocity_law_gets_velocities_that_sum_to_the_motion(tmp_path):
     (tmp_path / "v.yaml").write_text(SLIDE.replace("kp: 40000.0\n", "law: velocity\n"))
     g = ground(tmp_path / "v.yaml")
     positions = g.positions(MOTIONS[0])
@@ -81,9 +80,7 @@ def test_a_velocity_law_gets_velocities_that_sum_to_the_motion(tmp_path: Path) -
     ("kd", "rows_early", "said"),
     [(2400.0, 0, []), (2000.0, 1, [("shifted_from_twin", "error")]), (2400.0, 1, [("clock_or_effect", "warning")])],
 )
-def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
-    drive: Path, kd: float, rows_early: int, said: list[tuple[str, str]]
-) -> None:
+def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(drive, kd, rows_early, said):
     """20 % more damping lags by 0.2 · 2000 / 40000 = 10 ms, two rows, and no clock is off; a row early is an error. Both at
     once are a lag of one row, which speeds that are sent along would leave as well."""
     axis = Axis.load(drive)
@@ -100,9 +97,7 @@ def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
         ("integral_action", {"rate_per_s": 1.0}, False),
     ],
 )
-def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(
-    drive: Path, name: str, values: dict[str, float], warns: bool
-) -> None:
+def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(drive, name, values, warns):
     axis = Axis.load(drive)
     hidden = dataclasses.replace(axis, config=axis.config.with_effects([make_effect(name, **values)]))
     m = swept(drive, hidden)
@@ -122,9 +117,7 @@ def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(
         (("kp: 40000.0\nkd: 2000.0\n", "law: torque\n"), {}, "driven by torque"),
     ],
 )
-def test_limits_that_nobody_stated_are_not_guessed(
-    tmp_path: Path, change: tuple[str, str], limits: dict[str, Any], words: str
-) -> None:
+def test_limits_that_nobody_stated_are_not_guessed(tmp_path, change, limits, words):
     (tmp_path / "d.yaml").write_text(SLIDE.replace(*change) if change[0] else SLIDE)
     with pytest.raises(Exception, match=words.replace("[", r"\[")):
         ground(tmp_path / "d.yaml", **limits)
@@ -139,7 +132,7 @@ def suspected(folder: Path, **values: dict[str, float]) -> Path:
 
 
 @pytest.mark.parametrize(("limit_n", "within"), [(80.0, (1.3, 1.6)), (180.0, (0.6, 0.8 * 200.0 / 180.0))])
-def test_motions_are_aimed_at_a_suspected_limit(drive: Path, limit_n: float, within: tuple[float, float]) -> None:
+def test_motions_are_aimed_at_a_suspected_limit(drive, limit_n, within):
     """A jump d of the target is 40 000 N/m · d at once, which must be within 80 % of 200 N; 180 N are not."""
     g, values = ground(drive), {"torque_saturation.torque_max_nm": limit_n}
     m, effort, far = g.aimed(JUMPS, "torque_saturation", values)
@@ -148,9 +141,7 @@ def test_motions_are_aimed_at_a_suspected_limit(drive: Path, limit_n: float, wit
     assert np.abs(np.gradient(m.measured[:, 0], 1.0 / g.rate_hz)).max() <= 1.05 * 0.4
 
 
-def test_excite_says_which_suspected_limit_no_motion_reaches_and_by_how_much(
-    drive: Path, said: Any, tmp_path: Path
-) -> None:
+def test_excite_says_which_suspected_limit_no_motion_reaches_and_by_how_much(drive, said, tmp_path):
     """A stop at 0.14 m is within the limits of 0.15 m; 180 N are more than 80 % of 200 N."""
     found = suspected(
         tmp_path / "diagnosis",
@@ -174,7 +165,7 @@ def test_excite_says_which_suspected_limit_no_motion_reaches_and_by_how_much(
     assert "effort_limit 200" in text and "end_stop: no motion" not in text
 
 
-def test_excite_writes_targets_that_the_axis_can_follow(drive: Path, said: Any, tmp_path: Path) -> None:
+def test_excite_writes_targets_that_the_axis_can_follow(drive, said, tmp_path):
     out = tmp_path / "plan"
     words = ["--effects=[coulomb_friction,viscous_friction]", f"--twin={drive}", f"--out={out}", "--num=1"]
     code, text = said("excite", *words, "--speed=0.4")
@@ -190,7 +181,7 @@ def test_excite_writes_targets_that_the_axis_can_follow(drive: Path, said: Any, 
 
 
 @pytest.mark.slow
-def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(drive: Path, said: Any, tmp_path: Path) -> None:
+def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(drive, said, tmp_path):
     out = tmp_path / "made"
     words = ["--secret=4", f"--twin={drive}", "--speed=0.4", f"--out={out}"]
     code, text = said("surrogate", *words, "--effects=[viscous_friction]", "--strength=8")
@@ -210,7 +201,7 @@ def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(drive: Pat
     )
 
 
-def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said: Any, tmp_path: Path) -> None:
+def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said, tmp_path):
     (tmp_path / "foot.yaml").write_text(
         "kind: cells\ncells: [foot]\nload: {unit: kPa, rated: 400}\n"
         "reading: {unit: V, lowest: 0.0, highest: 3.3, falls: true}\nrate_hz: 250\n"
@@ -233,7 +224,7 @@ TWO_JOINTS = """<mujoco><worldbody><body><joint name="shoulder" axis="0 0 1"/>
 """
 
 
-def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said: Any, tmp_path: Path) -> None:
+def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said, tmp_path):
     (tmp_path / "arm.xml").write_text(TWO_JOINTS)
     twin = tmp_path / "arm.yaml"
     twin.write_text("kind: robot\nmodel: arm.xml\njoints: {shoulder: {kp: 50, kd: 5}, elbow: {kp: 20, kd: 2}}\n")
@@ -260,7 +251,7 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said:
     assert code == 2 and "another twin" in text
 
 
-def test_friction_of_a_sliding_joint_is_told_in_newtons_and_written_as_any_effect(said: Any, tmp_path: Path) -> None:
+def test_friction_of_a_sliding_joint_is_told_in_newtons_and_written_as_any_effect(said, tmp_path):
     (tmp_path / "gantry.xml").write_text(TWO_JOINTS.replace('name="elbow"', 'name="elbow" type="slide"'))
     twin = tmp_path / "gantry.yaml"
     twin.write_text("kind: robot\nmodel: gantry.xml\njoints: {shoulder: {kp: 50, kd: 5}, elbow: {kp: 8000, kd: 400}}\n")

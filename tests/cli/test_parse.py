@@ -170,9 +170,7 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("--name=a", "--config_path=typo.yaml"), ("pathz",)),
     ],
 )
-def test_a_slip_is_named_with_the_way_out(
-    words: tuple[str, ...], said: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slip_is_named_with_the_way_out(words, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("odd.yaml").write_text("- 1\n")
     Path("bad.yaml").write_text("paths: [a\n")

@@ -8,8 +8,7 @@ import numpy as np
 
 from taccorl.data.lerobot_format import quiet_lerobot
 
-Row = Mapping[str, Any]
-"""Feature → array, picture (rows, columns, 3) or text; and ``task``."""
+Row = Mapping[str, Any]  # Feature → array, picture (rows, columns, 3) or text; and ``task``
 
 
 def write_with_lerobot(

@@ -39,15 +39,11 @@ class Recipe:
     touch_delay_s: float = 0.02
     touch_clock_s: dict[str, float] = dataclasses.field(default_factory=dict)
     """Pad → how much later it feels everything."""
-    state_clock_s: float = 0.0
-    """States appear this much later than they were."""
-    noise_count: float | None = None
-    """Standard deviation of a taxel; None: drawn from 1 to 2."""
+    state_clock_s: float = 0.0  # States appear this much later than they were
+    noise_count: float | None = None  # Standard deviation of a taxel; None: drawn from 1 to 2
     drift_count_per_s: float = 0.0
-    part_m: dict[str, float] | None = None
-    """Arm → width of its part; None: drawn. 0: it closes on nothing."""
-    rest_s: tuple[float, float] = (0.0, 0.0)
-    """Stillness added before and after."""
+    part_m: dict[str, float] | None = None  # Arm → width of its part; None: drawn. 0: it closes on nothing
+    rest_s: tuple[float, float] = (0.0, 0.0)  # Stillness added before and after
 
 
 def _ramp(x: np.ndarray, start: float, end: float) -> np.ndarray:

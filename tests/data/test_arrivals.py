@@ -42,9 +42,7 @@ def test_a_recording_is_new_once_when_it_has_not_changed_for_the_time_of_settlin
 
 
 @pytest.mark.parametrize(("size", "time_ns"), [(20, 1), (10, 2)])
-def test_a_change_of_size_or_time_starts_the_time_again_also_after_it_was_complete(
-    tmp_path: Path, size: int, time_ns: int
-) -> None:
+def test_a_change_of_size_or_time_starts_the_time_again_also_after_it_was_complete(tmp_path, size, time_ns):
     watched = arrivals(tmp_path)
     changed(tmp_path / "a.mcap", 10, 1)
     watched.look(0.0)

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +55,7 @@ def good() -> Episode:
 
 
 @pytest.mark.parametrize("seed", [pytest.param(k, marks=[pytest.mark.slow] * (k >= 6)) for k in range(NUM_SEEDS)])
-def test_good_episode_gives_no_error_and_no_warning(seed: int) -> None:
+def test_good_episode_gives_no_error_and_no_warning(seed):
     rng = np.random.default_rng([seed, 77])
     episode = make(
         seed=seed, duration_s=rng.uniform(6, 24), lead_s=rng.uniform(0.04, 0.15), touch_delay_s=rng.uniform(0.0, 0.06)
@@ -64,7 +63,7 @@ def test_good_episode_gives_no_error_and_no_warning(seed: int) -> None:
     assert serious(check_episode(episode, pictures=seed % 5 == 0)) == []
 
 
-def test_findings_come_worst_first_and_name_their_place(good: Episode) -> None:
+def test_findings_come_worst_first_and_name_their_place(good):
     state, action, _ = copies(good)
     state[50, 0] = np.nan
     action[100, 3] += 1.0
@@ -75,7 +74,7 @@ def test_findings_come_worst_first_and_name_their_place(good: Episode) -> None:
     assert all(f.text and f.check for f in findings)
 
 
-def test_the_episode_itself_is_never_changed(good: Episode) -> None:
+def test_the_episode_itself_is_never_changed(good):
     before = {key: value.copy() for key, value in good.arrays.items()}
     check_episode(good, pictures=False)
     assert all(np.array_equal(before[key], good.arrays[key]) for key in before)
@@ -93,14 +92,14 @@ def first_rows(episode: Episode, num_rows: int) -> Episode:
 
 
 @pytest.mark.parametrize("gone", [keys for n in (1, 2, 3) for keys in combinations((STATE, ACTION, TOUCH), n)])
-def test_missing_features_give_notes_only(good: Episode, gone: tuple[str, ...]) -> None:
+def test_missing_features_give_notes_only(good, gone):
     findings = check_episode(without(good, *gone))
     assert serious(findings) == []
     assert len(gone) < 3 or [f.check for f in findings] == ["not_judged"]
 
 
 @pytest.mark.parametrize("num_rows", [1, 2, 5, 20, 45])
-def test_short_episode_says_too_short_and_nothing_else(good: Episode, num_rows: int) -> None:
+def test_short_episode_says_too_short_and_nothing_else(good, num_rows):
     findings = check_episode(first_rows(good, num_rows))
     assert serious(findings) == []
     assert any(f.check == "not_judged" for f in findings)
@@ -109,7 +108,7 @@ def test_short_episode_says_too_short_and_nothing_else(good: Episode, num_rows: 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("num_rows", [1, 3, 11, 30, 61, 95, 200])
 @pytest.mark.parametrize("kind", ["zeros", "constant", "random", "steps", "int64", "nan"])
-def test_any_numbers_are_judged_without_a_fault_of_ours(kind: str, num_rows: int) -> None:
+def test_any_numbers_are_judged_without_a_fault_of_ours(kind, num_rows):
     rng = np.random.default_rng(num_rows)
 
     def numbers(size: int) -> np.ndarray:
@@ -135,7 +134,7 @@ def respec(episode: Episode, key: str, **changes: object) -> Episode:
     return dataclasses.replace(episode, spec=spec)
 
 
-def test_unknown_units_skip_limits_speeds_and_rests(good: Episode) -> None:
+def test_unknown_units_skip_limits_speeds_and_rests(good):
     state, action, _ = copies(good)
     state[:, :] *= 57.3
     state[30] += 500.0
@@ -147,7 +146,7 @@ def test_unknown_units_skip_limits_speeds_and_rests(good: Episode) -> None:
     assert any("idle" in f.text for f in findings if f.check == "not_judged")
 
 
-def test_one_arm_without_prefix_is_judged_too(good: Episode) -> None:
+def test_one_arm_without_prefix_is_judged_too(good):
     names = tuple(n.removeprefix("left_") for n in NAMES[:7])
     limits = {n: tuple(SPEC.features[STATE].limits[i]) for i, n in enumerate(names)}
     episode = with_arrays(good, state=good.arrays[STATE][:, :7], action=good.arrays[ACTION][:, :7])
@@ -163,7 +162,7 @@ def test_one_arm_without_prefix_is_judged_too(good: Episode) -> None:
 # ---- values ----
 
 
-def test_nan_is_an_error_with_name_and_rows(good: Episode) -> None:
+def test_nan_is_an_error_with_name_and_rows(good):
     state, _, _ = copies(good)
     state[50:53, 4] = np.nan
     state[60, 6] = np.inf
@@ -182,14 +181,14 @@ def test_nan_is_an_error_with_name_and_rows(good: Episode) -> None:
         ("m", (0.0, 0.1), 1 / 0.07, "a normalised opening 0 to 1"),
     ],
 )
-def test_unit_hints(unit: str, limit: tuple[float, float], factor: float, hint: str) -> None:
+def test_unit_hints(unit, limit, factor, hint):
     true = np.linspace(0.0, 0.07 if unit == "m" else 3.1, 50)  # the whole stroke, the whole joint
     assert joint_checks.unit_hint(true * factor, np.array(limit), unit) == hint
     assert joint_checks.unit_hint(np.full(5, 1e12), np.array(limit), unit) is None
 
 
 @pytest.mark.parametrize(("share", "is_error"), [(0.00, False), (0.019, False), (0.021, True), (0.1, True)])
-def test_limit_tolerance_is_two_per_cent_of_the_span(good: Episode, share: float, is_error: bool) -> None:
+def test_limit_tolerance_is_two_per_cent_of_the_span(good, share, is_error):
     action = good.arrays[ACTION].astype(float)
     action[100:110, 0] = 2.618 + share * 5.236  # joint 1: −2.618 … 2.618
     action[90:120, 0] = np.interp(np.arange(90, 120), [90, 100, 109, 119], action[[90, 100, 109, 119], 0])
@@ -202,7 +201,7 @@ def test_limit_tolerance_is_two_per_cent_of_the_span(good: Episode, share: float
         assert 110 <= limits[0].rows[1] <= 120
 
 
-def test_touch_outside_its_range_is_an_error(good: Episode) -> None:
+def test_touch_outside_its_range_is_an_error(good):
     _, _, touch = copies(good)
     touch[10, 2, 3, 4] = 300
     finding = one(with_arrays(good, touch=touch.reshape(len(touch), -1)), "out_of_range")
@@ -214,9 +213,7 @@ def test_touch_outside_its_range_is_an_error(good: Episode) -> None:
 
 @pytest.mark.parametrize(("step_rad", "is_found"), [(0.20, False), (0.30, True), (1.0, True)])
 @pytest.mark.parametrize("key", ["state", "action"])
-def test_jumps_beyond_twice_the_joints_speed_are_found(
-    good: Episode, key: str, step_rad: float, is_found: bool
-) -> None:
+def test_jumps_beyond_twice_the_joints_speed_are_found(good, key, step_rad, is_found):
     # 3.93 rad/s × 2 rows / 30 rows/s = 0.262 rad. Row 140 of 360: arms at rest between two moves.
     values = good.arrays[STATE if key == "state" else ACTION].copy()
     values[:, 5] = 0.1
@@ -229,7 +226,7 @@ def test_jumps_beyond_twice_the_joints_speed_are_found(
         assert "left_joint_6.pos" in findings[0].text
 
 
-def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_last_changed() -> None:
+def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_last_changed():
     def jumps(values: list[float], unit: str = "rad") -> list[Finding]:
         time_s = np.arange(len(values)) / 200
         return list(joint_checks.check_sample_jumps("j", np.array(values)[:, None], time_s, ["a"], [unit], 1 / 30))
@@ -249,7 +246,7 @@ def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_
 
 @pytest.mark.parametrize(("rest_s", "is_found"), [(1.5, False), (4.5, True)])
 @pytest.mark.parametrize("end", [0, 1])
-def test_long_rests_at_the_ends_are_found(rest_s: float, is_found: bool, end: int) -> None:
+def test_long_rests_at_the_ends_are_found(rest_s, is_found, end):
     episode = make(seed=4, rest_s=(rest_s, 0.0) if end == 0 else (0.0, rest_s))
     findings = found(episode, "idle")
     assert bool(findings) == is_found
@@ -262,7 +259,7 @@ def test_long_rests_at_the_ends_are_found(rest_s: float, is_found: bool, end: in
 
 
 @pytest.mark.parametrize(("rest_s", "is_found"), [(3.0, False), (7.0, True)])
-def test_long_rest_in_the_middle_is_found(good: Episode, rest_s: float, is_found: bool) -> None:
+def test_long_rest_in_the_middle_is_found(good, rest_s, is_found):
     state, action, touch = copies(good)
     row, rows = 230, int(rest_s * FPS)  # 0.64 of 12 s: the left arm holds, the pads feel a steady grip
     noise = np.random.default_rng(0).normal(0, 2e-4, (rows, 14)).astype(np.float32)
@@ -279,7 +276,7 @@ def test_long_rest_in_the_middle_is_found(good: Episode, rest_s: float, is_found
         assert last >= row + rows - 1
 
 
-def test_pressing_with_arms_at_rest_is_not_idle() -> None:
+def test_pressing_with_arms_at_rest_is_not_idle():
     num_rows = 300
     still = np.tile(make(seed=4).arrays[STATE][:1], (num_rows, 1))
     _, _, touch = copies(make(seed=4, duration_s=10.0))
@@ -290,7 +287,7 @@ def test_pressing_with_arms_at_rest_is_not_idle() -> None:
     assert not found(with_arrays(episode, touch=touch.reshape(num_rows, -1).astype(np.int16)), "idle")
 
 
-def test_driver_that_repeats_old_joints_is_found(good: Episode) -> None:
+def test_driver_that_repeats_old_joints_is_found(good):
     state, _, _ = copies(good)
     state[40:70, 0:7] = state[40, 0:7]  # the left arm reaches from 0.24 s to 2.64 s
     finding = one(with_arrays(good, state=state), "frozen_state")
@@ -302,7 +299,7 @@ def test_driver_that_repeats_old_joints_is_found(good: Episode) -> None:
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.04, 0.1, 0.21, 0.37, 0.9, -0.1, -0.4])
-def test_lag_is_measured_to_a_tenth_of_a_row(lag_s: float) -> None:
+def test_lag_is_measured_to_a_tenth_of_a_row(lag_s):
     rng = np.random.default_rng(1)
     time_s = np.arange(-600, 3600) / 300
     smooth = np.stack([np.convolve(rng.normal(size=time_s.size), np.hanning(300), "same") for _ in range(6)], axis=1)
@@ -317,13 +314,13 @@ def test_lag_is_measured_to_a_tenth_of_a_row(lag_s: float) -> None:
 @pytest.mark.parametrize(
     ("clock_s", "severity"), [(0.0, None), (0.15, None), (0.40, "warning"), (-0.05, None), (-0.20, "error")]
 )
-def test_lag_of_state_behind_command_must_be_plausible(clock_s: float, severity: str | None) -> None:
+def test_lag_of_state_behind_command_must_be_plausible(clock_s, severity):
     # The good lag is about 0.08 s: together 0.08, 0.23, 0.48, 0.03 and −0.12 s; −1 row … 0.3 s + 1 row are allowed.
     findings = found(make(seed=5, state_clock_s=clock_s), "action_lag")
     assert [f.severity for f in findings] == ([severity, severity] if severity else [])
 
 
-def test_one_arm_on_another_clock_is_found(good: Episode) -> None:
+def test_one_arm_on_another_clock_is_found(good):
     state, _, _ = copies(good)
     state[5:, :7] = good.arrays[STATE][:-5, :7]  # 5 rows: 0.167 s, together with 0.08 s still plausible by itself
     finding = one(without(with_arrays(good, state=state), TOUCH), "action_lag")
@@ -331,7 +328,7 @@ def test_one_arm_on_another_clock_is_found(good: Episode) -> None:
     assert "differs between the arms" in finding.text
 
 
-def test_exchanged_action_and_state_and_exchanged_arms_are_errors(good: Episode) -> None:
+def test_exchanged_action_and_state_and_exchanged_arms_are_errors(good):
     state, action, _ = copies(make(seed=6, lead_s=0.12))
     findings = found(without(with_arrays(good, state=action, action=state), TOUCH), "action_lag")
     assert {f.severity for f in findings} == {"error"}
@@ -341,19 +338,19 @@ def test_exchanged_action_and_state_and_exchanged_arms_are_errors(good: Episode)
         assert one(swapped, "swapped_arms").severity == "error"
 
 
-def test_arms_that_move_alike_are_not_called_swapped(good: Episode) -> None:
+def test_arms_that_move_alike_are_not_called_swapped(good):
     state, action, _ = copies(good)
     state[:, 7:], action[:, 7:] = state[:, :7], action[:, :7]
     assert found(without(with_arrays(good, state=state, action=action), TOUCH), "swapped_arms") == []
 
 
-def test_swap_is_seen_when_only_one_arm_moves(good: Episode) -> None:
+def test_swap_is_seen_when_only_one_arm_moves(good):
     still = still_left(good)
     assert found(still, "swapped_arms") == []
     assert found(with_arrays(still, action=np.roll(still.arrays[ACTION], 7, axis=1)), "swapped_arms")
 
 
-def test_arms_at_rest_are_not_judged(good: Episode) -> None:
+def test_arms_at_rest_are_not_judged(good):
     still = np.tile(good.arrays[STATE][:1], (90, 1))
     findings = check_episode(without(with_arrays(good, state=still, action=still), TOUCH), pictures=False)
     assert sum(f.check == "not_judged" for f in findings) >= 2
@@ -381,12 +378,12 @@ def test_arms_at_rest_are_not_judged(good: Episode) -> None:
         ({"skipped": {"other names": 1}}, "skipped", "note"),
     ],
 )
-def test_timing_of_a_channel(good: Episode, changes: dict[str, Any], check: str | None, severity: str | None) -> None:
+def test_timing_of_a_channel(good, changes, check, severity):
     findings = list(check_timing(good_timing(STATE, **changes), good))
     assert [(f.check, f.severity, f.feature) for f in findings] == ([(check, severity, "state")] if check else [])
 
 
-def test_held_commands_may_come_rarely(good: Episode) -> None:
+def test_held_commands_may_come_rarely(good):
     timing = good_timing(ACTION, align="hold", rate_hz=1.0, longest_gap_s=5.0, gaps=50, age_median_s=2.0)
     assert list(check_timing(timing, good)) == []
 
@@ -415,9 +412,7 @@ def freeze(episode: Episode, key: str, first: int, end: int, *, black: bool = Fa
         (FRONT, 0, 360, True, "error", "black pictures"),
     ],
 )
-def test_frozen_camera_is_found_with_its_rows(
-    good: Episode, key: str, first: int, end: int, black: bool, severity: str, words: str
-) -> None:
+def test_frozen_camera_is_found_with_its_rows(good, key, first, end, black, severity, words):
     frozen = freeze(good, key, first, end, black=black)
     finding = one(frozen, "frozen_picture", pictures=True)
     assert (finding.severity, finding.feature) == (severity, key)
@@ -443,11 +438,11 @@ def still_left(episode: Episode) -> Episode:
         lambda e: dataclasses.replace(e, picture_rows={FRONT: np.arange(e.num_rows) // 2}),  # half the rate
     ],
 )
-def test_pictures_that_rest_for_a_reason_are_fine(good: Episode, fine: Callable[[Episode], Episode]) -> None:
+def test_pictures_that_rest_for_a_reason_are_fine(good, fine):
     assert found(fine(good), "frozen_picture", pictures=True) == []
 
 
-def test_repeated_source_picture_is_found_without_decoding(good: Episode) -> None:
+def test_repeated_source_picture_is_found_without_decoding(good):
     numbers = np.arange(good.num_rows)
     numbers[100:130] = 100
     episode = dataclasses.replace(good, picture_rows={FRONT: numbers})
@@ -455,7 +450,7 @@ def test_repeated_source_picture_is_found_without_decoding(good: Episode) -> Non
     assert (finding.severity, finding.feature, finding.rows) == ("warning", FRONT, (100, 130))
 
 
-def test_slow_change_is_not_the_same_picture() -> None:
+def test_slow_change_is_not_the_same_picture():
     thumbs = np.arange(100)[:, None, None] * 0.1 * np.ones((1, 28, 28))  # 2 grey levels take 20 rows
     assert {end - first for first, end in picture_checks.same_picture_runs(thumbs)} == {20}
     assert picture_checks.same_picture_runs(np.zeros((40, 28, 28))) == [(0, 40)]
@@ -464,7 +459,7 @@ def test_slow_change_is_not_the_same_picture() -> None:
 # ---- episodes of one recording ----
 
 
-def test_lag_of_one_episode_unlike_the_others_is_found() -> None:
+def test_lag_of_one_episode_unlike_the_others_is_found():
     episodes = [make(seed=s, touch_delay_s=0.03, duration_s=8.0) for s in range(3)]
     for few in ([], episodes[:1], episodes):
         assert check_recording_episodes(few) == []
@@ -533,13 +528,13 @@ FAULTS: dict[str, tuple[str, Callable[[int], Episode]]] = {
 
 @pytest.mark.parametrize("name", FAULTS)
 @pytest.mark.parametrize("num_episodes", [FEW_SEEDS, pytest.param(NUM_SEEDS, marks=pytest.mark.slow)])
-def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name: str, num_episodes: int) -> None:
+def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name, num_episodes):
     check, fault = FAULTS[name]
     hits = sum(bool(found(fault(seed), check, pictures=check == "frozen_picture")) for seed in range(num_episodes))
     assert hits >= 0.95 * num_episodes, f"{hits} of {num_episodes}"
 
 
-def test_motion_that_no_command_explains_is_a_warning() -> None:
+def test_motion_that_no_command_explains_is_a_warning():
     episode = base(0)
     state, action, _ = copies(episode)
     rng = np.random.default_rng(0)
@@ -549,7 +544,7 @@ def test_motion_that_no_command_explains_is_a_warning() -> None:
     assert "unexplained_motion" in [f.check for f in findings if f.severity == "warning"]
 
 
-def test_a_slow_way_to_one_target_is_no_frozen_command() -> None:
+def test_a_slow_way_to_one_target_is_no_frozen_command():
     """One target at the start, reached in 4 s: the joint comes nearer all the time."""
     episode = base(0)
     state, action, _ = copies(episode)

@@ -107,7 +107,7 @@ def lost_rows(found: Cut) -> int:
 # ---- rows show what truly was ----
 
 
-def test_state_and_action_are_the_truth_at_the_newest_samples_time(made: Made) -> None:
+def test_state_and_action_are_the_truth_at_the_newest_samples_time(made):
     [episode] = cut(made.path).episodes
     rows = row_ns(episode)
     for key, topics, truth in (
@@ -127,7 +127,7 @@ def test_state_and_action_are_the_truth_at_the_newest_samples_time(made: Made) -
     assert np.ptp(episode.arrays[STATE][:, 1]) > 0.3, "the arm does move"
 
 
-def test_rows_begin_at_the_start_marker_and_end_at_the_end_marker(made: Made) -> None:
+def test_rows_begin_at_the_start_marker_and_end_at_the_end_marker(made):
     [episode] = cut(made.path).episodes
     start_s = (episode.start_ns - START_UNIX_NS) * 1e-9
     end_s = start_s + (episode.num_rows - 1) / FPS
@@ -139,7 +139,7 @@ def test_rows_begin_at_the_start_marker_and_end_at_the_end_marker(made: Made) ->
     assert episode.origin == Origin("surrogate", "stand-in recording, not a robot")
 
 
-def test_touch_is_the_recorded_count_minus_the_median_of_the_first_30_frames(made: Made) -> None:
+def test_touch_is_the_recorded_count_minus_the_median_of_the_first_30_frames(made):
     [episode] = cut(made.path).episodes
     messages = read_raw(made.path)
     touch = episode.arrays[TOUCH].reshape(-1, 4, 32, 12)
@@ -155,7 +155,7 @@ def test_touch_is_the_recorded_count_minus_the_median_of_the_first_30_frames(mad
         np.testing.assert_array_equal(episode.pads(TOUCH)[list(PAD_ORDER)[p]], expected)
 
 
-def test_every_row_shows_the_newest_picture_at_or_before_it(made: Made, native: RecordingSpec) -> None:
+def test_every_row_shows_the_newest_picture_at_or_before_it(made, native):
     with cutter(made.path, native) as open_cutter:
         [episode] = open_cutter.cut().episodes
         for camera, topic in CAMERA_TOPICS.items():
@@ -163,7 +163,7 @@ def test_every_row_shows_the_newest_picture_at_or_before_it(made: Made, native: 
             np.testing.assert_array_equal(frame_ids(episode, camera), expected)
 
 
-def test_no_row_depends_on_what_comes_after_it(made: Made, tmp_path: Path) -> None:
+def test_no_row_depends_on_what_comes_after_it(made, tmp_path):
     """``by: whole_file``: the grid begins at the last channel's first sample, which no later message moves."""
     whole = ("episodes: {by: markers, topic: /episode, min_s: 1.0}", "episodes: {by: whole_file, min_s: 1.0}")
     said = ("instruction: {from: markers}", "instruction: {from: spec, text: touch it}")
@@ -189,7 +189,7 @@ def test_no_row_depends_on_what_comes_after_it(made: Made, tmp_path: Path) -> No
                 assert row >= early or (x[key] == y[key]).all(), (row, key)
 
 
-def test_window_holds_exactly_the_last_ten_frames_of_each_pad(made: Made, tmp_path: Path) -> None:
+def test_window_holds_exactly_the_last_ten_frames_of_each_pad(made, tmp_path):
     window = ("# observation.tactile_window:", "observation.tactile_window:")
     [episode] = cut(made.path, changed_specs(tmp_path, window)).episodes
     windows = episode.arrays[WINDOW].reshape(-1, 10, 4, 32, 12)
@@ -209,7 +209,7 @@ def test_window_holds_exactly_the_last_ten_frames_of_each_pad(made: Made, tmp_pa
 # ---- gaps ----
 
 
-def test_a_silent_camera_splits_exactly_there_and_losses_add_up(tmp_path: Path, native: RecordingSpec) -> None:
+def test_a_silent_camera_splits_exactly_there_and_losses_add_up(tmp_path, native):
     made = Made(tmp_path / "gap.mcap", duration_s=4.0, gap=(LEFT, 1.6, 2.1), camera_loss_probability=0.0)
     found = cut(made.path, native)
     whole = Made(tmp_path / "whole.mcap", duration_s=4.0, camera_loss_probability=0.0)
@@ -240,15 +240,13 @@ def test_a_silent_camera_splits_exactly_there_and_losses_add_up(tmp_path: Path, 
         ("success", (3.0, 3.5), [None]),  # what follows the gap is shorter than a second
     ],
 )
-def test_only_the_part_with_the_episodes_end_carries_its_outcome(
-    tmp_path: Path, outcome: str, gap_s: tuple[float, float], successes: list[bool | None]
-) -> None:
+def test_only_the_part_with_the_episodes_end_carries_its_outcome(tmp_path, outcome, gap_s, successes):
     gap = (LEFT, *gap_s)
     made = Made(tmp_path / "a.mcap", duration_s=4.0, outcomes=(outcome,), gap=gap, camera_loss_probability=0.0)
     assert [e.success for e in cut(made.path).episodes] == successes
 
 
-def test_pieces_shorter_than_min_s_are_reported_and_not_written(made: Made, tmp_path: Path) -> None:
+def test_pieces_shorter_than_min_s_are_reported_and_not_written(made, tmp_path):
     # fresh from 0.1 s, stale from 0.7 + 0.08 − one frame: 0.65 s, under the spec's 1 s; then 2.9 − 1.2 = 1.7 s
     found = cut(Made(tmp_path / "early.mcap", gap=(FRONT, 0.7, 1.2)).path)
     [episode] = found.episodes
@@ -258,7 +256,7 @@ def test_pieces_shorter_than_min_s_are_reported_and_not_written(made: Made, tmp_
     assert episode.num_rows + lost_rows(found) == uncut.num_rows
 
 
-def test_silence_of_several_channels_at_once_is_one_loss_that_names_them(tmp_path: Path) -> None:
+def test_silence_of_several_channels_at_once_is_one_loss_that_names_them(tmp_path):
     pad = PAD_TOPICS["left_robot_left_finger"]
     made = Made(tmp_path / "both.mcap", duration_s=4.0, gap=[(FRONT, 1.6, 2.2), (pad, 1.7, 2.1)])
     [loss] = cut(made.path).losses
@@ -266,7 +264,7 @@ def test_silence_of_several_channels_at_once_is_one_loss_that_names_them(tmp_pat
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
-def test_random_gaps_never_lose_a_row_unsaid(tmp_path: Path, seed: int) -> None:
+def test_random_gaps_never_lose_a_row_unsaid(tmp_path, seed):
     topics = [FRONT, LEFT, PAD_TOPICS["right_robot_left_finger"], STATE_TOPICS["left"]]
     rng = np.random.default_rng(seed)
     gaps = [(str(rng.choice(topics)), a, a + rng.uniform(0.02, 0.3)) for a in rng.uniform(0.3, 2.4, 4)]
@@ -282,7 +280,7 @@ def test_random_gaps_never_lose_a_row_unsaid(tmp_path: Path, seed: int) -> None:
 # ---- markers ----
 
 
-def test_each_marked_episode_has_its_own_outcome_and_instruction(tmp_path: Path) -> None:
+def test_each_marked_episode_has_its_own_outcome_and_instruction(tmp_path):
     made = Made(tmp_path / "a.mcap", duration_s=6.0)
     marks = [(0.3, "start:pick it"), (1.8, "failure"), (2.0, "start: place it "), (3.4, "discard")]
     marks += [(3.6, "start:push it"), (5.5, "success")]
@@ -301,9 +299,7 @@ def test_each_marked_episode_has_its_own_outcome_and_instruction(tmp_path: Path)
         ([(0.3, "start:a"), (1.5, "success"), (1.6, "start:b")], "the recording ends within", [37, None]),
     ],
 )
-def test_a_missing_end_marker_is_reported_and_leaves_success_unknown(
-    made: Made, tmp_path: Path, marks: list[tuple[float, str]], why: str, num_rows: list[int | None]
-) -> None:
+def test_a_missing_end_marker_is_reported_and_leaves_success_unknown(made, tmp_path, marks, why, num_rows):
     found = cut(with_markers(made.path, tmp_path / "b.mcap", marks))
     assert len(found.episodes) == 2
     assert [e.success for e in found.episodes].count(None) == 1
@@ -322,9 +318,7 @@ def test_a_missing_end_marker_is_reported_and_leaves_success_unknown(
         ([], ("without messages", EPISODE_TOPIC)),
     ],
 )
-def test_markers_that_make_no_sense_are_refused_with_a_word(
-    made: Made, tmp_path: Path, marks: list[tuple[float, str]], words: tuple[str, ...]
-) -> None:
+def test_markers_that_make_no_sense_are_refused_with_a_word(made, tmp_path, marks, words):
     path = with_markers(made.path, tmp_path / "b.mcap", marks)
     with pytest.raises(RecordingError) as error:
         cut(path)
@@ -332,7 +326,7 @@ def test_markers_that_make_no_sense_are_refused_with_a_word(
         assert word in str(error.value)
 
 
-def test_an_episode_before_a_channel_began_is_a_loss_not_a_silence(tmp_path: Path) -> None:
+def test_an_episode_before_a_channel_began_is_a_loss_not_a_silence(tmp_path):
     made = Made(tmp_path / "late.mcap", duration_s=4.0, episodes=2, gap=(FRONT, 0.0, 2.0))
     found = cut(made.path)
     assert [e.name.rsplit(" ", 2)[-2:] for e in found.episodes] == [["episode", "1"]]
@@ -340,7 +334,7 @@ def test_an_episode_before_a_channel_began_is_a_loss_not_a_silence(tmp_path: Pat
     assert found.losses[0].end_s == pytest.approx(1.9, abs=0.02)
 
 
-def test_a_held_command_that_ends_early_costs_nothing(tmp_path: Path) -> None:
+def test_a_held_command_that_ends_early_costs_nothing(tmp_path):
     topics = list(COMMAND_TOPICS.values())
     made = Made(tmp_path / "quiet.mcap", gap=[(topic, 1.5, 9.0) for topic in topics])
     hold = ("action:            {channels: [left_command, right_command], align: asof}",) * 2
@@ -364,7 +358,7 @@ def _at(seconds: float) -> str:
     return str(START_UNIX_NS + round(seconds * 1e9))
 
 
-def test_episodes_by_metadata(made: Made, tmp_path: Path) -> None:
+def test_episodes_by_metadata(made, tmp_path):
     spec = changed_specs(tmp_path / "specs", BY_METADATA, FROM_METADATA)
     metadata = {
         "episode_b": {"start": _at(1.5), "end": _at(2.7), "success": "False"},
@@ -390,9 +384,7 @@ def test_episodes_by_metadata(made: Made, tmp_path: Path) -> None:
         ({"episode_1": {"start": _at(0.2), "end": _at(2.0), "what": " "}}, ("no metadata key 'what'",)),
     ],
 )
-def test_metadata_that_names_no_episode_is_refused_with_a_word(
-    made: Made, tmp_path: Path, metadata: dict[str, dict[str, str]], words: tuple[str, ...]
-) -> None:
+def test_metadata_that_names_no_episode_is_refused_with_a_word(made, tmp_path, metadata, words):
     spec = changed_specs(tmp_path / "specs", BY_METADATA, FROM_METADATA)
     path = rewrite(made.path, tmp_path / "b.mcap", lambda messages: messages, metadata)
     with pytest.raises(RecordingError) as error:
@@ -404,9 +396,7 @@ def test_metadata_that_names_no_episode_is_refused_with_a_word(
 @pytest.mark.parametrize(
     ("texts", "instruction"), [(["lift it", " lift it "], "lift it"), (["lift it", "drop it"], None), ([" "], None)]
 )
-def test_instruction_from_a_topic_must_be_one(
-    made: Made, tmp_path: Path, texts: list[str], instruction: str | None
-) -> None:
+def test_instruction_from_a_topic_must_be_one(made, tmp_path, texts, instruction):
     whole = ("episodes: {by: markers, topic: /episode, min_s: 1.0}", "episodes: {by: whole_file, min_s: 1.0}")
     topic = ("instruction: {from: markers}", "instruction: {from: topic, topic: /episode}")
     spec = changed_specs(tmp_path / "specs", whole, topic)
@@ -421,7 +411,7 @@ def test_instruction_from_a_topic_must_be_one(
 # ---- clocks ----
 
 
-def test_repeated_and_zero_stamps_are_counted_and_never_shown(made: Made) -> None:
+def test_repeated_and_zero_stamps_are_counted_and_never_shown(made):
     [episode] = cut(made.path).episodes
     for channel, topic in (("left_state", STATE_TOPICS["left"]), ("left_command", COMMAND_TOPICS["left"])):
         [timing] = [t for t in episode.timing if t.channel == channel]
@@ -433,14 +423,14 @@ def test_repeated_and_zero_stamps_are_counted_and_never_shown(made: Made) -> Non
     assert np.abs(episode.arrays[ACTION][0, 1]) > 0.1, "not the zeros of a driver without a command"
 
 
-def test_zero_stamps_that_the_spec_does_not_expect_are_refused(made: Made, tmp_path: Path) -> None:
+def test_zero_stamps_that_the_spec_does_not_expect_are_refused(made, tmp_path):
     with pytest.raises(
         RecordingError, match=r"/joint_states_ctrl_left: 8 of 600 messages are stamped 0.*drop_zero_stamp"
     ):
         cut(made.path, changed_specs(tmp_path, (", drop_zero_stamp: true", "")))
 
 
-def test_latency_moves_a_camera_by_as_much(made: Made, tmp_path: Path) -> None:
+def test_latency_moves_a_camera_by_as_much(made, tmp_path):
     line = "/camera_f/color/image_raw/compressed, type: sensor_msgs/msg/CompressedImage, "
     spec = load_recording_spec(changed_specs(tmp_path, NATIVE, (line, line + "latency_s: 0.1, ")))
     with cutter(made.path, spec) as open_cutter:
@@ -460,7 +450,7 @@ def _without_touch(folder: Path) -> Path:
     return path
 
 
-def test_simulation_time_on_every_channel_is_a_clock_like_any_other(made: Made, tmp_path: Path) -> None:
+def test_simulation_time_on_every_channel_is_a_clock_like_any_other(made, tmp_path):
     spec = load_recording_spec(_without_touch(tmp_path / "specs"))
     sim = Made(tmp_path / "sim.mcap", sim_time_stamps=True)
     with cutter(made.path, spec) as wall, cutter(sim.path, spec) as simulated:
@@ -473,7 +463,7 @@ def test_simulation_time_on_every_channel_is_a_clock_like_any_other(made: Made, 
 # ---- pictures ----
 
 
-def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path: Path, native: RecordingSpec) -> None:
+def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path, native):
     made = Made(tmp_path / "a.mcap", duration_s=4.0)
     with cutter(garbled(made.path, tmp_path / "b.mcap", list(range(50, 60))), native) as open_cutter:
         assert open_cutter.drop_broken_pictures() == 10
@@ -486,15 +476,13 @@ def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path: Path, native:
             assert not set(range(50, 60)) & set(frame_ids(episode))
 
 
-def test_a_camera_without_one_sound_picture_is_refused(made: Made, tmp_path: Path) -> None:
+def test_a_camera_without_one_sound_picture_is_refused(made, tmp_path):
     path = garbled(made.path, tmp_path / "b.mcap", list(range(200)))
     with pytest.raises(RecordingError, match="a picture of format 'jpeg' that OpenCV cannot decode"), cutter(path):
         pass
 
 
-def test_cameras_one_after_the_other_in_the_file_give_the_same_rows(
-    made: Made, native: RecordingSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cameras_one_after_the_other_in_the_file_give_the_same_rows(made, native, tmp_path, monkeypatch):
     order = [*CAMERA_TOPICS.values()]
 
     def sort(messages: list[Raw]) -> list[Raw]:
@@ -513,7 +501,7 @@ def test_cameras_one_after_the_other_in_the_file_give_the_same_rows(
 # ---- baseline ----
 
 
-def test_a_pad_touched_while_the_baseline_is_taken_is_unfit(tmp_path: Path) -> None:
+def test_a_pad_touched_while_the_baseline_is_taken_is_unfit(tmp_path):
     made = Made(tmp_path / "a.mcap", duration_s=4.0)
     contact_s = made.truth.contact_s["left"][0][0]
     pad = PAD_TOPICS["left_robot_left_finger"]
@@ -525,7 +513,7 @@ def test_a_pad_touched_while_the_baseline_is_taken_is_unfit(tmp_path: Path) -> N
 # ---- for looking at ----
 
 
-def test_open_episodes_of_a_folder_gives_all_recordings(made: Made, tmp_path: Path) -> None:
+def test_open_episodes_of_a_folder_gives_all_recordings(made, tmp_path):
     for k in range(2):
         (tmp_path / f"{k}.mcap").write_bytes(made.path.read_bytes())
     with open_episodes(tmp_path, "piper_flexitac_mcap") as episodes:
@@ -533,7 +521,7 @@ def test_open_episodes_of_a_folder_gives_all_recordings(made: Made, tmp_path: Pa
         assert next(iter(episodes[1].pictures()))["observation.images.front"].shape == (224, 224, 3)
 
 
-def test_open_episodes_of_a_recording_without_rows_says_why(tmp_path: Path) -> None:
+def test_open_episodes_of_a_recording_without_rows_says_why(tmp_path):
     path = with_markers(Made(tmp_path / "a.mcap").path, tmp_path / "b.mcap", [(0.5, "start:a"), (0.9, "success")])
     with (
         pytest.raises(RecordingError, match="no episode: 13 rows are shorter"),

@@ -97,14 +97,14 @@ STILL = ("observation.images.still",)
         (MOTION + STILL, 10, ("put", "open")),
     ],
 )
-def test_a_dataset_of_lerobot_is_good(tmp_path: Path, features: tuple, fps: int, tasks: tuple) -> None:
+def test_a_dataset_of_lerobot_is_good(tmp_path, features, fps, tasks):
     root = build(tmp_path / "d", features, tasks, fps)
     assert findings(root) == {}
     assert read_as_lerobot(root, [0, ROWS, 3 * ROWS + 2]) == []
 
 
 @pytest.mark.parametrize("edit", ["delete", "merge", "split", "remove_feature"])
-def test_what_lerobots_own_tools_write_is_good(good: Path, tmp_path: Path, edit: str) -> None:
+def test_what_lerobots_own_tools_write_is_good(good, tmp_path, edit):
     with quiet_lerobot():
         from lerobot.datasets import dataset_tools as tools
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -218,7 +218,7 @@ def faulty(good: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_planted_fault_is_named(faulty: Path, name: str) -> None:
+def test_a_planted_fault_is_named(faulty, name):
     plant, check = FAULTS[name]
     plant(faulty)
     found = findings(faulty)
@@ -244,9 +244,7 @@ def more_rows(root: Path) -> None:
         ),
     ],
 )
-def test_what_is_too_much_is_said_in_a_line_before_it_is_read(
-    faulty: Path, plant: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_too_much_is_said_in_a_line_before_it_is_read(faulty, plant, said, capsys):
     plant(faulty)
     assert main(["check", str(faulty), "--pictures=false"]) == 1
     out = capsys.readouterr().out
@@ -254,23 +252,21 @@ def test_what_is_too_much_is_said_in_a_line_before_it_is_read(
 
 
 @pytest.mark.parametrize("from_s", [np.nan, 1e30, -1.0])
-def test_a_video_that_begins_at_no_time_is_named(
-    faulty: Path, from_s: float, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_that_begins_at_no_time_is_named(faulty, from_s, capsys):
     episodes("videos/observation.images.top/from_timestamp", at(1, from_s))(faulty)
     assert main(["check", str(faulty)]) == 2
     assert f"from_timestamp of episode 1 is {from_s:g} s" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e30])
-def test_a_stamp_that_is_no_time_refuses_the_episode_that_has_it(faulty: Path, value: float) -> None:
+def test_a_stamp_that_is_no_time_refuses_the_episode_that_has_it(faulty, value):
     data("timestamp", at(7, value))(faulty)
     with pytest.raises(RecordingError, match=re.escape(f"`timestamp` of row 7 is {value:g}")):
         list(readers.get("lerobot")(Source(faulty, (), "episode_000000"), None).messages(None))
 
 
 @pytest.mark.parametrize("name", ["stamps run on over the episodes", "wrong number of tasks"])
-def test_lerobots_own_reading_is_part_of_the_check(faulty: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lerobots_own_reading_is_part_of_the_check(faulty, name, capsys):
     FAULTS[name][0](faulty)
     assert main(["check", str(faulty), "--pictures=false"]) == 1
     out = capsys.readouterr().out
@@ -279,9 +275,7 @@ def test_lerobots_own_reading_is_part_of_the_check(faulty: Path, name: str, caps
 
 
 @pytest.mark.parametrize("from_within", [False, True])
-def test_the_episode_to_leave_out_is_named_by_its_own_number_and_folder(
-    faulty: Path, from_within: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_episode_to_leave_out_is_named_by_its_own_number_and_folder(faulty, from_within, monkeypatch, capsys):
     swap_rows(faulty)  # episode 0 is not readable
     path = next((faulty / "data").rglob("*.parquet"))
     table = pq.read_table(path)
@@ -301,7 +295,7 @@ REPAIRED = [name for name, (_, check) in FAULTS.items() if check not in ("episod
 
 
 @pytest.mark.parametrize("name", REPAIRED)
-def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, name: str, tmp_path: Path) -> None:
+def test_a_repaired_copy_is_the_good_dataset_again(good, faulty, name, tmp_path):
     FAULTS[name][0](faulty)
     before = {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()}
     assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}", "--pictures=false", "--quick=true"]) == 0
@@ -314,9 +308,7 @@ def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, nam
 
 # The check prints three different repair commands; each is run on one fault.
 @pytest.mark.parametrize("name", ["statistics absent", "mean of older data", "pictures' statistics infinite"])
-def test_the_printed_command_mends_wrong_statistics(
-    good: Path, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_printed_command_mends_wrong_statistics(good, name, tmp_path, monkeypatch, capsys):
     root = shutil.copytree(good, tmp_path / "it's a set")
     FAULTS[name][0](root)
     monkeypatch.chdir(root)
@@ -332,9 +324,7 @@ def test_the_printed_command_mends_wrong_statistics(
     assert main(["check", str(root), "--pictures=false"]) == 0
 
 
-def test_statistics_computed_anew_in_place_are_no_changed_file(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_statistics_computed_anew_in_place_are_no_changed_file(dataset, tmp_path, capsys):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     edit_dataset(recompute_statistics(copy))
     assert main(["check", str(copy), "--pictures=false"]) == 0 and "changed_statistics" in capsys.readouterr().out
@@ -344,14 +334,14 @@ def test_statistics_computed_anew_in_place_are_no_changed_file(
     assert main(["check", str(copy), "--pictures=false"]) == 1 and "changed_file" in capsys.readouterr().out
 
 
-def test_exchanged_rows_are_not_repaired(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exchanged_rows_are_not_repaired(faulty, tmp_path, capsys):
     swap_rows(faulty)
     assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}"]) != 0
     assert "cannot be repaired" in capsys.readouterr().err
     assert not (tmp_path / "copy").exists()
 
 
-def test_stamps_that_run_on_cost_no_row_in_ingest(faulty: Path) -> None:
+def test_stamps_that_run_on_cost_no_row_in_ingest(faulty):
     FAULTS["stamps run on over the episodes"][0](faulty)
     for index, (_, source) in enumerate(find_sources(faulty)):
         times = [m.log_ns for m in readers.get("lerobot")(source).messages({"action"})]
@@ -362,9 +352,7 @@ def test_stamps_that_run_on_cost_no_row_in_ingest(faulty: Path) -> None:
 # ---- what taccorl writes ----
 
 
-def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(tmp_path, capsys):
     for k, task in enumerate(("put the cup on the plate", "open the drawer")):
         folder = tmp_path / f"r{k}"
         for name in "ab":
@@ -394,9 +382,7 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
     assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
 
 
-def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(dataset, tmp_path, capsys):
     old = shutil.copytree(dataset, tmp_path / "a NEW set's NUMBER {0}")
     edit, keep = leave_out(old, 1).split("`")[1::2]
     edit_dataset(edit)

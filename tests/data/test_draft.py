@@ -73,9 +73,7 @@ def inspect_and_ingest(recording: Path, folder: Path, **values: str) -> Dataset:
     return Dataset(folder / "out")
 
 
-def test_a_robot_with_one_arm_and_one_camera_is_ingested_by_its_drafts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robot_with_one_arm_and_one_camera_is_ingested_by_its_drafts(tmp_path, capsys):
     dataset = inspect_and_ingest(one_arm(tmp_path / "a.mcap"), tmp_path)
     printed = capsys.readouterr().out
     assert f"names of /arm/joint_states: {', '.join(JOINTS)}" in printed

@@ -41,7 +41,7 @@ def write_demos(path: Path, names: list[str], rows: list[int], **attributes: Any
         (["take1", "take2"], ["take1", "take2"]),  # an unknown word, but rows of different number
     ],
 )
-def test_each_numbered_group_of_episodes_is_a_recording(tmp_path: Path, names: list[str], parts: list[str]) -> None:
+def test_each_numbered_group_of_episodes_is_a_recording(tmp_path, names, parts):
     rows = [60 + 3 * k for k in range(len(names))]
     path = write_demos(tmp_path / "rec.hdf5", names, rows)
     found = [source for _, source in find_sources(path)]
@@ -58,7 +58,7 @@ def test_each_numbered_group_of_episodes_is_a_recording(tmp_path: Path, names: l
         assert np.abs(state - arrays(rows[k], float(k))["/observations/qpos"]).max() < 1e-6
 
 
-def test_groups_of_arms_are_no_episodes_and_not_guessed_to_be_arms(tmp_path: Path) -> None:
+def test_groups_of_arms_are_no_episodes_and_not_guessed_to_be_arms(tmp_path):
     values = {f"/robot_{k}/{name}": np.zeros((40, 6)) for k in range(2) for name in ("qpos", "action")}
     path = write_hdf5(tmp_path / "rec.hdf5", values)
     ((_, source),) = find_sources(path)
@@ -68,9 +68,7 @@ def test_groups_of_arms_are_no_episodes_and_not_guessed_to_be_arms(tmp_path: Pat
     assert "# robot_1_qpos:" in text
 
 
-def test_one_inspection_and_one_draft_stand_for_all_episodes_of_a_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_inspection_and_one_draft_stand_for_all_episodes_of_a_file(tmp_path, capsys):
     path = write_demos(tmp_path / "rec.hdf5", [f"data/demo_{k}" for k in range(12)], [60] * 12)
     assert main(["ingest", "inspect", str(path)]) == 0
     out = capsys.readouterr().out
@@ -101,9 +99,7 @@ def stamps(
         ("stamp", stamps(gap_s=-1.5)),
     ],
 )
-def test_time_stamps_of_the_file_that_differ_from_the_spec_are_named(
-    tmp_path: Path, name: str, values: np.ndarray
-) -> None:
+def test_time_stamps_of_the_file_that_differ_from_the_spec_are_named(tmp_path, name, values):
     path = write_hdf5(tmp_path / "rec.hdf5", arrays() | {f"/observations/{name}": values})
     code, entry = ingest(path, write_spec(tmp_path, reader="hdf5"))
     assert (code, entry["outcome"]) == (1, "refused")
@@ -113,7 +109,7 @@ def test_time_stamps_of_the_file_that_differ_from_the_spec_are_named(
 
 @pytest.mark.parametrize("clock", ["log", "header"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, -1e300])
-def test_a_stamp_that_is_no_time_is_named_with_its_row(tmp_path: Path, value: float, clock: str) -> None:
+def test_a_stamp_that_is_no_time_is_named_with_its_row(tmp_path, value, clock):
     times = stamps()
     times[40] = value
     path = write_hdf5(tmp_path / "rec.hdf5", arrays() | {"/timestamp": times})
@@ -122,7 +118,7 @@ def test_a_stamp_that_is_no_time_is_named_with_its_row(tmp_path: Path, value: fl
     assert f"/timestamp of row 40 is {value:g}" in entry["reason"]
 
 
-def test_time_stamps_of_the_file_are_used_if_the_spec_says_so(tmp_path: Path) -> None:
+def test_time_stamps_of_the_file_are_used_if_the_spec_says_so(tmp_path):
     """20 rows a second, a gap of 2 s in the middle: two episodes of 3 s each, sampled at 30 Hz."""
     path = write_hdf5(tmp_path / "rec.hdf5", arrays() | {"/timestamp": stamps(rate_hz=20.0, gap_s=2.0)})
     spec = write_spec(
@@ -152,7 +148,7 @@ def test_time_stamps_of_the_file_are_used_if_the_spec_says_so(tmp_path: Path) ->
         {"/lift": np.linspace(0, 1, 120)},  # rises, but not from 1970 and not named
     ],
 )
-def test_fitting_stamps_and_other_columns_are_no_obstacle(tmp_path: Path, extra: dict[str, np.ndarray]) -> None:
+def test_fitting_stamps_and_other_columns_are_no_obstacle(tmp_path, extra):
     path = write_hdf5(tmp_path / "rec.hdf5", arrays() | extra)
     assert ingest(path, write_spec(tmp_path, reader="hdf5"))[1]["outcome"] == "written"
 
@@ -160,7 +156,7 @@ def test_fitting_stamps_and_other_columns_are_no_obstacle(tmp_path: Path, extra:
 @pytest.mark.parametrize(
     ("fps", "rate"), [("30", 30), ("29.97 Hz", 29.97), (29.97, 29.97), (b"25", 25), ("fast", None)]
 )
-def test_a_rate_of_the_file_may_be_a_text(tmp_path: Path, fps: Any, rate: float | None) -> None:
+def test_a_rate_of_the_file_may_be_a_text(tmp_path, fps, rate):
     path = write_hdf5(tmp_path / "rec.hdf5", arrays(), fps=fps)
     reader = readers.get("hdf5")(Source(path, (path,)))
     times = [m.log_ns for m in reader.messages({"/action"})]

@@ -131,7 +131,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory, spec: Path) -> dict[str, Any
     return {"folder": folder, "code": code, "report": report, "dataset": Dataset(folder / "out")}
 
 
-def test_every_recording_has_exactly_one_outcome(mixed: dict[str, Any]) -> None:
+def test_every_recording_has_exactly_one_outcome(mixed):
     report = mixed["report"]
     assert mixed["code"] == 1
     assert [(Path(r["recording"]).stem, r["outcome"]) for r in report["recordings"]] == [
@@ -149,7 +149,7 @@ def test_every_recording_has_exactly_one_outcome(mixed: dict[str, Any]) -> None:
         assert "traceback" not in r and "artefact" not in r
 
 
-def test_counts_in_the_report_are_those_of_the_dataset(mixed: dict[str, Any]) -> None:
+def test_counts_in_the_report_are_those_of_the_dataset(mixed):
     report, dataset = mixed["report"], mixed["dataset"]
     episodes = [e for r in report["recordings"] for e in r["episodes"] if e["outcome"] == "written"]
     assert [e["index_in_dataset"] for e in episodes] == list(range(4))
@@ -162,7 +162,7 @@ def test_counts_in_the_report_are_those_of_the_dataset(mixed: dict[str, Any]) ->
     assert messages["/joint_states_left"] == 1000  # 5 s at 200 Hz
 
 
-def test_times_in_the_report_count_from_the_recordings_first_sample(mixed: dict[str, Any]) -> None:
+def test_times_in_the_report_count_from_the_recordings_first_sample(mixed):
     first, second = mixed["report"]["recordings"][0]["episodes"]
     # the stand-in's start markers: 0.1 s into each slot of 2.5 s
     assert first["start_s"] == pytest.approx(0.1, abs=0.01)
@@ -173,7 +173,7 @@ def test_times_in_the_report_count_from_the_recordings_first_sample(mixed: dict[
     assert loss["start_s"] - before["end_s"] == pytest.approx(1 / 30, abs=0.002)
 
 
-def test_the_dataset_holds_what_cutting_gives(mixed: dict[str, Any], spec: Path) -> None:
+def test_the_dataset_holds_what_cutting_gives(mixed, spec):
     dataset, index = mixed["dataset"], 0
     for name in ("1_good", "2_gap"):
         with open_episodes(mixed["folder"] / f"in/{name}.mcap", spec) as episodes:
@@ -190,14 +190,14 @@ def test_the_dataset_holds_what_cutting_gives(mixed: dict[str, Any], spec: Path)
     assert dataset.video_problems() == []
 
 
-def test_the_named_commands_show_what_is_wrong(mixed: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_named_commands_show_what_is_wrong(mixed, capsys):
     commands = {Path(r["recording"]).stem: shlex.split(r["command"]) for r in mixed["report"]["recordings"]}
     for name, words in (("4_empty", "is empty (0 bytes)"), ("3_degrees", "degrees?"), ("2_gap", "no fresh sample of")):
         assert main(commands[name][1:]) == 1
         assert words in " ".join(capsys.readouterr().out.split())
 
 
-def test_an_unfit_recording_without_episodes_is_quarantined(ingests: Ingests, tmp_path: Path) -> None:
+def test_an_unfit_recording_without_episodes_is_quarantined(ingests, tmp_path):
     record(tmp_path / "in.mcap", gap=("/left_robot_left_finger", 0.2, 9.0))
     job = ingest_module.find_jobs(
         [tmp_path / "in.mcap"], load_recording_spec(ingests.spec), "spec", tmp_path / "store", True
@@ -210,9 +210,7 @@ def test_an_unfit_recording_without_episodes_is_quarantined(ingests: Ingests, tm
 # ---- pictures, watched while they are written ----
 
 
-def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_is_kept(
-    ingests: Ingests, tmp_path: Path
-) -> None:
+def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_is_kept(ingests, tmp_path):
     # frozen after a third of 6 s; two episodes of 3 s: of the first 1 s is frozen, all of the second
     record(tmp_path / "in.mcap", duration_s=6.0, episodes=2, frozen_camera="right_wrist", seed=2)
     assert ingests.run(tmp_path / "in.mcap") == 1
@@ -226,7 +224,7 @@ def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_i
     assert Dataset(ingests.out).num_episodes == 1
 
 
-def test_pictures_that_do_not_decode_cost_only_themselves(ingests: Ingests, tmp_path: Path) -> None:
+def test_pictures_that_do_not_decode_cost_only_themselves(ingests, tmp_path):
     garbled(record(tmp_path / "whole.mcap"), tmp_path / "in.mcap", (30, 40))
     assert ingests.run(tmp_path / "in.mcap") == 0
     [entry] = ingests.report()["recordings"]
@@ -239,9 +237,7 @@ def test_pictures_that_do_not_decode_cost_only_themselves(ingests: Ingests, tmp_
     assert {29, 31, 39, 41} <= set(ids)
 
 
-def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(
-    ingests: Ingests, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(ingests, good, monkeypatch, capsys):
     original = Cutter.cut
 
     def faulty(self: Cutter) -> Any:
@@ -260,9 +256,7 @@ def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(
 # ---- a second run ----
 
 
-def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_written(
-    ingests: Ingests, good: Path, tmp_path: Path
-) -> None:
+def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_written(ingests, good, tmp_path):
     inputs = Path(shutil.copytree(good, tmp_path / "in"))
     assert ingests.run(inputs) == 0
     assert ingests.written() == 2
@@ -286,7 +280,7 @@ def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_wri
 
 
 @pytest.mark.slow
-def test_a_changed_spec_writes_all_again(ingests: Ingests, good: Path, tmp_path: Path, spec: Path) -> None:
+def test_a_changed_spec_writes_all_again(ingests, good, tmp_path, spec):
     assert ingests.run(good) == 0
     assert ingests.written() == 2
     shutil.copytree(spec.parents[1], tmp_path / "specs")
@@ -299,9 +293,7 @@ def test_a_changed_spec_writes_all_again(ingests: Ingests, good: Path, tmp_path:
     assert ingests.written() == 2
 
 
-def test_one_file_by_several_names_is_one_input(
-    ingests: Ingests, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_file_by_several_names_is_one_input(ingests, good, tmp_path, monkeypatch):
     monkeypatch.chdir(good)
     (tmp_path / "link.mcap").symlink_to(good / "a.mcap")
     assert ingests.run("a.mcap", good / "a.mcap", "./a.mcap", f"../{good.name}/a.mcap", tmp_path / "link.mcap") == 0
@@ -310,9 +302,7 @@ def test_one_file_by_several_names_is_one_input(
 
 
 @pytest.mark.slow
-def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(
-    ingests: Ingests, good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(ingests, good, tmp_path, monkeypatch, capsys):
     names = ["2024-01-01.mcap", "[bold]it's #1 [].mcap", "über 測試 😀.mcap"]
     folder = tmp_path / "a: b [/c] 'd'"
     folder.mkdir(parents=True)
@@ -332,9 +322,7 @@ def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(
 # ---- what is in the way ----
 
 
-def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(
-    ingests: Ingests, good: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(ingests, good, capsys):
     ingests.out.mkdir()
     (ingests.out / "thesis.txt").write_text("do not touch")
     assert ingests.run(good) == 2
@@ -348,8 +336,8 @@ def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(
 
 
 def test_another_dataset_is_left_alone_and_the_same_content_under_another_name_is_known(
-    ingests: Ingests, good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    ingests, good, tmp_path, capsys
+):
     assert ingests.run(good / "a.mcap") == 0
     assert ingests.written() == 1
     before = content(ingests.out)
@@ -365,9 +353,7 @@ def test_another_dataset_is_left_alone_and_the_same_content_under_another_name_i
 
 
 @pytest.mark.slow
-def test_a_replacement_that_fails_puts_back_what_was_there(
-    ingests: Ingests, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_replacement_that_fails_puts_back_what_was_there(ingests, good, monkeypatch, capsys):
     assert ingests.run(good / "a.mcap") == 0
     before = content(ingests.out)
 
@@ -387,9 +373,7 @@ def test_a_replacement_that_fails_puts_back_what_was_there(
 # ---- dry runs ----
 
 
-def test_a_dry_run_writes_nothing_at_all(
-    ingests: Ingests, mixed: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_writes_nothing_at_all(ingests, mixed, monkeypatch, capsys):
     place = ingests.folder / "here"
     scratch = ingests.folder / "scratch"
     place.mkdir()
@@ -408,9 +392,7 @@ def outcomes(report: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize("feature", ["observation.images/front", "observation.images.front"])
-def test_a_dry_run_promises_what_the_run_then_does(
-    ingests: Ingests, good: Path, feature: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dry_run_promises_what_the_run_then_does(ingests, good, feature, monkeypatch):
     folder = Path(shutil.copytree(good, ingests.folder / "in"))
     shutil.copy(folder / "b.mcap", folder / "c.mcap")
     spec = load_recording_spec(ingests.spec)
@@ -443,9 +425,7 @@ def _no_damage(ingests: Ingests) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit_bytes", [20_000, 120_000])
-def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
-    ingests: Ingests, good: Path, limit_bytes: int, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(ingests, good, limit_bytes, capfd):
     """As a full disk would: some write fails, in LeRobot's encoder threads or elsewhere."""
     import lerobot.datasets.lerobot_dataset  # noqa: F401  (before the limit: importing writes files, too)
 
@@ -463,9 +443,7 @@ def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
     assert ingests.run(good) == 0, "with room again, it goes on"
 
 
-def test_a_store_that_is_read_only_is_told_at_once(
-    tmp_path: Path, spec: Path, good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_that_is_read_only_is_told_at_once(tmp_path, spec, good, monkeypatch, capsys):
     ingests = Ingests(tmp_path, spec, monkeypatch)
     assert ingests.run(good / "a.mcap", out="/proc/nothing/out") == 2
     assert ingests.run(good / "a.mcap", store="/proc/nothing/store") == 2
@@ -477,7 +455,7 @@ def test_a_store_that_is_read_only_is_told_at_once(
 
 
 @pytest.mark.slow
-def test_two_workers_write_the_same_bytes_as_one(ingests: Ingests, good: Path, tmp_path: Path) -> None:
+def test_two_workers_write_the_same_bytes_as_one(ingests, good, tmp_path):
     assert ingests.run(good) == 0
     assert ingests.run(good, out=tmp_path / "out2", store=tmp_path / "store2", engine__workers=2) == 0
     one, two = (

@@ -79,7 +79,7 @@ def table(root: Path, kind: str) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("of", ["parts", "filmed"])
-def test_it_is_what_lerobot_makes_of_them(of: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_it_is_what_lerobot_makes_of_them(of, tmp_path, request):
     parts = request.getfixturevalue(of)
     _join(parts, tmp_path / "ours")
     names = [f"local/{root.name}" for root in parts]
@@ -104,9 +104,7 @@ def test_it_is_what_lerobot_makes_of_them(of: str, tmp_path: Path, request: pyte
 
 
 @pytest.mark.parametrize("per_chunk", [2, 1000])
-def test_each_row_shows_its_own_picture_after_merging_twice(
-    filmed: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, per_chunk: int
-) -> None:
+def test_each_row_shows_its_own_picture_after_merging_twice(filmed, tmp_path, monkeypatch, per_chunk):
     from taccorl.data import joining
 
     read = joining.read_info
@@ -130,8 +128,8 @@ def test_each_row_shows_its_own_picture_after_merging_twice(
 
 @pytest.mark.parametrize(("limit_mb", "per_chunk", "files"), [(1, 2, 3), (100, 1000, 1)])
 def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
-    parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit_mb: int, per_chunk: int, files: int
-) -> None:
+    parts, tmp_path, monkeypatch, limit_mb, per_chunk, files
+):
     from taccorl.data import joining
 
     read = joining.read_info
@@ -153,9 +151,7 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
         np.testing.assert_array_equal(one.arrays["action"], other.arrays["action"])
 
 
-def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(
-    parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(parts, tmp_path, monkeypatch):
     shutil.copytree(parts[2], edited := tmp_path / "edited")
     path = edited / "meta/episodes/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(path).drop_columns(["stats/action/min"]), path)
@@ -168,7 +164,7 @@ def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(
         assert "stats/action/min" not in names and "stats/action/max" in names
 
 
-def test_statistics_that_a_removed_feature_left_behind_do_not_matter(parts: list[Path], tmp_path: Path) -> None:
+def test_statistics_that_a_removed_feature_left_behind_do_not_matter(parts, tmp_path):
     """LeRobot's ``modify_features`` removes a column, but not its statistics from the table of episodes."""
     edited = tmp_path / "edited"
     shutil.copytree(parts[0], edited)

@@ -103,7 +103,7 @@ def slow_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- every row its own picture ----
 
 
-def test_rows_keep_their_pictures_and_numbers(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_rows_keep_their_pictures_and_numbers(spec, tmp_path):
     episodes = [made_up(spec, 33), made_up(spec, 35, first_id=500, seed=1)]
     told: list[int] = []
     write_episodes(episodes, tmp_path / "ds", progress=told.append)
@@ -119,18 +119,14 @@ def test_rows_keep_their_pictures_and_numbers(spec: DatasetSpec, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_a_slow_encoder_loses_no_frame(spec: DatasetSpec, tmp_path: Path, slow_encoder: None) -> None:
+def test_a_slow_encoder_loses_no_frame(spec, tmp_path, slow_encoder):
     write_episodes([made_up(spec, 20)], tmp_path / "ds")
     assert row_ids(tmp_path / "ds") == list(range(20))
 
 
 def test_dropped_frames_are_found_and_the_dataset_is_written_again_exactly(
-    spec: DatasetSpec,
-    tmp_path: Path,
-    slow_encoder: None,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    spec, tmp_path, slow_encoder, monkeypatch, caplog
+):
     monkeypatch.setattr(lerobot_format, "_wait_for_room", lambda dataset: None)  # no back-pressure
     attempts: list[tuple[bool, list[str]]] = []
     original = lerobot_format._write
@@ -151,15 +147,13 @@ def test_dropped_frames_are_found_and_the_dataset_is_written_again_exactly(
     assert not list((tmp_path / "ds").rglob("*.png"))
 
 
-def test_a_dataset_that_stays_wrong_is_an_error(
-    spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dataset_that_stays_wrong_is_an_error(spec, tmp_path, monkeypatch):
     monkeypatch.setattr(Dataset, "video_problems", lambda self: ["front: 3 frames for 9 rows"])
     with pytest.raises(DatasetError, match="3 frames for 9 rows"):
         write_episodes([made_up(spec, 9)], tmp_path / "ds", streaming=False)
 
 
-def test_an_episode_without_pictures_is_written(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_an_episode_without_pictures_is_written(spec, tmp_path):
     blind = dataclasses.replace(made_up(spec, 9), picture_keys=())
     write_episodes([blind], tmp_path / "ds")
     np.testing.assert_array_equal(Dataset(tmp_path / "ds").episode(0).arrays[TOUCH], blind.arrays[TOUCH])
@@ -169,9 +163,7 @@ def test_an_episode_without_pictures_is_written(spec: DatasetSpec, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("fail_at", "streaming"), [(0, True), (25, True), (25, False)])
-def test_an_error_in_the_middle_leaves_nothing_behind(
-    spec: DatasetSpec, tmp_path: Path, fail_at: int, streaming: bool
-) -> None:
+def test_an_error_in_the_middle_leaves_nothing_behind(spec, tmp_path, fail_at, streaming):
     episodes = [made_up(spec, 10), made_up(spec, 40, fail_at=fail_at)]
     with pytest.raises(RecordingError, match="picture 7 is broken"):
         write_episodes(episodes, tmp_path / "ds", streaming=streaming)
@@ -179,7 +171,7 @@ def test_an_error_in_the_middle_leaves_nothing_behind(
     assert encoder_threads() == []
 
 
-def test_what_exists_is_never_touched(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_what_exists_is_never_touched(spec, tmp_path):
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds/mine.txt").write_text("keep")
     with pytest.raises(DatasetError, match="exists already"):
@@ -187,7 +179,7 @@ def test_what_exists_is_never_touched(spec: DatasetSpec, tmp_path: Path) -> None
     assert (tmp_path / "ds/mine.txt").read_text() == "keep"
 
 
-def test_statistics_are_lerobots_own_again_afterwards(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_statistics_are_lerobots_own_again_afterwards(spec, tmp_path):
     from lerobot.datasets import dataset_writer
 
     before, level = dataset_writer.compute_episode_stats, logging.getLogger().level
@@ -199,7 +191,7 @@ def test_statistics_are_lerobots_own_again_afterwards(spec: DatasetSpec, tmp_pat
 # ---- statistics ----
 
 
-def test_exact_statistics_are_lerobots_within_one_histogram_bin() -> None:
+def test_exact_statistics_are_lerobots_within_one_histogram_bin():
     from lerobot.datasets.compute_stats import compute_episode_stats
 
     rng = np.random.default_rng(3)
@@ -223,7 +215,7 @@ def test_exact_statistics_are_lerobots_within_one_histogram_bin() -> None:
     assert (ours["std"][7], ours["q99"][7]) == (0.0, 4.0)
 
 
-def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec, tmp_path):
     from lerobot.datasets import compute_stats
     from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
 
@@ -246,7 +238,7 @@ def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec: Data
 # ---- the features' own words ----
 
 
-def test_features_say_what_their_numbers_mean(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_features_say_what_their_numbers_mean(spec, tmp_path):
     write_episodes([made_up(spec, 5)], tmp_path / "ds")
     features = Dataset(tmp_path / "ds").info["features"]
     assert features["observation.state"]["unit"] == ["rad", "m"]
@@ -276,7 +268,7 @@ def shards(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[
     return [folder / name for name in "abc"]
 
 
-def test_datasets_with_other_features_do_not_merge(spec: DatasetSpec, shards: list[Path], tmp_path: Path) -> None:
+def test_datasets_with_other_features_do_not_merge(spec, shards, tmp_path):
     three = dataclasses.replace(spec.features["action"], shape=(3,), names=("a", "b", "c"), unit="rad")
     wider = dataclasses.replace(spec, features={**spec.features, "action": three})
     episode = made_up(spec, 9)
@@ -286,16 +278,14 @@ def test_datasets_with_other_features_do_not_merge(spec: DatasetSpec, shards: li
         merge([shards[1], tmp_path / "wide"], tmp_path / "all")
 
 
-def test_a_merge_that_loses_frames_is_an_error(
-    shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_merge_that_loses_frames_is_an_error(shards, tmp_path, monkeypatch):
     monkeypatch.setattr(Dataset, "video_problems", lambda self: ["front: one is missing"])
     with pytest.raises(DatasetError, match="after merging, first: front: one is missing"):
         merge(shards[1:], tmp_path / "all")
 
 
 @pytest.mark.parametrize("name", ["ünï 😀 #1", "a%d {y}", "a&b;$c", ".hidden"])
-def test_folders_with_odd_names_merge(shards: list[Path], tmp_path: Path, name: str) -> None:
+def test_folders_with_odd_names_merge(shards, tmp_path, name):
     folder = tmp_path / name
     for shard in shards[1:]:
         shutil.copytree(shard, folder / shard.name)
@@ -304,9 +294,7 @@ def test_folders_with_odd_names_merge(shards: list[Path], tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize("name", ["Anna's data", "run [3]", "a*", "what?"])
-def test_folders_that_lerobot_would_misread_are_refused(
-    spec: DatasetSpec, shards: list[Path], tmp_path: Path, name: str
-) -> None:
+def test_folders_that_lerobot_would_misread_are_refused(spec, shards, tmp_path, name):
     with pytest.raises(DatasetError, match="LeRobot cannot work in a folder with"):
         write_episodes([made_up(spec, 5)], tmp_path / name)
     with pytest.raises(DatasetError, match="LeRobot cannot work in a folder with"):
@@ -348,7 +336,7 @@ def blind(spec: DatasetSpec, seed: int, instruction: str = "touch it") -> Episod
 
 
 @pytest.mark.slow
-def test_every_process_writes_and_merges_the_same_bytes(tmp_path: Path) -> None:
+def test_every_process_writes_and_merges_the_same_bytes(tmp_path):
     folders = [tmp_path / hash_seed for hash_seed in "12"]  # of the order in which Python's sets of strings go
     processes = []
     for folder in folders:
@@ -367,15 +355,13 @@ def test_every_process_writes_and_merges_the_same_bytes(tmp_path: Path) -> None:
     ]
 
 
-def test_an_episode_of_one_row_is_written(spec: DatasetSpec, tmp_path: Path) -> None:
+def test_an_episode_of_one_row_is_written(spec, tmp_path):
     write_episodes([made_up(spec, 1)], tmp_path / "ds")
     assert row_ids(tmp_path / "ds") == [0]
 
 
 @pytest.mark.slow
-def test_data_files_are_those_of_lerobots_writer_left_alone(
-    spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_files_are_those_of_lerobots_writer_left_alone(spec, tmp_path, monkeypatch):
     import contextlib
 
     import pyarrow.parquet as pq

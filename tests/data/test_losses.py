@@ -49,7 +49,7 @@ def report_of(folder: Path, sent: list[Sent], *changes: tuple[str, str]) -> dict
         (lambda m: m.topic == CAMERA and 1.5 < m.time_s < 2.2, "split", ["no fresh sample of top"]),
     ],
 )
-def test_every_stretch_is_rows_or_a_listed_loss(tmp_path: Path, silent, outcome: str, listed: list[str]) -> None:
+def test_every_stretch_is_rows_or_a_listed_loss(tmp_path, silent, outcome, listed):
     entry = report_of(tmp_path, [m for m in messages() if not silent(m)])
     assert entry["outcome"] == outcome, entry["reason"]
     reasons = sorted(loss["reason"] for loss in entry["losses"])
@@ -63,16 +63,14 @@ def test_every_stretch_is_rows_or_a_listed_loss(tmp_path: Path, silent, outcome:
         assert listed[0] in entry["reason"]
 
 
-def test_the_printed_outcome_tells_a_whole_recording_from_a_shortened_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_printed_outcome_tells_a_whole_recording_from_a_shortened_one(tmp_path, capsys):
     report_of(tmp_path / "whole", messages())
     assert "written, whole" in capsys.readouterr().out
     report_of(tmp_path / "late", [m for m in messages() if m.topic != STATE or m.time_s >= 0.9])
     assert "written, 27 rows lost" in capsys.readouterr().out
 
 
-def test_samples_left_out_are_counted_by_reason(tmp_path: Path) -> None:
+def test_samples_left_out_are_counted_by_reason(tmp_path):
     sent = messages()
     states = [m for m in sent if m.topic == STATE]
     broken = [m.later(0) for m in sent if m.topic == CAMERA][40]
@@ -95,7 +93,7 @@ def test_samples_left_out_are_counted_by_reason(tmp_path: Path) -> None:
         assert counts["messages"] == sum(n for reason, n in counts.items() if reason != "messages")
 
 
-def test_a_dataset_of_one_recording_is_stored_once_and_an_edit_of_it_is_not_served_again(tmp_path: Path) -> None:
+def test_a_dataset_of_one_recording_is_stored_once_and_an_edit_of_it_is_not_served_again(tmp_path):
     entry = report_of(tmp_path, messages())
     out = tmp_path / "out"
     published = [path for kind in ("data", "videos") for path in (out / kind).rglob("*") if path.is_file()]
@@ -117,7 +115,7 @@ def test_a_dataset_of_one_recording_is_stored_once_and_an_edit_of_it_is_not_serv
     assert main(["check", str(out)]) != 0
 
 
-def test_videos_of_several_recordings_are_stored_once(tmp_path: Path) -> None:
+def test_videos_of_several_recordings_are_stored_once(tmp_path):
     (tmp_path / "in").mkdir()
     for k in range(3):
         write_mcap(tmp_path / f"in/rec_{k}.mcap", messages(3.0 + k))
@@ -132,7 +130,7 @@ def test_videos_of_several_recordings_are_stored_once(tmp_path: Path) -> None:
     assert main(["check", str(tmp_path / "out")]) == 0
 
 
-def test_an_instruction_of_megabytes_is_refused(tmp_path: Path) -> None:
+def test_an_instruction_of_megabytes_is_refused(tmp_path):
     entry = report_of(tmp_path, messages(1.0), ("put the cup on the plate", "put " * 2500))
     assert entry["outcome"] == "refused"
     assert "an instruction of 9,999 characters" in entry["reason"]
@@ -169,7 +167,7 @@ TWO_CHANNELS = (
 
 
 @pytest.mark.parametrize("changes", [(), TWO_CHANNELS])
-def test_several_partial_messages_make_one_state(tmp_path: Path, changes: tuple[tuple[str, str], ...]) -> None:
+def test_several_partial_messages_make_one_state(tmp_path, changes):
     entry = report_of(tmp_path, in_parts(messages()), *changes)
     assert (entry["outcome"], entry["rows_lost"]) == ("written", 0)
     for name, counts in entry["samples"].items():
@@ -181,7 +179,7 @@ def test_several_partial_messages_make_one_state(tmp_path: Path, changes: tuple[
     assert np.abs(state[:, 3] - truth[at, 3]).max() < 2e-4  # the gripper may be the one of 10 ms before
 
 
-def test_a_joined_sample_is_complete_when_every_name_has_come_again(tmp_path: Path) -> None:
+def test_a_joined_sample_is_complete_when_every_name_has_come_again(tmp_path):
     """The arm at 100 Hz, the gripper at 10 Hz: joined, there are 10 samples a second, none with an old gripper."""
     wide = ("rate_hz: 100, max_age_s: 0.1}\n  command", "rate_hz: 10, max_age_s: 0.2}\n  command")
     entry = report_of(tmp_path / "joined", in_parts(messages(), grip_hz=10), wide)
@@ -192,7 +190,7 @@ def test_a_joined_sample_is_complete_when_every_name_has_come_again(tmp_path: Pa
 
 
 @pytest.mark.parametrize("names", [((), ()), (("pan",), ())])
-def test_empty_messages_are_skipped_and_counted(tmp_path: Path, names: tuple[tuple[str, ...], ...]) -> None:
+def test_empty_messages_are_skipped_and_counted(tmp_path, names):
     sent = messages()
     states = [i for i, m in enumerate(sent) if m.topic == STATE]
     for i in states[:5]:
@@ -203,7 +201,7 @@ def test_empty_messages_are_skipped_and_counted(tmp_path: Path, names: tuple[tup
     assert [f["check"] for f in entry["episodes"][0]["findings"]].count("skipped") == 1
 
 
-def test_a_name_that_no_message_has_is_an_error(tmp_path: Path) -> None:
+def test_a_name_that_no_message_has_is_an_error(tmp_path):
     sent = [m for m in in_parts(messages()) if m.topic != STATE or m.fields["name"] != ["grip"]]
     entry = report_of(tmp_path, sent)
     assert entry["outcome"] == "refused"
@@ -211,9 +209,7 @@ def test_a_name_that_no_message_has_is_an_error(tmp_path: Path) -> None:
     assert "'grip' is not among its names" in entry["reason"]
 
 
-def test_inspect_lists_every_set_of_names_and_drafts_a_channel_for_each(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_lists_every_set_of_names_and_drafts_a_channel_for_each(tmp_path, capsys):
     sent = in_parts(messages(), grip_hz=10)
     sent[0] = replace(sent[0], fields=sent[0].fields | {"name": [], "position": []})
     path = write_mcap(tmp_path / "rec.mcap", sent)
@@ -228,7 +224,7 @@ def test_inspect_lists_every_set_of_names_and_drafts_a_channel_for_each(
 
 
 @pytest.mark.parametrize("ros", ["mcap", "db3"])
-def test_messages_compressed_one_by_one_are_read_without_metadata(tmp_path: Path, ros: str) -> None:
+def test_messages_compressed_one_by_one_are_read_without_metadata(tmp_path, ros):
     plain = report_of(tmp_path / "plain", messages())
     if ros == "mcap":
         path = write_mcap(tmp_path / "zstd" / "rec.mcap", messages(), zstd=True)
@@ -246,7 +242,7 @@ def test_messages_compressed_one_by_one_are_read_without_metadata(tmp_path: Path
     assert all(np.array_equal(a.arrays[key], b.arrays[key]) for key in a.arrays)
 
 
-def test_a_message_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+def test_a_message_that_unpacks_to_gigabytes_is_refused(tmp_path):
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 29))
     assert len(bomb) < 1 << 16
     with pytest.raises(ValueError, match="unpacks to more than"):

@@ -176,9 +176,7 @@ def test_a_table_s_user_states_its_domain_in_the_columns_file_or_for_the_folder(
         assert [m.origin for m in read_measurements(tmp_path).all] == [expected]
 
 
-def test_check_says_that_a_domain_was_derived(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_says_that_a_domain_was_derived(dataset, tmp_path, capsys):
     old = tmp_path / "old"
     shutil.copytree(dataset, old)
     path = old / "meta/taccorl/episodes.json"

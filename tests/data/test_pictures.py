@@ -1,8 +1,5 @@
 """Pictures of whole recordings: videos frame by frame, and the true reason where none is read, before any work is done."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -30,7 +27,7 @@ from taccorl.data.dataset import Dataset
 
 
 @pytest.mark.parametrize(("codec", "form"), [("libx264", "h264"), ("libx265", "h265")])
-def test_a_video_frame_by_frame_shows_the_picture_of_every_row(tmp_path: Path, codec: str, form: str) -> None:
+def test_a_video_frame_by_frame_shows_the_picture_of_every_row(tmp_path, codec, form):
     path = write_mcap(tmp_path / "rec.mcap", messages(picture=video(codec=codec, form=form)))
     code, entry = ingest(path, write_spec(tmp_path))
     assert (code, entry["outcome"], entry["rows_lost"]) == (0, "written", 0)
@@ -39,7 +36,7 @@ def test_a_video_frame_by_frame_shows_the_picture_of_every_row(tmp_path: Path, c
         assert np.abs(shown.astype(int) - scene(k / 30)).mean() < 12  # the bar moves by 1 pixel a row; H.264 twice
 
 
-def test_an_episode_in_mid_video_is_decoded_from_the_frames_before_it(tmp_path: Path) -> None:
+def test_an_episode_in_mid_video_is_decoded_from_the_frames_before_it(tmp_path):
     """State begins at 1.2 s, between two key frames (1.0 and 1.5 s): the rows' pictures need those before them."""
     sent = [m for m in messages(picture=video(every=60)) if m.topic == CAMERA or m.time_s >= 1.2]
     path = write_mcap(tmp_path / "rec.mcap", sent)
@@ -48,7 +45,7 @@ def test_an_episode_in_mid_video_is_decoded_from_the_frames_before_it(tmp_path: 
         assert np.abs(first.astype(int) - scene(36 / 30)).mean() < 6
 
 
-def test_a_video_that_begins_between_key_frames_loses_those_pictures_only(tmp_path: Path) -> None:
+def test_a_video_that_begins_between_key_frames_loses_those_pictures_only(tmp_path):
     sent = messages(picture=video(every=60))
     path = write_mcap(tmp_path / "rec.mcap", [m for m in sent if m.topic != CAMERA or m.time_s > 1.0])
     _, entry = ingest(path, write_spec(tmp_path))
@@ -71,9 +68,7 @@ YUV = np.zeros((ROWS, COLUMNS, 2), np.uint8)
         (lambda t: raw(t, "yuv411", YUV), "yuv411"),
     ],
 )
-def test_pictures_that_are_not_read_are_refused_with_their_reason(
-    tmp_path: Path, picture: Callable[[float], Sent], reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures_that_are_not_read_are_refused_with_their_reason(tmp_path, picture, reason, capsys):
     path = write_mcap(tmp_path / "rec.mcap", messages(picture=picture))
     spec = write_spec(tmp_path)
     code, entry = ingest(path, spec)
@@ -89,7 +84,7 @@ def test_pictures_that_are_not_read_are_refused_with_their_reason(
     assert f"# not used: {CAMERA}" in inspected  # and the draft does not use them
 
 
-def test_pictures_that_change_their_size_are_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_that_change_their_size_are_a_warning(tmp_path, capsys):
     sizes = [(ROWS, COLUMNS), (2 * ROWS, 2 * COLUMNS)]
 
     def picture(time_s: float) -> Sent:
@@ -117,9 +112,7 @@ def test_pictures_that_change_their_size_are_a_warning(tmp_path: Path, capsys: p
         (lambda rgb: rgb[..., 0].astype(np.uint16), "uint16"),
     ],
 )
-def test_stored_arrays_are_read_or_refused_with_their_reason(
-    tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_stored_arrays_are_read_or_refused_with_their_reason(tmp_path, change, reason, capsys):
     values = arrays(60)
     topic = "/observations/images/top"
     values[topic] = change(values[topic])

@@ -21,8 +21,7 @@ from taccorl.errors import RecordingError
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 START_NS = 1_780_000_000 * 10**9
-NUM = 300
-"""3 s at 100 Hz."""
+NUM = 300  # 3 s at 100 Hz
 XYZ = ("x", "y", "z")
 
 

@@ -17,8 +17,7 @@ NUM_SEEDS = 30
 FEW_SEEDS = 2
 SEEDS = (100, *range(5))
 LEFT_A, LEFT_B, RIGHT_A, RIGHT_B = range(4)
-Change = Callable[[np.ndarray], object]
-"""Modifies (T, 4, 32, 12) counts in place."""
+Change = Callable[[np.ndarray], object]  # Modifies (T, 4, 32, 12) counts in place
 
 
 def flat(touch: np.ndarray) -> np.ndarray:

@@ -76,8 +76,7 @@ class Squire(Square):
         return Square.signal(t, seed) + 0.001 * np.sin(7.0 * t)
 
 
-Hidden = kind("hidden", lambda t, seed: drive(t, seed))
-"""As what the gain does: no recording shows it."""
+Hidden = kind("hidden", lambda t, seed: drive(t, seed))  # As what the gain does: no recording shows it
 
 
 def drive(t: np.ndarray, seed: int) -> np.ndarray:

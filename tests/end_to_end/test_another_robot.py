@@ -109,9 +109,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
-def test_its_recording_becomes_a_dataset_with_its_own_joints_and_pads(
-    dataset: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_its_recording_becomes_a_dataset_with_its_own_joints_and_pads(dataset, capsys):
     there = Dataset(dataset)
     assert there.spec.features["observation.state"].names == tuple(f"{name}.pos" for name in NAMES)
     assert there.spec.features["observation.tactile"].shape == (2 * 16 * 16,)
@@ -129,7 +127,7 @@ def test_its_recording_becomes_a_dataset_with_its_own_joints_and_pads(
     assert "touch_inner" in said and "touch_outer" in said and "error" not in said
 
 
-def test_its_episode_is_drawn_with_its_own_pads(dataset: Path, tmp_path: Path) -> None:
+def test_its_episode_is_drawn_with_its_own_pads(dataset, tmp_path):
     sheet = tmp_path / "sheet.png"
     assert main(["view", str(dataset), f"--sheet={sheet}"]) == 0
     picture = cv2.imread(str(sheet))
@@ -137,9 +135,7 @@ def test_its_episode_is_drawn_with_its_own_pads(dataset: Path, tmp_path: Path) -
     assert main(["view", str(dataset), f"--save={tmp_path / 'x.rrd'}"]) == 0
 
 
-def test_what_the_twin_or_a_cut_file_has_nothing_for_is_said(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_the_twin_or_a_cut_file_has_nothing_for_is_said(dataset, tmp_path, capsys):
     (tmp_path / "twin.yaml").write_text("effects: []\n")
     words = [str(dataset), f"--against={tmp_path / 'twin.yaml'}", f"--save={tmp_path / 'x.rrd'}"]
     assert main(["view", *words]) == 2
@@ -154,7 +150,7 @@ def test_what_the_twin_or_a_cut_file_has_nothing_for_is_said(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_tactile_policy_is_trained_on_it_and_gives_its_actions(dataset: Path, tmp_path: Path) -> None:
+def test_the_tactile_policy_is_trained_on_it_and_gives_its_actions(dataset, tmp_path):
     import torch
     from lerobot.policies.factory import make_pre_post_processors
 

@@ -21,8 +21,7 @@ from tests.recordings.stand_in import StandInConfig, write_mcap
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 SECONDS, SEED = 4.0, 7
-FAULTY_SECONDS = 8.0
-"""In 8 s the grippers close one after the other, so that exchanged arms and pads can be told apart."""
+FAULTY_SECONDS = 8.0  # In 8 s the grippers close one after the other, so that exchanged arms and pads can be told apart
 CAMERAS = (96, 128)
 BASE = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024)
 

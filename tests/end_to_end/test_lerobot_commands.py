@@ -61,9 +61,7 @@ def test_a_training_begins_goes_on_and_ends(dataset: Path, recipe: Path, tmp_pat
     assert training.command() == []
 
 
-def test_other_data_another_recipe_or_other_options_are_another_training(
-    dataset: Path, recipe: Path, tmp_path: Path
-) -> None:
+def test_other_data_another_recipe_or_other_options_are_another_training(dataset, recipe, tmp_path):
     first = Training(recipe, dataset, [], tmp_path).folder
     assert Training(recipe, dataset, [], tmp_path).folder == first
     found = {first, Training(recipe, dataset, ["--steps=5"], tmp_path).folder}

@@ -1,7 +1,6 @@
 """pipelines/post_train.py with ``--small``: from sources to a comparison of before and after; again, it does nothing anew."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -9,9 +8,7 @@ from pipelines import post_train
 
 
 @pytest.mark.slow
-def test_the_chain_ends_in_a_comparison_and_goes_on_where_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_chain_ends_in_a_comparison_and_goes_on_where_it_was(tmp_path, monkeypatch):
     words = ["--small", f"--out={tmp_path / 'out'}", f"--learn_out={tmp_path / 'learn'}"]
     post_train.main(words)
     (out,) = (tmp_path / "out" / "assembly_2").iterdir()
@@ -36,6 +33,6 @@ def test_the_chain_ends_in_a_comparison_and_goes_on_where_it_was(
         (["--policy=outputs/a"], "both --policy and --dataset"),
     ],
 )
-def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:
+def test_what_it_does_not_know_is_named(words, said):
     with pytest.raises(SystemExit, match=said):
         post_train.main(words)

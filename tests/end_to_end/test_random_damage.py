@@ -214,9 +214,7 @@ def changed_in_silence(base: Base, entries: list[dict[str, Any]], intact: list[R
 
 
 @pytest.mark.parametrize("kind", ["mcap", "db3", "rosbag1", "hdf5", "lerobot"])
-def test_random_damage_ends_in_the_right_outcome(
-    kind: str, dataset: Path, tmp_path: Path, record_property: Callable[[str, object], None]
-) -> None:
+def test_random_damage_ends_in_the_right_outcome(kind, dataset, tmp_path, record_property):
     base = made(kind, tmp_path, dataset)
     clean = base.entries(tmp_path / "store")
     assert {one["outcome"] for one in clean} == {"written"}

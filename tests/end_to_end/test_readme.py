@@ -32,8 +32,7 @@ SECTIONS = (  # run after README.md, in this order
     ("data.md", "## Look at it"),
 )
 FENCE = re.compile(r"(?:<!--(?P<comment>.*?)-->\n)?```(?P<language>\w*)\n(?P<text>.*?)```", re.DOTALL)
-CELL = re.compile(r"^\|.*?`((?:taccorl|lerobot-\w+) [^`]+)`", re.MULTILINE)
-"""First command in a row of a table."""
+CELL = re.compile(r"^\|.*?`((?:taccorl|lerobot-\w+) [^`]+)`", re.MULTILINE)  # First command in a row of a table
 PROGRAMS = re.compile(r"(taccorl|lerobot-\w+|make|python) ")
 NOT_RUN = "no test runs these"
 SMALL = {  # verb → options that take the place of the line's own, or are added

@@ -208,9 +208,7 @@ def test_one_takeover_is_at_the_stall_and_the_others_before_it() -> None:
     assert takeover_step(early, 1, before_grasp=False) == (int(229 * share(1)), "drawn before the grasp")
 
 
-def test_a_policy_with_more_time_than_the_task_s_own_is_taken_over_beyond_it(
-    sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_with_more_time_than_the_task_s_own_is_taken_over_beyond_it(sim, stub, monkeypatch):
     """The limit is 4 steps, also of the expert, which acts for 3 here; the seed draws a step beyond."""
     seed = next(seed for seed in range(99) if share(0, seed) > 0.8)
     episode = held_still(sim, seed, 10)

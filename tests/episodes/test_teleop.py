@@ -6,7 +6,6 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,7 +70,7 @@ def settle(sim: Simulation, jogger: Jogger, seconds: float = 1.5) -> None:
 # keys ------------------------------------------------------------------------------------------------------------------
 
 
-def test_none_of_our_keys_means_something_to_mujocos_viewer() -> None:
+def test_none_of_our_keys_means_something_to_mujocos_viewer():
     toggles = [*mujoco.mjVISSTRING, *mujoco.mjRNDSTRING]  # name, default, key
     theirs = {ord(key) for _, _, key in toggles if key}
     theirs |= set(range(ord("0"), ord("6")))  # groups of geoms, with shift of sites
@@ -86,7 +85,7 @@ def test_none_of_our_keys_means_something_to_mujocos_viewer() -> None:
     ("code", "moved_mm"),
     [(UP, (5, 0, 0)), (DOWN, (-5, 0, 0)), (LEFT, (0, 5, 0)), (RIGHT, (0, -5, 0)), (HOME, (0, 0, 5)), (END, (0, 0, -5))],
 )
-def test_tap_moves_goal_by_a_step_along_the_bench(jogger: Jogger, code: int, moved_mm: tuple) -> None:
+def test_tap_moves_goal_by_a_step_along_the_bench(jogger, code, moved_mm):
     before, other = jogger.hands["left"].goal.copy(), jogger.hands["right"].goal.copy()
     tap(jogger, code)
     after = jogger.hands["left"].goal
@@ -96,7 +95,7 @@ def test_tap_moves_goal_by_a_step_along_the_bench(jogger: Jogger, code: int, mov
 
 
 @pytest.mark.parametrize(("codes", "axis"), [("67", 2), ("89", 1), ("-=", 0)])
-def test_turn_is_about_the_hands_own_axis_and_leaves_the_tcp_where_it_is(jogger: Jogger, codes: str, axis: int) -> None:
+def test_turn_is_about_the_hands_own_axis_and_leaves_the_tcp_where_it_is(jogger, codes, axis):
     before = jogger.hands["left"].goal.copy()
     tap(jogger, ord(codes[0]))
     after = jogger.hands["left"].goal.copy()
@@ -108,7 +107,7 @@ def test_turn_is_about_the_hands_own_axis_and_leaves_the_tcp_where_it_is(jogger:
     np.testing.assert_allclose(jogger.hands["left"].goal, before, atol=1e-12)
 
 
-def test_space_switches_the_arm_and_page_down_the_step(jogger: Jogger) -> None:
+def test_space_switches_the_arm_and_page_down_the_step(jogger):
     keyboard = Keyboard()
     assert keyboard.requested_steps([SPACE, PAGE_DOWN], ())[1] == [Command.SWITCH_ARM, Command.STEP_SIZE]
     jogger.switch_arm()
@@ -122,7 +121,7 @@ def test_space_switches_the_arm_and_page_down_the_step(jogger: Jogger) -> None:
     assert (jogger.arm, jogger.size.move_m) == ("left", 0.001)
 
 
-def test_held_key_goes_on_at_eight_steps_a_second_after_a_quarter() -> None:
+def test_held_key_goes_on_at_eight_steps_a_second_after_a_quarter():
     keyboard = Keyboard()
     total = keyboard.requested_steps([LEFT], {LEFT})[0]
     for _ in range(29):
@@ -132,7 +131,7 @@ def test_held_key_goes_on_at_eight_steps_a_second_after_a_quarter() -> None:
     assert not keyboard.requested_steps([], {LEFT})[0].any(), "down again: a new quarter of a second"
 
 
-def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim: Simulation, jogger: Jogger) -> None:
+def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim, jogger):
     hand = jogger.hands["left"]
     tap(jogger, *[INSERT] * 3)
     assert hand.opening_m == ROBOT.opening_max_m
@@ -147,7 +146,7 @@ def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim: Sim
     assert sim.proprioception()[0, 13] == pytest.approx(ROBOT.opening_max_m, abs=1e-3), "the other one is still open"
 
 
-def test_target_out_of_reach_is_refused_with_its_error_and_does_not_run_away(jogger: Jogger) -> None:
+def test_target_out_of_reach_is_refused_with_its_error_and_does_not_run_away(jogger):
     jogger.next_size()
     tap(jogger, *[UP] * 60)  # 1.2 m: the arm is 0.6 m long
     hand, kinematics = jogger.hands["left"], jogger.kinematics["left"]
@@ -162,7 +161,7 @@ def test_target_out_of_reach_is_refused_with_its_error_and_does_not_run_away(jog
     assert hand.goal[0, 3] == pytest.approx(edge[0, 3] - 0.02), "one step back is one step back"
 
 
-def test_hand_follows_its_goal_no_faster_than_a_quarter_metre_a_second(jogger: Jogger) -> None:
+def test_hand_follows_its_goal_no_faster_than_a_quarter_metre_a_second(jogger):
     jogger.next_size()
     tap(jogger, *[HOME] * 3)  # 60 mm at once
     hand, kinematics = jogger.hands["left"], jogger.kinematics["left"]
@@ -197,9 +196,6 @@ class ScriptedWindow:
     def held(self, codes: Iterable[int]) -> set[int]:
         return set()
 
-    def locked(self) -> Any:
-        return nullcontext()
-
     def close(self) -> None:
         self.script = iter(())
 
@@ -224,9 +220,7 @@ def column(recorder: EpisodeRecorder, key: str) -> np.ndarray:
 DRIVE = [[UP], [UP], [], [SPACE], [HOME], [DELETE], []]
 
 
-def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(
-    tmp_path: Path, bench: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(tmp_path, bench, monkeypatch):
     window = with_script(monkeypatch, [[], [LEFT], [ENTER], *DRIVE, [ENTER], *[[UP]] * 40])
     plan = CollectPlan(task="bench", source=KeyboardSource(folder=str(tmp_path)), seed=3)
     recorder = run(plan, bench)
@@ -256,9 +250,7 @@ def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(
         run(plan, bench, k=1)  # but another scene needs the person
 
 
-def test_discarded_attempt_is_kept_apart_and_the_scene_begins_anew(
-    tmp_path: Path, bench: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_discarded_attempt_is_kept_apart_and_the_scene_begins_anew(tmp_path, bench, monkeypatch):
     with_script(monkeypatch, [[ENTER], [UP], [UP], [F9], [ENTER], [LEFT], [ENTER], *[[]] * 40])
     source = KeyboardSource(folder=str(tmp_path))
     recorder = run(CollectPlan(task="bench", source=source, seed=3), bench)
@@ -270,9 +262,7 @@ def test_discarded_attempt_is_kept_apart_and_the_scene_begins_anew(
     assert ActionsSource(path=str(tmp_path)).files()[0].path == second.path, "a folder's discarded files are left out"
 
 
-def test_window_closed_in_the_middle_loses_nothing_and_asks_anew_next_time(
-    tmp_path: Path, bench: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_window_closed_in_the_middle_loses_nothing_and_asks_anew_next_time(tmp_path, bench, monkeypatch):
     plan = CollectPlan(task="bench", source=KeyboardSource(folder=str(tmp_path)), seed=3)
     with_script(monkeypatch, [[ENTER], [UP], [UP], [UP]])
     with pytest.raises(TaccorlError, match=r"3 actions are in .*_000\.jsonl"):
@@ -283,9 +273,7 @@ def test_window_closed_in_the_middle_loses_nothing_and_asks_anew_next_time(
     assert len(run(plan, bench).rows) == 31
 
 
-def test_failure_waits_for_the_person_who_tries_again_or_keeps_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failure_waits_for_the_person_who_tries_again_or_keeps_it(tmp_path, monkeypatch):
     script = [[ENTER], *[[UP]] * 6, [], [], [F9], [ENTER], *[[LEFT]] * 6, [], [ENTER]]
     window = with_script(monkeypatch, script)
     sim = Simulation(tasks.get("bench")())
@@ -297,9 +285,7 @@ def test_failure_waits_for_the_person_who_tries_again_or_keeps_it(
     assert any("timeout! F9: again; Enter: keep" in shown for shown in window.shown)
 
 
-def test_person_has_more_time_than_the_task_gives_an_expert_and_so_has_the_re_execution(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_person_has_more_time_than_the_task_gives_an_expert_and_so_has_the_re_execution(tmp_path, monkeypatch):
     hasty = type("Hasty", (tasks.get("bench"),), {"time_limit_s": 0.2})  # out of time after 6 control steps
     sim = Simulation(hasty())
     with_script(monkeypatch, [[ENTER], *[[UP]] * 10, [ENTER], *[[]] * 40])
@@ -326,7 +312,7 @@ class Overheard(ExpertSource):
             yield targets
 
 
-def test_experts_actions_re_executed_give_bit_identical_rows(tmp_path: Path) -> None:
+def test_experts_actions_re_executed_give_bit_identical_rows(tmp_path):
     plan = CollectPlan(task="assembly_1", randomization=0.5)
     sim = plan.make()
     sim.reset([plan.attempt_seed(0)])
@@ -361,7 +347,7 @@ def random_actions(num: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(ROBOT.action_low, ROBOT.action_high, (num, 14)).astype(np.float32)
 
 
-def test_float32_actions_come_back_bit_for_bit_wherever_the_file_is_cut(tmp_path: Path, sim: Simulation) -> None:
+def test_float32_actions_come_back_bit_for_bit_wherever_the_file_is_cut(tmp_path, sim):
     actions = random_actions(40)
     actions[3, :3] = np.float32(1) / 3, np.nextafter(np.float32(0.1), np.float32(1)), -0.0
     whole = write(tmp_path, sim, actions, "finished", "success")
@@ -378,9 +364,7 @@ def test_float32_actions_come_back_bit_for_bit_wherever_the_file_is_cut(tmp_path
         assert cut.end is None
 
 
-def test_actions_reach_the_file_at_once_and_the_disk_each_second(
-    tmp_path: Path, sim: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_actions_reach_the_file_at_once_and_the_disk_each_second(tmp_path, sim, monkeypatch):
     log = ActionLog(tmp_path, sim, "keyboard")
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(log.num_actions))
@@ -392,7 +376,7 @@ def test_actions_reach_the_file_at_once_and_the_disk_each_second(
     assert synced == [30, 60, 75]
 
 
-def test_damaged_and_foreign_files_are_refused_by_line(tmp_path: Path, sim: Simulation) -> None:
+def test_damaged_and_foreign_files_are_refused_by_line(tmp_path, sim):
     path = write(tmp_path, sim, random_actions(3), "finished")
     lines = path.read_text().splitlines()
     for number, line, says in (
@@ -409,7 +393,7 @@ def test_damaged_and_foreign_files_are_refused_by_line(tmp_path: Path, sim: Simu
         ActionFile.read(path)
 
 
-def test_only_a_finished_demonstration_of_the_very_scene_is_taken_for_one(tmp_path: Path, sim: Simulation) -> None:
+def test_only_a_finished_demonstration_of_the_very_scene_is_taken_for_one(tmp_path, sim):
     scene = scene_of(sim)
     write(tmp_path, sim, random_actions(2), "discarded")
     write(tmp_path, sim, random_actions(2), None)
@@ -424,7 +408,7 @@ def test_only_a_finished_demonstration_of_the_very_scene_is_taken_for_one(tmp_pa
     assert find_finished(tmp_path, scene, "keyboard") is None, "another MuJoCo: not surely the same bits"
 
 
-def test_re_execution_that_does_not_end_as_recorded_is_an_error(tmp_path: Path, sim: Simulation) -> None:
+def test_re_execution_that_does_not_end_as_recorded_is_an_error(tmp_path, sim):
     plan = ActionsSource(path=str(write(tmp_path, sim, random_actions(3) * 0, "finished", "success"))).plan(
         CollectPlan(task="")
     )
@@ -432,9 +416,7 @@ def test_re_execution_that_does_not_end_as_recorded_is_an_error(tmp_path: Path, 
         run(plan, sim)
 
 
-def test_plan_of_action_files_is_theirs_and_says_where_the_command_line_differs(
-    tmp_path: Path, sim: Simulation
-) -> None:
+def test_plan_of_action_files_is_theirs_and_says_where_the_command_line_differs(tmp_path, sim):
     paths = [write(tmp_path, sim, random_actions(2), "finished", outcome) for outcome in ("unfinished", "success")]
     source = ActionsSource(path=str(tmp_path))
     plan = source.plan(CollectPlan(task="bench"))
@@ -453,7 +435,7 @@ def test_plan_of_action_files_is_theirs_and_says_where_the_command_line_differs(
         ActionsSource(path=str(tmp_path / "nothing")).plan(CollectPlan(task=""))
 
 
-def test_other_actions_under_the_same_path_are_another_source(tmp_path: Path, sim: Simulation) -> None:
+def test_other_actions_under_the_same_path_are_another_source(tmp_path, sim):
     path = write(tmp_path, sim, random_actions(2), "finished")
     before = ActionsSource(path=str(path))
     path.write_bytes(path.read_bytes().replace(b'"finished"', b'"discarded"'))
@@ -464,7 +446,7 @@ def test_other_actions_under_the_same_path_are_another_source(tmp_path: Path, si
 
 
 @pytest.mark.slow
-def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path: Path) -> None:
+def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path):
     command = ["-m", "taccorl.cli.main", "collect", "--task=bench", "--source.type=keyboard", "--images=false"]
     done = fresh_python(*command, "--store=store", "--out=out", cwd=tmp_path, without=("DISPLAY", "WAYLAND_DISPLAY"))
     assert done.returncode == 2
@@ -473,7 +455,7 @@ def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path: Path) -
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="X11")
-def test_display_that_does_not_answer_is_an_error_and_not_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_display_that_does_not_answer_is_an_error_and_not_a_wait(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":7777")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(TaccorlError, match=r"DISPLAY=:7777 does not respond \(.+\)"):
@@ -546,7 +528,7 @@ def pair(tmp_path: Path, names: Sequence[str] = NAMES, port: str = "/dev/null", 
     return LeaderSource(teleop="test_pair_of_arms", options=path, folder=str(tmp_path / "teleop"), **said)
 
 
-def test_leader_in_degrees_and_percent_is_read_in_rad_and_m(tmp_path: Path, leader_kind: Any) -> None:
+def test_leader_in_degrees_and_percent_is_read_in_rad_and_m(tmp_path, leader_kind):
     from taccorl.lerobot_plugin.leader import open_leader
 
     leader = open_leader(pair(tmp_path, NAMES[::-1]))  # LeRobot promises no order
@@ -554,7 +536,7 @@ def test_leader_in_degrees_and_percent_is_read_in_rad_and_m(tmp_path: Path, lead
     leader.close()
 
 
-def test_normalised_range_spans_the_twins_own_joint_range() -> None:
+def test_normalised_range_spans_the_twins_own_joint_range():
     from taccorl.lerobot_plugin.leader import to_twin
 
     low, high = to_twin(np.full(14, -100.0), "range_m100_100", "m"), to_twin(np.full(14, 100.0), "range_m100_100", "m")
@@ -563,7 +545,7 @@ def test_normalised_range_spans_the_twins_own_joint_range() -> None:
     np.testing.assert_array_equal(to_twin(np.arange(14.0), "rad", "m"), np.arange(14.0))
 
 
-def test_values_missing_and_left_over_are_named_and_can_be_renamed(tmp_path: Path, leader_kind: Any) -> None:
+def test_values_missing_and_left_over_are_named_and_can_be_renamed(tmp_path, leader_kind):
     from taccorl.lerobot_plugin.leader import match_names, open_leader
 
     given = [*NAMES[:5], "left_wrist_roll.pos", *NAMES[6:], "left_joint_7.pos"]
@@ -583,9 +565,7 @@ def test_values_missing_and_left_over_are_named_and_can_be_renamed(tmp_path: Pat
         match_names(NAMES, {"left_jiont_2.pos": None}, "x")
 
 
-def test_units_have_to_be_said_and_wrong_ones_are_refused_at_the_first_reading(
-    tmp_path: Path, leader_kind: Any
-) -> None:
+def test_units_have_to_be_said_and_wrong_ones_are_refused_at_the_first_reading(tmp_path, leader_kind):
     from taccorl.lerobot_plugin.leader import open_leader
 
     with pytest.raises(TaccorlError, match=r"joint_unit=rad\|deg\|range_m100_100: it has to be said"):
@@ -598,7 +578,7 @@ def test_units_have_to_be_said_and_wrong_ones_are_refused_at_the_first_reading(
         open_leader(pair(tmp_path, gripper_unit="m")).read()
 
 
-def test_unknown_leader_wrong_options_and_dead_port_are_told(tmp_path: Path, leader_kind: Any) -> None:
+def test_unknown_leader_wrong_options_and_dead_port_are_told(tmp_path, leader_kind):
     from taccorl.lerobot_plugin.leader import open_leader, teleoperator_config
 
     with pytest.raises(TaccorlError, match="did you mean 'bi_so_leader'"):
@@ -609,7 +589,7 @@ def test_unknown_leader_wrong_options_and_dead_port_are_told(tmp_path: Path, lea
         open_leader(pair(tmp_path, port="nowhere"))
 
 
-def test_arms_catch_up_with_the_leader_slowly_and_then_follow_at_once(sim: Simulation) -> None:
+def test_arms_catch_up_with_the_leader_slowly_and_then_follow_at_once(sim):
     class Still:
         target = np.array([*(0.0, 1.6, -1.0, 0.0, 0.9, 0.0, 0.035)] * 2)
 
@@ -632,9 +612,7 @@ def test_arms_catch_up_with_the_leader_slowly_and_then_follow_at_once(sim: Simul
     assert "beyond the twin's range: left_joint2" in hands.lines()[0]
 
 
-def test_leader_drives_a_whole_attempt(
-    tmp_path: Path, bench: Simulation, leader_kind: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_leader_drives_a_whole_attempt(tmp_path, bench, leader_kind, monkeypatch):
     from taccorl.lerobot_plugin.leader import open_leader
 
     teleop.use_leader_driver(open_leader)

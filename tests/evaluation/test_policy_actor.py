@@ -50,14 +50,14 @@ def facts(**changes: Any) -> PolicyFacts:
     return dataclasses.replace(fitting, **changes)
 
 
-def test_pictures_become_the_numbers_of_lerobots_conversion() -> None:
+def test_pictures_become_the_numbers_of_lerobots_conversion():
     pictures = np.arange(2 * 16 * 8 * 3, dtype=np.uint8).reshape(2, 16, 8, 3)
     theirs = preprocess_observation({"pixels": {"front": pictures}, "agent_pos": np.zeros((2, 14))})
     ours = pictures_on(torch.device("cpu"), pictures)
     assert torch.equal(ours, theirs["observation.images.front"]) and ours.is_contiguous()
 
 
-def test_a_policy_that_fits_passes() -> None:
+def test_a_policy_that_fits_passes():
     """What is compared by containment is not called the same: one of three cameras, data within the limits."""
     checks = preflight(facts(), TwinConfig(), tasks=["assembly_1"])
     assert {c.what for c in checks if c.verdict == "within"} == {"cameras", "pictures", "range of action"}
@@ -79,7 +79,7 @@ def test_a_policy_that_fits_passes() -> None:
         (None, ["assembly_1"], "not stated"),
     ],
 )
-def test_a_policy_of_another_task_is_found_by_its_instructions(instructions: Any, tasks: list, verdict: str) -> None:
+def test_a_policy_of_another_task_is_found_by_its_instructions(instructions, tasks, verdict):
     checks = preflight(facts(instructions=instructions), TwinConfig(), tasks=tasks)
     (check,) = [c for c in checks if c.what == "task"]
     assert check.verdict == verdict and check.environment == ", ".join(tasks)
@@ -92,7 +92,7 @@ def test_a_policy_of_another_task_is_found_by_its_instructions(instructions: Any
             refuse_differences(checks, "policy")
 
 
-def test_pictures_that_differ_from_training_are_said_and_never_refused() -> None:
+def test_pictures_that_differ_from_training_are_said_and_never_refused():
     for training, pictures, verdict in (
         ("crop 95 %", "randomised", "same"),
         ("crop 95 %", "clear", "within"),
@@ -105,7 +105,7 @@ def test_pictures_that_differ_from_training_are_said_and_never_refused() -> None
         refuse_differences(checks, "policy")
 
 
-def test_what_a_checkpoint_does_not_state_is_no_difference() -> None:
+def test_what_a_checkpoint_does_not_state_is_no_difference():
     checks = preflight(PolicyFacts(inputs={}, action_shape=(14,)), TwinConfig())
     refuse_differences(checks, "policy")
     assert {c.what for c in checks if c.verdict == "not stated"} == {"robot", "rate"}
@@ -139,20 +139,20 @@ def test_what_a_checkpoint_does_not_state_is_no_difference() -> None:
         ({"unnormalised": ("action",)}, "normalisation: no statistics of action"),
     ],
 )
-def test_each_difference_is_named_with_both_sides(changes: dict, words: str) -> None:
+def test_each_difference_is_named_with_both_sides(changes, words):
     checks = preflight(facts(**changes), TwinConfig())
     with pytest.raises(TaccorlError, match="policy does not fit the environment") as error:
         refuse_differences(checks, "policy")
     assert words in str(error.value) and str(error.value).endswith("Nothing was run")
 
 
-def test_a_twin_without_the_camera_does_not_fit() -> None:
+def test_a_twin_without_the_camera_does_not_fit():
     blind = dataclasses.replace(TwinConfig(), cameras=[c for c in TwinConfig().cameras if c.name != "front"])
     with pytest.raises(TaccorlError, match="cameras: front 224×224 in the checkpoint, left_wrist 224×224"):
         refuse_differences(preflight(facts(), blind), "policy")
 
 
-def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
+def test_a_checkpoint_states_its_facts(checkpoint):
     opened = open_checkpoint(checkpoint, "cpu")
     found = opened.facts()
     assert found.inputs["observation.images.front"] == (3, 224, 224) and found.action_shape == (14,) and found.fps == 30
@@ -165,7 +165,7 @@ def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
     assert len(opened.digest) == 64 and opened.digest == open_checkpoint(checkpoint, "cpu").digest
 
 
-def test_executed_actions_are_at_most_a_chunk(checkpoint: Path) -> None:
+def test_executed_actions_are_at_most_a_chunk(checkpoint):
     chunk = open_checkpoint(checkpoint, "cpu").config.chunk_size
     assert open_checkpoint(checkpoint, "cpu", n_action_steps=1).config.n_action_steps == 1
     for wrong in (0, -1, chunk + 1):
@@ -173,7 +173,7 @@ def test_executed_actions_are_at_most_a_chunk(checkpoint: Path) -> None:
             open_checkpoint(checkpoint, "cpu", n_action_steps=wrong)
 
 
-def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoint: Path, tmp_path: Path) -> None:
+def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoint, tmp_path):
     from tiny_dataset import write_tiny
 
     trained = shutil.copytree(checkpoint, tmp_path / "trained")
@@ -184,7 +184,7 @@ def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoin
     assert open_checkpoint(trained, "cpu").facts().instructions == Dataset(root).instructions != ()
 
 
-def test_statistics_that_are_missing_are_found(checkpoint: Path, tmp_path: Path) -> None:
+def test_statistics_that_are_missing_are_found(checkpoint, tmp_path):
     from lerobot.policies.factory import make_pre_post_processors
 
     bare = shutil.copytree(checkpoint, tmp_path / "bare")
@@ -194,7 +194,7 @@ def test_statistics_that_are_missing_are_found(checkpoint: Path, tmp_path: Path)
     assert set(found.unnormalised) == {"observation.state", "action"}
 
 
-def test_folders_that_are_no_checkpoint_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+def test_folders_that_are_no_checkpoint_are_refused(checkpoint, tmp_path):
     with pytest.raises(TaccorlError, match=r"no config\.json there; give the folder pretrained_model"):
         open_checkpoint(tmp_path)
     with pytest.raises(TaccorlError, match=f"did you mean {checkpoint}"):
@@ -240,7 +240,7 @@ def lerobot_rollout(path: Path, task: str, n: int, length: int | None) -> Any:
 
 
 @pytest.mark.slow
-def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actions_are_those_of_lerobot_eval(checkpoint, monkeypatch):
     """Flow matching draws noise: equal actions show equal observations, processors, weights and random numbers."""
     theirs = lerobot_rollout(checkpoint, "assembly_1", 2, STEPS)
     where = Scenes(tasks=("assembly_1",), episodes=2, seed=SEED, episode_length=STEPS)
@@ -267,7 +267,7 @@ def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.cluster.Job", "no_such_package.Step"])
-def test_a_class_that_is_no_step_is_not_called(checkpoint: Path, tmp_path: Path, named: str) -> None:
+def test_a_class_that_is_no_step_is_not_called(checkpoint, tmp_path, named):
     """LeRobot imports and calls the class that a processor's file names."""
     foreign, mark = shutil.copytree(checkpoint, tmp_path / "foreign"), tmp_path / "executed"
     file = foreign / "policy_postprocessor.json"
@@ -309,7 +309,7 @@ def damaged(data: bytes, how: str, rng: np.random.Generator) -> bytes:
 
 @pytest.mark.parametrize("how", ["flipped", "truncated"])
 @pytest.mark.parametrize("name", FILES)
-def test_every_damage_of_a_checkpoint_is_found_and_one_line(trained: Path, tmp_path: Path, name: str, how: str) -> None:
+def test_every_damage_of_a_checkpoint_is_found_and_one_line(trained, tmp_path, name, how):
     """A flipped bit of the manifest that is in no digest may be any: the checkpoint is then whole."""
     folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(0)
     file = next(folder.glob(name))
@@ -331,9 +331,7 @@ def test_every_damage_of_a_checkpoint_is_found_and_one_line(trained: Path, tmp_p
 
 @pytest.mark.parametrize("how", ["flipped", "truncated"])
 @pytest.mark.parametrize("name", [name for name in FILES if name != "manifest.json"])
-def test_damage_without_digests_is_never_a_traceback(
-    trained: Path, tmp_path: Path, name: str, how: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damage_without_digests_is_never_a_traceback(trained, tmp_path, name, how, caplog):
     """Of a foreign checkpoint that can be read all the same, a note says that nothing was compared."""
     folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(1)
     file = next(folder.glob(name))
@@ -379,9 +377,7 @@ for kill_at in range(1, 1000):
 
 
 @pytest.mark.slow
-def test_killed_between_any_two_files_a_checkpoint_is_refused_or_whole(
-    checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_killed_between_any_two_files_a_checkpoint_is_refused_or_whole(checkpoint, tmp_path, caplog):
     shutil.copytree(checkpoint, tmp_path / "whole")
     tests = Path(__file__).parents[1]
     words = [sys.executable, "-c", KILLED, str(tmp_path), str(tests), str(tests / "lineage")]

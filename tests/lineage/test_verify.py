@@ -27,7 +27,7 @@ def stored(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_untouched_files_are_what_was_stored(stored: Path) -> None:
+def test_untouched_files_are_what_was_stored(stored):
     assert not is_verified(stored)
     found = verify(stored)
     assert found is not None and (found.num_files, found.changed, found.missing) == (3, (), ())
@@ -35,7 +35,7 @@ def test_untouched_files_are_what_was_stored(stored: Path) -> None:
     assert digest_each(stored).keys() == {"data/a", "data/b", "data/c", PLACE}, "the mark is no part of the content"
 
 
-def test_changed_and_missing_files_are_named_also_with_their_old_times(stored: Path) -> None:
+def test_changed_and_missing_files_are_named_also_with_their_old_times(stored):
     verify(stored)
     path = stored / "data" / "b"
     times = path.stat()
@@ -48,7 +48,7 @@ def test_changed_and_missing_files_are_named_also_with_their_old_times(stored: P
     assert not is_verified(stored)
 
 
-def test_another_manifest_is_not_verified(stored: Path) -> None:
+def test_another_manifest_is_not_verified(stored):
     verify(stored)
     (stored / "data" / "d").write_bytes(b"d")
     files = digest_each(stored / "data")
@@ -57,9 +57,7 @@ def test_another_manifest_is_not_verified(stored: Path) -> None:
     assert not is_verified(stored)
 
 
-def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(
-    stored: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(stored, monkeypatch):
     def read(path: Path) -> str:
         digest = digest_file(path)
         if path.name == "b":
@@ -72,7 +70,7 @@ def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(
     assert not is_verified(stored)
 
 
-def test_a_file_that_cannot_be_read_does_not_hide_the_others(stored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_cannot_be_read_does_not_hide_the_others(stored, monkeypatch):
     def read(path: Path) -> str:  # root may read everything, so that a mode of 000 would show nothing
         if path.name == "a":
             raise PermissionError(errno.EACCES, "Permission denied", str(path))
@@ -85,7 +83,7 @@ def test_a_file_that_cannot_be_read_does_not_hide_the_others(stored: Path, monke
     assert found.unreadable == ("data/a (Permission denied)",)
 
 
-def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored: Path) -> None:
+def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored):
     files = {"x" * 5000: "0" * 64}
     (stored / PLACE).unlink()
     write_manifest(stored, PLACE, {"files": files, "digest": digest_files(files)})
@@ -96,9 +94,7 @@ def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored: Path) -> 
 @pytest.mark.parametrize(
     "content", ['{"files": 3}', '{"files": [1, 2]}', '{"files": {}}', "[" * 200_000, '{"files": null}']
 )
-def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(
-    content: str, stored: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(content, stored, caplog):
     if content.startswith("{"):
         content = json.dumps(json.loads((stored / PLACE).read_text()) | json.loads(content))
     (stored / PLACE).write_text(content)
@@ -108,7 +104,7 @@ def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(
     assert "have not been compared" in caplog.text
 
 
-def test_a_list_of_files_that_was_changed_is_a_damaged_manifest(stored: Path) -> None:
+def test_a_list_of_files_that_was_changed_is_a_damaged_manifest(stored):
     content = json.loads((stored / PLACE).read_text())
     del content["files"]["data/a"]
     (stored / PLACE).write_text(json.dumps(content))
@@ -117,7 +113,7 @@ def test_a_list_of_files_that_was_changed_is_a_damaged_manifest(stored: Path) ->
 
 
 @pytest.mark.parametrize("name", ["../other", "/etc/hostname", "data/../../other"])
-def test_a_file_outside_of_the_folder_is_not_read(name: str, tmp_path: Path) -> None:
+def test_a_file_outside_of_the_folder_is_not_read(name, tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
     (tmp_path / "other").write_bytes(b"other")
@@ -127,12 +123,12 @@ def test_a_file_outside_of_the_folder_is_not_read(name: str, tmp_path: Path) -> 
         verify(folder)
 
 
-def test_a_folder_of_somebody_else_has_nothing_to_compare_with(tmp_path: Path) -> None:
+def test_a_folder_of_somebody_else_has_nothing_to_compare_with(tmp_path):
     (tmp_path / "manifest.json").write_text("{}")
     assert verify(tmp_path) is None and not is_verified(tmp_path)
 
 
-def test_training_says_once_that_a_dataset_was_never_compared(stored: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_training_says_once_that_a_dataset_was_never_compared(stored, caplog):
     with caplog.at_level(logging.WARNING, "taccorl.training.reading"):
         for _ in range(2):
             _warn_unverified(stored)

@@ -18,8 +18,7 @@ from taccorl.lineage.store import Store
 
 PAUSE_S = 0.004
 NUM_PARTS = 5
-PATIENCE_S = 240.0
-"""Time after which a test gives up waiting: long, so that no test depends on how busy the machine is."""
+PATIENCE_S = 240.0  # Time after which a test gives up waiting: long, so that no test depends on how busy the machine is
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
 
 

@@ -164,9 +164,7 @@ def test_what_an_adapter_cannot_start_from_is_refused(place: Any, decay: float, 
         policy.wrap_with_peft(peft_cli_overrides={"full_training_modules": []})
 
 
-def test_missing_and_damaged_weights_are_noticed_before_a_network_is_built(
-    place: Any, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_missing_and_damaged_weights_are_noticed_before_a_network_is_built(place, tmp_path, monkeypatch):
     monkeypatch.setattr("taccorl.policies.tactile_pi05.modeling_tactile_pi05.TactilePI05Pytorch", None)
     flipped, cut, config = tmp_path / "flipped", tmp_path / "cut", PreTrainedConfig.from_pretrained(place.whole)
     whole = (place.whole / "model.safetensors").read_bytes()

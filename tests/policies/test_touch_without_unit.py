@@ -25,8 +25,7 @@ from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Polic
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import center_and_scale
 from taccorl.training import reading
 
-Touch = dict[str, tuple[str, tuple[int, ...]]]
-"""Feature → its type and shape."""
+Touch = dict[str, tuple[str, tuple[int, ...]]]  # Feature → its type and shape
 LAYOUTS: dict[str, tuple[int, str | None, Touch]] = {
     "leflexitac": (6, "video", {"observation.tactile.primary": ("float32", (12, 32))}),
     "anyskin": (
@@ -117,7 +116,7 @@ def chunk(policy: TactilePI05Policy, batch: dict[str, Any]) -> torch.Tensor:
     return policy.predict_action_chunk(batch)
 
 
-def test_touch_of_any_shape_is_trained_by_lerobots_command_and_used(trained: SimpleNamespace, tmp_path: Path) -> None:
+def test_touch_of_any_shape_is_trained_by_lerobots_command_and_used(trained, tmp_path):
     policy, preprocess, postprocess = opened(trained.checkpoint)
     config = policy.config
     assert config.tactile_layouts == {key: list(shape) for key, (_, shape) in trained.touch.items()}
@@ -167,9 +166,7 @@ def test_touch_of_any_shape_is_trained_by_lerobots_command_and_used(trained: Sim
     assert hidden[0].all()
 
 
-def test_a_checkpoint_refuses_other_touch_and_the_twin(
-    trained: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_checkpoint_refuses_other_touch_and_the_twin(trained, tmp_path, capsys):
     from taccorl.cli.main import main
 
     joints, pictures, touch = LAYOUTS[trained.name]
@@ -231,9 +228,7 @@ def matched(features: dict[str, Any], **changes: Any) -> TactilePI05Config:
         ({TACTILE: OWN, f"{TACTILE}.gel": {"dtype": "video", "shape": (48, 64, 3)}}, {}, {TACTILE: (4, 32, 12)}),
     ],
 )
-def test_every_feature_of_touch_is_used_or_named(
-    features: dict[str, Any], changes: Any, layouts: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_feature_of_touch_is_used_or_named(features, changes, layouts, caplog):
     config = matched(features, tactile_layouts=changes or None)
     found = config.require_touch()
     assert {key: touch.layout for key, touch in found.items()} == layouts
@@ -249,7 +244,7 @@ def test_every_feature_of_touch_is_used_or_named(
     assert config.require_touch() == found
 
 
-def test_a_window_at_the_pads_own_rate_is_named_and_not_used(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_window_at_the_pads_own_rate_is_named_and_not_used(caplog):
     window = {"dtype": "int16", "shape": (15360,), "tactile": {**OWN["tactile"], "layout": [10, 4, 32, 12]}}
     assert list(matched({TACTILE: OWN, f"{TACTILE}_window": window}).require_touch()) == [TACTILE]
     assert f"the policy does not use {TACTILE}_window" in caplog.text
@@ -272,12 +267,12 @@ def test_a_window_at_the_pads_own_rate_is_named_and_not_used(caplog: pytest.LogC
         ({}, {}, f"has no {TACTILE}, which --policy.tactile=true needs"),
     ],
 )
-def test_touch_that_cannot_be_used_is_refused_by_name(features: dict[str, Any], changes: Any, said: str) -> None:
+def test_touch_that_cannot_be_used_is_refused_by_name(features, changes, said):
     with pytest.raises(TaccorlError, match=said):
         matched(features, **changes)
 
 
-def test_noise_of_pads_with_a_unit_is_suppressed_beside_touch_without() -> None:
+def test_noise_of_pads_with_a_unit_is_suppressed_beside_touch_without():
     config = matched({TACTILE: OWN, f"{TACTILE}.a": {"dtype": "float32", "shape": (2,)}}, noise_threshold=0.1)
     policy = TactilePI05Policy(config)
     rows = {TACTILE: torch.full((1, 10, 1536), 0.05), f"{TACTILE}.a": torch.full((1, 10, 2), 0.05)}
@@ -289,7 +284,7 @@ def test_noise_of_pads_with_a_unit_is_suppressed_beside_touch_without() -> None:
     assert policy.model.tactile(readings, contact).tokens_BMD.shape[:2] == (1, 16)
 
 
-def test_statistics_are_of_each_element_of_a_vector_and_one_of_a_grid() -> None:
+def test_statistics_are_of_each_element_of_a_vector_and_one_of_a_grid():
     """Vector: deviations, at least a tenth of the root mean square of all, √((3² + 0.01²) / 2) where the second hardly moves.
     Grid, by LeRobot's statistics of its columns: means 1 and 3, deviations 1 and 3: mean 2, √((1 + 9 + 1 + 1) / 2) = √6."""
     told = {"mean": [1.0, 2.0], "std": [3.0, 4.0], "min": [-9.0, -9.0], "max": [9.0, 9.0]}
@@ -312,14 +307,14 @@ def test_statistics_are_of_each_element_of_a_vector_and_one_of_a_grid() -> None:
         (None, "has no 'x' of x"),
     ],
 )
-def test_touch_without_usable_statistics_is_refused(told: dict[str, Any] | None, said: str) -> None:
+def test_touch_without_usable_statistics_is_refused(told, said):
     whole = {"mean": [1.0, 2.0], "std": [1.0, 1.0], "min": [-9.0, -9.0], "max": [9.0, 9.0]}
     for is_grid in (False, True):
         with pytest.raises(TaccorlError, match=said):
             center_and_scale({} if told is None else {"x": {**whole, **told}}, "x", is_grid=is_grid)
 
 
-def test_processors_without_statistics_do_not_pass_touch_on() -> None:
+def test_processors_without_statistics_do_not_pass_touch_on():
     config = matched({f"{TACTILE}.a": GRID})
     process, _ = make_pre_post_processors(config)
     row = {"observation.state": torch.zeros(1, 14), f"{TACTILE}.a": torch.zeros(1, 12, 32), "task": ["x"]}
@@ -327,7 +322,7 @@ def test_processors_without_statistics_do_not_pass_touch_on() -> None:
         process(row)
 
 
-def test_readings_without_a_unit_have_two_scales_with_both_signs() -> None:
+def test_readings_without_a_unit_have_two_scales_with_both_signs():
     """One standard deviation is 100 counts: log 11 and 0.5. −10 deviations are −log 101 and, at most, −3."""
     fine, coarse = scales(torch.tensor([1.0, -10.0, 0.0]), None)
     torch.testing.assert_close(fine, torch.tensor([math.log(11), -math.log(101), 0.0]))

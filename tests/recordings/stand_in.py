@@ -35,18 +35,15 @@ Gap = tuple[str, float, float]  # topic, from, to [s since the start]
 class StandInConfig(drivers.DriverConfig):
     """Settings of a stand-in recording. Faults are absent by default."""
 
-    episodes: int = 1
-    """Number of episodes: equal time slots of at least 2 s, each with one attempt between its markers."""
+    episodes: int = 1  # Number of episodes: equal time slots of at least 2 s, each with one attempt between its markers
     outcomes: tuple[str, ...] = ("success",)
     """Closing markers, repeated over the episodes; in an episode with ``failure`` the tube misses the hole."""
     # Faults
-    joints_in_degrees: bool = False
-    """Fault: joint messages are in degrees."""
+    joints_in_degrees: bool = False  # Fault: joint messages are in degrees
     swap_arms: bool = False
     """Fault: the joint topics of each arm hold the other arm's messages (exchanged CAN adapters); cameras and pads are
     correct."""
-    sim_time_stamps: bool = False
-    """Fault: header stamps count from 0, while log times are wall-clock times."""
+    sim_time_stamps: bool = False  # Fault: header stamps count from 0, while log times are wall-clock times
     clock_offset_s: dict[str, float] = field(default_factory=dict)
     """Fault: topic → time by which its clock is ahead [s]. It moves the header stamp, or the log time of messages without a
     header."""
@@ -54,8 +51,7 @@ class StandInConfig(drivers.DriverConfig):
     """Fault: missing messages, (topic, from, to) in seconds since the start; one or several."""
     frozen_camera: str | None = None
     """Fault: name of a camera that repeats one picture, with new stamps, after a third of the recording."""
-    swap_pads: tuple[str, str] | None = None
-    """Fault: two pads whose messages are published under each other's topic."""
+    swap_pads: tuple[str, str] | None = None  # Fault: two pads whose messages are published under each other's topic
 
     @property
     def gaps(self) -> list[Gap]:
@@ -74,8 +70,7 @@ class StandInTruth:
     """Arm → (start, end) of the contact of its pads [s], one interval per episode."""
     sampled_s: dict[str, np.ndarray]
     """Topic → true time of what each message shows [s]: stamp without clock faults, or middle of a pad's scan. MCAP only."""
-    log_s: dict[str, np.ndarray]
-    """Topic → log time of each message [s], clock faults included. MCAP only."""
+    log_s: dict[str, np.ndarray]  # Topic → log time of each message [s], clock faults included. MCAP only
     frame_ids: dict[str, np.ndarray]
     """Camera → frame id in each published picture: the index of the camera's tick, counting lost ones."""
 

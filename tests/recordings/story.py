@@ -54,14 +54,10 @@ _TREMOR_RAD = 0.002  # times three sines
 class EpisodePlan:
     """Plan of one episode; times in seconds from the start of the recording."""
 
-    start_s: float
-    """Start of the episode."""
-    end_s: float
-    """End of the episode."""
-    outcome: str
-    """Closing marker, one of ``OUTCOMES``."""
-    shift_rad: np.ndarray
-    """(2, 6) shift of all poses of an arm but at rest, left arm first [rad]."""
+    start_s: float  # Start of the episode
+    end_s: float  # End of the episode
+    outcome: str  # Closing marker, one of ``OUTCOMES``
+    shift_rad: np.ndarray  # (2, 6) shift of all poses of an arm but at rest, left arm first [rad]
 
     def at(self, fraction: float) -> float:
         """Time at which this fraction (0 … 1) of the episode has passed [s]."""

@@ -50,9 +50,7 @@ def test_a_section_of_one_place_is_in_that_place_only(capsys: pytest.CaptureFixt
     assert [page.count(f"<div>{word}</div>") for word in "pb"] == [2, 2]
 
 
-def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(monkeypatch, capsys):
     monkeypatch.setattr("taccorl.report.terminal.WIDE", 60)
     path = "/data/robots/left_lab/2026-11-22/very_long_session_name/demonstration_000123.mcap"
     reason = f"{path}: /front/camera/image_raw/compressed: a message at log time 1700000000000000000 ns does not fit"

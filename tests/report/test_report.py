@@ -186,9 +186,7 @@ def facts(finding: JointFinding) -> list[str]:
     return found + [f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *apart])}"] * bool(apart)
 
 
-def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(
-    diagnosed: tuple[JointFinding, Path], capsys: pytest.CaptureFixture[str]
-):
+def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(diagnosed, capsys):
     finding, path = diagnosed
     verdict = Report(title="", comparison=small().comparison, found=[finding]).verdicts()[SIGNAL]
     show(brief(finding, verdict), sections_of(finding, ()))

@@ -73,7 +73,7 @@ def logged(file: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+def test_one_iteration_leaves_a_policy_folder_and_a_line(start, real, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(options(start, real, out)) == 0
     printed = capsys.readouterr().out
@@ -92,9 +92,7 @@ def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path
 
 
 @pytest.mark.slow
-def test_damage_of_a_run_is_one_line_and_the_way_out_works(
-    start: Path, real: Path, tmp_path: Path, capsys: Any
-) -> None:
+def test_damage_of_a_run_is_one_line_and_the_way_out_works(start, real, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(options(start, real, out)) == 0
     last, _ = out / "checkpoints" / "last", capsys.readouterr()
@@ -118,7 +116,7 @@ def test_damage_of_a_run_is_one_line_and_the_way_out_works(
 
 
 @pytest.mark.slow
-def test_a_policy_without_touch_is_post_trained_and_resumed(real: Path, tmp_path: Path) -> None:
+def test_a_policy_without_touch_is_post_trained_and_resumed(real, tmp_path):
     """One iteration, then a second after a resume, with an anchor whose rows have touch and with randomised pictures; Weights &
     Biases gets the rows of both, of one run."""
     blind = with_gain(write_checkpoint(tmp_path / "blind", tactile=False))
@@ -141,9 +139,7 @@ def test_a_policy_without_touch_is_post_trained_and_resumed(real: Path, tmp_path
     assert before.keys() == after.keys() and any(not torch.equal(value, after[name]) for name, value in before.items())
 
 
-def test_input_that_does_not_fit_is_refused_before_anything_is_written(
-    start: Path, real: Path, tmp_path: Path, capsys: Any
-) -> None:
+def test_input_that_does_not_fit_is_refused_before_anything_is_written(start, real, tmp_path, capsys):
     out = tmp_path / "out"
     cases = [
         ({"env.task": "asembly_2"}, "assembly_2"),
@@ -165,7 +161,7 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
+def test_killed_and_resumed_is_the_same_bit_for_bit(start, real, tmp_path, capsys):
     """Two iterations at once, and one, kill -9, a line that was written without its checkpoint, and one more."""
     more = {"ppo.privileged_critic": True, "ppo.adapt_lr": True}
     assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
@@ -190,7 +186,7 @@ def test_killed_and_resumed_is_the_same_bit_for_bit(start: Path, real: Path, tmp
 
 
 @pytest.mark.slow
-def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> None:
+def test_rerun_files_of_rollouts_change_nothing(start, tmp_path):
     """Two iterations of two decisions of 5 steps, episodes of 12 steps: the first ends in the second iteration."""
     from taccorl.views.episode import save_episode
 
@@ -219,7 +215,7 @@ def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> 
     assert not (tmp_path / "without" / "rollouts").exists()
 
 
-def test_the_watched_episode_is_the_one_that_ended_and_no_later_state_of_another() -> None:
+def test_the_watched_episode_is_the_one_that_ended_and_no_later_state_of_another():
     """Three episodes of environment 0: of 2 + 1 steps, then one that began in a stored state, then one of 2 steps."""
     from taccorl.rl.twin_shard import Acted
     from taccorl.rl.watched_episode import EpisodeWatch
@@ -251,7 +247,7 @@ def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: A
     return PostTraining(settings, lines.append, save)
 
 
-def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
+def test_a_collapse_goes_back_to_the_best_checkpoint(start, tmp_path):
     lines: list[str] = []
     made = run(start, tmp_path / "out", lines, noise_check=False, keep_checkpoints=1)
     # 2 decisions of 5 of 12 steps: only short episodes have ended
@@ -278,9 +274,7 @@ def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path
     made.world.close()
 
 
-def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(
-    start: Path, real: Path, tmp_path: Path
-) -> None:
+def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(start, real, tmp_path):
     """With β = 0 the loss on the dataset is logged all the same, and is that of before, too."""
     from taccorl.rl.settings import PPOSettings
 
@@ -303,7 +297,7 @@ def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(
         made.world.close()
 
 
-def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_noise_that_ruins_the_policy_is_reported(start, tmp_path, monkeypatch):
     from taccorl.rl import post_train
 
     lines: list[str] = []
@@ -318,7 +312,7 @@ def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, mo
     made.world.close()
 
 
-def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:
+def test_noise_at_the_hand_is_that_of_the_kinematics():
     """2e-2 rad at one joint of the left arm and 3 mm at its gripper, in a chunk of two steps: root mean squares over twelve
     joints, two hands, two grippers, of which one moves. With opposite noise in the steps the mean displacement is nearly 0."""
     from taccorl.rl.exploration import noise_of_targets
@@ -342,7 +336,7 @@ def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:
     assert found.hand_mm == pytest.approx(moved_mm / 2**0.5, rel=0.02) and found.offset_mm < 0.02 * found.hand_mm
 
 
-def test_every_configuration_of_post_training_is_read() -> None:
+def test_every_configuration_of_post_training_is_read():
     from taccorl.cli.parse import parse
     from taccorl.cli.post_train import PostTrainConfig
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -88,7 +87,7 @@ def home(world: TwinWorld, n: int = 5) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("pictures", ["clear", "randomised"])
-def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, opened: Any, pictures: str) -> None:
+def test_without_noise_actions_are_those_of_evaluation(envs, opened, pictures):
     """Two chunks of five steps through ``select_action`` and through a rollout, from the same noise."""
     actor = opened.load(0)
     noise = [torch.randn(N, 10, 32, generator=torch.Generator().manual_seed(k)) for k in range(2)]
@@ -120,7 +119,7 @@ def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, o
     np.testing.assert_allclose(np.concatenate(executed, 1), np.stack(expected, 1), atol=2e-6)
 
 
-def test_ratios_of_randomised_pictures_are_1_before_the_first_update(envs: TaccorlVectorEnv, opened: Any) -> None:
+def test_ratios_of_randomised_pictures_are_1_before_the_first_update(envs, opened):
     """The stored pictures are scored as they were seen: whole values, cropped and changed once."""
     world, policy = make_world(envs, opened, pictures="randomised"), opened.load(0).policy
     actor, sde = TactileFlowPolicy(policy, PolicySettings(), num_steps=4), FlowSDE(FlowSDESettings(level=0.5))
@@ -136,7 +135,7 @@ def test_ratios_of_randomised_pictures_are_1_before_the_first_update(envs: Tacco
     torch.testing.assert_close(picture, 2 * (seen[front] / 255) - 1, rtol=0, atol=1e-6)
 
 
-def test_time_limit_gives_the_last_observation_before_the_reset(envs: TaccorlVectorEnv, opened: Any) -> None:
+def test_time_limit_gives_the_last_observation_before_the_reset(envs, opened):
     """12 control steps, 5 a chunk: the third chunk ends after two."""
     world = make_world(envs, opened)
     first = world.observe()
@@ -159,9 +158,7 @@ def test_time_limit_gives_the_last_observation_before_the_reset(envs: TaccorlVec
 
 
 @pytest.mark.parametrize(("history", "stride"), [(10, 1), (3, 4)])
-def test_readings_after_the_end_are_not_in_the_last_window(
-    envs: TaccorlVectorEnv, opened: Any, history: int, stride: int
-) -> None:
+def test_readings_after_the_end_are_not_in_the_last_window(envs, opened, history, stride):
     world = make_world(envs, opened, history=history, stride=stride)
     assert world.observe().batch[TOUCH].shape == (N, history, 1536)
     readings = [envs.observe()[TOUCH]]
@@ -180,7 +177,7 @@ def test_readings_after_the_end_are_not_in_the_last_window(
     np.testing.assert_allclose(acted.last.batch[TOUCH].numpy(), expected, atol=1e-5)
 
 
-def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs: TaccorlVectorEnv, opened: Any) -> None:
+def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs, opened):
     world = make_world(envs, opened)
     chunk = home(world).clone()
     chunk[1, 3, 2] = torch.nan
@@ -190,7 +187,7 @@ def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs: Taccorl
     assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
 
 
-def test_a_reset_is_of_its_rows_only(envs: TaccorlVectorEnv, opened: Any) -> None:
+def test_a_reset_is_of_its_rows_only(envs, opened):
     world = make_world(envs, opened)
     world.act(home(world))
     before = world.observe()
@@ -203,9 +200,7 @@ def test_a_reset_is_of_its_rows_only(envs: TaccorlVectorEnv, opened: Any) -> Non
 
 
 @pytest.mark.parametrize("pictures", ["clear", "randomised"])
-def test_a_stopped_world_goes_on_bit_for_bit(
-    envs: TaccorlVectorEnv, opened: Any, tmp_path: Path, pictures: str
-) -> None:
+def test_a_stopped_world_goes_on_bit_for_bit(envs, opened, tmp_path, pictures):
     world = make_world(envs, opened, pictures=pictures)
     moves = [0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k)) for k in range(4)]
     world.observe()
@@ -232,9 +227,7 @@ def later_world(envs: TaccorlVectorEnv, opened: Any, share: float = 1.0, size: i
     return world_of([envs], opened, share=share, size=size)
 
 
-def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_counted_apart(
-    envs: TaccorlVectorEnv, opened: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_counted_apart(envs, opened, monkeypatch):
     """12 control steps, 5 a chunk. One third of the time must be left: states after 5 steps are kept, those after 10 are not."""
     monkeypatch.setattr(start_states, "_KEPT", 1.0)
     world = later_world(envs, opened)
@@ -258,9 +251,7 @@ def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_count
     assert acted.outcome_N.tolist() == ["timeout", "timeout"] and acted.began_later_N.all()
 
 
-def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
-    envs: TaccorlVectorEnv, opened: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(envs, opened, monkeypatch):
     monkeypatch.setattr(start_states, "_KEPT", 0.7)
     world = later_world(envs, opened, share=0.5, size=2)
 
@@ -281,7 +272,7 @@ def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
     assert all(torch.equal(one, other) for one, other in zip(steps(9), expected, strict=True))
 
 
-def test_a_share_beyond_one_is_refused() -> None:
+def test_a_share_beyond_one_is_refused():
     with pytest.raises(TaccorlError, match=r"start_share=1\.5"):
         EnvSettings(start_share=1.5)
 
@@ -289,7 +280,7 @@ def test_a_share_beyond_one_is_refused() -> None:
 # shards ---------------------------------------------------------------------------------------------------------------
 
 
-def test_shards_give_what_one_gives(opened: Any) -> None:
+def test_shards_give_what_one_gives(opened):
     """Three environments at once, and as two and one: scenes, touch, randomised pictures, outcomes, last observations."""
 
     def made(*sizes: int) -> TwinWorld:

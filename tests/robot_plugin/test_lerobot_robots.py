@@ -81,7 +81,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "dataset", folder / "run.mcap"
 
 
-def test_check_calls_a_recorded_dataset_ok(recorded: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_calls_a_recorded_dataset_ok(recorded, capsys):
     assert taccorl(["check", str(recorded[0])]) == 0, capsys.readouterr().out
     episode = Dataset(recorded[0]).episode(0)
     assert ROWS <= episode.num_rows <= 1.15 * ROWS and episode.origin.domain == "surrogate"
@@ -93,15 +93,13 @@ def test_check_calls_a_recorded_dataset_ok(recorded: tuple[Path, Path], capsys: 
     np.testing.assert_allclose(states[1][0], states[0][0], atol=2e-3, err_msg="the scene is reset before each episode")
 
 
-def test_it_merges_with_an_ingested_dataset(recorded: tuple[Path, Path], dataset: Path, tmp_path: Path) -> None:
+def test_it_merges_with_an_ingested_dataset(recorded, dataset, tmp_path):
     words = ["merge", f"--real={recorded[0]}", f"--real={dataset}", f"--out={tmp_path / 'both'}"]
     assert taccorl([*words, f"--store={tmp_path / 'store'}"]) == 0
     assert Dataset(tmp_path / "both").num_episodes == 2 + Dataset(dataset).num_episodes
 
 
-def test_what_ran_is_ingested_as_any_recording(
-    recorded: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_ran_is_ingested_as_any_recording(recorded, tmp_path, capsys):
     out = tmp_path / "ingested"
     taccorl(["ingest", str(recorded[1]), f"--spec={SPEC}", f"--out={out}", f"--store={tmp_path / 'store'}"])
     assert "1 written, 0 split" in (shown := capsys.readouterr().out) and "lost" not in shown, shown
@@ -117,9 +115,7 @@ def test_what_ran_is_ingested_as_any_recording(
     assert np.isfinite(measured.effort[:ROWS]).all() and np.isnan(measured.velocity).all(), "unmeasured, not zero"
 
 
-def test_a_full_disk_is_named_and_the_episodes_before_it_are_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_is_named_and_the_episodes_before_it_are_whole(tmp_path, monkeypatch, capsys):
     robot = SimulatedRobot(tmp_path / "calibration", camera_px=64, paced=True)
     theirs = robot.get_observation
     monkeypatch.setattr(lerobot_hooks, "_FULL_BYTES", 1 << 60)  # no disk of today has more
@@ -171,9 +167,7 @@ def roll(
         strategy.teardown(made)
 
 
-def test_rollout_runs_our_policy_with_its_window_of_touch(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rollout_runs_our_policy_with_its_window_of_touch(checkpoint, tmp_path, monkeypatch):
     from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
     felt: list[tuple[int, ...]] = []
@@ -191,7 +185,7 @@ def test_rollout_runs_our_policy_with_its_window_of_touch(
     assert any("period" in line for line in robot.summary())
 
 
-def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_real_time_chunking_runs_it_too(checkpoint, tmp_path, monkeypatch):
     """A thread of LeRobot's predicts chunks, whose window of touch is in the observation; the loop only takes actions."""
     from lerobot.rollout.inference import RTCInferenceConfig
 
@@ -200,7 +194,7 @@ def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkey
     assert robot.commands > 5 and not robot.guard.stopped
 
 
-def test_real_time_chunking_executes_each_action_at_its_time() -> None:
+def test_real_time_chunking_executes_each_action_at_its_time():
     """The state is the number of the period, and chunks go on counting. LeRobot 0.6.1 is 1 to 2 actions ahead after each chunk,
     and guides a chunk towards 0 beyond what is left of the last."""
     from lerobot.rollout import context
@@ -252,9 +246,7 @@ def test_real_time_chunking_executes_each_action_at_its_time() -> None:
         (224, {}, "range of action: .* in the checkpoint, -2.97 … 3.14 rad"),  # its data are in degrees
     ],
 )
-def test_a_policy_of_another_robot_is_refused(
-    camera_px: int, change: dict, said: str, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_of_another_robot_is_refused(camera_px, change, said, checkpoint, tmp_path, monkeypatch):
     from lerobot.configs import PreTrainedConfig
     from safetensors.numpy import load_file, save_file
 
@@ -273,7 +265,7 @@ def test_a_policy_of_another_robot_is_refused(
         robot.connect()
 
 
-def test_an_episodic_rollout_begins_each_episode_in_a_new_scene_with_new_inference() -> None:
+def test_an_episodic_rollout_begins_each_episode_in_a_new_scene_with_new_inference():
     from lerobot.rollout.strategies.episodic import EpisodicStrategy
 
     lerobot_hooks.install()
@@ -289,7 +281,7 @@ def test_an_episodic_rollout_begins_each_episode_in_a_new_scene_with_new_inferen
     assert hasattr(EpisodicStrategy._policy_loop, "theirs")
 
 
-def test_no_action_is_consumed_while_the_arms_hold_an_old_observation() -> None:
+def test_no_action_is_consumed_while_the_arms_hold_an_old_observation():
     """Actions count. Without this, the first action after a hold of 5 periods is the 9th, not the 4th."""
     actions, guard = iter(torch.arange(16.0)), types.SimpleNamespace(holding="", is_late=False)
     engine = types.SimpleNamespace(get_action=lambda _: next(actions))
@@ -303,7 +295,7 @@ def test_no_action_is_consumed_while_the_arms_hold_an_old_observation() -> None:
     assert take(None).item() == 5
 
 
-def test_a_sleep_that_is_too_long_is_regained_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sleep_that_is_too_long_is_regained_by_the_next(monkeypatch):
     now, begun = [0.0], list[float]()
     monkeypatch.setattr(lerobot_hooks, "time", types.SimpleNamespace(perf_counter=lambda: now[0]))
 
@@ -319,7 +311,7 @@ def test_a_sleep_that_is_too_long_is_regained_by_the_next(monkeypatch: pytest.Mo
     assert now[0] == pytest.approx(10.5 + 0.08), "of the 10 s of a suspended computer 20 ms are regained"
 
 
-def test_an_error_of_ours_is_one_sentence_in_lerobots_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_of_ours_is_one_sentence_in_lerobots_commands(capsys):
     theirs: list[Any] = []
     show = lerobot_hooks._in_a_sentence(lambda *error: theirs.append(error))
     show(TaccorlError, TaccorlError("no surrogate answers"), None)

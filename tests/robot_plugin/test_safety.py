@@ -62,9 +62,7 @@ def fresh(robot: SimulatedRobot) -> None:
 
 @pytest.mark.parametrize("of_each", [1, pytest.param(20, marks=pytest.mark.slow)])  # 20 of 10 kinds: 200 faults
 @pytest.mark.parametrize("fault", FAULTS)
-def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(
-    fault: str, of_each: int, robot: SimulatedRobot, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(fault, of_each, robot, caplog):
     rng, right, moved = np.random.default_rng(FAULTS.index(fault)), 0, []
     for _ in range(of_each):
         fresh(robot)

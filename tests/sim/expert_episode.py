@@ -17,12 +17,9 @@ MIDDLE = 240  # control steps: both parts are in the hands
 class ExpertEpisode:
     """Of scene ``SEED``."""
 
-    actions: np.ndarray
-    """(T, 14) float32; the last one completes the task."""
-    middle: Snapshot
-    """After ``MIDDLE`` actions."""
-    late: Snapshot
-    """After all but three."""
+    actions: np.ndarray  # (T, 14) float32; the last one completes the task
+    middle: Snapshot  # After ``MIDDLE`` actions
+    late: Snapshot  # After all but three
 
 
 @functools.cache

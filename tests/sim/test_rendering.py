@@ -13,7 +13,7 @@ from mujoco.batch import Batch
 
 from taccorl.data.pictures import letterbox
 from taccorl.errors import TaccorlError
-from taccorl.sim.cameras import CameraConfig, Intrinsics, add_cameras, bench_cameras, project
+from taccorl.sim.cameras import CameraConfig, Intrinsics, add_cameras, bench_cameras, letterbox_window, project
 from taccorl.sim.rendering import Renderer, style
 from tests.fresh_python import fresh_python
 
@@ -33,6 +33,13 @@ def hands(spec: mujoco.MjSpec) -> None:
         body = spec.worldbody.add_body(name=f"{arm}_link6", pos=[0.3, side, 0.32], quat=[0, 1, 0, 0])
         body.add_joint(name=f"{arm}_joint", axis=[0, 1, 0.5])
         body.add_geom(size=[0.004, 0, 0], pos=[0, 0, 0.05], mass=0.1, group=3)  # not drawn
+
+
+def letterboxed(config: CameraConfig, rows: int, columns: int) -> Intrinsics:
+    camera = config.recorded_intrinsics()
+    window = letterbox_window((camera.rows, camera.columns), (rows, columns))
+    inner = camera.scaled(window.rows, window.columns)
+    return dataclasses.replace(inner, cx_px=inner.cx_px + window.left, cy_px=inner.cy_px + window.top)
 
 
 def spots(cameras: tuple[CameraConfig, ...] = bench_cameras(), radius_m: float = 0.008) -> mujoco.MjModel:
@@ -121,9 +128,7 @@ def unusual_front() -> CameraConfig:
     ("shape", "radius_m"), [((224, 224), 0.008), ((480, 640), 0.005), ((96, 130), 0.012), ((150, 96), 0.012)]
 )
 @pytest.mark.parametrize("front", [bench_cameras()[0], unusual_front()], ids=["nominal", "measured"])
-def test_a_point_lands_on_the_pixel_that_the_pinhole_model_says(
-    shape: tuple[int, int], radius_m: float, front: CameraConfig
-):
+def test_a_point_lands_on_the_pixel_that_the_pinhole_model_says(shape, radius_m, front):
     cameras = (front, *bench_cameras()[1:])
     model = spots(cameras, radius_m)
     data = mujoco.MjData(model)
@@ -133,7 +138,7 @@ def test_a_point_lands_on_the_pixel_that_the_pinhole_model_says(
     errors = []
     for config, picture in zip(cameras, pictures, strict=True):
         camera = data.camera(config.name)
-        intrinsics = config.recorded_intrinsics().letterboxed(*shape)
+        intrinsics = letterboxed(config, *shape)
         for position, color in SPOTS.items():
             expected = project(np.array(position), camera.xpos, camera.xmat.reshape(3, 3), intrinsics)
             errors.append(centre_of(picture, color) - expected)
@@ -199,7 +204,7 @@ def test_cameras_of_unlike_shape_share_a_sheet(max_sheet_px: int):
         with Renderer(model, [name]) as renderer:
             assert np.array_equal(renderer.render([data] * 4)[:, 0], pictures[:, column])
     camera = data.camera("left_wrist")
-    intrinsics = wide.recorded_intrinsics().letterboxed(224, 224)
+    intrinsics = letterboxed(wide, 224, 224)
     for position, color in SPOTS.items():
         expected = project(np.array(position), camera.xpos, camera.xmat.reshape(3, 3), intrinsics)
         assert np.abs(centre_of(pictures[1, 1], color) - expected).max() < 0.5

@@ -55,9 +55,7 @@ def alone(episode: ExpertEpisode) -> list[list[dict]]:
 
 
 @pytest.mark.parametrize(("num_envs", "num_threads"), [(1, 1), (3, 1), (3, 2), (8, 1), (8, 2)])
-def test_company_and_threads_change_no_bit(
-    num_envs: int, num_threads: int, alone: list[list[dict]], episode: ExpertEpisode
-) -> None:
+def test_company_and_threads_change_no_bit(num_envs, num_threads, alone, episode):
     envs = vector(num_envs, num_threads=num_threads)
     observation, _ = envs.reset(seed=[7 + i for i in range(num_envs)])
     for k in range(NUM_STEPS + 1):
@@ -71,7 +69,7 @@ def test_company_and_threads_change_no_bit(
     assert np.abs(observation[TACTILE][-1]).max() > 30  # and there was something to feel
 
 
-def test_a_chunk_equals_its_single_steps(episode: ExpertEpisode) -> None:
+def test_a_chunk_equals_its_single_steps(episode):
     by_chunk, by_step = vector(3), vector(3)
     state = together(*[episode.middle] * 3)
     for envs in (by_chunk, by_step):
@@ -86,7 +84,7 @@ def test_a_chunk_equals_its_single_steps(episode: ExpertEpisode) -> None:
     assert not np.array_equal(chunk.observation[STATE][0], chunk.observation[STATE][2])
 
 
-def test_success_within_a_chunk_counts_once_and_the_rest_of_it_is_not_carried_out(episode: ExpertEpisode) -> None:
+def test_success_within_a_chunk_counts_once_and_the_rest_of_it_is_not_carried_out(episode):
     envs, single = vector(2), TaccorlEnv("assembly_1", images=False)
     envs.reset(seed=[3, 4], options={"state": together(episode.late, episode.middle)})
     actions = np.stack([np.r_[episode.actions[-3:], episode.actions[:5]], episode.actions[MIDDLE : MIDDLE + 8]])
@@ -109,7 +107,7 @@ def test_success_within_a_chunk_counts_once_and_the_rest_of_it_is_not_carried_ou
     assert same(row(observation, 0), single.step(episode.actions[0])[0])
 
 
-def test_autoreset_happens_in_the_step_that_ends_an_episode(episode: ExpertEpisode) -> None:
+def test_autoreset_happens_in_the_step_that_ends_an_episode(episode):
     envs, frozen = vector(2, max_episode_steps=3), vector(2, max_episode_steps=3, autoreset=AutoresetMode.DISABLED)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     for e in (envs, frozen):
@@ -127,7 +125,7 @@ def test_autoreset_happens_in_the_step_that_ends_an_episode(episode: ExpertEpiso
     assert not envs.step(episode.actions[:2])[3].any()
 
 
-def test_without_autoreset_what_is_over_waits_for_the_mask(episode: ExpertEpisode) -> None:
+def test_without_autoreset_what_is_over_waits_for_the_mask(episode):
     envs = vector(2, autoreset=AutoresetMode.DISABLED)
     envs.reset(seed=1, options={"state": together(episode.late, episode.middle)})
     ended = envs.step_chunk(for_all(episode.actions[-3:], 2))
@@ -142,7 +140,7 @@ def test_without_autoreset_what_is_over_waits_for_the_mask(episode: ExpertEpisod
     assert not envs.step(episode.actions[:2])[2].any()
 
 
-def test_seeds_are_a_function_of_root_environment_and_episode(episode: ExpertEpisode) -> None:
+def test_seeds_are_a_function_of_root_environment_and_episode(episode):
     def expected(root: int, i: int, k: int) -> int:
         return int(np.random.SeedSequence(root, spawn_key=(i, k)).generate_state(1)[0])
 
@@ -160,7 +158,7 @@ def test_seeds_are_a_function_of_root_environment_and_episode(episode: ExpertEpi
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("broken", ["qpos", "qvel"])
-def test_a_diverged_simulation_fails_alone(broken: str, episode: ExpertEpisode) -> None:
+def test_a_diverged_simulation_fails_alone(broken, episode):
     healthy, ill = vector(3), vector(3)
     runs: dict[str, list] = {"healthy": [], "ill": []}
     for name, envs in (("healthy", healthy), ("ill", ill)):
@@ -198,7 +196,7 @@ class Camera:
         return {name: pictures.copy() for name in cameras}
 
 
-def test_pictures_are_taken_only_when_asked_for(monkeypatch: pytest.MonkeyPatch, episode: ExpertEpisode) -> None:
+def test_pictures_are_taken_only_when_asked_for(monkeypatch, episode):
     camera = Camera(monkeypatch)
     envs = vector(2, images="on_request")
     observation, _ = envs.reset(seed=0)
@@ -214,9 +212,7 @@ def test_pictures_are_taken_only_when_asked_for(monkeypatch: pytest.MonkeyPatch,
         never.observe(images=True)
 
 
-def test_a_chunk_takes_one_picture_and_one_more_of_what_ended(
-    monkeypatch: pytest.MonkeyPatch, episode: ExpertEpisode
-) -> None:
+def test_a_chunk_takes_one_picture_and_one_more_of_what_ended(monkeypatch, episode):
     camera = Camera(monkeypatch)
     envs = vector(2, images="always", render_mode="rgb_array")
     first, _ = envs.reset(seed=0, options={"state": together(episode.late, episode.middle)})
@@ -230,7 +226,7 @@ def test_a_chunk_takes_one_picture_and_one_more_of_what_ended(
     assert frames is not None and [f[0, 0, 0] for f in frames] == [3, 12] and len(camera.asked) == 3
 
 
-def test_what_stands_still_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch, episode: ExpertEpisode) -> None:
+def test_what_stands_still_is_not_drawn_again(monkeypatch, episode):
     camera = Camera(monkeypatch)
     envs = vector(2, images="always", autoreset=AutoresetMode.DISABLED)
     envs.reset(seed=0, options={"state": together(episode.late, episode.middle)})
@@ -239,7 +235,7 @@ def test_what_stands_still_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch, e
     assert [pictures[:, 0, 0, 0].tolist() for pictures in seen] == [[2, 12], [2, 13]]
 
 
-def test_wrong_input_is_named(episode: ExpertEpisode) -> None:
+def test_wrong_input_is_named(episode):
     with pytest.raises(TaccorlError, match="images: 'alway' does not exist; did you mean 'always'"):
         vector(1, images="alway")
     envs = vector(2)
@@ -261,13 +257,13 @@ def test_wrong_input_is_named(episode: ExpertEpisode) -> None:
         envs.reset(options={"reset_mask": np.array([0, 1])})
 
 
-def test_calls_answer_for_every_environment() -> None:
+def test_calls_answer_for_every_environment():
     envs = vector(3)
     assert envs.call("task_description") == ("insert the orange plug into the grey socket in the air",) * 3
     assert envs.get_attr("_max_episode_steps") == (900, 900, 900)
 
 
-def test_a_bad_action_ends_its_own_episode_and_is_not_carried_out(episode: ExpertEpisode) -> None:
+def test_a_bad_action_ends_its_own_episode_and_is_not_carried_out(episode):
     healthy, ill = vector(3), vector(3)
     actions = for_all(episode.actions[MIDDLE : MIDDLE + 4], 3)
     broken = actions.copy()
@@ -292,7 +288,7 @@ def test_a_bad_action_ends_its_own_episode_and_is_not_carried_out(episode: Exper
     assert same(row(chunk.observation, 1), single.reset(seed=int(chunk.info["seed"][1]))[0])
 
 
-def test_an_episode_that_is_over_takes_any_action_without_autoreset(episode: ExpertEpisode) -> None:
+def test_an_episode_that_is_over_takes_any_action_without_autoreset(episode):
     envs = vector(2, autoreset=AutoresetMode.DISABLED)
     envs.reset(seed=0)
     nonsense = np.full((2, 1, 14), np.nan)

@@ -1,9 +1,6 @@
 """The study of sensors of cells: what counts as exact, its table, and its section of the page."""
 
 import dataclasses
-from pathlib import Path
-
-import pytest
 
 from pipelines import diagnosis_page
 from pipelines.studies.cells import CellsRow, run_cells, table
@@ -21,7 +18,7 @@ ROW = CellsRow(
 )
 
 
-def test_exact_is_the_hidden_effect_alone_and_of_a_clean_sensor_nothing() -> None:
+def test_exact_is_the_hidden_effect_alone_and_of_a_clean_sensor_nothing():
     assert ROW.exact
     assert not dataclasses.replace(ROW, found=("taxel_creep", "touch_lag")).exact
     assert not dataclasses.replace(ROW, found=()).exact
@@ -29,7 +26,7 @@ def test_exact_is_the_hidden_effect_alone_and_of_a_clean_sensor_nothing() -> Non
     assert not dataclasses.replace(ROW, before=1.4).material
 
 
-def test_the_table_has_a_line_an_effect_and_names_each_case_that_was_not_exact() -> None:
+def test_the_table_has_a_line_an_effect_and_names_each_case_that_was_not_exact():
     wrong = dataclasses.replace(ROW, seed=2, found=("touch_lag",), error=float("nan"), status="something_else")
     lines = table([ROW, wrong, dataclasses.replace(ROW, seed=3, before=1.2, found=())])
     assert "| taxel_creep | 3 | 2 | 1 of 2 | 9.00 | 1.00 | 2.0% |" in lines
@@ -37,13 +34,13 @@ def test_the_table_has_a_line_an_effect_and_names_each_case_that_was_not_exact()
     assert "taxel_creep (seed 3): nothing, at_floor" in lines[-1]
 
 
-def test_one_case_is_run() -> None:
+def test_one_case_is_run():
     row = run_cells("", 3)
     assert row.exact and row.status == "nothing_missing"
     assert row.after < 1.3
 
 
-def test_a_section_is_replaced_and_others_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_section_is_replaced_and_others_stay(tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text("# Own\n\n## Design\n\ntext\n")
     monkeypatch.setattr(diagnosis_page, "PAGE", page)

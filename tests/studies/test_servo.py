@@ -27,7 +27,7 @@ from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 
 
-def test_a_study_whose_rows_are_all_there_runs_nothing(tmp_path: Path):
+def test_a_study_whose_rows_are_all_there_runs_nothing(tmp_path):
     """A row names a wrong data sheet otherwise than its job does, so that the seed alone says whether a job is done."""
     shipped = Path(__file__).parents[2] / "docs" / "pendulum_study.jsonl"
     rows = tmp_path / "rows.jsonl"
@@ -76,9 +76,7 @@ def swings(servo: tuple[Servo, Path]) -> Measurements:
     return read_measurements(servo[1] / "swings", units={"servo": "rad"})
 
 
-def test_its_tables_hold_five_loads_at_three_gains_as_a_script_would_log_them(
-    servo: tuple[Servo, Path], swings: Measurements
-):
+def test_its_tables_hold_five_loads_at_three_gains_as_a_script_would_log_them(servo, swings):
     made, folder = servo
     assert len(swings.all) == len(LOADS) * len(GAINS) + 2 and len(swings.validation) == len(swings.test) == 3
     assert {m.payload_kg["servo"] for m in swings.all} == {mass for mass, _ in LOADS}
@@ -94,15 +92,13 @@ def test_its_tables_hold_five_loads_at_three_gains_as_a_script_would_log_them(
     assert "SIMULATED" in "".join(p.name for p in folder.iterdir()) and swings.fit[0].origin.domain == "surrogate"
 
 
-def test_what_is_hidden_is_in_no_file_that_the_user_has(servo: tuple[Servo, Path]):
+def test_what_is_hidden_is_in_no_file_that_the_user_has(servo):
     made, folder = servo
     text = (folder / "servo.yaml").read_text() + (folder / "swings" / "measurements.yaml").read_text()
     assert "load_friction" not in text and f"{made.strength:.3f}" not in text
 
 
-def test_with_the_hidden_effect_its_own_numbers_reach_the_noise_and_without_they_do_not(
-    servo: tuple[Servo, Path], swings: Measurements
-):
+def test_with_the_hidden_effect_its_own_numbers_reach_the_noise_and_without_they_do_not(servo, swings):
     """Simulated truth: what the generator ran with, in 3 % or three floors; the search's model shares no code with it."""
     made, folder = servo
     problem = AxisProblem(load_axis(folder / "servo.yaml"), swings)
@@ -120,7 +116,7 @@ def test_with_the_hidden_effect_its_own_numbers_reach_the_noise_and_without_they
 
 
 @pytest.mark.slow
-def test_friction_that_grows_with_the_load_is_found_from_the_tables(servo: tuple[Servo, Path], swings: Measurements):
+def test_friction_that_grows_with_the_load_is_found_from_the_tables(servo, swings):
     problem = AxisProblem(load_axis(servo[1] / "servo.yaml"), swings)
     begun = {"start": problem.start, "present": problem.present, "config": SearchConfig(max_effects=1)}
     found = diagnose(problem, problem.fit, problem.validation, problem.test, **begun)

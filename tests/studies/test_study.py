@@ -11,20 +11,15 @@ from pipelines.studies.joints_and_pads import (
     Job,
     conditions,
     drop_said,
-    dropped,
     exact,
     exact_but_for_algebra,
     failed,
     inside,
-    loop,
+    jobs,
     material,
     named,
-    nothing,
-    pairs,
-    removed,
     run,
     silently_wrong,
-    single,
 )
 from taccorl.sim.effects import effects
 from taccorl.surrogate.hidden import KINDS
@@ -132,19 +127,19 @@ def test_a_failed_case_is_material_so_that_it_counts():
 
 
 def test_every_condition_is_as_frequent_as_it_is_said_to_be():
-    def share(jobs: list[Job], name: str) -> float:
-        return sum(getattr(conditions(job), name) for job in jobs) / len(jobs)
+    def share(of: list[Job], name: str) -> float:
+        return sum(getattr(conditions(job), name) for job in of) / len(of)
 
-    clean = nothing("chirp", range(20000, 20162))
+    clean = jobs("none", "chirp", [""], range(20000, 20162))
     shares = [share(clean, n) for n in ("loaded", "sampled", "coloured", "effort")]
     assert shares == pytest.approx([1 / 3] * 4, abs=0.01)  # efforts: half of the two thirds without a sampled loop
     assert not any(conditions(j).sampled and conditions(j).effort for j in clean)
-    assert all(conditions(j).sampled and conditions(j).effort for j in loop("chirp", [1, 2]))
-    hidden = single("pack", ["cogging", "backlash", "payload"], range(20000, 20016))
+    assert all(conditions(j).sampled and conditions(j).effort for j in jobs("loop", "chirp", [""], [1, 2]))
+    hidden = jobs("single", "pack", ["cogging", "backlash", "payload"], range(20000, 20016))
     assert [share(hidden, n) for n in ("effort", "sampled", "coloured", "loaded")] == [0.5, 0.5, 0.25, 0.0]
-    both = {(conditions(j).effort, conditions(j).sampled) for j in single("chirp", ["cogging"], range(4))}
+    both = {(conditions(j).effort, conditions(j).sampled) for j in jobs("single", "chirp", ["cogging"], range(4))}
     assert len(both) == 4  # every combination within four seeds
-    assert conditions(clean[5]) == conditions(nothing("pack", [20005])[0])
+    assert conditions(clean[5]) == conditions(jobs("none", "pack", [""], [20005])[0])
     assert isinstance(conditions(clean[0]), Conditions)
 
 
@@ -152,17 +147,21 @@ def test_keys_tell_jobs_apart_and_are_the_same_for_the_same_job():
     assert Job(study="single", hidden=("cogging",), seed=3, design="pack").key == "single pack cogging seed 3"
     strong = Job(study="single", hidden=("cogging",), seed=3, design="pack", strength=2.0)
     assert strong.key == "single pack cogging at 2 seed 3"
-    couples = [("backlash", "cogging"), ("cogging", "backlash")]
-    jobs = [
-        *single("chirp", ["cogging", "backlash"], [0, 1]),
-        *single("pack", ["cogging", "backlash"], [0, 1]),
-        *nothing("chirp", [0, 1]),
-        *removed("chirp", ["cogging"], [0, 1]),
-        *pairs("chirp", couples, [0, 1]),
-        *dropped("chirp", [0, 1]),
+    one, two = ["cogging", "backlash"], ["backlash+cogging", "cogging+backlash"]
+    made = [
+        *jobs("single", "chirp", one, [0, 1]),
+        *jobs("single", "pack", one, [0, 1]),
+        *jobs("none", "chirp", [""], [0, 1]),
+        *jobs("removed", "chirp", ["cogging"], [0, 1]),
+        *jobs("pairs", "chirp", two, [0, 1]),
     ]
-    assert len({job.key for job in jobs}) == len(jobs) == 18
-    assert {job.key for job in nothing("chirp", [0])} == {"none chirp none seed 0"}
+    assert len({job.key for job in made}) == len(made) == 16
+    assert made[8].key == "none chirp none seed 0" and [job.without for job in made[9:12]] == [
+        (),
+        ("cogging",),
+        ("cogging",),
+    ]
+    assert made[-1].hidden == ("cogging", "backlash")
 
 
 @pytest.mark.slow

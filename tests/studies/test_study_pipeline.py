@@ -4,20 +4,20 @@ import json
 from typing import Any
 
 from pipelines import diagnosis_page, diagnosis_study
-from pipelines.studies.joints_and_pads import Job, failed, single
+from pipelines.studies.joints_and_pads import Job, failed, jobs
 from taccorl.lineage.processes import Done, Failed
 
 
 def test_pads_come_first_and_reference_loops_are_among_the_cases():
-    jobs = [*single("chirp", ["cogging"], range(60)), *single("press", ["touch_lag"], range(30))]
-    order = diagnosis_study.ordered(jobs, "now")
+    made = [*jobs("single", "chirp", ["cogging"], range(60)), *jobs("single", "press", ["touch_lag"], range(30))]
+    order = diagnosis_study.ordered(made, "now")
     assert [j.design for j in order if isinstance(j, Job)] == ["press"] * 30 + ["chirp"] * 60
     assert [k for k, j in enumerate(order) if isinstance(j, str)] == [0, 41, 82]
 
 
 def test_final_seeds_are_none_that_anything_was_tuned_on():
-    for name, jobs in diagnosis_study.STUDIES.items():
-        seeds = {j.seed for j in jobs(diagnosis_study.FIRST_SEED, 10)}
+    for name, jobs_of in diagnosis_study.STUDIES.items():
+        seeds = {j.seed for j in jobs_of(diagnosis_study.FIRST_SEED, 10)}
         assert min(seeds) >= 60000, name
     assert len(diagnosis_study.STUDIES["none"](0, 10)) >= 150 and len(diagnosis_study.STUDIES["outside"](0, 10)) >= 60
 
@@ -32,8 +32,8 @@ def test_of_a_case_that_was_run_again_the_last_row_counts(tmp_path, monkeypatch)
 
 def test_a_run_skips_what_is_there_and_stores_what_fails(tmp_path, monkeypatch, capsys):
     path = tmp_path / "rows.jsonl"
-    jobs = single("chirp", ["cogging", "backlash", "slew_limit"], [300])
-    path.write_text(json.dumps(row(jobs[0])) + "\n")
+    made = jobs("single", "chirp", ["cogging", "backlash", "slew_limit"], [300])
+    path.write_text(json.dumps(row(made[0])) + "\n")
 
     def ran(work, these, workers, name, take, care, first):
         for k, job in enumerate(these):
@@ -42,11 +42,11 @@ def test_a_run_skips_what_is_there_and_stores_what_fails(tmp_path, monkeypatch, 
                 take(k, Done(row(job)) if good else Failed("ValueError: no", "Traceback\nValueError: no"))
 
     monkeypatch.setattr(diagnosis_study, "run_in_processes", ran)
-    monkeypatch.setitem(diagnosis_study.STUDIES, "chirp", lambda first, n: jobs)
+    monkeypatch.setitem(diagnosis_study.STUDIES, "chirp", lambda first, n: made)
     diagnosis_study.main(["chirp", f"--rows={path}"])
     rows = {r["key"]: r for r in diagnosis_study.read_rows(path)}
-    assert [r for r in rows if r.startswith("single")] == [j.key for j in jobs]
-    assert rows[jobs[2].key]["failed"] == "Traceback\nValueError: no"
+    assert [r for r in rows if r.startswith("single")] == [j.key for j in made]
+    assert rows[made[2].key]["failed"] == "Traceback\nValueError: no"
     assert "2 rows more, 1 of them of cases that failed" in capsys.readouterr().out
 
 
@@ -80,8 +80,8 @@ def row(job: Job, **other: Any) -> dict[str, Any]:
 def test_the_page_counts_failed_cases_as_wrong_and_shows_them(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").mkdir()
-    jobs = single("chirp", ["cogging"], range(20000, 20004))
-    rows = [row(j) for j in jobs[:3]] + [failed(jobs[3], "Traceback\nValueError: no robot")]
+    made = jobs("single", "chirp", ["cogging"], range(20000, 20004))
+    rows = [row(j) for j in made[:3]] + [failed(made[3], "Traceback\nValueError: no robot")]
     rows.append({"key": "m", "study": "machine", "machine": "EPYC, 16 cores", "workers": 16})
     rows += [{"key": f"reference {k}", "study": "reference", "cpu_s": s} for k, s in enumerate((2.0, 2.4, 3.0))]
     diagnosis_page.write_page(rows)

@@ -1,23 +1,41 @@
-"""Surrogate robots drawn at random: the same for the same seed, as strong as asked, and at the floor where nothing is hidden."""
+"""Surrogate robots drawn at random: same seed, same robot; as strong as asked; sampled loops; conditions of their recordings."""
 
+import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter
 
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.motions import CHIRP, POSES, RATE_HZ, Motion, Room
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import TOUCH_SLOTS
+from taccorl.sim.robot import link_poses
 from taccorl.sim.twin import TwinConfig
-from taccorl.surrogate.cases import Case, case_of, draw_case, draw_secret
-from taccorl.surrogate.hidden import KINDS, NOT_FITTED, OUTSIDE, REGISTERED
-from taccorl.surrogate.recordings import recordings
+from taccorl.surrogate.arm import GRAVITY
+from taccorl.surrogate.cases import LOOP_FLOORS, PAYLOAD_KG, Case, case_of, draw_case, draw_secret
+from taccorl.surrogate.hidden import KINDS, NOT_FITTED, OUTSIDE, REGISTERED, Change
+from taccorl.surrogate.plant import STEP_S
+from taccorl.surrogate.recordings import record, recordings
+from taccorl.surrogate.robot import (
+    LOST_RUN,
+    NOISE_RAD,
+    PAYLOAD_LINK6_M,
+    TWIN_LATE_S,
+    Robot,
+    free_inertia,
+    inertia_and_weight,
+)
+from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable, spectral_radius
 from taccorl.surrogate.touch import touch_case_of
 
 FEW = ("coulomb_friction", "command_delay", "backlash", "payload")  # of the registry: all of them with make test-slow
@@ -190,3 +208,187 @@ def test_secrets_are_of_every_sort():
     for names in drawn:
         if names:
             assert set.intersection(*(set(KINDS[n].joints) for n in names))
+
+
+JOINT = 1  # no weight
+POSE = POSES[JOINT - 1]
+INERTIA, _ = inertia_and_weight(np.array(POSE), JOINT)
+OMEGA, ZETA = 12.0, 1.2
+KP, KD = INERTIA * OMEGA**2, 2 * ZETA * OMEGA * INERTIA
+ROOM = Room.of(JOINT, POSE[JOINT - 1], INERTIA, 0.0)
+LOOP = SampledLoop(steps=8, filter_s=2e-3)
+
+
+def test_rates_are_from_half_to_four_kilohertz():
+    assert [round(1 / (steps * STEP_S)) for steps in PERIODS_STEPS] == [4000, 2000, 1600, 1000, 800, 500]
+
+
+@pytest.mark.parametrize(("share", "stable"), [(0.99, True), (1.01, False)])
+def test_without_low_pass_a_velocity_loop_is_stable_up_to_two_inertias_a_period(share, stable):
+    # w_k = (v_k + v_{k-1}) / 2 and v_{k+1} = v_k − g w_k with g = K_d T / J: z² − z + g (z + 1) / 2 = 0, |z|² = g / 2 < 1.
+    loop = SampledLoop(steps=8, filter_s=0.0)
+    kd = share * 2 * INERTIA / loop.period_s
+    assert (spectral_radius(loop, 1e-9, kd, INERTIA) < 1 + 1e-6) == stable
+
+
+@pytest.mark.parametrize(("share", "grows"), [(0.8, False), (1.3, True)])
+def test_the_plant_rings_where_the_eigenvalues_say_so(share, grows):
+    damping = np.arange(100.0, 3000.0, 5.0) * INERTIA
+    light = free_inertia(np.array(POSE), JOINT)  # at some 50 Hz the other joints give way
+    assert 0.3 * INERTIA < light < INERTIA
+    most = next(kd for kd in damping if spectral_radius(LOOP, KP, kd, light) >= 1.0)
+    step = Motion(name="made", target=lambda room: np.repeat([0.0, 0.05], [20, 180]))
+    run = Robot(f"left_joint{JOINT}", (KP, share * most, 0.0), [], POSE, loop=LOOP).run(step, ROOM)
+    assert (np.ptp(run.angle[-100:, 0]) > 0.02) == grows  # the other joints damp what grows
+
+
+def test_the_margin_counts_doubled_gains_and_every_inertia():
+    most = 2 * INERTIA / (1e-3 * 1.0)
+    loop = SampledLoop(steps=8, filter_s=1e-6)
+    assert is_stable(loop, 1e-6, most / 3.3, [INERTIA])
+    assert not is_stable(loop, 1e-6, most / 3.1, [INERTIA])
+    assert not is_stable(loop, 1e-6, most / 3.3, [INERTIA, 0.4 * INERTIA])
+
+
+def linear(inertia: float) -> np.ndarray:
+    discrete: Any = cont2discrete(([KP / inertia], [1.0, KD / inertia, KP / inertia]), 1 / RATE_HZ)
+    return np.asarray(lfilter(np.ravel(discrete[0]), discrete[1], CHIRP.target(ROOM) - POSE[JOINT - 1]))
+
+
+def test_a_sampled_loop_moves_as_a_lighter_joint_does():
+    run = Robot(f"left_joint{JOINT}", (KP, KD, 0.0), [], POSE, loop=LOOP).run(CHIRP, ROOM)
+    angle = run.angle[::5, 0] - POSE[JOINT - 1]
+    # K_d of the drive is larger by K_p (T / 2 + half of the twin's step), see ``TWIN_LATE_S``.
+    late = (KD + KP * (0.5 * LOOP.period_s + TWIN_LATE_S)) * LOOP.late_s
+    assert late / INERTIA == pytest.approx(0.088, abs=0.002)  # K_p from angles and J is 9.6 % too large
+    as_light, as_heavy = (rms(angle - linear(inertia)) for inertia in (INERTIA - late, INERTIA))
+    assert as_light < 0.4 * as_heavy  # the twin's half step is left
+
+
+def test_a_drawn_loop_is_no_later_than_asked():
+    rng = np.random.default_rng(0)
+    drawn = [draw_loop(rng, 1.5e-3) for _ in range(200)]
+    assert {loop.steps for loop in drawn} == {2, 4, 5, 8}
+    assert all(loop.late_s <= 1.5e-3 + 1e-12 and loop.filter_s >= FILTER_S[0] for loop in drawn)
+    assert draw_loop(rng, 1e-4).late_s == pytest.approx(2 * STEP_S + FILTER_S[0])  # nothing is faster
+
+
+def test_a_drawn_case_has_a_stable_loop_that_alone_leaves_next_to_nothing():
+    case = draw_case(["coulomb_friction"], 301, signal="left_joint1", strength=8.0, design="chirp", sampled=True)
+    assert case.loop is not None and case.loop_floors <= LOOP_FLOORS
+    assert is_stable(case.loop, *case.gains[:2], [inertia_and_weight(np.array(case.pose), 1)[0]])
+    truth = case.truth()
+    torque = case.hidden[0].values["torque_nm"]
+    assert truth["loop_hz"] == pytest.approx(1 / case.loop.period_s)
+    ratios = truth["ratios"]
+    assert isinstance(ratios, dict)
+    assert ratios["coulomb_friction.torque_nm/kp"] == pytest.approx(torque / case.gains[0])
+    late_s = 0.5 * case.loop.period_s + TWIN_LATE_S  # of K_p, which the timing takes from the drive's K_d
+    assert ratios["kd/kp"] == pytest.approx(case.gains[1] / case.gains[0] + late_s)
+    assert math.isclose(case.left_floors, 8.0, rel_tol=0.25)
+
+
+@pytest.mark.slow
+def test_where_no_loop_is_stable_a_gear_keeps_the_continuous_one_and_any_other_robot_is_refused(monkeypatch):
+    monkeypatch.setattr("taccorl.surrogate.cases.is_stable", lambda *_: False)
+    case = draw_case(["backlash"], 302, signal="left_joint2", strength=8.0, design="chirp", sampled=True)
+    assert case.loop is None
+    assert case.gains == draw_case(["backlash"], 302, signal="left_joint2", strength=8.0, design="chirp").gains
+    with pytest.raises(TaccorlError, match="no sampled loop of left_joint2, seed 302, is stable"):
+        draw_case([], 302, signal="left_joint2", design="chirp", sampled=True)
+
+
+def test_a_known_mass_sits_between_the_pads():
+    assert (0.0, 0.0, ROBOT.tcp_from_hand_m) == PAYLOAD_LINK6_M
+    pose = np.array(POSES[4])
+    without, held = (inertia_and_weight(pose, 5, kg)[1] for kg in (0.0, 0.3))
+    wrist, hand = link_poses(pose)[4], link_poses(pose)[5]
+    lever = hand[:3, 3] + ROBOT.tcp_from_hand_m * hand[:3, 2] - wrist[:3, 3]
+    # Torque about the joint's axis z: (r × m g) · z, which the motor holds with the opposite sign.
+    weight = np.cross(lever, [0.0, 0.0, -0.3 * GRAVITY]) @ wrist[:3, 2]
+    assert held - without == pytest.approx(-weight, rel=1e-9)
+
+
+def test_it_is_gripped_a_few_millimetres_off_its_middle_on_each_robot_elsewhere():
+    places = np.array([draw_case([], seed, design="chirp").payload_m for seed in (300, 301, 302)]) - PAYLOAD_LINK6_M
+    assert 1e-4 < np.abs(places).max() < 8e-3
+    assert len(np.unique(places)) == places.size
+
+
+def test_a_loaded_robot_holds_a_weighed_mass_in_every_recording():
+    case = draw_case([], 303, signal="left_joint5", design="chirp", loaded=True)
+    assert PAYLOAD_KG[0] <= case.payload_kg <= PAYLOAD_KG[1]
+    assert record(case, CHIRP).payload_kg == {"left": case.payload_kg}
+    both = record(case, dataclasses.replace(CHIRP, payload_kg=0.3))
+    assert both.payload_kg["left"] == pytest.approx(case.payload_kg + 0.3)
+    assert draw_case([], 303, signal="left_joint5", design="chirp").payload_kg == 0.0
+
+
+def test_of_lost_commands_the_one_before_is_held():
+    share = 0.06
+    robot = Robot("left_joint1", (1.0, 0.1, 0.0), [Change(dropped=share)], POSES[0])
+    arrived = robot._lost(40000, np.random.default_rng(0))
+    held = np.arange(40000) - arrived
+    assert (held > 0).mean() == pytest.approx(share, rel=0.06)
+    lengths = np.bincount(held)[1:]  # how long a command has been held
+    alone = (lengths[0] - lengths[1]) / lengths[0]
+    assert alone == pytest.approx(LOST_RUN[0], abs=0.05)  # runs that meet each other are longer
+    assert (robot._lost(1000, np.random.default_rng(1)) != robot._lost(1000, np.random.default_rng(2))).any()
+    whole = Robot("left_joint1", (1.0, 0.1, 0.0), [], POSES[0])._lost(1000, np.random.default_rng(1))
+    np.testing.assert_array_equal(whole, np.arange(1000))
+
+
+def test_a_lost_command_moves_the_joint_a_period_late_and_stays_in_the_log():
+    case = draw_case(["dropped_commands"], 304, signal="left_joint1", design="chirp")
+    assert 0.01 <= case.hidden[0].values["probability"] <= 0.1
+    plain = dataclasses.replace(case, hidden=())
+    one, other = record(case, CHIRP), record(plain, CHIRP)
+    np.testing.assert_array_equal(one.target, other.target)  # what was sent is logged as sent
+    again = record(case, dataclasses.replace(CHIRP, name="chirp_again"))
+    assert np.abs(one.measured - again.measured)[:, 0].max() > 3 * NOISE_RAD  # other commands are lost
+
+
+def test_coloured_noise_is_as_large_as_white_and_lasts():
+    white = draw_case([], 305, signal="left_joint1", design="chirp")
+    coloured = draw_case([], 305, signal="left_joint1", design="chirp", coloured=True)
+    still = Motion(name="still", target=lambda room: np.zeros(4000))
+    resting = slice(7, 13)  # the other arm
+    for case, memory in ((white, 0.0), (coloured, np.exp(-1 / (200 * coloured.colour_s)))):
+        noise = record(case, still).measured[:, resting]
+        noise = noise - noise.mean(axis=0)
+        assert noise.std() == pytest.approx(NOISE_RAD, rel=0.15)
+        assert (noise[1:] * noise[:-1]).mean() / noise.var() == pytest.approx(memory, abs=0.1)
+    assert coloured.colour_s > 0.0 and white.colour_s == 0.0
+
+
+def made(change: Change, target: np.ndarray, kp: float = 5.0) -> np.ndarray:
+    """(T, 2) angle from the middle and effort of joint 1, which has no weight."""
+    robot = Robot("left_joint1", (kp, 0.5, 0.0), [change], POSES[0])
+    run = robot.run(Motion(name="made", target=lambda room: target), Room.of(1, 0.0, 0.02, 0.0))
+    return np.column_stack([run.angle[::5, 0], run.effort[::5, 0]])
+
+
+SLOW = 0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0])  # 0.1 rad/s
+
+
+def test_gains_that_differ_by_direction_hold_a_spring_differently():
+    drive = {"one_way": 0.2, "spring": 1.0, "spring_rest": 0.0}
+    for side, gain in ((1.0, 1.2), (-1.0, 0.8)):
+        end = made(Change(drive=drive), side * np.repeat([0.0, 0.3], [100, 700]))[-1, 0]
+        assert end == pytest.approx(side * 0.3 * 5.0 * gain / (5.0 * gain + 1.0), abs=1e-4)
+
+
+def test_a_hung_mass_is_inertia_to_slow_motion_and_rings_at_its_own_frequency():
+    drive = {"hung_inertia": 0.004, "hung_rad_per_s": 2 * np.pi * 5.0, "hung_damping": 0.02}
+    step = np.repeat([0.0, 0.05], [100, 900])
+    rest = made(Change(drive=drive), step)[300:, 0] - 0.05
+    spectrum = np.abs(np.fft.rfft(rest * np.hanning(len(rest))))
+    hz = np.fft.rfftfreq(len(rest), 0.005)
+    assert hz[3:][np.argmax(spectrum[3:])] == pytest.approx(5.0, rel=0.25)
+    assert np.abs(rest).max() > 5 * np.abs(made(Change(), step)[300:, 0] - 0.05).max()
+
+
+def test_kinds_are_registered_or_outside_or_not_fitted():
+    assert set(REGISTERED) | set(OUTSIDE) | set(NOT_FITTED) == set(KINDS)
+    assert set(REGISTERED) <= set(effects) and not set(OUTSIDE) & set(effects)
+    assert len(OUTSIDE) >= 10

@@ -36,8 +36,7 @@ def joint(run: Run) -> np.ndarray:
 
 
 REST = of_targets(np.zeros(400))
-SLOW = of_targets(0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0]))
-"""0.1 rad/s."""
+SLOW = of_targets(0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0]))  # 0.1 rad/s
 
 
 def test_without_effects_a_joint_is_the_linear_one_of_its_inertia_and_gains():

@@ -47,7 +47,7 @@ def read(written: tuple[Path, TouchRecordings]) -> Measurements:
     return read_measurements(written[0] / PRESSES)
 
 
-def test_frames_and_stamps_are_read_back_as_they_were_made(written: tuple[Path, TouchRecordings], read: Measurements):
+def test_frames_and_stamps_are_read_back_as_they_were_made(written, read):
     made = written[1]
     assert [m.name for m in read.fit] == ["01_ball.mcap", "02_again.mcap"] and read.validation[0].name == "03_rod.mcap"
     for one, back in zip((*made.fit, *made.validation), read.all, strict=True):
@@ -66,7 +66,7 @@ def test_frames_and_stamps_are_read_back_as_they_were_made(written: tuple[Path, 
     assert read.fit[1].repeat_of == read.fit[0].name
 
 
-def test_what_was_pressed_is_read_back(case: TouchCase, read: Measurements):
+def test_what_was_pressed_is_read_back(case, read):
     for m, press in zip(read.all, (BALL, AGAIN, ROD), strict=True):
         meant = touch.pressed_object(case, press)
         assert m.pressed is not None and (m.pressed.arm, m.pressed.frame) == ("right", "tcp")
@@ -76,14 +76,12 @@ def test_what_was_pressed_is_read_back(case: TouchCase, read: Measurements):
         assert [getattr(solid, k) for k in SIZES] == [getattr(true, k) for k in SIZES]
 
 
-def test_nothing_is_wrong_with_the_recordings(read: Measurements):
+def test_nothing_is_wrong_with_the_recordings(read):
     found = checked(PiperTwin.nominal(), read, "")
     assert found is not None and [f for own in found.values() for f in own if f.severity != "note"] == []
 
 
-def test_the_truth_is_sealed_and_the_twin_is_the_one_to_start_from(
-    case: TouchCase, written: tuple[Path, TouchRecordings]
-):
+def test_the_truth_is_sealed_and_the_twin_is_the_one_to_start_from(case, written):
     folder = written[0]
     assert load_twin(folder / TWIN) == case.twin
     assert reveal(folder) == json.loads(json.dumps(case.truth()))
@@ -91,7 +89,7 @@ def test_the_truth_is_sealed_and_the_twin_is_the_one_to_start_from(
         assert b"saturation" not in path.read_bytes()
 
 
-def test_a_repeat_with_something_else_pressed_is_refused(written: tuple[Path, TouchRecordings], tmp_path: Path):
+def test_a_repeat_with_something_else_pressed_is_refused(written, tmp_path):
     for path in (written[0] / PRESSES).glob("0[12]*.mcap"):
         (tmp_path / path.name).symlink_to(path)
     index = yaml.safe_load((written[0] / PRESSES / INDEX).read_text())
@@ -124,15 +122,13 @@ def test_a_secret_hides_what_pads_can_hide():
         (["--pads=both"], "both"),
     ],
 )
-def test_the_command_line_says_what_is_wrong(words: list[str], message: str, capsys, tmp_path: Path):
+def test_the_command_line_says_what_is_wrong(words, message, capsys, tmp_path):
     assert main(["surrogate", "--secret=1", "--pads=left", f"--out={tmp_path / 'x'}", *words]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "x").exists()
 
 
-def test_a_disk_that_is_full_leaves_nothing_half_written_and_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_disk_that_is_full_leaves_nothing_half_written_and_what_was_there(tmp_path, monkeypatch):
     case = draw_touch_case((), 3, arm="left")
     monkeypatch.setattr(touch, "_USES", {"fit": (BALL,), "validation": (), "test": ()})
     folder = tmp_path / "robot"

@@ -25,9 +25,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize(("torchcodec", "expected"), [(BROKEN, "pyav"), ("", "torchcodec")])
-def test_a_torchcodec_that_cannot_be_loaded_is_left_out_in_silence(
-    torchcodec: str, expected: str, site: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_torchcodec_that_cannot_be_loaded_is_left_out_in_silence(torchcodec, expected, site, capfd, caplog):
     from lerobot.configs.default import DatasetConfig
     from lerobot.datasets import lerobot_dataset
 

@@ -13,10 +13,8 @@ from rerun.experimental import RrdReader
 class Column:
     """One component of one entity."""
 
-    values: list[Any]
-    """One list of instances per row."""
-    frame_index: list[int]
-    """Empty for static data."""
+    values: list[Any]  # One list of instances per row
+    frame_index: list[int]  # Empty for static data
     time_s: np.ndarray
 
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from taccorl.data.episode import Episode
 from taccorl.views.colors import CONTACT_COLOR, heat
-from taccorl.views.contact_sheet import GATE_COLORS, ORIGIN_COLOR, PAPER, choose_instants, contact_sheet, nice_ticks
+from taccorl.views.contact_sheet import GATE_COLORS, ORIGIN_COLOR, PAPER, choose_instants, contact_sheet
 from taccorl.views.touch import contact_gate, pads_of, peak_row
 
 from .made_episode import ORIGIN, TOUCH, draw, made_episode, without
@@ -124,17 +124,3 @@ def test_pictures_are_decoded_in_one_pass(episode: Episode, tmp_path: Path):
 
     contact_sheet(dataclasses.replace(episode, pictures=stream), tmp_path / "sheet.png")
     assert asked == list(range(ROWS)), "once each"
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [
-        (0.0, 0.065, [0.0, 0.02, 0.04, 0.06, 0.08]),
-        (0.0, 10400.0, [0.0, 5000.0, 10000.0, 15000.0]),
-        (-6.0, 120.0, [-50.0, 0.0, 50.0, 100.0, 150.0]),
-        (-1.0, 1.0, [-1.0, -0.5, 0.0, 0.5, 1.0]),
-        (0.0, 1e-9, [0.0, 5e-10, 1e-9]),
-    ],
-)
-def test_ticks_are_round_and_enclose_the_values(low: float, high: float, expected: list[float]):
-    assert nice_ticks(low, high) == pytest.approx(expected)

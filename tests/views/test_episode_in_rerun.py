@@ -126,9 +126,7 @@ def test_dataset_shows_its_own_mp4_from_the_episodes_first_frame_on(from_dataset
     assert "EncodedImage:blob" not in entity
 
 
-def test_h264_becomes_pictures_where_the_rerun_program_could_not_decode_it(
-    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_h264_becomes_pictures_where_the_rerun_program_could_not_decode_it(episode, tmp_path, monkeypatch):
     in_h264 = in_dataset(episode, tmp_path, codec="h264")
     assert "AssetVideo:blob" in logged(in_h264, tmp_path)["/observation/images/front"]
     monkeypatch.setenv("PATH", str(tmp_path))  # a machine without ffmpeg

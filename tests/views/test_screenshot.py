@@ -100,9 +100,7 @@ def test_a_browser_draws_every_view(episode: Episode, tmp_path: Path):
     assert_every_view_shows_its_things(tmp_path / "view.png", episode)
 
 
-def test_a_machine_without_either_is_told_what_to_install(
-    episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_machine_without_either_is_told_what_to_install(episode, tmp_path, monkeypatch):
     monkeypatch.setenv("WGPU_BACKEND", "metal")  # what the Rerun program finds on Linux without Vulkan: nothing
     monkeypatch.setenv("PATH", str(tmp_path))  # and no browser
     told: list[str] = []

@@ -120,9 +120,7 @@ def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
         (["{dataset}", "--against={dataset}", "--against_episode=7", "--save={tmp}/x.rrd"], "no episode 7; it has 2"),
     ],
 )
-def test_what_cannot_be_done_says_why_and_what_to_do(
-    words: list[str], message: str, dataset: Path, recording: Path, tmp_path: Path, capsys, monkeypatch
-):
+def test_what_cannot_be_done_says_why_and_what_to_do(words, message, dataset, recording, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     Image.new("RGB", (4, 4)).save(tmp_path / "theirs.png")

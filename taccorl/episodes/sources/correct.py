@@ -50,14 +50,10 @@ class PolicyEpisode:
     """Actions of a policy in one scene and the robot's states, up to the end of its episode."""
 
     seed: int
-    outcome: str
-    """``success``, or a failure category as in ``taccorl evaluate``."""
-    actions: np.ndarray
-    """(T, 14) float32 actions as the policy returned them."""
-    states: np.ndarray
-    """(T + 1, 14) float32 ``observation.state`` before each action, and after the last one."""
-    subtasks: np.ndarray
-    """(T + 1, 2) int16 index of each arm's subtask, likewise."""
+    outcome: str  # ``success``, or a failure category as in ``taccorl evaluate``
+    actions: np.ndarray  # (T, 14) float32 actions as the policy returned them
+    states: np.ndarray  # (T + 1, 14) float32 ``observation.state`` before each action, and after the last one
+    subtasks: np.ndarray  # (T + 1, 2) int16 index of each arm's subtask, likewise
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,6 @@ import time
 import warnings
 import weakref
 from collections.abc import Callable, Collection, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -122,10 +121,6 @@ class ViewerWindow:
             if self._window is None or not self._viewer.is_running():
                 return set()
             return {code for code in codes if glfw.get_key(self._window, code) == glfw.PRESS}
-
-    def locked(self) -> AbstractContextManager[Any]:
-        """Context manager: while it is open, the window's own thread does not poll devices."""
-        return self._viewer.lock()
 
     def close(self) -> None:
         self._viewer.close()

@@ -125,16 +125,11 @@ class Keyboard:
 class JoggedHand:
     """Goal and present target of one arm that a person moves in steps."""
 
-    goal: np.ndarray
-    """World-from-TCP (4, 4) to which the hand moves; always reachable."""
-    pose: np.ndarray
-    """World-from-TCP (4, 4) of the present target on the way there."""
-    joints_rad: np.ndarray
-    """(6,) joint angles for ``pose`` [rad]."""
-    bias_rad: np.ndarray
-    """(6,) offset of the joints at rest from their targets at the beginning [rad]."""
-    opening_m: float
-    """Commanded opening between the pads [m]."""
+    goal: np.ndarray  # World-from-TCP (4, 4) to which the hand moves; always reachable
+    pose: np.ndarray  # World-from-TCP (4, 4) of the present target on the way there
+    joints_rad: np.ndarray  # (6,) joint angles for ``pose`` [rad]
+    bias_rad: np.ndarray  # (6,) offset of the joints at rest from their targets at the beginning [rad]
+    opening_m: float  # Commanded opening between the pads [m]
 
 
 class Jogger:

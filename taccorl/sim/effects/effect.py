@@ -85,23 +85,16 @@ TOUCH_SLOTS: tuple[Slot, ...] = SLOTS[SLOTS.index("material") : SLOTS.index("cam
 class Parameter:
     """One parameter of an effect: its name, unit, bounds, and the value at which the effect is absent."""
 
-    name: str
-    """Name of the effect's field, with the unit as suffix."""
-    unit: str
-    """Unit as text, such as ``N·m`` or ``1``."""
-    symbol: str
-    """Symbol in the effect's equation."""
+    name: str  # Name of the effect's field, with the unit as suffix
+    unit: str  # Unit as text, such as ``N·m`` or ``1``
+    symbol: str  # Symbol in the effect's equation
     absent: float | None
     """Value at which the effect does nothing. None: the parameter only shapes the effect, and has no meaning while the effect is
     absent."""
-    low: float
-    """Lower bound."""
-    high: float
-    """Upper bound; with ``low`` the range for fitting. Other values are rejected (``Effect.accepted``)."""
-    typical: float
-    """Value for a robot such as the PiPER, at which a search starts."""
-    source: str
-    """Where ``typical`` and the bounds come from."""
+    low: float  # Lower bound
+    high: float  # Upper bound; with ``low`` the range for fitting. Other values are rejected (``Effect.accepted``)
+    typical: float  # Value for a robot such as the PiPER, at which a search starts
+    source: str  # Where ``typical`` and the bounds come from
     over: Literal["", "kp"] = ""
     """``kp``: a torque, stiffness, damping, inertia or mass. From positions alone only (value − absent) / K_p is identifiable
     (``diagnosis.search.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""

@@ -86,25 +86,17 @@ class Hand:
 
     pose: np.ndarray
     """Target pose (4, 4) of the TCP in the world. It contains the expert's aiming error, but not its tremor."""
-    opening_m: float
-    """Commanded opening between the pads [m]."""
-    joints_rad: np.ndarray
-    """(6,) joint angles of the last command, without the correction for the offset [rad]."""
+    opening_m: float  # Commanded opening between the pads [m]
+    joints_rad: np.ndarray  # (6,) joint angles of the last command, without the correction for the offset [rad]
     bias_rad: np.ndarray
     """(6,) offset of the joints at rest from their targets [rad], estimated in free motion, as a person corrects the hand by
     eye."""
-    predicted_rad: np.ndarray
-    """(6,) joint angles that are expected now if nothing touches the arm [rad]."""
-    goal: np.ndarray
-    """World-from-TCP (4, 4) target, with tremor."""
-    learns: bool = True
-    """False in contact: an offset that contact causes is not learned."""
-    tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) present tremor [m, rad]."""
-    steadiness: float = 1.0
-    """Factor on the tremor, 0 … 1."""
-    rests: bool = False
-    """True while what it holds stands on the table, which pulses would push away."""
+    predicted_rad: np.ndarray  # (6,) joint angles that are expected now if nothing touches the arm [rad]
+    goal: np.ndarray  # World-from-TCP (4, 4) target, with tremor
+    learns: bool = True  # False in contact: an offset that contact causes is not learned
+    tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))  # (6,) present tremor [m, rad]
+    steadiness: float = 1.0  # Factor on the tremor, 0 … 1
+    rests: bool = False  # True while what it holds stands on the table, which pulses would push away
     mating: Mating | None = None
     """The held part and its hole, from the approach to the hole until the hand opens; else None."""
     intended: np.ndarray = field(init=False)

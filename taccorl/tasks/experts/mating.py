@@ -21,16 +21,11 @@ class BodyPoses(Protocol):
 class Mating:
     """A held part and the hole it goes into. The mate is the part's leading end."""
 
-    held: str
-    """Name of the held part."""
-    held_from_mate: np.ndarray
-    """(4, 4) pose of its leading end (``Mate``) in its frame."""
-    num_turns: int | None
-    """Number of rotations about the hole's axis at which it looks the same; None: any angle."""
-    holder: str
-    """Name of the part with the hole."""
-    holder_from_hole: np.ndarray
-    """(4, 4) pose of the hole in that part's frame."""
+    held: str  # Name of the held part
+    held_from_mate: np.ndarray  # (4, 4) pose of its leading end (``Mate``) in its frame
+    num_turns: int | None  # Number of rotations about the hole's axis at which it looks the same; None: any angle
+    holder: str  # Name of the part with the hole
+    holder_from_hole: np.ndarray  # (4, 4) pose of the hole in that part's frame
 
     @classmethod
     def of(cls, held: Part, holder: Part, hole: str) -> "Mating":

@@ -11,7 +11,7 @@ from taccorl.sim.part import Part
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.tasks.experts.hands import DT_S
 from taccorl.tasks.experts.scripted import Aim, Mating, Script, ScriptedExpert
-from taccorl.tasks.experts.se3 import inverse, turn
+from taccorl.tasks.experts.se3 import turn
 from taccorl.tasks.puzzle.scene import Puzzle
 
 # Heights of a piece's underside over the tray's top: when carried (clear of the other knobs), and before it is pressed.
@@ -152,12 +152,7 @@ class PuzzleExpert(ScriptedExpert):
         """
         hand, config = self.hands[arm], self.config
         hand.mating = mating
-        aim = Aim(
-            off_m=self.rng.normal(size=2) * config.aim_m,
-            off_rad=self.rng.normal(size=3) * config.aim_rad,
-            part_from_tcp=inverse(self.body(mating.held)) @ self.tcp(arm),
-            turned=mating.turned(self),
-        )
+        aim = self._first_aim(arm, mating)
         if carry:
             yield from self.aim(arm, mating, aim, -_CARRY_M, speed_mps=_CARRY_MPS)
         yield from self.aim(arm, mating, aim, -_HOVER_M, speed_mps=_NEAR_MPS, settle=True)

@@ -1,7 +1,8 @@
-"""Formats without checksums: what of a changed byte is found, where it is said, and what the report says cannot be found."""
+"""Formats without checksums: what of a changed byte is found; files that ask for more than a machine has, or name others."""
 
 import sqlite3
 import struct
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,20 @@ import pytest
 import test_db3
 from mcap.writer import Writer
 from test_db3 import START_NS, STORE, db3_of, write_bag
+from test_hdf5 import ROWS, state, write
 from test_hdf5 import write as write_hdf5
 
 from taccorl.cli.main import main
+from taccorl.data import ingest as ingest_module
 from taccorl.data.cutting import Unfit, open_episodes
-from taccorl.data.ingest import find_jobs, ingest_one
+from taccorl.data.ingest import find_jobs, ingest, ingest_one
+from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import Source, readers
 from taccorl.data.spec import RecordingSpec, load_recording_spec
+from taccorl.errors import RecordingError
 
 JOINTS = [f"joint{j}" for j in range(1, 7)]
-NUM = 600
-"""3 s of joints at 200 Hz: 0.3 sin(t + 1.001 j), at most 0.3 rad/s."""
+NUM = 600  # 3 s of joints at 200 Hz: 0.3 sin(t + 1.001 j), at most 0.3 rad/s
 
 
 def angle(k: int, j: int) -> float:
@@ -69,9 +73,7 @@ def entry_of(path: Path, spec: RecordingSpec) -> dict[str, Any]:
     return ingest_one(job)
 
 
-def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_its_place(
-    bag: Path, spec: RecordingSpec
-) -> None:
+def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_its_place(bag, spec):
     clean = entry_of(bag, spec)
     assert not [f for f in clean["episodes"][0]["findings"] if f["severity"] != "note"]
     # Sample 302 lies between row 45 (sample 300) and row 46 (sample 306.7): no row shows it.
@@ -97,7 +99,7 @@ def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_
         assert fact in finding["text"]
 
 
-def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(bag: Path, spec: RecordingSpec) -> None:
+def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(bag, spec):
     path = db3_of(bag)
     with sqlite3.connect(path) as connection:
         ((number, log_ns),) = connection.execute("SELECT id, timestamp FROM messages WHERE id = 20")
@@ -108,7 +110,7 @@ def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(ba
     assert f"row {number} missing from index timestamp_idx" in entry["reason"]
 
 
-def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag: Path, spec: RecordingSpec) -> None:
+def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag, spec):
     sec, nanosec = divmod(START_NS + 300 * 5_000_000, 10**9)
     old = struct.pack("<iI", sec, nanosec)
     change(db3_of(bag), old, struct.pack("<iI", sec ^ 1 << 28, nanosec))
@@ -118,9 +120,7 @@ def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag: Pa
     assert entry_of(bag, spec)["outcome"] == "quarantined"
 
 
-def test_the_report_and_the_screen_say_that_a_bag_has_no_checksums(
-    bag: Path, spec: RecordingSpec, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_and_the_screen_say_that_a_bag_has_no_checksums(bag, spec, tmp_path, capsys):
     entry = entry_of(bag, spec)
     assert "SQLite" in entry["unprotected"] and "no checksums" in entry["unprotected"]
     assert main(["ingest", str(bag), f"--spec={tmp_path / 'spec.yaml'}", "--dry_run=true"]) == 0
@@ -134,7 +134,7 @@ def unprotected(path: Path, name: str, spec: str) -> str:
     return reader.unprotected
 
 
-def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path: Path) -> None:
+def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path):
     path = write_hdf5(tmp_path / "e.hdf5")
     with h5py.File(path, "a") as file:
         for name, options in (("action", {"fletcher32": True}), ("observations/qpos", {"compression": "gzip"})):
@@ -154,7 +154,7 @@ def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path: Path) -> N
     assert damage.reason.startswith("/action, rows 31 to 61 cannot be read")
 
 
-def test_mcap_without_crcs_is_called_unprotected_and_with_them_not(tmp_path: Path) -> None:
+def test_mcap_without_crcs_is_called_unprotected_and_with_them_not(tmp_path):
     path = tmp_path / "a.mcap"
     for options, is_protected in (
         ({}, True),
@@ -171,3 +171,92 @@ def test_mcap_without_crcs_is_called_unprotected_and_with_them_not(tmp_path: Pat
         reader = readers.get("mcap")(Source(path, (path,)))
         assert len(list(reader.messages(None))) == 1
         assert ("without a CRC" in reader.unprotected) is not is_protected
+
+
+SECRET = "secret.bin"
+OTHER = "other.h5"
+SHAPE = (ROWS, 14)
+
+
+def external(file: h5py.File, name: str) -> None:
+    path = Path(file.filename).with_name(SECRET)
+    np.full(SHAPE, 0.01, np.float32).tofile(path)
+    file.create_dataset(name, SHAPE, "f4", external=[(str(path), 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file: h5py.File, name: str) -> None:
+    path = Path(file.filename).with_name(OTHER)
+    with h5py.File(path, "w") as other:
+        other["x"] = np.full(SHAPE, 0.01, np.float32)
+    layout = h5py.VirtualLayout(SHAPE, "f4")
+    layout[:] = h5py.VirtualSource(str(path), "x", SHAPE)
+    file.create_virtual_dataset(name, layout)
+
+
+@pytest.mark.parametrize(
+    ("make", "facts"),
+    [
+        (lambda f, n: f.create_dataset(n, (ROWS, 10**10), "f4"), ("[10000000000]", "37.3 GiB", "1 GiB")),
+        (
+            lambda f, n: f.create_dataset(n, (ROWS, 14 * 10**6), "f4", chunks=(ROWS, 10**6), compression="gzip"),
+            ("62 rows", "[14000000]", "3.2 GiB", "smaller chunks"),
+        ),
+        (
+            lambda f, n: f.create_dataset(
+                n, SHAPE, "f8", maxshape=(None, None), chunks=(1, 250 * 10**6), compression="gzip"
+            ),
+            ("1.9 GiB", "1 GiB"),  # HDF5 unpacks whole chunks, and these are wider than the rows
+        ),
+        (lambda f, n: f.create_dataset(n, SHAPE, "f4"), ("none of its 62 rows was ever written",)),
+        (external, (SECRET, "external storage", "not opened")),
+        (virtual, (OTHER, "virtual dataset", "not opened")),
+    ],
+)
+def test_a_dataset_that_must_not_be_read_costs_its_own_recording_only(make, facts, tmp_path):
+    folder = tmp_path / "in"
+    write(folder / "episode_0.hdf5")
+    with h5py.File(write(folder / "episode_1.hdf5"), "a") as file:
+        del file["action"]
+        make(file, "action")
+    spec = load_recording_spec("cobot_magic_hdf5")
+    jobs = find_jobs([folder / f"episode_{k}.hdf5" for k in (1, 0)], spec, "s", tmp_path / "store", dry_run=True)
+    refused, written = ingest(jobs, tmp_path / "out", None)["recordings"]
+    assert (refused["outcome"], written["outcome"]) == ("refused", "written")
+    assert "episode_1.hdf5: /action: " in refused["reason"]
+    assert all(fact in refused["reason"] for fact in facts)
+
+
+def test_rows_that_were_never_written_are_no_zeros(tmp_path):
+    path = write(tmp_path / "e.hdf5")
+    with h5py.File(path, "a") as file:
+        del file["action"]
+        file.create_dataset("action", SHAPE, "f4", chunks=(10, 14))[:30] = np.stack([state(k + 1) for k in range(30)])
+    reader = readers.get("hdf5")(Source(path, (path,)))
+    assert len(list(reader.messages({"/action"}))) == 30
+    assert reader.damage[0].reason == "/action, rows 30 to 39 cannot be read (never written)"
+
+
+def test_a_thousand_million_rows_are_refused_at_once(tmp_path):
+    path = tmp_path / "e.hdf5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("action", (10**9, 14), "f4", chunks=(1000, 14))[:1000] = 1.0
+    begin_s = time.monotonic()
+    reader = readers.get("hdf5")(Source(path, (path,)))
+    with pytest.raises(RecordingError, match=r"e.hdf5: /action: it claims 1,000,000,000 rows; at most 1,000,000"):
+        list(reader.messages({"/action"}, stamps_only={"/action"}))
+    (topic,) = inspect_source("hdf5", Source(path, (path,))).topics
+    assert topic.num_messages == 0 and "1,000,000,000 rows" in topic.problem
+    assert time.monotonic() - begin_s < 5
+
+
+def test_a_recording_that_needs_too_much_memory_does_not_end_the_batch(tmp_path, monkeypatch):
+    path = write(tmp_path / "e.hdf5")
+
+    def too_much(*_: Any) -> None:
+        np.empty(10**15)  # 8 PB
+
+    monkeypatch.setattr(ingest_module, "opened", too_much)
+    (job,) = find_jobs([path], load_recording_spec("cobot_magic_hdf5"), "s", tmp_path / "store", dry_run=True)
+    entry = ingest_one(job)
+    assert entry["outcome"] == "refused"
+    assert "more memory than there is" in entry["reason"]

@@ -70,9 +70,7 @@ def messages(path: Path, topic: str, **options: Any) -> list:
 
 # 1/30 s is no whole number of ns: three lengths that round differently.
 @pytest.mark.parametrize(("compressed", "rows"), [(False, 62), (True, 62), (True, 63), (True, 64)])
-def test_an_episode_has_every_row_with_its_state_its_command_and_its_pictures(
-    tmp_path: Path, compressed: bool, rows: int
-) -> None:
+def test_an_episode_has_every_row_with_its_state_its_command_and_its_pictures(tmp_path, compressed, rows):
     path = write(tmp_path / "episode_0.hdf5", compressed=compressed, rows=rows)
     with opened(Source(path, (path,)), load_recording_spec("cobot_magic_hdf5")) as recording:
         (episode,) = Cutter(recording).cut().episodes

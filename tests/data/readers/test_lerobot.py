@@ -157,9 +157,7 @@ def lerobot_spec(lead_frames: int) -> RecordingSpec:
     return dataclasses.replace(spec, channels={**spec.channels, "command": command})
 
 
-def test_an_older_dataset_is_brought_to_the_convention_and_never_read_as_if_it_had_it(
-    ours: Path, tmp_path: Path
-) -> None:
+def test_an_older_dataset_is_brought_to_the_convention_and_never_read_as_if_it_had_it(ours, tmp_path):
     _, source = find_sources(older(ours, tmp_path / "older"))[0]
     with (
         pytest.raises(RecordingError, match=r"in force at row k .*older taccorl.*`lead_frames: 1`, it needs 0"),

@@ -166,8 +166,7 @@ class Place(NamedTuple):
 
     start: int
     end: int
-    next_end: int
-    """End of the record behind it."""
+    next_end: int  # End of the record behind it
 
 
 def records_of(data: bytes) -> list[tuple[int, int, int]]:

@@ -174,9 +174,7 @@ def test_peak_torque_includes_the_carried_weight_and_the_pose_is_stated():
         (1, {"even": [(1, 1)] * 3, "one": [(9, 9), (0, 0), (9, 9)], "two": [(0, 0), (9, 9), (0, 0)]}, {"one", "two"}),
     ],
 )
-def test_a_plan_has_the_motions_that_its_message_recommends_and_one_for_each_pair(
-    num: int, scores: dict[str, list[tuple[float, float]]], expected: set[str]
-) -> None:
+def test_a_plan_has_the_motions_that_its_message_recommends_and_one_for_each_pair(num, scores, expected):
     part = JointPart(arm_ground(NOMINAL, SIGNAL, rest_pose(SIGNAL, None)), FLOOR_RAD)
     rivals = ("a", "b", "c") if "even" in scores else ("a", "b")
     pairs = [f"{a} | {b}" for a, b in itertools.combinations(rivals, 2)]
@@ -207,7 +205,7 @@ def lift(folder: Path, motion: str, patch: pytest.MonkeyPatch, text: str = LIFT)
     return JointPart(ground_of(Axis.load(folder / "lift.yaml"), "lift", speed=1.5), 1e-4)
 
 
-def test_efforts_are_tried_where_positions_separate_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_efforts_are_tried_where_positions_separate_nothing(monkeypatch):
     """With K_p and K_d fitted, K_d takes up the viscous friction; the motor's effort shows both."""
     monkeypatch.setattr(motions, "LIBRARY", [m for m in LIBRARY if m.name == "holds"])
     part = JointPart(arm_ground(NOMINAL, SIGNAL, rest_pose(SIGNAL, None)), FLOOR_RAD, gains="fitted")
@@ -221,9 +219,7 @@ def test_efforts_are_tried_where_positions_separate_nothing(monkeypatch: pytest.
     assert any(pair in str(line) and f"{found.best(pair):.2f} {where}" in str(line) for line in lines.text)
 
 
-def test_a_mounted_mass_is_tried_where_neither_positions_nor_efforts_separate(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_mounted_mass_is_tried_where_neither_positions_nor_efforts_separate(monkeypatch, tmp_path):
     """A drive that is 2 % weak carries less, by more the heavier the load: drag does not."""
     part, pair = lift(tmp_path, "wide_triangle", monkeypatch), "torque_scale | viscous_friction"
     weak = {"torque_scale": {"torque_scale.factor": 0.98}}
@@ -237,7 +233,7 @@ def test_a_mounted_mass_is_tried_where_neither_positions_nor_efforts_separate(
     assert first.made[0].payload_kg == {"lift": kg} and len(found.tried) == 2, "efforts first"
 
 
-def test_an_axis_without_a_lever_says_why_no_mass_was_tried(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_axis_without_a_lever_says_why_no_mass_was_tried(monkeypatch, tmp_path):
     text = LIFT.replace("payload_kg: 1.0\nlever_m: 0.3\n", "law: velocity\n").replace("kp: 300.0\n", "")
     found = plan(lift(tmp_path, "holds", monkeypatch, text), ("coulomb_friction", "asymmetric_friction"))
     assert found.hopeless and "lever_m" in found.refused["mounted_mass"]

@@ -64,7 +64,7 @@ def swung(machine: Machine, seed: int, hz: float) -> Measurement:
     return dataclasses.replace(m, measured=m.measured + np.random.default_rng(seed).normal(0.0, 1e-4, target.shape))
 
 
-def test_the_chosen_pose_is_the_one_with_another_weight_that_touches_nothing(machine: Machine) -> None:
+def test_the_chosen_pose_is_the_one_with_another_weight_that_touches_nothing(machine):
     """The pan joint feels a leaning base, and the inertia of the arm, by cos(lift), least at ± 1 rad; at + 1 the arm is in the
     post."""
     like = swung(machine, 1, 0.3)
@@ -91,9 +91,7 @@ def test_the_chosen_pose_is_the_one_with_another_weight_that_touches_nothing(mac
         ({"pan": 0.1}, 20.0, ("pan is no other joint", "lift")),
     ],
 )
-def test_a_pose_that_must_not_be_recorded_is_refused(
-    tmp_path: Path, machine: Machine, positions: dict[str, float], limit: float, words: tuple[str, ...]
-) -> None:
+def test_a_pose_that_must_not_be_recorded_is_refused(tmp_path, machine, positions, limit, words):
     like = swung(machine, 1, 0.3)
     (tmp_path / "robot.yaml").write_text(FILE.replace("20.0", str(limit)))
     with pytest.raises(TaccorlError) as error:
@@ -101,7 +99,7 @@ def test_a_pose_that_must_not_be_recorded_is_refused(
     assert all(word in str(error.value) for word in words), error.value
 
 
-def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_does_not(machine: Machine) -> None:
+def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_does_not(machine):
     """Within ± 0.5 rad, sin q and q differ by 1 % of the torque; at lift -1 the base loads 0.54 as much, the spring as before."""
     known = Measurements((swung(machine, 1, 0.3), swung(machine, 2, 0.5)))
     ground = ground_of(machine, "pan", known)
@@ -114,7 +112,7 @@ def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_d
     assert apart[0] < 0.5 * TELLS and apart[1] > 2 * TELLS, apart
 
 
-def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machine: Machine) -> None:
+def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machine):
     """At lift 0 the base loads 1 / cos 1 = 1.85 times as much as at -1."""
     m = swung(machine, 1, 0.3)
     lowered = np.array([0.0, -1.0])
@@ -126,9 +124,7 @@ def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machin
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_excite_plans_another_pose_where_the_diagnosis_asks(
-    asked: bool, tmp_path: Path, machine: Machine, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_excite_plans_another_pose_where_the_diagnosis_asks(asked, tmp_path, machine, capsys, monkeypatch):
     """Also where nothing asks, but no motion in the present pose separates the rivals."""
     monkeypatch.setattr(motions, "MOTIONS", [m for m in motions.MOTIONS if m.name == "wide_triangle"])
     sweeps, out = tmp_path / "sweeps", tmp_path / "plan"
@@ -161,7 +157,7 @@ def test_excite_plans_another_pose_where_the_diagnosis_asks(
     assert "post" in capsys.readouterr().err and not (tmp_path / "other").exists()
 
 
-def test_the_pose_of_a_piper_arm_is_changed_within_its_limits() -> None:
+def test_the_pose_of_a_piper_arm_is_changed_within_its_limits():
     pose = np.array([0.0, 1.732, -0.883, 0.0, 0.2, 0.0, 0.02])
     assert posed("left_joint5", pose, {"left_joint2": 1.2}).tolist() == [0.0, 1.2, -0.883, 0.0, 0.2, 0.0, 0.02]
     for positions, word in (

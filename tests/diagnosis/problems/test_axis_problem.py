@@ -445,9 +445,7 @@ def test_gains_that_a_recording_states_are_those_it_is_simulated_with(slide: Mea
     assert (motion.kp_scale, motion.kd_scale) == pytest.approx((1.0, 0.5)), "K_p is the product of both"
 
 
-def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(
-    slide: Measurements, problem: AxisProblem
-):
+def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(slide, problem):
     free = {f.name: f for f in problem.base if not f.held}
     assert list(free) == ["inertia", "torque_ff", "weight_cos", "target_late_s", "kp", "kd"]
     assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)

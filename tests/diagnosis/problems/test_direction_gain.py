@@ -25,8 +25,7 @@ AIR = AxisConfig(name="rod", unit="m", inertia=25.0, kp=KP, kd=KD, limits=LIMITS
 OIL = AxisConfig(
     name="rod", unit="m", law="cascade", inertia=OIL_KG, kp=PER_S, kd=STIFF, limits=LIMITS, effort_limit=5000.0
 )
-Force = Callable[[float, float], float]
-"""(error of the position [m], speed [m/s]) → force [N]."""
+Force = Callable[[float, float], float]  # (error of the position [m], speed [m/s]) → force [N]
 
 
 def air(factor: float) -> Force:
@@ -95,9 +94,7 @@ def found_in(axis: AxisConfig, force: Force, mass_kg: float, friction_n: tuple[f
         pytest.param(OIL, oil, OIL_KG, 0.6, marks=pytest.mark.slow),
     ],
 )
-def test_the_gain_of_a_cylinder_that_differs_by_direction_is_found(
-    axis: AxisConfig, force: Callable[[float], Force], mass_kg: float, factor: float
-) -> None:
+def test_the_gain_of_a_cylinder_that_differs_by_direction_is_found(axis, force, mass_kg, factor):
     found = found_in(axis, force(factor), mass_kg)
     assert found.names == ("direction_gain",) and not found.rivals and found.status == "at_floor"
     assert found.errors["fitted"]["validation"] > 5.0

@@ -16,8 +16,7 @@ from taccorl.diagnosis.problems.cells_problem import CellsProblem
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.diagnosis.search.search import diagnose
 
-RATE_HZ, FINE = 100, 10
-"""Rows per second, and simulated steps of a row."""
+RATE_HZ, FINE = 100, 10  # Rows per second, and simulated steps of a row
 COUNT_PER_N, OFFSET = 40.0, 100.0
 CONFIG = CellsConfig(
     cells=["thumb"],

@@ -78,9 +78,7 @@ def test_the_bent_law_is_found_with_its_numbers(finding: PadFinding):
     assert pads_of(d.base) == ["left_a", "left_b"]
 
 
-def test_the_mended_twin_has_the_effect_and_the_refitted_numbers_and_its_error_falls(
-    finding: PadFinding, measured: Measurements
-):
+def test_the_mended_twin_has_the_effect_and_the_refitted_numbers_and_its_error_falls(finding, measured):
     twin = TwinConfig()
     new = PiperTwin(twin).mended([finding])[0].config
     assert twin == TwinConfig(), "the old one stays"

@@ -19,8 +19,7 @@ BOX = {"left": "cradle", "right": "plug"}
 OTHER = {"left": "plug", "right": "cradle"}
 HZ = 30.0
 SETTLES = ("num_settle_steps_before_gripper", "num_settle_steps_before_contact")
-REST = transform((0, 0, 0.003))
-"""From a hand's goal to what is commanded for it: an arm hangs."""
+REST = transform((0, 0, 0.003))  # From a hand's goal to what is commanded for it: an arm hangs
 
 
 def pose(x: float, y: float, z: float, *rotvec: float) -> np.ndarray:
@@ -151,8 +150,7 @@ class Generated:
 
     goals: dict[str, np.ndarray]
     openings: dict[str, np.ndarray]
-    objects: dict[str, np.ndarray]
-    """Before each step."""
+    objects: dict[str, np.ndarray]  # Before each step
     director: Director
 
 

@@ -177,12 +177,9 @@ class BeforeContact:
     """Steps up to the first of contact, which both hands begin in the same; then before that step:"""
 
     num_steps: int
-    step_m: float
-    """How far the goal of the right hand went in the last step in which it moved."""
-    off_m: dict[str, float]
-    """Hand → how far it is from its last goal."""
-    apart: np.ndarray
-    """Cradle-from-plug (4, 4)."""
+    step_m: float  # How far the goal of the right hand went in the last step in which it moved
+    off_m: dict[str, float]  # Hand → how far it is from its last goal
+    apart: np.ndarray  # Cradle-from-plug (4, 4)
 
 
 def until_contact(kind: type[IdealHands], settle: int, **generation) -> BeforeContact:

@@ -13,8 +13,7 @@ from taccorl.sim.twin import TwinConfig, empty_bench
 
 LEFT_HOME = (0.003, 1.732, -0.883, -0.528, 0.884, -1.213)
 RIGHT_HOME = (-0.003, 1.732, -0.883, 0.528, 0.884, 1.213)
-BLOCK_M = 0.02
-"""Between the pads; they press it by 2000 N/m for each metre that the command lies below the opening."""
+BLOCK_M = 0.02  # Between the pads; they press it by 2000 N/m for each metre that the command lies below the opening
 
 
 @functools.cache

@@ -15,8 +15,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import TOUCH_SLOTS, ArmEffect, Effect
 
-BASE = ("kp", "kd", "torque_ff", "k_n", "k_d")
-"""Numbers that are always fitted."""
+BASE = ("kp", "kd", "torque_ff", "k_n", "k_d")  # Numbers that are always fitted
 SEEN = ("reported", "hands", "reading")
 UNITS = {
     "_nms2_per_rad2": "N·m·s²/rad²",

@@ -1,15 +1,22 @@
-"""Closed forms of effects on joint 5 of the right arm, one row each: a steady sweep and a rest.
+"""Closed forms of effects on joint 5 of the right arm: a steady sweep, a rest, two limits of one drive, lost commands.
 
 Laws that ``tests/surrogate`` computes apart from the one-joint model, which tests/alignment/controller/test_joint_model.py
 compares with MuJoCo, are not repeated here. At rest at home targets stand T_ref / K_p below the angles, and weight is carried.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 from joint_bench import COLUMN, KP, TORQUE_FF, asked_nm, drive, on_joint5
-from press_bench import RIGHT_HOME, start
+from press_bench import RIGHT_HOME, PressBench, start
+
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.command import uniform
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import TwinConfig
 
 HOME = RIGHT_HOME[4]
 STRIBECK = {"torque_nm": 0.5, "stiction_share": 1.0, "stribeck_rad_per_s": 0.1, "presliding_rad": 5e-4}
@@ -31,9 +38,7 @@ LEANING = {"torque_nm": 0.5, "asymmetry": 0.3}
         ("stribeck_friction", STRIBECK, 0.4, 0.7, 0.5 + 0.5 * np.exp(-16.0), 0.02),
     ],
 )
-def test_a_steady_sweep_takes_the_torque_of_the_law(
-    name: str, values: dict[str, float], speed: float, seconds: float, torque_nm: float, rel: float
-) -> None:
+def test_a_steady_sweep_takes_the_torque_of_the_law(name, values, speed, seconds, torque_nm, rel):
     motion = drive(start(on_joint5(name, **values)), seconds, lambda t: speed * t)
     assert motion["v"][-1] == pytest.approx(speed, rel=0.02)
     assert asked_nm(motion)[-1] == pytest.approx(torque_nm, rel=rel)
@@ -72,9 +77,7 @@ def balance(torque_nm: Callable[[float], float], goal: float) -> float:
         ({"coulomb_friction": {"torque_nm": 0.5}}, -0.02, lambda q: -0.5, 3e-5),
     ],
 )
-def test_a_joint_rests_where_the_drive_balances_the_law(
-    effects: dict[str, dict[str, float]], offset: float, torque_nm: Callable[[float], float], tolerance: float
-) -> None:
+def test_a_joint_rests_where_the_drive_balances_the_law(effects, offset, torque_nm, tolerance):
     motion = drive(start(*(on_joint5(name, **values) for name, values in effects.items())), 2.0, lambda t: offset)
     goal = motion["u"][-1] + TORQUE_FF / KP
     assert motion["q"][-1] == pytest.approx(balance(torque_nm, goal), abs=tolerance)
@@ -96,9 +99,7 @@ def test_a_joint_rests_where_the_drive_balances_the_law(
         ("asymmetric_friction", LEANING, -0.4, -1.1 * 0.05 / KP, -0.9 * 0.05 / KP),
     ],
 )
-def test_friction_at_rest_holds_up_to_its_break_away(
-    name: str, values: dict[str, float], torque_nm: float, least: float, most: float
-) -> None:
+def test_friction_at_rest_holds_up_to_its_break_away(name, values, torque_nm, least, most):
     motion = drive(start(on_joint5(name, **values)), 1.0, lambda t: torque_nm / KP)
     assert least < motion["q"][-1] - HOME < most
     if least < 0 < most:
@@ -113,9 +114,7 @@ def test_friction_at_rest_holds_up_to_its_break_away(
         ("encoder_eccentricity", {"amplitude_rad": 0.05, "phase_rad": 0.6}, lambda q: q + 0.05 * np.sin(q + 0.6)),
     ],
 )
-def test_an_encoder_settles_the_arm_where_it_reads_the_target_and_reports_that_it_is_there(
-    name: str, values: dict[str, float], reads: Callable[[float], float]
-) -> None:
+def test_an_encoder_settles_the_arm_where_it_reads_the_target_and_reports_that_it_is_there(name, values, reads):
     sim = start(on_joint5(name, **values))
     assert sim.proprioception()[0, COLUMN] == pytest.approx(HOME, abs=1e-12)
     motion = drive(sim, 1.5, lambda t: 0.05)
@@ -123,3 +122,65 @@ def test_an_encoder_settles_the_arm_where_it_reads_the_target_and_reports_that_i
     assert motion["reported"][-1] == pytest.approx(at_target, abs=1e-6)
     assert reads(motion["q"][-1]) == pytest.approx(at_target, abs=1e-6)
     assert abs(motion["q"][-1] - at_target) > 0.009
+
+
+def test_both_limits_of_one_drive_hold() -> None:
+    sim = start(
+        on_joint5("torque_speed_limit", stall_nm=4.0, no_load_rad_per_s=50.0),
+        on_joint5("torque_saturation", torque_max_nm=2.0),
+    )
+    alone = start(on_joint5("torque_saturation", torque_max_nm=2.0))
+    np.testing.assert_allclose(drive(sim, 0.01, lambda t: 0.5)["v"], drive(alone, 0.01, lambda t: 0.5)["v"], rtol=1e-9)
+
+
+def dropping(probability: float = 0.3, seed: int = 5, num_sims: int = 1) -> Simulation:
+    config = TwinConfig(effects=[make_effect("dropped_commands", probability=probability, seed=seed, arm="right")])
+    return Simulation(PressBench(), config, num_sims=num_sims)
+
+
+def arrived(sim: Simulation, num: int = 60) -> np.ndarray:
+    """(num, N) what is in force of a ramp of 1 mrad a command, in mrad."""
+    rest = sim.targets.copy()
+    rows = []
+    for k in range(1, num + 1):
+        sim.advance(rest[None] + 1e-3 * k, 1)
+        rows.append(sim.arrays["ctrl"][:, sim.action_actuators[COLUMN]] - rest[:, COLUMN])
+    return np.round(1e3 * np.array(rows)).astype(int)
+
+
+def test_a_lost_command_leaves_the_one_before_in_force_and_each_episode_loses_its_own() -> None:
+    sim = dropping(num_sims=3)
+    sim.reset([0, 2**40 + 3, 0])
+    got = arrived(sim)
+    for i, episode in ((0, 0), (1, 3 ^ 2**8)):  # 2⁴⁰ + 3 folded into 32 bits
+        arrives = uniform(5, np.full(60, episode), np.arange(60)) >= 0.3
+        newest = np.maximum.accumulate(np.where(arrives, np.arange(1, 61), 0))
+        np.testing.assert_array_equal(got[:, i], newest)
+    np.testing.assert_array_equal(got[:, 2], got[:, 0])
+    assert (got[:, 1] != got[:, 0]).any()
+    sim.reset([0, 0, 0])
+    np.testing.assert_array_equal(arrived(sim)[:, 1], got[:, 0])
+
+
+def test_a_greater_probability_loses_more_commands_besides_the_same_ones() -> None:
+    draws = uniform(1, np.zeros(20000), np.arange(20000))
+    assert draws.mean() == pytest.approx(0.5, abs=3 / math.sqrt(12 * 20000))
+    for p in (0.02, 0.3):
+        assert (draws < p).mean() == pytest.approx(p, abs=3 * math.sqrt(p * (1 - p) / 20000))
+    assert abs(np.corrcoef(draws[1:], draws[:-1])[0, 1]) < 3 / math.sqrt(20000)
+    assert abs(np.corrcoef(draws, uniform(2, np.zeros(20000), np.arange(20000)))[0, 1]) < 3 / math.sqrt(20000)
+
+
+def test_other_joints_hear_every_command() -> None:
+    sim = Simulation(PressBench(), TwinConfig(effects=[on_joint5("dropped_commands", probability=0.95)]))
+    sim.reset([0])
+    rest = sim.targets.copy()
+    sim.advance(rest[None] + 1e-3 * np.arange(1, 4)[:, None, None], 1)
+    others = np.delete(np.arange(14), COLUMN)
+    np.testing.assert_allclose((sim.arrays["ctrl"][:, sim.action_actuators] - rest)[0, others], 3e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True, 2**32])
+def test_a_seed_that_is_no_whole_number_of_32_bits_is_refused(seed: float) -> None:
+    with pytest.raises(TaccorlError, match=r"dropped_commands: seed is .*give a whole number in 0 … 4294967295"):
+        make_effect("dropped_commands", seed=seed)

@@ -73,9 +73,7 @@ def bumps() -> np.ndarray:
         ("taxel_creep", {"share": -0.5, "time_constant_s": 0.5}, [2.0, 0.0], [2.0 - (1 - np.exp(-0.02)), 0.0]),
     ],
 )
-def test_a_taxel_reads_what_the_law_says(
-    name: str, values: dict[str, float], path: list[float], expected: list[float]
-) -> None:
+def test_a_taxel_reads_what_the_law_says(name, values, path, expected):
     pads = Pads(make_effect(name, **values))
     np.testing.assert_allclose([pads.read(f, 0.01)[2, 3, 4] for f in path], expected, rtol=1e-5, atol=1e-6)
 

@@ -102,14 +102,10 @@ class Ahead:
 class Choice:
     """Source and transform that an attempt chose for one subtask; stored in the provenance."""
 
-    source: int
-    """Index of the source in the pool, from 0."""
-    segment: Segment
-    """Rows of the source that the subtask repeats."""
-    delta: np.ndarray
-    """Δ (4, 4), world to world: transform of the source's motion to the new scene."""
-    correction: np.ndarray
-    """C = G_src · G_new⁻¹ (4, 4): correction for the present pose of the held object in the hand."""
+    source: int  # Index of the source in the pool, from 0
+    segment: Segment  # Rows of the source that the subtask repeats
+    delta: np.ndarray  # Δ (4, 4), world to world: transform of the source's motion to the new scene
+    correction: np.ndarray  # C = G_src · G_new⁻¹ (4, 4): correction for the present pose of the held object in the hand
 
 
 @dataclass
@@ -119,16 +115,11 @@ class _Path:
     bridge: list[ArmTarget]
     choice: Choice
     track: ArmTrack
-    held: str | None
-    """What the hand holds, where its path is to be kept."""
-    rows: np.ndarray
-    """Of the source, one for each step after the bridge."""
-    contact: int
-    """First row that counts as contact."""
-    joints_rad: np.ndarray | None
-    """(steps after the bridge, 6) where joints are told."""
-    is_handed_over: bool = False
-    """Another moves the hand in contact, for as long as it takes."""
+    held: str | None  # What the hand holds, where its path is to be kept
+    rows: np.ndarray  # Of the source, one for each step after the bridge
+    contact: int  # First row that counts as contact
+    joints_rad: np.ndarray | None  # (steps after the bridge, 6) where joints are told
+    is_handed_over: bool = False  # Another moves the hand in contact, for as long as it takes
 
     def __len__(self) -> int:
         return self.num_own + self.is_handed_over * _HANDED_OVER_STEPS

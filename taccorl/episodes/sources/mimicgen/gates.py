@@ -17,14 +17,10 @@ _JOINTS = np.array([not name.endswith("gripper") for name in ROBOT.action_names]
 class Measured:
     """Largest values over an episode, for the acceptance criteria: force, penetration, joint speed, joint limit."""
 
-    force_n: float = 0.0
-    """Net force between mating parts [N]."""
-    penetration_m: float = 0.0
-    """Overlap of mating parts [m]."""
-    joint_speed_radps: float = 0.0
-    """Measured speed of any joint [rad/s]."""
-    at_limit: str = ""
-    """Name of a joint whose command was at its limit; empty: none."""
+    force_n: float = 0.0  # Net force between mating parts [N]
+    penetration_m: float = 0.0  # Overlap of mating parts [m]
+    joint_speed_radps: float = 0.0  # Measured speed of any joint [rad/s]
+    at_limit: str = ""  # Name of a joint whose command was at its limit; empty: none
 
     def record(self) -> dict[str, object]:
         """The values as JSON values, name of the field → value, for the provenance."""

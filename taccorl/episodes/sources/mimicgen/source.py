@@ -19,18 +19,13 @@ _AT_REST_ROWS = 4  # a gripper that has not moved for so long, and then does, be
 class ArmTrack:
     """Poses, gripper openings and commands of one arm at the T rows of a source."""
 
-    tcp: np.ndarray
-    """(T, 4, 4) world-from-TCP."""
-    goal: np.ndarray
-    """(T, 4, 4) world-from-TCP that action t is to reach."""
-    joints_rad: np.ndarray
-    """(T, 6) joint angles of ``goal`` [rad]."""
-    opening_m: np.ndarray
-    """(T,) gripper command of action t [m]."""
+    tcp: np.ndarray  # (T, 4, 4) world-from-TCP
+    goal: np.ndarray  # (T, 4, 4) world-from-TCP that action t is to reach
+    joints_rad: np.ndarray  # (T, 6) joint angles of ``goal`` [rad]
+    opening_m: np.ndarray  # (T,) gripper command of action t [m]
     command: np.ndarray
     """(T, 4, 4) world-from-TCP of the commanded joint angles of action t: the goal corrected by the arm's steady-state offset."""
-    command_rad: np.ndarray
-    """(T, 6) commanded joint angles [rad]."""
+    command_rad: np.ndarray  # (T, 6) commanded joint angles [rad]
 
     @functools.cached_property
     def gripper_acts(self) -> np.ndarray:
