@@ -7,9 +7,9 @@ cent outweighs the friction of a fast drive. They stay, and so do the delays, if
 law, row by row, to the noise floor: a fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted
 within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file states it, because positions determine ratios
 only. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
-delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. So is the delay of a
-speed that the drive filters; it is fitted if efforts were recorded and the file states ``loop_hz``. The scale of efforts is
-fitted in place of the inertia where that decides.
+delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. If efforts
+were recorded, so is the delay of a speed that the drive filters, or the period of its loop where the file states no
+``loop_hz``. The scale of efforts is fitted in place of the inertia where that decides.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, seen_in
+from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, seen_in
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -174,9 +174,11 @@ class AxisProblem(WithoutMaps):
             at = axis.target_late_s
             late = Free(name="target_late_s", unit="s", start=at, low=0.0, high=max(TIMING_S, at), scale=1e-4)
             found.append(dataclasses.replace(late, unless="command_delay"))
-        if self.effort and axis.loop_hz and axis.kd and axis.law != "pwm":
-            high = max(FILTER_PERIODS / axis.loop_hz, axis.speed_late_s)
-            found.append(Free(name="speed_late_s", unit="s", start=axis.speed_late_s, low=0.0, high=high, scale=1e-4))
+        if self.effort and axis.kd and axis.law != "pwm":
+            at = axis.speed_late_s
+            high = max(FILTER_PERIODS / (axis.loop_hz or math.inf), at)
+            late = Free(name="speed_late_s", unit="s", start=at, low=0.0, high=high, scale=1e-4)
+            found.append(late if axis.loop_hz else LOOP)
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
         found += [
             Free(

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.fits import STEPS, Fits, model_of, refusal
 from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Values, with_held, with_scale
@@ -39,18 +40,20 @@ OF_LOOP = ("loop_s", "speed_delay_s")
 
 def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Changed, ...]:
     """Numbers of the file whose refit explains a part of the error of the twin as it was: before an effect was added, unless the
-    added ones bring them back into their 95 % intervals or near it (``NEGLIGIBLE``); and beside the added ones. ``names``: effects that may be missing."""
+    added ones bring them back into their 95 % intervals or near the file's value; and beside the added ones. ``names``: effects
+    that may be missing."""
     found: dict[str, Changed] = {}
     intervals = model.intervals()
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
-            if fit is not model:
-                moved = [f for f in moved if not _near(fits.given[f.name], model.values[f.name])]
+            moved = [f for f in moved if fit is model or not _near(fits.given[f.name], model.values[f.name])]
             of_drive = frees[0].name in (*STATED, *OF_LOOP)
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
                 name, before, after, unit = f.name, float(fits.given[f.name]), float(model.values[f.name]), f.unit
+                if name in OF_LOOP and model.values["loop_s"] < SHORTEST_STEP_S:
+                    continue  # faster than the model's own steps
                 if name in OF_LOOP:
                     name, before, after, unit = "loop_hz", np.inf, 1.0 / max(model.values["loop_s"], 1e-9), "Hz"
                 alone = fit is not model

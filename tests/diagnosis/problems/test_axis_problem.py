@@ -447,7 +447,7 @@ def test_gains_that_a_recording_states_are_those_it_is_simulated_with(slide: Mea
 
 def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(slide, problem):
     free = {f.name: f for f in problem.base if not f.held}
-    assert list(free) == ["inertia", "torque_ff", "weight_cos", "target_late_s", "kp", "kd"]
+    assert list(free) == ["inertia", "torque_ff", "weight_cos", "target_late_s", "loop_s", "kp", "kd"]
     assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)
     silent = tuple(dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit)
     assert [f.name for f in AxisProblem(AXIS, Measurements(silent)).base] == ["inertia", "torque_ff", "target_late_s"]
