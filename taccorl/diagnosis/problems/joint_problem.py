@@ -66,8 +66,8 @@ equivalent."""
 LOOP = Free(name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4)
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
-EFFORT_AGE = Free(name="effort_age_s", unit="s", start=0.0, low=-TIMING_S, high=TIMING_S, scale=1e-4)
-"""Age of the reported effort relative to the torque that acts, where the twin states no timing of the drive's loop: at an
+EFFORT_AGE = Free(name="effort_age_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-4)
+"""Age of the reported effort, which is never newer than the torque that acts, where the twin has no timing of the loop: at an
 acceleration of 20 rad/s² a quarter of a millisecond makes 0.4 N·m of K_d = 88 N·m·s/rad, as a little ``torque_lag``,
 ``command_delay`` or ``velocity_feedforward`` would."""
 PAYLOAD_PLACE = tuple(
@@ -256,7 +256,8 @@ class JointProblem(WithoutMaps):
             starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
             gains = [_around(*starts[name]) for name in joint.gain_names]
             found = gains + found + [delay] * (self.effort or self._weight_shows(1.0)) + scale
-            found += [EFFORT_AGE] * (self.effort and not joint.position_age_s)
+            untimed = self.effort and not joint.position_age_s
+            found += [LOOP if joint.exact_timing else EFFORT_AGE] * untimed
         found += [_within(name, value) for name, value in joint.winding.items()]
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
