@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_703,
+    "taccorl/alignment": 15_701,
     "taccorl/cli": 5_134,
     "taccorl/data": 8_797,
     "taccorl/diagnosis": 11_318,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_508,
     "taccorl/training": 1_570,
     "taccorl/views": 2_638,
-    "tests": 56_562,
+    "tests": 56_560,
     "pipelines": 6_245,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -239,7 +239,7 @@ def align_camera(camera: str, config: TwinConfig, episode: Episode) -> Alignment
 
 
 def _align_camera(part: str, camera: str, config: TwinConfig, episode: Episode) -> Alignment:
-    had = _effects_of(config, camera)
+    had = [e for e in config.effects if e.name.startswith("camera_") and camera in e.acts_on()]
     late = camera_latency(all_pictures(episode, camera), episode.time_s, joint_rows(episode), config, camera)
     known_s = sum(float(getattr(e, "delay_s", 0.0)) for e in had)
     latency_s = known_s if late.problems else late.latency_s
@@ -343,10 +343,6 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
         except TaccorlError as error:
             why = f"the pads are as they were: {error}"
     return config, why
-
-
-def _effects_of(config: TwinConfig, camera: str) -> list[Effect]:
-    return [e for e in config.effects if e.name.startswith("camera_") and camera in e.acts_on()]
 
 
 def _without(config: TwinConfig, camera: str, names: Sequence[str]) -> TwinConfig:

@@ -63,11 +63,8 @@ class Covariance:
         along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
         named = [k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE]
         width = 1.96 * float(np.sqrt(values[-1]))
-        return width, " together with ".join(f"{AXES[k]} (±{_in_words(float(self.half_width[k]), k)})" for k in named)
-
-
-def _in_words(value: float, axis: int) -> str:
-    return f"{math.degrees(value):.2f}°" if axis < 3 else f"{1e3 * value:.1f} mm"
+        half = [f"{math.degrees(x):.2f}°" if k < 3 else f"{1e3 * x:.1f} mm" for k, x in enumerate(self.half_width)]
+        return width, " together with ".join(f"{AXES[k]} (±{half[k]})" for k in named)
 
 
 def covariance(view: TwinView, joints: np.ndarray, level: Level, solution: Solution) -> Covariance | None:

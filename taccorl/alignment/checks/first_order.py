@@ -185,13 +185,8 @@ def _rows(target: np.ndarray, measured: np.ndarray, period_s: float) -> np.ndarr
 def _of_delay(
     rows: float, column: int, left: np.ndarray, jacobian: np.ndarray, shape: np.ndarray, period_s: float
 ) -> dict[str, float]:
-    """Fields of ``Shift`` of a delay [rows] that is a parameter of a fit with four.
-
-    Args:
-        column: column of the delay in the Jacobian.
-        left: residual; one that is like its neighbour counts for fewer samples.
-        shape: fitted response.
-    """
+    """Fields of ``Shift`` of a delay [rows], the parameter ``column`` of a fit with four. ``left``: residual; one that is like
+    its neighbour counts for fewer samples. ``shape``: fitted response."""
     rms = math.sqrt(float(left @ left) / max(len(left) - 4, 1))
     likeness = float(np.clip(left[1:] @ left[:-1] / max(left @ left, 1e-300), 0.0, 0.999))
     variance = float(np.linalg.pinv(jacobian.T @ jacobian)[column, column]) * (1 + likeness) / (1 - likeness)

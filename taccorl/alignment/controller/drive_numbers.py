@@ -53,6 +53,9 @@ class _Own(NamedTuple):
     """1: the reported effort includes the torque of the gravity compensation; 0: it does not."""
     effort_age: float = 0.0
     """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
+    speed_age: float = 0.0
+    """Mean age of the speed that K_d multiplies [s]: an inertia smaller by K_d · age (at most by ``joint_kernel.MOST_LOST`` of
+    it), except while the motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""
     midpoint: float = 0.0
     """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
     dropped_commands__seed: float = 0.0
@@ -73,5 +76,4 @@ Drive = namedtuple(
 )
 """One joint with its drive: the fields of ``_Own``, and ``EFFECT__PARAMETER`` of the effects, which do nothing by default.
 
-``speed_delay__delay_s`` acts as an inertia smaller by K_d · delay (by at most ``joint_kernel.MOST_LOST`` of it), except while the
-motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""
+``speed_delay__delay_s`` is the time constant of a low-pass on the speed that K_d multiplies; below 0 it adds to ``speed_age``."""

@@ -168,13 +168,8 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def covariance(jacobian: np.ndarray, residual: np.ndarray, correlated: float) -> np.ndarray:
-    """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, with σ² times ``correlated``; very large where J is singular.
-
-    Args:
-        jacobian: (R, P) J.
-        residual: (R,), from which σ is estimated.
-        correlated: correlation time of the residuals [rows].
-    """
+    """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹ with J ``jacobian`` (R, P), and σ² that of ``residual`` (R,) times
+    its correlation time ``correlated`` [rows]; very large where J is singular."""
     norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30)
     _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
     half = right / np.maximum(singular, 1e-12)[:, None] / norms

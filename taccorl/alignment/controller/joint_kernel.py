@@ -266,7 +266,9 @@ def _simulated(
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
-    lost = min(p.kd * p.speed_delay__delay_s, MOST_LOST * whole_inertia)
+    lost = min(p.kd * (p.speed_age + min(p.speed_delay__delay_s, 0.0)), MOST_LOST * whole_inertia)
+    fresh_share = where(p.speed_delay__delay_s > 0.0, ahead * h / (ahead * h + p.speed_delay__delay_s), 1.0)
+    with_filter = holds(fresh_share < 1.0)
     ruled_inertia = whole_inertia - lost
     ruled_inertia -= min(early * (p.kd + p.back_emf), 0.5 * ruled_inertia)
     link = p.inertia - p.rotor_inertia  # beyond the gear
@@ -287,7 +289,7 @@ def _simulated(
     rubs = with_load or with_spot or with_power or holds((coulomb > 0.0) & (bend_rad <= 0.0))
 
     # Where it is when the encoder reports ``start``, and what is in balance there.
-    q, v = none + start, none + start_speed
+    q, v, late_v = none + start, none + start_speed, none + start_speed
     for _ in range(20):
         q += start - _reading(p, q)
     gear, gear_v = none, none  # angle of the link against the motor, and its rate
@@ -365,6 +367,8 @@ def _simulated(
             shown = where(lag_s > 0.0, torque, shown)
             shown_strength = strength * _of_direction(p, shown + carried)
             given_weight = shown_strength * carried
+            if with_filter:
+                shown += where(lag_s > 0.0, 0.0, (by_speed - on[seen] * p.back_emf) * (v - late_v))
             total = _limited(p, shown_strength * (shown + older) + lost * acceleration + given_weight, v)
             store(effort, row, where(p.effort_holds_weight == 0.0, total - given_weight, total))
             store(reported, row, _reading(p, q))
@@ -383,6 +387,9 @@ def _simulated(
         if with_integral and kind == VELOCITY:
             integral += ahead * h * now  # taken ahead as the position is, which is its other part
         asked, stiffness, damping = _asked(p, kind, now, until_now, q, v, integral, supply[part], on[part], added[part])
+        if with_filter:
+            slow = (1.0 - fresh_share) * (damping - on[part] * p.back_emf)
+            asked, damping = asked + slow * (v - late_v), damping - slow
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness
         gain = newest_share * strength
@@ -480,6 +487,8 @@ def _simulated(
             else:
                 integral += h * (now - p.encoder_scale__factor * q)
         acceleration = (v_next - v) / h
+        if with_filter:
+            late_v = where(fresh_share < 1.0, late_v + fresh_share / ahead * (moved / h - late_v), v_next)
         q += moved
         v = v_next
     return answers

@@ -158,13 +158,11 @@ class JointModel:
     def _prepared(self, case: "Numbers") -> "_Prepared":
         """Prepare what does not depend on the recording."""
         present = self.joint.effects(case.effects)
-        speed_late_s = self.joint.speed_delay_s
         drives = [(effect.name, effect.drive()) for effect in present]
-        timing = [("the drive", {"speed_delay__delay_s": speed_late_s})] if speed_late_s > 0.0 else []
         of_effects = [(name, drive) for name, drive in drives if drive is not None]
-        known = {**self.joint.facts, **(case.facts or {})}
+        known = {"speed_age": self.joint.speed_delay_s, **self.joint.facts, **(case.facts or {})}
         known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
-        numbers = _combined([*timing, ("the drive", known), *of_effects])
+        numbers = _combined([("the drive", known), *of_effects])
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
         return _Prepared(case, present, bodies, numbers if len(of_effects) == len(drives) else None)
 

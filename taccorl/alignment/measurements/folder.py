@@ -184,7 +184,8 @@ def read_measurements(
     path = Path(path)
     folder = path if path.is_dir() else path.parent
     index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))
-    spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
+    if spec is None and index.spec is not None:  # beside the index, or a shipped one
+        spec = folder / index.spec if (folder / index.spec).is_file() else index.spec
     columns = columns if columns is not None or index.columns is None else folder / index.columns
     if isinstance(columns, TableSpec):
         stated = columns
@@ -331,11 +332,6 @@ def _check_pressed(document: Document[MeasurementIndex], key: str, pressed: Pres
             "is it in millimetres?"
         )
         raise document.error(f"{key}/radius_m", text)
-
-
-def _beside(folder: Path, name: str) -> str | Path:
-    """A spec beside the index, or the shipped one of that name."""
-    return folder / name if (folder / name).is_file() else name
 
 
 def _note(index: MeasurementIndex, measurement: Measurement) -> RecordingNote:

@@ -183,15 +183,13 @@ class _Rows:
         self.grid_ns = self._grid()
 
     def _rate_hz(self) -> float:
-        rates = {c: NS_PER_S / float(np.median(np.diff(self._time_ns(c)))) for c in self.commands if self._many(c)}
+        many = [c for c in self.commands if len(self.cutter.clocks[c].time_ns) > 1]
+        rates = {c: NS_PER_S / float(np.median(np.diff(self._time_ns(c)))) for c in many}
         if not rates:
             raise RecordingError(f"{self.cutter.recording.source.name}: fewer than two commands: nothing to replay")
         name, rate_hz = max(rates.items(), key=lambda item: item[1])
         said = self.cutter.nominal_hz(name)
         return said if abs(rate_hz / said - 1) < RATE_TOLERANCE else rate_hz
-
-    def _many(self, channel: str) -> bool:
-        return len(self.cutter.clocks[channel].time_ns) > 1
 
     def _time_ns(self, channel: str) -> np.ndarray:
         return self.cutter.clocks[channel].time_ns

@@ -209,7 +209,8 @@ class Comparison:
     def signals(self) -> tuple[tuple[str, Kind], ...]:
         """(signal, kind), positions first, in the order of the PiPER's actions, or else in the order of the recordings."""
         found: dict[tuple[str, Kind], None] = dict.fromkeys((t.signal, t.kind) for t in self.traces)
-        return tuple(sorted(found, key=lambda s: (s[1] != "position", _order(s[0]))))
+        place = {name: k for k, name in enumerate(ROBOT.action_names)}
+        return tuple(sorted(found, key=lambda s: (s[1] != "position", place.get(s[0], len(place)))))
 
     def of(self, signal: str, kind: Kind = "position", use: Use | None = None) -> tuple[Trace, ...]:
         """Traces of one signal, for one use or (None) for all."""
@@ -339,10 +340,6 @@ def shown(value: float, unit: str) -> str:
     """Text of ``value`` [``unit``] in a readable unit, such as ``2.01 mrad``."""
     factor, name = shown_unit(unit)
     return f"{value * factor:.3g} {name}"
-
-
-def _order(signal: str) -> int:
-    return ROBOT.action_names.index(signal) if signal in ROBOT.action_names else len(ROBOT.action_names)
 
 
 def only(comparison: Comparison, signals: Iterable[str]) -> Comparison:

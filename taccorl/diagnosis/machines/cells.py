@@ -228,9 +228,10 @@ class CellsMachine(Machine):
         (part,) = self.select((self.config.name,), joints, pads)
         made = self.effect(name, part, {**values, "evidence": "by hand"})
         if made is None:
-            raise TaccorlError(f"{name} is not an effect of a sensor of cells; {nearest(name, _cells_effects())}")
-        known = {key: getattr(self.config, key) for key in ("gain", "offset") if getattr(self.config, key)}
-        numbers = {f"{key}_{cell}": x for key in known for cell, x in zip(self.config.names, known[key], strict=True)}
+            known = [name for name in registry if "cells" in registry.get(name).kinds()]
+            raise TaccorlError(f"{name} is not an effect of a sensor of cells; {nearest(name, known)}")
+        own = {key: getattr(self.config, key) for key in ("gain", "offset") if getattr(self.config, key)}
+        numbers = {f"{key}_{cell}": x for key in own for cell, x in zip(self.config.names, own[key], strict=True)}
         return [Addition(part, [made], numbers, {})]
 
     def with_additions(self, additions: Sequence[Addition]) -> "CellsMachine":
@@ -251,10 +252,6 @@ class CellsMachine(Machine):
 
 def _cells(measurements: Sequence[Any]) -> list[CellMeasurement]:
     return [m for m in measurements if isinstance(m, CellMeasurement)]
-
-
-def _cells_effects() -> list[str]:
-    return [name for name in registry if "cells" in registry.get(name).kinds()]
 
 
 def _cut_words(config: CellsConfig, measurements: Measurements) -> list[str]:

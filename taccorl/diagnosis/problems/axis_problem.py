@@ -82,7 +82,7 @@ class AxisProblem(WithoutMaps):
             age_s, used = DrivenAxis(axis).speed_delay_s, (*measurements.fit, *measurements.validation)
             self.law_error = max(law_error(axis, m, axis.name, age_s) for m in used) / self.floors[-1].value
         self._stated = {f"{e.name}.{p.name}": getattr(e, p.name) for e in own for p in e.parameters()}
-        base = self._base()
+        base = (*self._numbers(), *[dataclasses.replace(EFFORT_SCALE, held=True)] * self.effort)
         self.start: Values = {f.name: f.start for f in base} | self._stated
         self.base = holding(base, self.known, self.start)
         self.candidates: dict[str, Candidate] = {}
@@ -142,9 +142,6 @@ class AxisProblem(WithoutMaps):
             if cls is not None:
                 c = candidate(cls, seen)
                 self.candidates[name] = dataclasses.replace(c, frees=holding(c.frees, self.known, self._stated))
-
-    def _base(self) -> tuple[Free, ...]:
-        return (*self._numbers(), *[dataclasses.replace(EFFORT_SCALE, held=True)] * self.effort)
 
     def _numbers(self) -> tuple[Free, ...]:
         axis, unit = self.axis, self.axis.scale.unit_of

@@ -13,7 +13,7 @@ import numpy as np
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
-from taccorl.alignment.controller.joint_kernel import LANES, MOST_LOST
+from taccorl.alignment.controller.joint_kernel import LANES
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -57,7 +57,7 @@ scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
 """Ratio of reported effort to torque, which differs between versions of PiPER firmware."""
 SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
-"""τ of the effect speed_delay, the influence of a sampled loop on the inertia. It is fitted if something besides the inertia
+"""τ of the effect speed_delay: how late a sampled loop damps the speed. It is fitted if something besides the inertia
 determines the scale of the torques; otherwise a change of K_p is equivalent (``taccorl.diagnosis.search.identifiable``)."""
 POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4)
 """Age of the measured position when the drive's torque acts, beyond the age that follows from the loop. It is fitted together
@@ -66,9 +66,10 @@ equivalent."""
 LOOP = Free(name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4)
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
-EFFORT_AGE = Free(name="effort_age_s", unit="s", start=0.0, low=-TIMING_S, high=TIMING_S, scale=1e-4)
-"""Age of the reported effort relative to the torque that acts, where the twin states no timing of the drive's loop: at an
-acceleration of 20 rad/s² a quarter of a millisecond makes 0.4 N·m of K_d = 88 N·m·s/rad."""
+EFFORT_AGE = Free(name="effort_age_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-4)
+"""Age of the reported effort, which is never newer than the torque that acts, where the twin has no timing of the loop: at an
+acceleration of 20 rad/s² a quarter of a millisecond makes 0.4 N·m of K_d = 88 N·m·s/rad, as a little ``torque_lag``,
+``command_delay`` or ``velocity_feedforward`` would."""
 PAYLOAD_PLACE = tuple(
     Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
     for name in ("payload_sin_m", "payload_cos_m")
@@ -206,14 +207,13 @@ class JointProblem(WithoutMaps):
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         half_s = 0.5 * float(base.get(LOOP.name, 0.0))
         if SPEED_DELAY.name in base:
-            delay_s = min(base[SPEED_DELAY.name] + half_s, TIMING_S)
-            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
+            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s)]
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
         facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
             waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
             effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
-            facts |= {"effort_age": effort_age, "command_delay__delay_s": waits_s}
+            facts |= {"effort_age": effort_age, "speed_age": 2.0 * half_s, "command_delay__delay_s": waits_s}
         return Numbers(gains, effects, lever, age_s, facts)
 
     def learn(self, values: Mapping[str, float]) -> None:
@@ -240,14 +240,9 @@ class JointProblem(WithoutMaps):
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
         found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (not self.model.joint.holds_torque_ff)
-        # A loop whose speed is later than J / K_d is unstable.
-        # A measured speed lacks the age of the difference of two samples, which is half of what a loop states.
-        delay = dataclasses.replace(
-            SPEED_DELAY,
-            low=-0.5 * self.model.joint.speed_delay_s,
-            high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9)),
-        )
         joint = self.model.joint
+        # A measured speed lacks the age of the difference of two samples, which is half of what a loop states.
+        delay = dataclasses.replace(SPEED_DELAY, low=-0.5 * joint.speed_delay_s)
         units = Scale(unit=joint.unit)
         scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (self.effort and not self._left_out)
         if joint.target_kind == "effort":
@@ -261,6 +256,8 @@ class JointProblem(WithoutMaps):
             starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
             gains = [_around(*starts[name]) for name in joint.gain_names]
             found = gains + found + [delay] * (self.effort or self._weight_shows(1.0)) + scale
+            untimed = self.effort and not joint.position_age_s
+            found += [LOOP if joint.exact_timing else EFFORT_AGE] * untimed
         found += [_within(name, value) for name, value in joint.winding.items()]
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known

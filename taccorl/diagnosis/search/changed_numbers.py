@@ -47,7 +47,8 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
-            moved = [f for f in moved if fit is model or not _near(fits.given[f.name], model.values[f.name])]
+            change = {f.name: abs(model.values[f.name] - fits.given[f.name]) for f in moved}
+            moved = [f for f in moved if fit is model or change[f.name] > NEGLIGIBLE * abs(fits.given[f.name])]
             of_drive = frees[0].name in (*STATED, *OF_LOOP)
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
@@ -62,10 +63,6 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
                 )
                 found.setdefault(name, own)
     return tuple(found.values())
-
-
-def _near(stated: float, fitted: float) -> bool:
-    return abs(fitted - stated) <= NEGLIGIBLE * abs(stated)
 
 
 def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:

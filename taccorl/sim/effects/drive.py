@@ -115,8 +115,8 @@ class SpeedDelay(JointEffect):
 
     τ is the sum of half a sampling period for the difference of two samples, half a period for the output that is held, and the
     time constant of the velocity's filter. The diagnosis fits τ with the gains if the recordings determine it (recorded effort,
-    known weight, commanded gains), so that it is not a candidate of the search. In the one-joint model the effort includes K_d τ
-    q̈, which the motor supplies; in a whole twin in MuJoCo, where only the inertia is changed, it does not."""
+    known weight, commanded gains), so that it is not a candidate of the search. The one-joint model has a low-pass, −K_d w with
+    τ ẇ = q̇ − w. In a whole twin in MuJoCo only the inertia is changed, and efforts lack K_d τ q̈, which the motor supplies."""
 
     fitted: ClassVar = False
     delay_s: float = number(

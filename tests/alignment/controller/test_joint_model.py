@@ -90,7 +90,7 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
     exact = in_mujoco(motion, signal, gains, effect)
     away = np.abs(quick.reported - exact.reported)
     assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
-    assert away[100:].max() < 1e-6
+    assert away[100:].max() < (2e-5 if name == "speed_delay" else 1e-6)  # MuJoCo's is exact to the first order
     # the effort is what the motor gives, not what was asked of it
     if name not in OTHER_EFFORT:
         away_nm = np.abs(quick.effort - exact.effort)[100:].max()
@@ -394,6 +394,19 @@ class _Geared(AxisJoint):
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         return Rigid(3.3, 0.6)
+
+
+@pytest.mark.parametrize("kd", [110.0, 2640.0])
+def test_a_late_speed_is_behind_a_low_pass(kd: float) -> None:
+    """J q̈ = K_p (q* − q) − K_d w, τ ẇ = q̇ − w after a step of the target; also where K_d τ is 1.2 J, as of a light wrist."""
+    inertia, kp, late_s = 3.3, 1320.0, 1.5e-3
+    model = JointModel.of(_Geared("pan", inertia, Gains(kp, kd, 0.0), "rad", 1e-4))
+    motion = of_joint("step", 200.0, np.where(np.arange(60) > 0, 1.0, 0.0), np.full(60, np.nan))
+    found = model.simulate(motion, model.gains, [make_effect("speed_delay", delay_s=late_s)])
+    law = np.array([[0.0, 1.0, 0.0], [-kp / inertia, 0.0, -kd / inertia], [0.0, 1.0 / late_s, -1.0 / late_s]])
+    off = np.array([expm(law * 5e-3 * k) @ [-1.0, 0.0, 0.0] for k in range(59)])
+    np.testing.assert_allclose(found.reported[1:], 1.0 + off[:, 0], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.effort[2:], -kp * off[1:, 0] - kd * off[1:, 2], rtol=0, atol=1e-3 * kp)
 
 
 def test_a_rotor_on_a_stiff_gear_swings_as_its_two_masses_do() -> None:

@@ -121,12 +121,12 @@ def test_friction_hidden_under_each_law_is_recovered_beside_commanded_gains(law:
     assert model.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_NM, rel=0.005)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_a_speed_that_a_sampled_loop_measures_is_newer_than_a_difference_of_two_samples(stated: bool, tmp_path: Path):
+@pytest.mark.parametrize(("stated", "gains"), [(True, "commanded"), (False, "commanded"), (False, "fitted")])
+def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(stated: bool, gains: str, tmp_path: Path) -> None:
     """A loop of 1 kHz holds its torque for 1 ms: position and measured speed are 0.5 ms old. The file's 1 ms for the speed, as
     of a difference, would be an inertia that lacks 1.5 N·m·s · 0.5 ms, 1.5 %, at every joint. A rate that the file does not state
     is named, and written with the error that the diagnosis says."""
-    drive = f"{FILES['impedance']}, gains: commanded{', loop_hz: 1000.0' * stated}"
+    drive = f"{FILES['impedance']}, gains: {gains}{', loop_hz: 1000.0' * stated}"
     machine = RobotMachine(robot(tmp_path, drive), "robot")
     one, other = (recording("impedance", name, hz, 1, 0.0, held_steps=50) for name, hz in (("a", 2.5), ("b", 2.0)))
     without = [name for name in effects if name not in ("armature", "command_delay")]
