@@ -4,7 +4,8 @@
 # setsid bash .ci/gpu/ppo.sh SURROGATE SECOND > /dev/shm/job.log 2>&1 < /dev/null &
 # PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
 # clock; then start and result are scored in the surrogate. `TASK=assembly_2 bash .ci/gpu/ppo.sh nominal SECOND`: of $POLICIES/nominal,
-# in the nominal twin alone.
+# in the nominal twin alone. RUNS="nominal_1000 ppo_anchored,nominal_2000 ppo_anchored": other policies of $POLICIES, whose names begin
+# with that of their twin.
 if [ "$1" = pack ]; then
   mkdir -p outputs/ppo_{1,2,3}
   ln -sfn "$(realpath "$2")" outputs/ppo_1/nominal && ln -sfn "$(realpath "$3")" outputs/ppo_1/mended
@@ -21,6 +22,7 @@ else
   robot=configs/surrogates/$name.yaml
   scored_in=(--twin="$robot") runs=("nominal ppo" "nominal ppo_anchored" "mended ppo" "mended ppo_anchored")
 fi
+if [ -n "${RUNS:-}" ]; then IFS=, read -ra runs <<<"$RUNS"; fi
 threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
 scored=${SCORED:-192} demonstrations=${DEMONSTRATIONS:-50} options=(${OPTIONS:-})
 quarter=$((threads / gpus))
@@ -32,14 +34,14 @@ if [ -n "$robot" ]; then
   python3 -c "import sys
 from pathlib import Path
 from pipelines.learn import LearnConfig, demonstrations, parsed
-demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), '$task', Path('$robot'))" --task="$task" --episodes="$demonstrations" \
+demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), '$task', Path('$robot'), domain='surrogate')" --task="$task" --episodes="$demonstrations" \
     --scored_in=["$robot"] --out=/dev/shm/anchor --workers="$threads" >/dev/shm/made_anchor.log 2>&1
   since "anchor made: $?"
 fi
 improve() { # NUMBER TWIN STAGE
   out=/dev/shm/learn_ppo/$task/policy_$2_$3 twin=() first=$(($1 % gpus * quarter))
   local cores=$first-$((first + quarter - 1))
-  if [ "$2" = mended ]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
+  if [[ "$2" = mended* ]]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
   if [ "$3" = ppo_anchored ]; then
     anchor=(--anchor.dataset="$(echo /dev/shm/anchor/$task/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store)
   else
@@ -66,8 +68,10 @@ from pathlib import Path
 from pipelines.learn import named
 
 learnt, robot, score, stage = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
-of, twin = re.fullmatch(r"train_(\d+)_20_steps_?(.*)", Path(learnt["dataset"]["root"]).name).groups()
-about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin, "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
+name = Path(learnt["dataset"]["root"]).name
+of, twin, real = re.fullmatch(r"train_(\d+)_20_steps(?:_(?!and_)(.*?))?(?:_and_train_(\d+)_20_steps_.*)?", name).groups()
+about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin or "", "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
+about |= {"real": int(real), "sim_weight": learnt["policy"]["sim_weight"]} if real else {}
 (Path(score) / "settings.json").write_text(json.dumps(about | {"stage": stage}))
 P
     fi

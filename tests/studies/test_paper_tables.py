@@ -38,7 +38,7 @@ def test_cells_are_what_was_counted():
     beside = [*moved, moved[1] | {"twin": "", "real": 5, "sim_weight": 0.5}]
     assert len(transfer(beside)["late", 9]["nominal"]) == 1
     alone = "0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* |"
-    assert f"| late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | {alone}" in page(beside)
+    assert f"| late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | not run | {alone}" in page(beside)
     grip = ROW | {"task": "assembly_1", "demonstrations": 100}
     told = page([grip, grip | {"sources": 10, "demonstrations": 1000, "successes": 48}, grip | {"stage": "ppo"}])
     assert "| cameras and touch | each its own grip | 0 % (0 … 4) of 96* | not run | not run | not run |" in told
