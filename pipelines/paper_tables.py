@@ -150,8 +150,7 @@ def share(rows: Rows) -> str:
 def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
-    both = [row | {"stage": row.get("stage", "")} for row in rows if "real" in row]
-    mixed = _grouped(both, "scored_in", "real", "sim_weight", "stage")
+    mixed = _grouped([{"stage": "", **r} for r in rows if "real" in r], "scored_in", "real", "sim_weight", "stage")
     own = _grouped([row for row in seen if PLAIN.items() <= row.items() and "sources" not in row], "task", "sensors")
     harder = [row for row in seen if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])]
     cells = _grouped(harder, "task", "pictures", "demonstrations", "difficulty", "executed", "sensors")
@@ -176,8 +175,7 @@ def page(rows: Rows) -> str:
             table_4.append((robot, text, share(of["nominal"]), share(of["mended"]), gain(of)))
     for robot, real in sorted({key[:2] for key in mixed}):
         name = robot.rpartition("_")[0]
-        weights = [mixed[robot, real, weight, ""] for weight in (0, 0.5, 0.95)]
-        weights.append(mixed[robot, real, 0.95, "ppo_anchored"])
+        weights = [mixed[robot, real, *cell] for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))]
         n = max(row["demonstrations"] for row in itertools.chain(*weights))
         alone = transfer(seen).get((name, n), {})
         shares = [*weights, alone.get("nominal", []), alone.get("mended", [])]
@@ -225,7 +223,7 @@ scored ([settings](training.md#post-training-ppo-in-the-twin)).
 assembly_1, cameras and touch, scored in the surrogate; the loss is α · the twin's + (1 − α) · the surrogate's.
 The paper, of a robot: {PAPER_REAL}.
 
-{_table("surrogate: its, the twin's | α = 0: its own | α = 0.5 | α = 0.95 | … after PPO with an anchor | α = 1: nominal twin | mended twin", table_6)}
+{_table("surrogate: its, the twin's | α = 0 | 0.5 | 0.95 | … after PPO, anchored | 1: nominal twin | mended twin", table_6)}
 
 **Not run**: PPO after other policies, with exploration noise and from base; β; Table 2 in other surrogates and after PPO;
 other cells that say so.

@@ -204,8 +204,7 @@ class JointProblem(WithoutMaps):
         ]
 
     def _numbers(self, base: Mapping[str, float], effects: Sequence[Effect]) -> Numbers:
-        lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
-        half_s = 0.5 * float(base.get(LOOP.name, 0.0))
+        lever, half_s = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE)), 0.5 * base.get(LOOP.name, 0.0)
         if SPEED_DELAY.name in base:
             effects = [*effects, SpeedDelay(**self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s)]
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
@@ -213,7 +212,8 @@ class JointProblem(WithoutMaps):
         if half_s:
             waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
             effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
-            facts |= {"effort_age": effort_age, "speed_age": 2.0 * half_s, "command_delay__delay_s": waits_s}
+            speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
+            facts |= {"effort_age": effort_age, "speed_age": speed_age, "command_delay__delay_s": waits_s}
         return Numbers(gains, effects, lever, age_s, facts)
 
     def learn(self, values: Mapping[str, float]) -> None:
