@@ -202,8 +202,8 @@ def _check(config: LearnConfig) -> None:
     if not config.scored_in and ({"mended", "surrogate"} & {*config.twins} or config.singly or config.real):
         asked = "--singly" if config.singly else f"--real={config.real}" if config.real else f"--twins={config.twins}"
         raise SystemExit(f"{asked}: of which surrogate? Give its twin file as --scored_in=")
-    if config.real and (config.singly or len(config.episodes) > 1):
-        raise SystemExit(f"--real={config.real}: takes one number of --episodes, and no --singly")
+    if config.real and (config.singly or len(config.episodes) > 1 or any(map(_is_folder, config.twins))):
+        raise SystemExit(f"--real={config.real}: takes one number of --episodes, no --singly, and no folder of --twins")
     if not all(0 <= weight <= 1 for weight in config.sim_weight):
         raise SystemExit(f"--sim_weight={config.sim_weight}: shares of the loss, 0 … 1")
     if config.sim_weight and not config.real:

@@ -35,7 +35,7 @@ post_train() { # GPU NAME OPTIONS
   cp "$out/$2/progress.jsonl" "$out/score_$2.jsonl"
 }
 bench() { # NAME SECONDS
-  timeout "$2" python3 -m pipelines.benchmarks --only="$1" >"$out/score_$1.log" 2>&1
+  timeout "$2" ${cores:-} python3 -m pipelines.benchmarks --only="$1" >"$out/score_$1.log" 2>&1
   since "$1: $?"
   cp bench.json "$out/score_bench.json"
 }
@@ -43,7 +43,7 @@ for part in $parts; do
   since "$part begins"
   case $part in
   adapters) bench full_adapters "${ADAPTERS_S:-200}" ;;
-  bench) CUDA_VISIBLE_DEVICES=1 bench physics_on_gpu 130 ;;
+  bench) cores="taskset -c $half-$((2 * half - 1))" CUDA_VISIBLE_DEVICES=1 bench physics_on_gpu 130 ;;
   scores)
     for task in "${tasks[@]}"; do
       (OMP_NUM_THREADS=1 score 0 "$task" c --workers="$half" --batch_size=32) &

@@ -65,7 +65,7 @@ def spread(values: Sequence[float]) -> float:
 
 
 def cpu_times_s(work: Callable[[], object], repeats: int) -> list[float]:
-    """CPU-seconds of each of ``repeats`` calls after one that is not measured."""
+    """CPU-seconds of each of ``repeats`` calls of ``work``, after one warm-up call."""
     times = []
     for _ in range(1 + repeats):
         before = time.process_time()

@@ -277,8 +277,8 @@ def inside(row: dict[str, Any], *, hidden_only: bool = False) -> list[bool]:
 
 
 def jobs(study: str, design: str, hidden: Sequence[str], seeds: Sequence[int]) -> list[Job]:
-    """A case for each seed and each of ``hidden``: an effect, two joined by +, or nothing (""). In the study ``removed`` the
-    search does not know them."""
+    """One case for each seed and each entry of ``hidden``: the name of an effect, two names joined by +, or "" for no hidden
+    effect. In the study ``removed`` these effects are taken out of the search."""
     made = [
         Job(study=study, hidden=tuple(filter(None, h.split("+"))), seed=s, design=design) for s in seeds for h in hidden
     ]

@@ -110,10 +110,6 @@ def in_fork(work: Callable[[], int]) -> int:
         os._exit(code)
 
 
-def exit_code(pid: int) -> int:
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-
-
 # ---- one outcome each, and a report that adds up ----
 
 
@@ -433,7 +429,7 @@ def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(ingests, goo
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
         return ingests.run(good)
 
-    assert exit_code(in_fork(limited)) == 2
+    assert os.waitstatus_to_exitcode(os.waitpid(in_fork(limited), 0)[1]) == 2
     shown = capfd.readouterr()
     assert "Traceback" not in shown.out + shown.err
     last = shown.err.strip().splitlines()[-1]

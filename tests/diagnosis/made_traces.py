@@ -54,7 +54,7 @@ def comparison(*traces: Trace, **fields: Any) -> Comparison:
 
 
 def touch_trace(measured: np.ndarray, replayed: np.ndarray, floor_count: float, **fields: Any) -> TouchTrace:
-    """Frames of pads (N, P, R, C) at 100 Hz, with one noise floor for all taxels."""
+    """Readings [counts] of P pads of R × C taxels in N frames at 100 Hz, (N, P, R, C); one noise floor for all taxels."""
     time_s = np.repeat(np.arange(len(measured))[:, None] / 100, measured.shape[1], axis=1)
     own = {"recording": "press", "use": "validation", "pads": ("left_a", "left_b"), "origin": ORIGIN, "time_s": time_s}
     floor = np.full(measured.shape[1:], floor_count)

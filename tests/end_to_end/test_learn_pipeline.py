@@ -80,6 +80,7 @@ def test_demonstrations_of_a_surrogate_are_merged_as_the_robot_s(tmp_path: Path)
         (["--real=5"], "--real=5: of which surrogate"),
         (["--real=-1"], "real=-1: at least 0"),
         ([f"--scored_in=[{LATE}]", "--real=5", "--episodes=[1,2]"], "one number of --episodes"),
+        ([f"--scored_in=[{LATE}]", "--real=5", "--twins=[configs/randomised]"], "no folder of --twins"),
         (["--sim_weight=[0.5]"], r"beside that of --real=50"),
         (["--sim_weight=[0.5,2]"], r"sim_weight=\[0.5, 2.0\]: .*0 … 1"),
     ],

@@ -101,10 +101,6 @@ def opened(checkpoint: Path) -> tuple[TactilePI05Policy, Any, Any]:
     return policy, *make_pre_post_processors(config, pretrained_path=str(checkpoint))
 
 
-def rows_of(root: Path) -> list[dict[str, Any]]:
-    return [dict(row) for row in LeRobotDataset("local/other", root=root, video_backend="pyav")]  # pyright: ignore
-
-
 def observation(row: dict[str, Any]) -> dict[str, Any]:
     """As a robot's loop gives it: one row, without its action."""
     told = {k: v[None] for k, v in row.items() if k.startswith("observation.")}
@@ -121,7 +117,8 @@ def test_touch_of_any_shape_is_trained_by_lerobots_command_and_used(trained, tmp
     config = policy.config
     assert config.tactile_layouts == {key: list(shape) for key, (_, shape) in trained.touch.items()}
     assert config.tactile_format is None
-    rows = rows_of(trained.root)[:9]  # one episode
+    every = LeRobotDataset("local/other", root=trained.root, video_backend="pyav")
+    rows = [dict(row) for row in every][:9]  # pyright: ignore  # one episode
     ages = [4, 2, 0]
     batch = preprocess(
         observation(rows[8])

@@ -184,7 +184,7 @@ STOP = re.compile(r"STOPPED: (the (left|right) hand would be at .* outside of sa
 
 
 def added(port: int) -> dict[str, list[str]]:
-    """Verb → options that a test adds: a port of its own, small pictures, few steps, patience."""
+    """Command → options that a test adds to it: the server's port, small pictures, few steps, long time limits."""
     safety = [f"safety.max_age_s={PATIENT}", "safety.stop_after_s=9"]
     options = [f"port={port}", "camera_px=64", "lost_after_s=5", "id=two_terminals", "calibration_dir=calibration"]
     robot = [f"--robot.{option}" for option in (*options, *safety)]

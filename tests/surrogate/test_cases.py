@@ -1,4 +1,4 @@
-"""Surrogate robots drawn at random: same seed, same robot; as strong as asked; sampled loops; conditions of their recordings."""
+"""Random surrogate robots: the same from the same seed, effects as strong as asked; sampled loops; conditions of recordings."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The faster reader gives what LeRobot's gives, and can be left out; datasets that do not fit a policy are refused, with why."""
+"""``FastReader`` returns the rows of LeRobot's reader, and can be switched off; datasets that do not fit a policy are refused."""
 
 import dataclasses
 import json
@@ -238,7 +238,7 @@ def policy_for(root: Path, **settings: Any) -> Any:
 
 
 def read_fast(root: Path, **words: Any) -> LeRobotDataset:
-    """As LeRobot reads it where taccorl.lerobot_plugin is at work."""
+    """The dataset at ``root``, read by LeRobot with the ``FastReader`` that taccorl.lerobot_plugin puts in its reader's place."""
     before, lerobot_dataset.DatasetReader = lerobot_dataset.DatasetReader, FastReader
     try:
         return LeRobotDataset(f"local/{root.name}", root=root, **words)

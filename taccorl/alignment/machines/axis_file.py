@@ -29,7 +29,7 @@ from typing import Any, ClassVar, Literal
 
 import yaml
 
-from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S, DriveLaw
+from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
@@ -180,7 +180,7 @@ class AxisConfig(DriveLaw):
         same = ("inertia", "weight_sin", "weight_cos", "target_late_s", "speed_late_s")
         new = {name: base[name] for name in same if name in base}
         new |= self.law_numbers(base)
-        if base.get("loop_s", 0.0) > SHORTEST_STEP_S:  # else none
+        if base.get("loop_s", 0.0) > 0.0:
             new["loop_hz"] = 1.0 / base["loop_s"]
         if "inertia" in new:
             new["rotor_inertia"] = new["inertia"] * min(self.rotor_inertia / self.inertia, 1.0)

@@ -154,7 +154,7 @@ REGIMES: tuple[Regime, ...] = (
     Regime("second third", "time", "of each recording's time", _time(1)),
     Regime("last third", "time", "of each recording's time", _time(2)),
     Regime("in contact", "contact", "a pad of its arm touches", lambda m: m.trace.touched),
-    Regime("no contact", "contact", "no pad of its arm touches", lambda m: ~m.trace.touched & _has_contact(m)),
+    Regime("no contact", "contact", "no pad of its arm touches", lambda m: ~m.trace.touched & m.trace.touched.any()),
 )
 """All regimes of the motion of a joint or axis."""
 WHERE_NOT_WHY = (
@@ -162,10 +162,6 @@ WHERE_NOT_WHY = (
     "taccorl diagnose tries each cause."
 )
 """Remark that reports add to errors by regime."""
-
-
-def _has_contact(m: Motion) -> np.ndarray:
-    return np.full(len(m.trace.time_s), bool(m.trace.touched.any()))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -152,11 +152,10 @@ def _trace(r: Recording, floor: SignalFloor) -> Trace:
 
 
 def _regimes() -> list[tuple[str, Callable[[Motion], np.ndarray]]]:
-    return [(ALL, _every), *((r.name, r.rows) for r in REGIMES if r.group in GROUPS)]
-
-
-def _every(motion: Motion) -> np.ndarray:
-    return np.ones(len(motion.trace.time_s), dtype=bool)
+    return [
+        (ALL, lambda m: np.ones(len(m.trace.time_s), dtype=bool)),
+        *((r.name, r.rows) for r in REGIMES if r.group in GROUPS),
+    ]
 
 
 def _row(

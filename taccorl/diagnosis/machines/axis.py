@@ -15,7 +15,7 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_fit
 from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
 from taccorl.alignment.checks.telemetry import least_motion
-from taccorl.alignment.controller.drive_law import with_gains
+from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S, with_gains
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, Use
@@ -190,7 +190,10 @@ class Axis(Machine):
     def with_additions(self, additions: Sequence[Addition]) -> "Axis":
         config = self.config
         for a in additions:
-            config = config.with_numbers(a.base).with_effects(a.effects)
+            timing = (
+                {"loop_s": 0.0} if a.base.get("loop_s", 0.0) < SHORTEST_STEP_S else {}
+            )  # faster than the model's steps
+            config = config.with_numbers({**a.base, **timing}).with_effects(a.effects)
         return dataclasses.replace(self, config=config)
 
 

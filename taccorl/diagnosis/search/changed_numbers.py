@@ -33,7 +33,7 @@ STATED = {
 """Always fitted number that a file can state → group of numbers that are judged together. Not here: gains that nobody knows and
 that are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
 NEGLIGIBLE = 0.01
-"""A number that the added effects bring back to within this share of the file's value is not named. A choice."""
+"""If, with the added effects, a number is fitted within this share of the file's value, its change is not reported. A choice."""
 OF_LOOP = ("loop_s", "speed_delay_s")
 """Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 

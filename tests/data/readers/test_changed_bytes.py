@@ -1,4 +1,4 @@
-"""Formats without checksums: what of a changed byte is found; files that ask for more than a machine has, or name others."""
+"""Formats without checksums: which changed bytes are detected; files that need too much memory or refer to others are refused."""
 
 import sqlite3
 import struct

@@ -364,6 +364,15 @@ def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows:
     assert late.speed_late_s == found["speed_late_s"] and "speed_late_s" in axis_text(late)
 
 
+def test_the_period_of_a_loop_that_the_file_does_not_state_is_fitted_and_becomes_its_loop_hz(slide: Measurements):
+    drive = dataclasses.replace(AXIS, kd=4.0 * KD, known=("kp", "kd", "inertia"))
+    sampled, problem = AxisProblem(dataclasses.replace(drive, loop_hz=500.0), slide), AxisProblem(drive, slide)
+    measured = sampled.simulate(sampled.start, [], problem.fit[0])
+    found = best_fit(problem, [dataclasses.replace(problem.fit[0], measured=measured)], (), [problem.start], 30).values
+    assert found["loop_s"] == pytest.approx(2e-3, abs=1e-6)
+    assert drive.with_numbers(found).loop_hz == pytest.approx(500.0, rel=1e-3)
+
+
 @pytest.mark.parametrize("change", [{}, {"kp": 1.03 * STIFF}, {"kd": 0.9 * DAMPED}, {"effort_after_target": False}])
 def test_the_drive_stays_as_stated_where_its_efforts_are_those_of_its_law(change: dict[str, Any]):
     """Noise of 0.1 µm on the positions would be about 1 N of the law, ten floors of the efforts: it is left out."""
