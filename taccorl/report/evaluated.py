@@ -68,19 +68,14 @@ class Evaluation:
     @property
     def about(self) -> dict[str, str]:
         """Resolved settings, versions and digests, by name."""
-        before = {
-            f"{name}, {task}, before the mate": a["text"] for name, own in self.aimed.items() for task, a in own.items()
-        }
+        aims = [(f"{name}, {task}", a["text"]) for name, own in self.aimed.items() for task, a in own.items()]
+        twin = {} if self.robot else {"digest of the twin": digest_bytes(twin_text(self.scenes.twin_config()).encode())}
         return {
             **{f"digest of {one.name}": one.digest for one in self.policies},
             **{f"executed actions of {name}": text for name, text in self.executed.items()},
-            **before,
+            **{f"{of}, before the mate": text for of, text in aims},
             **{name: str(value) for name, value in scenes_to_json(self.scenes).items()},
-            **(
-                {}
-                if self.robot
-                else {"digest of the twin": digest_bytes(twin_text(self.scenes.twin_config()).encode())}
-            ),
+            **twin,
             **{f"robot's {name}": str(value) for name, value in self.robot.items()},
             "against": str(self.against),
             "taccorl": taccorl.__version__,
@@ -115,14 +110,9 @@ class Evaluation:
 
     def html(self, failures: Sequence[tuple[FailedEpisode, Path]]) -> str:
         """Text of ``report.html`` with some failed episodes, which are shown with pictures, and their Rerun files."""
-        rows, found = self.rows, summaries(self.rows)
-        every = Section(
-            title=f"all {len(rows)} episodes",
-            heads=_EPISODE,
-            rows=[*map(_episode, rows)],
-            right=(2, 4, 5, 6, 7),
-            folded=True,
-        )
+        found, title = summaries(self.rows), f"all {len(self.rows)} episodes"
+        rows = [*map(_episode, self.rows)]
+        every = Section(title=title, heads=_EPISODE, rows=rows, right=(2, 4, 5, 6, 7), folded=True)
         checked = [preflight(one.name, one.checks) for one in self.policies if one.checks]
         sections = [
             Section(text=[self.robot.get("origin", ORIGIN)], style="data"),

@@ -23,7 +23,7 @@ from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell
 from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
 from taccorl.diagnosis.comparison.result import Comparison, origin_words
 from taccorl.diagnosis.machines.machine import Finding
-from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.diagnosis.search.result import Diagnosis, may_go_on
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import check_writable
 from taccorl.report import compared, page
@@ -126,11 +126,14 @@ class Report:
     def unsettled(self, part: str) -> list[str]:
         """Texts, with the recording's name, of errors that the checks found in the recordings of one part (for a joint: those
         that move it). A clock offset counts only if it is also found with the fitted twin, because a missing effect can look like
-        an offset."""
+        an offset; where the search may add another effect, only if it was there before the first one, too."""
         moved = {t.recording for t in self.comparison.of(part)}
         clock = self.comparison.clock
         own = [(name, f) for name, found in self.findings.items() for f in found if f not in clock.get(name, ())]
-        own += [(name, f) for name, found in self.last.clock.items() for f in found if not moved or f.feature == part]
+        goes_on = any(f.part == part and may_go_on(f.diagnosis) for f in self.found)
+        first = {(n, f.feature) for n, found in clock.items() for f in found if f.severity == "error"}
+        last = [(n, f) for n, found in self.last.clock.items() for f in found if not goes_on or (n, f.feature) in first]
+        own += [(name, f) for name, f in last if not moved or f.feature == part]
         return [f"{name}: {f.text}" for name, f in own if f.severity == "error" and (not moved or name in moved)]
 
     def sections(self) -> list[Section]:

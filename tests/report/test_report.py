@@ -199,6 +199,24 @@ def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(diagnosed, 
     assert page.count("--twin=a.yaml") == 1 + bool(separable(d, name, d.rivals.get(name, ()))), "add-effect, excite"
 
 
+def test_a_lead_that_only_one_effect_of_several_left_behind_holds_nothing_up(diagnosed: tuple[JointFinding, Path]):
+    """A second missing effect can look like an offset; the search may go on. One that was there from the beginning stays."""
+    leads = {"b.csv": (Finding("shifted_from_twin", "error", SIGNAL, "leads"),)}
+    before, after = (comparison(trace(0 * POSITION, POSITION, recording="b.csv", signal=SIGNAL)) for _ in range(2))
+    stopped = dataclasses.replace(diagnosed[0].diagnosis, status="too_many")
+    for d, clock, told in (
+        (stopped, {}, []),
+        (diagnosed[0].diagnosis, {}, ["b.csv: leads"]),
+        (stopped, leads, ["b.csv: leads"]),
+    ):
+        report = small(
+            comparison=dataclasses.replace(before, clock=clock),
+            after=dataclasses.replace(after, clock=leads),
+            found=[dataclasses.replace(diagnosed[0], diagnosis=d)],
+        )
+        assert report.unsettled(SIGNAL) == told
+
+
 def test_a_number_that_is_nothing_beside_its_interval_is_zero_and_no_change_has_no_sign():
     assert (clean(2.6e-13, 4e-5), clean(-0.0285, 0.001)) == ("0", "-0.0285")
     assert (change(100.0, 99.7), change(2.0, 1.0)) == ("+0%", "-50%")

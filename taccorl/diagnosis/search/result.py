@@ -259,6 +259,11 @@ class Diagnosis:
         return tuple(name for name, without in self.test_without.items() if gains_nothing(without, after))
 
 
+def may_go_on(d: Diagnosis) -> bool:
+    """Whether the search ended only because it was to add no further effect, fewer than ``SearchConfig().max_effects``."""
+    return d.status == "too_many" and len(d.effects) - len(d.present) < SearchConfig().max_effects
+
+
 def gains_nothing(before: float, after: float) -> bool:
     """Whether test recordings show no improvement: less than the share of the squared error above the floor that a search asks of
     validation recordings, and of at least one squared floor.
