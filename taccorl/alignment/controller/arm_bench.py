@@ -1,28 +1,22 @@
 """MuJoCo model of one joint of the twin: its arm with the other joints held, without contacts and with a fixed gripper.
 
-``alignment.controller.joint_model`` reads inertia and weight from it, and simulates it for effects that only MuJoCo can compute.
+``alignment.controller.joint_model`` reads inertia and weight from it.
 """
 
-import copy
 import dataclasses
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from taccorl.alignment.controller.joint_motion import AT_TCP, Position
 from taccorl.alignment.controller.rigid_joint import Rigid, rigid_terms
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.controller import MotorEffort
-from taccorl.sim.effects.added import AddedEffects, present
+from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
-from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.twin import TwinConfig, empty_bench
-
-_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 
 
 def split_signal(signal: str) -> tuple[str, str]:
@@ -128,137 +122,3 @@ def rigid_of(spec: mujoco.MjSpec, config: TwinConfig, signal: str, effects: Sequ
     for effect in effects:
         effect.edit(spec, config)
     return rigid_terms(spec.compile(), signal)
-
-
-def run(
-    config: TwinConfig,
-    signal: str,
-    sent: np.ndarray,
-    hold: int,
-    coupling_nm: np.ndarray,
-    *,
-    gains: tuple[float, float, float],
-    start: float,
-    pose: np.ndarray,
-    payload_kg: float,
-    effects: Sequence[Effect],
-    payload_at_m: Position = AT_TCP,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate the joint in MuJoCo, with its effects as in the twin, from rest; a link that hangs in a gear's play or spring
-    starts in equilibrium.
-
-    Args:
-        sent: (S,) targets [rad], each held for ``hold`` physics steps.
-        coupling_nm: (S hold,) torque that must be held against the other joints' motion.
-        gains: K_p [N·m/rad], K_d [N·m·s/rad], T_ref [N·m].
-        start: position that the encoder reports at rest [rad].
-        pose: (7,) as in ``arm_spec``.
-        effects: effects of this joint alone (``of_joint``).
-
-    Returns:
-        (S,) reported [rad] and (S,) motor torque [N·m] when each target is sent, before it acts.
-    """
-    arm, joint = split_signal(signal)
-    spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
-    kp, kd, torque_ff = gains
-    motor = spec.actuator(signal)
-    motor.gainprm[0], motor.biasprm[:3] = kp, [torque_ff, -kp, -kd]
-    for effect in effects:
-        effect.edit(spec, config)
-    model = spec.compile()
-    column, motor_id, encoder = (
-        ROBOT.action_names.index(signal),
-        model.actuator(signal).id,
-        model.sensor(f"{signal}_pos").adr[0],
-    )
-    batch = Batch(model, 1, 1)
-    batch.bind("sensordata")  # from now on each forward pass fills it
-    given = MotorEffort(batch, np.array([motor_id]))
-    hooks = AddedEffects(effects, batch.bind("time"), batch)
-
-    def reports(angles: np.ndarray) -> np.ndarray:
-        rows = np.zeros((len(angles), len(ROBOT.action_names)))
-        rows[:, column] = angles
-        return hooks.encoder(rows)[:, column]
-
-    angle = np.array([start])
-    for _ in range(20):
-        angle += start - reports(angle)
-    batch.bind("qpos")[0] = _hanging(model, signal, angle[0])
-    batch.bind("ctrl")[0, motor_id] = sent[0]
-    targets = np.zeros((1, len(ROBOT.action_names)))
-    targets[0, column] = sent[0]
-    only = np.array([0])
-    hooks.reset(only, targets)
-    fill_histories(batch, only)
-    batch.forward()
-    hooks.feel(only, 0.0)
-
-    held_s = np.array([hold * model.opt.timestep])
-    inputs = np.zeros((len(sent) * hold, model.nu + 6 * model.nbody))
-    for k, target in enumerate(sent):
-        targets[0, column] = target
-        inputs[k * hold : (k + 1) * hold, motor_id] = hooks.command(targets, held_s)[0, column]
-    # The coupling is a torque on the link about the joint's axis, which does not move.
-    link = model.body(f"{arm}_link{joint[-1]}").id
-    axis = batch.get_data(0).xaxis[model.joint(signal).id]
-    inputs[:, model.nu + 6 * link + 3 : model.nu + 6 * link + 6] = -coupling_nm[:, None] * axis
-    ask = _step_by_step if hooks.rewrites else _at_once
-    reported, effort = ask(batch, hooks, given, inputs, hold, motor_id, encoder)
-    return reports(reported), effort
-
-
-def _at_once(
-    batch: Batch, hooks: AddedEffects, given: MotorEffort, inputs: np.ndarray, hold: int, motor: int, encoder: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Readings and the motor's torques when each command is sent, before it acts."""
-    whole = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    first = given()[0, 0]
-    done = batch.rollout(len(inputs), inputs[None], _INPUTS, ("sensordata", whole))
-    # After a step sensors still say what was before it: exactly the time at which the step's command was sent.
-    reported = done["sensordata"][0, ::hold, encoder]
-    # Forces hold the new command already; those before it come from the state at the end of the last one's stretch.
-    rows = Batch(batch.model, len(reported), 1)
-    rows.state[0] = done[whole][0, 0]
-    rows.state[1:] = done[whole][0, hold - 1 : -1 : hold]
-    after = MotorEffort(rows, np.array([motor]))
-    rows.forward()
-    effort = after()[:, 0]
-    effort[0] = first
-    return reported, effort
-
-
-def _step_by_step(
-    batch: Batch, hooks: AddedEffects, given: MotorEffort, inputs: np.ndarray, hold: int, motor: int, encoder: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same with effects that rewrite the model before every physics step."""
-    ctrl, xfrc = batch.bind("ctrl"), batch.bind("xfrc_applied").reshape(1, -1)
-    sensed = batch.bind("sensordata")
-    num, only = batch.model.nu, np.array([0])
-    reported, effort = np.empty(len(inputs) // hold), np.empty(len(inputs) // hold)
-    for n, values in enumerate(inputs):
-        if n % hold == 0:
-            reported[n // hold], effort[n // hold] = sensed[0, encoder], given()[0, 0]
-        ctrl[0], xfrc[0] = values[:num], values[num:]
-        batch.step(stage=mujoco.mjtStage.mjSTAGE_ACC)
-        hooks.feel(only, batch.model.opt.timestep)
-    return reported, effort
-
-
-def _hanging(model: mujoco.MjModel, signal: str, angle: float) -> np.ndarray:
-    """(nq,) the motor held at ``angle``; what there is between it and the link where the weight has pulled it."""
-    held = copy.copy(model)
-    motor = held.joint(signal)
-    held.dof_armature[motor.dofadr[0]], held.opt.tolerance = (
-        1e8,
-        0.0,
-    )  # so heavy a joint would make the solver content too soon
-    data = mujoco.MjData(held)
-    data.qpos[motor.qposadr[0]] = angle
-    for step_s in (0.02, model.opt.timestep) if model.nv > 1 else ():  # far, and then exactly
-        held.opt.timestep = step_s
-        for _ in range(300):
-            mujoco.mj_step(held, data)
-            data.qpos[motor.qposadr[0]] = angle
-            data.qvel[:] *= 0.5
-    return data.qpos.copy()

@@ -91,25 +91,6 @@ class ArmJoint(RigidJoint):
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         return selectors(cls, self.signal)
 
-    def in_mujoco(
-        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        steps = np.arange(len(sent) * hold) / (parts * hold)
-        reported, effort = arm_bench.run(
-            self._config,
-            self.signal,
-            sent,
-            hold,
-            np.interp(steps, np.arange(len(motion.coupling_nm)), motion.coupling_nm),
-            gains=gains,
-            start=motion.start,
-            pose=motion.pose,
-            payload_kg=motion.payload_kg,
-            payload_at_m=motion.payload_at_m,
-            effects=effects,
-        )
-        return reported[::parts], effort[::parts]
-
     def _coupling(self, m: Measurement, known: Surroundings) -> np.ndarray:
         """(T,) torque beyond the joint's own inertia and weight, because other joints of its arm move."""
         arm, joint = split_signal(self.signal)

@@ -7,9 +7,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from made_rows import of_joint, of_signal
-from one_joint import HOME, TWIN, AxisJoint, at_rest, chirp, in_mujoco
+from one_joint import HOME, TWIN, AxisJoint, at_rest, chirp
 from scipy.linalg import expm
 
+from pipelines.benchmarks.one_joint import in_mujoco
 from taccorl.alignment.controller import arm_bench, joint_model
 from taccorl.alignment.controller.drive_numbers import TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.joint_kernel import simulate
@@ -21,7 +22,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, number
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
@@ -87,7 +88,7 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
     motion = at_rest(joint_motion(chirp(signal, 3.0, high_hz=3.0), TWIN, signal), gains)
     quick, plain = model.simulate_all([motion], [Numbers(gains, [effect]), Numbers(gains)])[0]
     np.testing.assert_array_equal(plain.reported, JointModel(TWIN, signal).simulate(motion, gains).reported)
-    exact = in_mujoco(motion, signal, gains, effect)
+    exact = in_mujoco(motion, signal, gains, [effect])
     away = np.abs(quick.reported - exact.reported)
     assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
     assert away[100:].max() < (2e-5 if name == "speed_delay" else 1e-6)  # MuJoCo's is exact to the first order
@@ -108,7 +109,7 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
 
 def test_every_effect_of_joints_is_known_to_the_model() -> None:
     unknown = [name for name in effects if _on_joints(name) and name not in KNOWN]
-    assert unknown == [], "identification would run MuJoCo for these, fifty times slower"
+    assert unknown == [], "no recording of a joint can be simulated with these"
     assert len(KNOWN) >= 18
 
 
@@ -123,7 +124,7 @@ def test_effects_act_together_as_in_mujoco() -> None:
         make_effect("velocity_feedforward", share=0.5, **at),
         make_effect("joint_compliance", **at, compliance_rad_per_nm=0.01),
     ]
-    quick, exact = model.simulate(motion, model.gains, together), in_mujoco(motion, signal, model.gains, *together)
+    quick, exact = model.simulate(motion, model.gains, together), in_mujoco(motion, signal, model.gains, together)
     np.testing.assert_allclose(quick.reported, exact.reported, atol=1e-5)
     # In the twin's own config they do the same.
     own = JointModel(TwinConfig(effects=together), signal).simulate(motion, model.gains)
@@ -162,7 +163,7 @@ def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
         make_effect("presliding", presliding_rad=1e-3, **at),
     )
     quick = model.simulate(motion, model.gains, [dry, bristles]).reported
-    exact = in_mujoco(motion, signal, model.gains, dry, bristles).reported
+    exact = in_mujoco(motion, signal, model.gains, [dry, bristles]).reported
     np.testing.assert_allclose(quick, exact, atol=1e-5)
     assert np.abs(quick - model.simulate(motion, model.gains, [dry]).reported).max() > 1e-4
     np.testing.assert_array_equal(
@@ -170,7 +171,7 @@ def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
     )
     own = make_effect("coulomb_friction", torque_nm=0.3, presliding_rad=1e-3, **at)
     np.testing.assert_array_equal(model.simulate(motion, model.gains, [own]).reported, quick)
-    np.testing.assert_array_equal(in_mujoco(motion, signal, model.gains, own).reported, exact)
+    np.testing.assert_array_equal(in_mujoco(motion, signal, model.gains, [own]).reported, exact)
     for twin, said in (
         ([bristles, dry], "left_joint5: coulomb_friction comes after"),
         ([own, bristles], "bristles of its own"),
@@ -245,46 +246,9 @@ def test_of_an_effect_of_all_joints_the_model_takes_what_acts_on_its_own() -> No
     np.testing.assert_array_equal(other.simulate(motion, gains).reported, plain.reported)
 
 
-@dataclasses.dataclass(kw_only=True)
-class _Late(JointEffect):
-    """An outsider's effect that the one-joint model has never heard of: each command arrives one sending late, and the
-    encoder reads 2 mrad too much."""
-
-    name = "test_late"
-    late: float = number("n", "1", 0.0, 1.0, (0.0, 1.0), "a test")
-
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> dict[str, np.ndarray]:
-        return {"last": np.full((num_sims, 14), np.nan)}
-
-    def command(self, targets: np.ndarray, memory: dict[str, np.ndarray], dt_s: np.ndarray) -> np.ndarray:
-        last = np.where(np.isnan(memory["last"]), targets, memory["last"])
-        memory["last"][:] = targets
-        arriving = targets.copy()
-        arriving[:, self.columns] = last[:, self.columns]
-        return arriving
-
-    def encoder(self, values: np.ndarray) -> np.ndarray:
-        values = values.copy()
-        values[:, self.columns] += 0.002
-        return values
-
-
-def test_an_effect_that_only_has_hooks_runs_in_mujoco() -> None:
-    signal = "left_joint5"
-    model, motion = from_rest(signal)
-    plain = model.simulate(motion, model.gains)
-    late = model.simulate(motion, model.gains, [_Late(late=1.0, arm="left", joints=["joint5"])])
-    # Where it starts it reports what was measured, so it stands 2 mrad lower and comes up from there within K_d / K_p.
-    np.testing.assert_allclose(late.reported[150:], 0.002 + plain.reported[149:-1], atol=1e-4)
-    assert late.reported[0] == pytest.approx(motion.start, abs=1e-12)
-
-
 def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
     model, slow = from_rest("left_joint5", rate_hz=30.0)
-    late = _Late(late=1e-9, arm="left", joints=["joint5"])  # forces MuJoCo; it delays and shifts as above
     assert len(model.simulate(slow, model.gains).reported) == len(slow.target) == 90
-    sent = model.simulate(slow, model.gains, [late])
-    assert len(sent.reported) == 90
     # By hand: 30 Hz are five commands a row, on the line to the next row.
     line = np.interp(np.arange(90 * 5) + 1.0, 5 * np.arange(90), slow.target)
     fine = dataclasses.replace(slow, target=line, rate_hz=150.0, coupling_nm=np.zeros(450))
@@ -382,8 +346,8 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
     np.testing.assert_allclose(answer, expected, atol=2e-5)
     with_friction = model.simulate(motion, model.gains, [make_effect("coulomb_friction", torque_nm=20)])
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
-    with pytest.raises(TaccorlError, match="test_late"):
-        model.simulate(motion, model.gains, [_Late(late=1.0)])
+    with pytest.raises(TaccorlError, match="slide: the one-joint model does not have touch_lag"):
+        model.simulate(motion, model.gains, [make_effect("touch_lag", time_constant_s=0.02)])
 
 
 class _Geared(AxisJoint):
