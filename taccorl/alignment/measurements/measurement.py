@@ -8,10 +8,10 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -257,27 +257,27 @@ class Measurement:
                 raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
             if extra := self.twin_cannot_take(name):
                 raise TaccorlError(f"{self.name}: {name} has {extra}: the PiPER's twin cannot use this")
-        at = [ROBOT.action_names.index(name) for name in self.signals]
-        arrays: dict[str, np.ndarray] = {
-            name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")
-        }
-        arrays["target"] = np.tile(np.asarray(rest, dtype=float), (self.num_rows, 1))
+        nothing = np.empty(0)
+        plain = dataclasses.replace(
+            self, load=nothing, torque_ff=nothing, supply_v=nothing, enabled=nothing, target_kinds=()
+        )
+        return plain.extended(dict(zip(ROBOT.action_names, ROBOT_UNITS, strict=True)), rest)
+
+    def extended(self, units: Mapping[str, str], rest: Sequence[float] | np.ndarray) -> Self:
+        """The measurement extended to the signals ``units`` (signal → unit of its position), in their order: missing ones stay at
+        ``rest`` [rad, m] and count as not measured."""
+        at, names = [list(units).index(name) for name in self.signals], tuple(units)
+        absent = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
+        columns = ("measured", "velocity", "effort", *self.extra_columns)
+        arrays = {name: np.full((self.num_rows, len(units)), absent.get(name, np.nan)) for name in columns}
+        arrays |= {"target": np.tile(np.asarray(rest, float), (self.num_rows, 1))}
         for name, values in arrays.items():
             values[:, at] = getattr(self, name)
-        quantum = np.zeros(ROBOT.num_actions)
+        kinds = tuple(self.target_kind(name) if name in self.signals else "position" for name in names)
+        quantum = np.zeros(len(units))
         quantum[at] = self.quantum
-        return dataclasses.replace(
-            self,
-            **arrays,
-            quantum=quantum,
-            load=np.empty(0),
-            torque_ff=np.empty(0),
-            supply_v=np.empty(0),
-            enabled=np.empty(0),
-            signals=ROBOT.action_names,
-            units=ROBOT_UNITS,
-            target_kinds=(),
-        )
+        more: dict[str, Any] = {"signals": names, "units": tuple(units.values()), "quantum": quantum}
+        return dataclasses.replace(self, **arrays, **more, target_kinds=kinds if self.target_kinds else ())
 
 
 def other_arm(signal: str) -> str:
