@@ -50,7 +50,33 @@ class Touch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measurement:
+class Stated:
+    """Facts about one recording that its rows do not hold."""
+
+    kp: dict[str, float] = field(default_factory=dict)
+    """Signal → commanded K_p [N·m/rad, N/m], if stated."""
+    kd: dict[str, float] = field(default_factory=dict)
+    """Signal → commanded K_d [N·m·s/rad, N·s/m], if stated."""
+    gain_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
+    payload_kg: dict[str, float] = field(default_factory=dict)
+    """Arm, or name of an axis → known mass of the payload [kg]."""
+    lever_m: dict[str, float] = field(default_factory=dict)
+    """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
+    arm_kg: dict[str, float] = field(default_factory=dict)
+    """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
+    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
+    (0, 0, 0.168)."""
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of these facts."""
+        return [f.name for f in dataclasses.fields(Stated)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement(Stated):
     """One recording on one clock, at the rate at which commands were sent. Raises TaccorlError: the shapes do not fit
     together."""
 
@@ -99,21 +125,6 @@ class Measurement:
     """Time of row 0 on the recording's clock [ns]."""
     repeat_of: str | None = None
     """Name of the measurement whose commands this one repeats; None if it is no repeat."""
-    kp: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_p [N·m/rad, N/m], if stated."""
-    kd: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_d [N·m·s/rad, N·s/m], if stated."""
-    gain_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
-    payload_kg: dict[str, float] = field(default_factory=dict)
-    """Arm → known mass in its gripper [kg]."""
-    lever_m: dict[str, float] = field(default_factory=dict)
-    """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
-    arm_kg: dict[str, float] = field(default_factory=dict)
-    """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
-    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
-    (0, 0, 0.168)."""
     pressed: PressedObject | None = None
     """Known object between the fingers of one arm, if stated; the arm's pads are compared with the twin's for it."""
     time_error_s: float = 0.0

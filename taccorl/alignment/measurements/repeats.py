@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.measurement import Measurement, Stated
 from taccorl.errors import TaccorlError
 
 SAME_SHARE = 0.01
@@ -47,7 +47,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
         raise TaccorlError(
             f"{second.name} and {first.name} have different signals, so that one cannot repeat the other"
         )
-    for what in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "payload_position_m"):
+    for what in Stated.names():
         one, other = getattr(first, what), getattr(second, what)
         silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
         if one != other and not silent:
