@@ -22,6 +22,7 @@ Numbers may have leading zeros. Every cell must have one column, and every colum
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -29,7 +30,7 @@ from typing import Literal
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
 from taccorl.alignment.measurements.tables import POSITION, Column, ColumnsFile
 from taccorl.data.finding import listed
-from taccorl.data.strict_yaml import Document
+from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, nearest
 
 _PLACE = re.compile(r"\{(\w*)\}")
@@ -95,88 +96,76 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
     """Load a columns file, and check it against the cells file. Raises SpecError: it is invalid; the message names file, line,
     key and remedy."""
     document = Document(CellTableSpec, Path(path))
-    spec = document.value
-    spec.check(document)
-    if bool(spec.cells) == (spec.array is not None):
-        raise document.error("", "give `cells:` with the columns of each cell, or `array:` with a pattern for all")
+    document.value.check(document)
+    document.refuse(_rules(document.value, config))
+    return document.value
+
+
+def _rules(spec: CellTableSpec, config: CellsConfig) -> Rules:
+    neither = "give `cells:` with the columns of each cell, or `array:` with a pattern for all"
+    yield bool(spec.cells) == (spec.array is not None), "", neither
     if spec.array is not None:
-        _check_array(spec.array, config, document)
+        yield from _rules_of_array(spec.array, config)
     for name in spec.cells:
-        if name not in config.names:
-            raise document.error(f"cells/{name}", f"the cells file has no cell {name!r}; {nearest(name, config.names)}")
+        unknown = f"the cells file has no cell {name!r}; {nearest(name, config.names)}"
+        yield name not in config.names, f"cells/{name}", unknown
     lacking = [name for name in config.names if name not in spec.cells]
-    if lacking and spec.array is None:
-        raise document.error("cells", f"cell {lacking[0]!r} of the cells file is missing")
-    if (spec.position is None) != (config.same_place_mm is None):
-        raise document.error(
-            "position",
-            "the probe's position is missing: the cells file has same_place_mm"
-            if spec.position is None
-            else "write `same_place_mm:` in the cells file, the largest distance of presses at one place; or remove position",
-        )
-    for key, column in (("x", spec.position.x), ("y", spec.position.y)) if spec.position else ():
-        if POSITION.get(column.unit, ("",))[0] != "m":
-            lengths = [unit for unit, (of, _) in POSITION.items() if of == "m"]
-            raise document.error(
-                f"position/{key}/unit", f"{column.unit!r} is not a length; {nearest(column.unit, lengths)}"
-            )
-    kind = LOADS[config.load.unit][0]
+    yield (
+        lacking and spec.array is None,
+        "cells",
+        f"cell {', '.join(map(repr, lacking[:1]))} of the cells file is missing",
+    )
+    at, same = spec.position, config.same_place_mm
+    yield (
+        at is None and same is not None,
+        "position",
+        "the probe's position is missing: the cells file has same_place_mm",
+    )
+    where = "write `same_place_mm:` in the cells file, the largest distance of presses at one place; or remove position"
+    yield at is not None and same is None, "position", where
+    for key, column in (("x", at.x), ("y", at.y)) if at else ():
+        lengths = [unit for unit, (of, _) in POSITION.items() if of == "m"]
+        no_length = f"{column.unit!r} is not a length; {nearest(column.unit, lengths)}"
+        yield POSITION.get(column.unit, ("",))[0] != "m", f"position/{key}/unit", no_length
+    shared = config.load.shared
     stated = {f"cells/{name}": cell for name, cell in spec.cells.items()}
     for place, cell in (stated if spec.array is None else {"array": spec.array}).items():
-        own, factor = READINGS.get(cell.reading.unit, ("", 0.0)), READINGS[config.reading.unit]
-        if own[0] != factor[0]:
-            same = [unit for unit, (quantity, _) in READINGS.items() if quantity == factor[0]]
-            text = f"{cell.reading.unit!r} is no unit like the cells file's {config.reading.unit}; "
-            raise document.error(f"{place}/reading/unit", text + nearest(cell.reading.unit, same))
-        load, key = (cell.load, f"{place}/load") if not config.load.shared else (spec.load, "load")
-        if load is None:
-            shared = (
-                "each cell has a load of its own (shared: false)"
-                if not config.load.shared
-                else "all cells share one load"
-            )
-            raise document.error(key, f"is missing: the cells file states that {shared}")
-        if LOADS.get(load.unit, ("",))[0] != kind:
-            same = [unit for unit, (other, _) in LOADS.items() if other == kind]
-            raise document.error(
-                f"{key}/unit",
-                f"{load.unit!r} is not of the same kind as the cells file's unit {config.load.unit}; "
-                f"{nearest(load.unit, same)}",
-            )
+        yield _other_kind(cell.reading, READINGS, config.reading.unit, f"{place}/reading")
+        load, key = (spec.load, "load") if shared else (cell.load, f"{place}/load")
+        states = "all cells share one load" if shared else "each cell has a load of its own (shared: false)"
+        yield load is None, key, f"is missing: the cells file states that {states}"
+        assert load is not None
+        yield _other_kind(load, LOADS, config.load.unit, key)
         for where, column in ((f"{place}/reading", cell.reading), (key, load)):
-            if column.factor == 0.0:
-                raise document.error(f"{where}/factor", "is 0; give another number")
-            if column.if_missing is not None:
-                raise document.error(
-                    f"{where}/if_missing", "a cell has a reading and a load in every recording; remove it"
-                )
-    return spec
+            yield column.factor == 0.0, f"{where}/factor", "is 0; give another number"
+            always = "a cell has a reading and a load in every recording; remove it"
+            yield column.if_missing is not None, f"{where}/if_missing", always
 
 
-def _check_array(array: ArrayColumns, config: CellsConfig, document: Document[CellTableSpec]) -> None:
-    """Check the patterns of an array against the cells file. Raises SpecError: a placeholder is unknown or missing, or the order
-    of the cells is."""
-    if array.first < 0:
-        raise document.error("array/first", f"{array.first} is below 0")
+def _other_kind(column: Column, units: Mapping[str, tuple[str, float]], unit: str, key: str) -> tuple[bool, str, str]:
+    """Rule: the unit of a column has the kind of the cells file's ``unit``."""
+    kind = units[unit][0]
+    alike = nearest(column.unit, [other for other, (of, _) in units.items() if of == kind])
+    text = f"{column.unit!r} is not of the same kind as the cells file's unit {unit}; {alike}"
+    return units.get(column.unit, ("",))[0] != kind, f"{key}/unit", text
+
+
+def _rules_of_array(array: ArrayColumns, config: CellsConfig) -> Rules:
+    """An array's placeholders are known and complete, and the order of its cells is stated."""
+    yield array.first < 0, "array/first", f"{array.first} is below 0"
     for key, column in (("reading", array.reading), ("load", array.load)):
         if column is None:
             continue
         where, found = f"array/{key}/column", _PLACE.findall(column.column)
-        if len(found) != len(set(found)) or set(found) not in PLACES:
-            text = f"{column.column!r}: a pattern has {{index}} once, or {{row}} and {{column}} once each, in quotes"
-            raise document.error(where, f'{text}: "t{{index}}", "taxel_{{row}}_{{column}}"')
-        if "row" in found and config.cells:
-            raise document.error(
-                where, "{row} and {column} are of a grid, but the cells file gives names: write {index}"
-            )
-        ordered = "index" in found and not config.cells
-        if ordered != (array.order is not None):
-            text = (
-                "is missing: write `order: row by row` or `order: column by column`"
-                if ordered
-                else "is only for {index}"
-            )
-            raise document.error("array/order", f"{text} of a grid")
+        text = f"{column.column!r}: a pattern has {{index}} once, or {{row}} and {{column}} once each, in quotes"
+        wrong = len(found) != len(set(found)) or set(found) not in PLACES
+        yield wrong, where, f'{text}: "t{{index}}", "taxel_{{row}}_{{column}}"'
+        of_grid = "{row} and {column} are of a grid, but the cells file gives names: write {index}"
+        yield "row" in found and config.cells, where, of_grid
+        ordered, order = "index" in found and not config.cells, "array/order"
+        missing = "is missing: write `order: row by row` or `order: column by column` of a grid"
+        yield ordered and array.order is None, order, missing
+        yield not ordered and array.order is not None, order, "is only for {index} of a grid"
 
 
 def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config: CellsConfig) -> CellTableSpec:
