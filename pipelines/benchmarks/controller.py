@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 from pipelines.benchmarks import cameras as camera_benchmarks  # noqa: F401, registers its rows
 from pipelines.benchmarks.one_joint import in_mujoco
 from pipelines.benchmarks.rows import Row, against_reference, benchmark, cpu_times_s
-from taccorl.alignment.controller.arm_bench import arm_spec, split_signal
+from taccorl.alignment.controller.arm_joint import arm_spec, split_signal
 from taccorl.alignment.controller.identification import REFERENCE, identify_controller
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from taccorl.alignment.controller.arm_bench import arm_spec, of_joint, split_signal
+from taccorl.alignment.controller.arm_joint import arm_spec, of_joint, split_signal
 from taccorl.alignment.controller.joint_model import JointResponse
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import Gains

@@ -22,10 +22,10 @@ from taccorl.alignment.checks.first_order import (
     far_delay,
     fit_first_order,
     left_by_change,
+    onset_delay,
     pure_shift,
 )
 from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
-from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
 from taccorl.alignment.checks.wiring import FOLLOWS_FROM

@@ -12,9 +12,8 @@ from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
-from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
+from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, onset_delay, pure_shift
 from taccorl.alignment.checks.held_commands import _second_order
-from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import check_measurement, check_measurements, check_names
 from taccorl.alignment.checks.trial import Trial

@@ -11,7 +11,7 @@ from one_joint import HOME, TWIN, AxisJoint, at_rest, chirp
 from scipy.linalg import expm
 
 from pipelines.benchmarks.one_joint import in_mujoco
-from taccorl.alignment.controller import arm_bench, joint_model
+from taccorl.alignment.controller import arm_joint, joint_model
 from taccorl.alignment.controller.drive_numbers import TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.alignment.controller.joint_model import JointModel, Numbers
@@ -314,9 +314,9 @@ def test_a_payload_s_position_sets_its_lever_arm() -> None:
     # The same weight further out: joint 5's axis is 0.091 m behind the flange.
     signal = "left_joint5"
     pose = np.array([0.0, 1.2, -1.4, 0.0, 0.0, 0.0, 0.02])
-    masses = {at: arm_bench.rigid(TWIN, signal, pose, 0.5, [], (0.0, 0.0, at)) for at in (0.0, 0.1, 0.168)}
-    bare = arm_bench.rigid(TWIN, signal, pose, 0.0, [])
-    assert arm_bench.rigid(TWIN, signal, pose, 0.5, []) == masses[0.168]
+    masses = {at: arm_joint.rigid(TWIN, signal, pose, 0.5, [], (0.0, 0.0, at)) for at in (0.0, 0.1, 0.168)}
+    bare = arm_joint.rigid(TWIN, signal, pose, 0.0, [])
+    assert arm_joint.rigid(TWIN, signal, pose, 0.5, []) == masses[0.168]
     for at, body in masses.items():
         weight_nm = np.hypot(body.gravity_sin - bare.gravity_sin, body.gravity_cos - bare.gravity_cos)
         assert weight_nm == pytest.approx(0.5 * 9.81 * (0.091 + at), rel=0.01)
