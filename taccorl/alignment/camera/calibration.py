@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from taccorl.alignment.camera.edges import twin_edges
 from taccorl.alignment.camera.fit import (
@@ -115,19 +114,11 @@ class CameraFit:
     """Number of frames that the fit did not use."""
     name: str
     """``CameraFrames.name``."""
-    origin: Origin
-    """Origin of the pictures."""
 
     @property
     def converged(self) -> bool:
         """True if ``problems`` is empty: the result is a valid calibration."""
         return not self.problems
-
-    @property
-    def change(self) -> tuple[float, float]:
-        """Size of the change from the twin's camera: rotation angle [rad] and distance [m]."""
-        start, end = (Rotation.from_rotvec(x[:3]) for x in (self.start, self.offset))
-        return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
 
     def twin(self, config: TwinConfig) -> TwinConfig:
         """``config`` with the calibrated camera. The new offset contains the whole error of the mount. So ``camera_pose`` effects
@@ -180,7 +171,6 @@ def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> C
             num_frames=int((~held).sum()),
             num_held_out=int(held.sum()),
             name=frames.name,
-            origin=frames.origin,
         )
 
 

@@ -115,17 +115,6 @@ def _comes_to_rest(m: Measurement) -> bool:
     return bool(known.any() and (last[0] == 0.0).all() and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all())
 
 
-def no_motion(m: Measurement, name: str) -> Finding:
-    """A signal that must move is never commanded to."""
-    j = m.column(name)
-    unit = m.units[j]
-    text = (
-        f"{name} is never commanded to move (by {np.ptp(m.target[:, j]):.2g} {unit}, it takes {least_motion(m, name):.2g}): "
-        "nothing about it can be learnt here; record a sweep of it"
-    )
-    return find("no_motion", name, text)
-
-
 @check("no_motion", "error")
 @check("dead_channel", "error", needs="position")
 def check_motion(t: Trial) -> Iterator[Finding]:
@@ -139,7 +128,6 @@ def check_motion(t: Trial) -> Iterator[Finding]:
         )
         yield find("no_motion", "", text)
         return
-    yield from (no_motion(m, name) for name in t.joints if not t.moves[m.column(name)])
     for j in np.flatnonzero(t.moves):
         name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
         known = measured[np.isfinite(measured)]

@@ -143,8 +143,6 @@ def read_measurements(
     *,
     spec: str | Path | RecordingSpec | None = None,
     columns: Path | TableSpec | None = None,
-    validation: Sequence[str] = (),
-    test: Sequence[str] = (),
     validation_every: int | None = None,
     units: Mapping[str, str] | None = None,
     table: "TableReader | None" = None,
@@ -156,8 +154,7 @@ def read_measurements(
         spec: recording spec; else the index's, else the only shipped one that reads the format.
         columns: columns file of the tables, and of datasets that do not state their units; else the index's, else taccorl's own
             names.
-        validation, test: names of measurements; with them the index's ``use`` is ignored.
-        validation_every: every k-th motion that is not named is for validation; else the index's.
+        validation_every: every k-th motion that the index does not name is for validation; else the index's.
         units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
         table: for machines whose tables hold no joints: function that reads a table from its path and that of the columns file;
             ``columns`` is then a path.
@@ -185,14 +182,11 @@ def read_measurements(
     )
     found = sorted(found, key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
-    whole = path.is_dir()
-    if validation or test or not whole:  # who asks for one file wants to fit it
-        named = {"validation": list(validation), "test": list(test)}
-    else:
-        named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
+    whole, uses = path.is_dir(), ("fit", "validation", "test")  # who asks for one file wants to fit it
+    named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
     every = index.validation_every * whole if validation_every is None else validation_every
     divided = split(found, **named, validation_every=every, fit_needed=fit_needed)
-    states_uses = whole and not (validation or test) and any(note.use for note in index.recordings.values())
+    states_uses = whole and any(note.use for note in index.recordings.values())
     unlisted = tuple(m.name for m in divided.fit if states_uses and m.name not in index.recordings)
     return dataclasses.replace(divided, skipped=tuple(skipped), unlisted=unlisted)
 

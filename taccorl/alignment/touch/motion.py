@@ -41,6 +41,7 @@ SMOOTH_S, SMOOTH_ORDER = 0.045, 3
 and 0.5 mm/s."""
 _STEP_S = 5e-4  # of central differences of the pads' poses, along splines through the smoothed rows
 _KEPT = 4  # depths of a motion with its pads moved: what a fit asks for again and again
+_DISTURBED_M = 3e-4  # an object this near to a pad may touch it
 _NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
 
 
@@ -147,9 +148,9 @@ class TouchMotion:
         """(T, P, R, C) bool: the taxel would touch if it were ``margin_m`` further out of the pad."""
         return self.depth(((0.0, 0.0, margin_m),) * len(self.pads))[0] > 0
 
-    def undisturbed(self, margin_m: float = 3e-4, after_s: float = 1.0) -> np.ndarray:
+    def undisturbed(self, after_s: float = 1.0) -> np.ndarray:
         """(T, P) bool: nothing is near the pad, and nothing touched it during the last ``after_s`` [s]."""
-        near = self.near(margin_m).any(axis=(2, 3))
+        near = self.near(_DISTURBED_M).any(axis=(2, 3))
         last = np.where(near, self.time_s, -np.inf)
         return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
 
@@ -220,15 +221,8 @@ def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
         name: np.ascontiguousarray(getattr(motion, name)[:, pads])
         for name in ("time_s", "measured", "object_from_pad", "velocity", "clearance_m")
     }
-    return TouchMotion(
-        measurement=motion.measurement,
-        pads=tuple(motion.pads[p] for p in pads),
-        baseline=motion.baseline[pads],
-        groups=motion.groups,
-        shapes=motion.shapes,
-        layout=motion.layout,
-        **arrays,
-    )
+    kept = tuple(motion.pads[p] for p in pads)
+    return dataclasses.replace(motion, pads=kept, baseline=motion.baseline[pads], **arrays)
 
 
 def _taxel_xy(layout: PadLayout) -> np.ndarray:

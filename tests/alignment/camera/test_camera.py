@@ -67,9 +67,8 @@ def test_the_new_camera_is_saved_and_loaded_with_the_twin(tmp_path: Path):
     front = next(camera for camera in loaded.cameras if camera.name == "front")
     assert front.offset == as_offset(fit.offset)
     again = calibrate_camera(made("front")[1], loaded, "front")  # from where it is now, it has no reason to move
-    turned_rad, moved_m = again.change
-    assert np.degrees(turned_rad) < 0.1
-    assert moved_m < 0.0015
+    turned_deg, moved_mm = drawn.pose_error(again.offset, again.start)
+    assert turned_deg < 0.1 and moved_mm < 1.5
     assert again.before_px == pytest.approx(fit.after_px, abs=0.05)
 
 
