@@ -339,7 +339,8 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
     # 95 kg, K_p 1e4 N/m, K_d 4e3 N s/m: overdamped, poles at −2.7 and −39.4 1/s.
     model = JointModel.of(AxisJoint("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", step_s=1e-4))
     time_s = np.arange(5000) / 1000
-    motion = joint_motion(of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m"), None, "slide")
+    m = of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m")
+    motion = motion_of(m, "slide", model.joint)
     answer = model.simulate(motion, model.gains).reported
     fast, slow = np.sort(np.roots([95.0, 4e3, 1e4]))
     expected = 0.02 * (1 - (slow * np.exp(fast * time_s) - fast * np.exp(slow * time_s)) / (slow - fast))
