@@ -69,7 +69,6 @@ class MotionError:
 class ControllerFit:
     """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
-    signal: str
     gains: Gains
     """Gains in force in the first recording."""
     estimates: dict[str, Estimate]
@@ -124,7 +123,6 @@ def identify_controller(
     if at_bound:
         unfinished = [*unfinished, f"{' and '.join(at_bound)} ended at a bound of the search"]
     return ControllerFit(
-        signal=model.signal,
         gains=search.gains(x),
         estimates=estimates,
         ridge=ridge,
