@@ -224,8 +224,11 @@ class ArmJoint(RigidJoint):
 
 
 def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
-    """Arguments (``arm``, ``joints``) with which an effect acts on one joint of the PiPER alone; None if it cannot act on it."""
+    """Arguments (``arm``, ``joints``) with which an effect acts on one joint of the PiPER alone; None if it cannot act on it, or
+    if the one-joint model lacks it: an outside effect with hooks alone."""
     arm, joint = signal.split("_", 1)
+    if cls().drive() is None:
+        return None
     if issubclass(cls, JointEffect):
         return {"arm": arm, "joints": [joint]} if joint in cls.possible else None
     return {"arm": arm} if issubclass(cls, ArmEffect) else None

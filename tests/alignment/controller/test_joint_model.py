@@ -22,7 +22,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, number
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
@@ -244,6 +244,21 @@ def test_of_an_effect_of_all_joints_the_model_takes_what_acts_on_its_own() -> No
     plain = JointModel(TWIN, signal).simulate(motion, gains)
     other = JointModel(TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0, arm="right")]), signal)
     np.testing.assert_array_equal(other.simulate(motion, gains).reported, plain.reported)
+
+
+@dataclasses.dataclass(kw_only=True)
+class _Hooks(JointEffect):
+    """An outsider's effect that the one-joint model has never heard of."""
+
+    name = "test_hooks"
+    late: float = number("n", "1", 0.0, 1.0, (0.0, 1.0), "a test")
+
+
+def test_an_effect_that_only_has_hooks_is_not_searched_and_refused_by_name() -> None:
+    model, motion = from_rest("left_joint5")
+    assert model.joint.selectors(_Hooks) is None and model.joint.selectors(effects.get("coulomb_friction")) is not None
+    with pytest.raises(TaccorlError, match="left_joint5: the one-joint model does not have test_hooks"):
+        model.simulate(motion, model.gains, [_Hooks(late=1.0, arm="left", joints=["joint5"])])
 
 
 def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
