@@ -116,20 +116,11 @@ class JointResponse:
 
 
 class JointModel:
-    """Model of one joint of a machine, with the machine's own effects on it. Raises TaccorlError: there is no such joint, or it
-    is a gripper of the PiPER."""
+    """Model of a joint, or of joint ``signal`` of a machine, with its own effects. Raises TaccorlError: there is no such joint,
+    or it is a gripper of the PiPER."""
 
-    def __init__(self, machine: TwinConfig | HasJoints, signal: str) -> None:
-        self._set(joint_of(machine, signal))
-
-    @classmethod
-    def of(cls, joint: RigidJoint) -> "JointModel":
-        """The model of a given ``RigidJoint``."""
-        model = cls.__new__(cls)
-        model._set(joint)
-        return model
-
-    def _set(self, joint: RigidJoint) -> None:
+    def __init__(self, of: TwinConfig | HasJoints | RigidJoint, signal: str = "") -> None:
+        joint = of if isinstance(of, RigidJoint) else joint_of(of, signal)
         self.joint, self.signal, self.unit, self.gains = joint, joint.signal, joint.unit, joint.gains
         self._rigid: dict[tuple, Rigid] = {}
         self._answers: Answers = {}

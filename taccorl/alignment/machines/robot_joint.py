@@ -345,7 +345,7 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         q[:, model.joint(name).qposadr[0]] = CubicSpline(rows, values)(times) if fine > 1 else values
     needed, carried, masses = needed_along(robot, q, m.period_s / fine)
     found = Along(frozenset(angles), q, needed, carried)
-    models = {name: JointModel.of(RobotJoint(robot, name, along=found)) for name in driven}
+    models = {name: JointModel(RobotJoint(robot, name, along=found)) for name in driven}
     motions = {name: motion_of(m, name, one.joint) for name, one in models.items()}
     for name in driven * SWEEPS:
         one, moved, joint = models[name], motions[name], model.joint(name)

@@ -204,7 +204,7 @@ def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
 
 def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     """−K_d (q̇ − τ q̈) on a free mass: what the motor gives is J q̈, not (J − K_d τ) q̈, which is 5 % less here."""
-    joint = JointModel.of(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-3))
+    joint = JointModel(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-3))
     time_s = np.arange(2000) * 1e-3
     target = 0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0)
     m = of_signal("made", 1000.0, target, np.zeros(2000), "mass")
@@ -217,7 +217,7 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
 
 def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_reports_the_limit() -> None:
     """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
-    joint = JointModel.of(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
+    joint = JointModel(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
     time_s = np.arange(200) * 1e-3
     m = of_signal("made", 1000.0, np.where(time_s > 0.0095, 1.0, 0.0), np.zeros(200), "mass")
     effects = [make_effect("speed_delay", delay_s=1.5e-3), make_effect("torque_saturation", torque_max_nm=1.0)]
@@ -352,7 +352,7 @@ def test_commanded_gains_scale_what_the_model_is_given() -> None:
 
 def test_a_sliding_axis_follows_its_closed_form() -> None:
     # 95 kg, K_p 1e4 N/m, K_d 4e3 N s/m: overdamped, poles at −2.7 and −39.4 1/s.
-    model = JointModel.of(AxisJoint("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", step_s=1e-4))
+    model = JointModel(AxisJoint("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", step_s=1e-4))
     time_s = np.arange(5000) / 1000
     m = of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m")
     motion = motion_of(m, "slide", model.joint)
@@ -380,7 +380,7 @@ class _Geared(AxisJoint):
 def test_a_late_speed_is_behind_a_low_pass(kd: float) -> None:
     """J q̈ = K_p (q* − q) − K_d w, τ ẇ = q̇ − w after a step of the target; also where K_d τ is 1.2 J, as of a light wrist."""
     inertia, kp, late_s = 3.3, 1320.0, 1.5e-3
-    model = JointModel.of(_Geared("pan", inertia, Gains(kp, kd, 0.0), "rad", 1e-4))
+    model = JointModel(_Geared("pan", inertia, Gains(kp, kd, 0.0), "rad", 1e-4))
     motion = of_joint("step", 200.0, np.where(np.arange(60) > 0, 1.0, 0.0), np.full(60, np.nan))
     found = model.simulate(motion, model.gains, [make_effect("speed_delay", delay_s=late_s)])
     law = np.array([[0.0, 1.0, 0.0], [-kp / inertia, 0.0, -kd / inertia], [0.0, 1.0 / late_s, -1.0 / late_s]])
@@ -392,7 +392,7 @@ def test_a_late_speed_is_behind_a_low_pass(kd: float) -> None:
 def test_a_rotor_on_a_stiff_gear_swings_as_its_two_masses_do() -> None:
     """0.6 q̈ = K_p (q* − q) − K_d q̇ − t, 2.7 p̈ = t, t = k (q − p) + d (q̇ − ṗ): 71 Hz and a damping ratio of 0.33 in the gear."""
     kp, kd, k, d = 6000.0, 190.0, 1e5, 150.0
-    model = JointModel.of(_Geared("pan", 3.3, Gains(kp, kd, 0.0), "rad", 1e-3))
+    model = JointModel(_Geared("pan", 3.3, Gains(kp, kd, 0.0), "rad", 1e-3))
     target = np.where(np.arange(60) > 0, 0.01, 0.0)
     motion = of_joint("step", 200.0, target, np.full(60, np.nan))
     gear = make_effect("joint_compliance", compliance_rad_per_nm=1 / k, damping_s=d / k)
