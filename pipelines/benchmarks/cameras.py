@@ -12,12 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipelines.benchmarks.rows import Row, benchmark
-from taccorl.alignment.camera.calibration import CameraFrames, KnownPoint, calibrate_camera, pnp
-from taccorl.alignment.camera.fit import pixels_of, seen_from
+from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera
 from taccorl.alignment.camera.interval import JOINT_RAD, SHAPE_M
 from taccorl.alignment.camera.light import camera_light
 from taccorl.alignment.camera.timing import camera_latency
-from taccorl.alignment.camera.view import TwinView, as_offset
+from taccorl.alignment.camera.view import as_offset
 from taccorl.data.origin import Origin
 from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
@@ -35,11 +34,6 @@ _FIRST_SEED = 1000  # none below was used while this was written
 _OFFSETS, _OTHERS = 12, 10
 """Number of random cases, each with a seed of its own: of a camera's pose; of its latency, and of its light."""
 _CAMERAS = ROBOT.cameras[:2]  # the fixed one, and one that an arm carries
-_BODIES = [
-    f"{arm}_{body}"
-    for arm in ROBOT.arms
-    for body in ("base_link", ROBOT.links[-2].name, ROBOT.hand, *(f"finger_{f}" for f in ROBOT.fingers))
-]
 
 
 def random_offset(rng: np.random.Generator, angle_rad: float = OFF_RAD, length_m: float = OFF_M) -> np.ndarray:
@@ -127,21 +121,6 @@ def pose_error(offset: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return apart, float(np.linalg.norm(offset[3:] - truth[3:]) * 1e3)
 
 
-def known_points(
-    view: TwinView, truth: np.ndarray, joints: np.ndarray, rng: np.random.Generator, noise_px: float = 1.0
-) -> list[KnownPoint]:
-    """Origins of ten bodies as a camera at ``truth`` (6,) shows them, found to within ``noise_px``, where they are in view."""
-    found = []
-    for frame, row in enumerate(joints):
-        for body in _BODIES:
-            point = view.in_mount(row, body, np.zeros(3))
-            u, v = pixels_of(seen_from(view, truth, point[None]), view.intrinsics)[0] + rng.normal(0, noise_px, 2)
-            if 0 <= u < view.window.columns and 0 <= v < view.window.rows:
-                pixel = (float(u + view.window.left), float(v + view.window.top))
-                found.append(KnownPoint(frame=frame, body=body, position_m=(0.0, 0.0, 0.0), pixel=pixel))
-    return found
-
-
 @benchmark("cameras")
 def cameras() -> Iterator[Row]:
     """Pose from 2.7° and 25 mm off, intervals, latency, light."""
@@ -154,7 +133,7 @@ def cameras() -> Iterator[Row]:
 
 
 def _poses(camera: str, size: tuple[int, int], what: str) -> Iterator[Row]:
-    errors, times, rivals, held = [], [], [], []
+    errors, times, held = [], [], []
     for seed in range(_FIRST_SEED, _FIRST_SEED + _OFFSETS):
         rng = np.random.default_rng(seed)
         truth, joints = random_offset(rng), random_poses(rng, 12)
@@ -166,18 +145,10 @@ def _poses(camera: str, size: tuple[int, int], what: str) -> Iterator[Row]:
         times.append(cpu_s() - before)
         errors.append(pose_error(fit.offset, truth))
         held.append(fit.after_px)
-        if camera == "front":  # a wrist camera has hardly six of these points in view
-            with TwinView(TwinConfig(), camera, size) as view:
-                rivals.append(pose_error(pnp(view, joints, known_points(view, truth, joints, rng)), truth))
     for k, (unit, goal) in enumerate((("°", "≤ 0.3"), ("mm", "≤ 4"))):
         values = [error[k] for error in errors]
         name = f"{camera}, {what}, from 2.7° and 25 mm off, 12 frames, surrogate: largest error of the pose"
-        by_pnp = (
-            {"rival": "PnP, ten points a frame found to 1 px", "rival_value": max(e[k] for e in rivals)}
-            if rivals
-            else {}
-        )
-        yield Row.of(values, by=max, name=name, unit=unit, goal=goal, **by_pnp)
+        yield Row.of(values, by=max, name=name, unit=unit, goal=goal)
     yield Row.of(held, name=f"{camera}, {what}, surrogate: outlines off held-out edges, median of fits", unit="px")
     yield Row.of(times, name=f"{camera}, {what}: one calibration", unit="CPU-s")
 

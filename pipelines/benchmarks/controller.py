@@ -1,24 +1,19 @@
-"""Figures of the one-joint model and of controller identification. ``make bench ONLY=joint_model`` and ``ONLY=controller_sysid``.
+"""Figures of the one-joint model and of identification. ``make bench ONLY=joint_model`` and ``ONLY=controller_sysid``."""
 
-The rival of identification is ``mujoco.sysid`` on the same recording. Its extra packages are not among ours; where they are not
-installed (``pip install mujoco[sysid]``) its column stays empty.
-"""
-
-import contextlib
 import dataclasses
-import io
-import math
 import time
 from collections.abc import Iterator
 from statistics import median
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from pipelines.benchmarks import cameras as camera_benchmarks  # noqa: F401, registers its rows
+from pipelines.benchmarks.one_joint import in_mujoco
 from pipelines.benchmarks.rows import Row, against_reference, benchmark, cpu_times_s
-from taccorl.alignment.controller import arm_bench
-from taccorl.alignment.controller.identification import PAPER_BOUNDS, REFERENCE, identify_controller
+from taccorl.alignment.controller.arm_joint import arm_spec, split_signal
+from taccorl.alignment.controller.identification import REFERENCE, identify_controller
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion
@@ -29,7 +24,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import Effect, JointEffect
+from taccorl.sim.effects.effect import JointEffect
 from taccorl.sim.twin import TwinConfig
 
 NOISE_RAD = 2e-4
@@ -51,28 +46,23 @@ def sweep(signal: str, config: TwinConfig) -> tuple[JointMotion, np.ndarray]:
     measured = target.copy()
     measured[:, column] += gains.torque_ff / gains.kp
     m = Measurement(name=f"simulated sweep of {signal}", time_s=time_s, target=target, measured=measured)
-    true = in_mujoco(joint_motion(m, config, signal), signal, gains, config)
+    true = in_mujoco(joint_motion(m, config, signal), signal, gains, config=config).reported
     measured[:, column] = true + NOISE_RAD * np.random.default_rng(column).normal(size=len(time_s))
     return joint_motion(m, config, signal), true
 
 
-def in_mujoco(
-    motion: JointMotion, signal: str, gains: Gains, config: TwinConfig, present: tuple[Effect, ...] = ()
-) -> np.ndarray:
-    """(T,) the joint's answer by MuJoCo's own steps."""
-    hold = round(1 / (RATE_HZ * config.physics.timestep_s))
-    return arm_bench.run(
-        config,
-        signal,
-        motion.target,
-        hold,
-        np.zeros(len(motion.target) * hold),
-        gains=gains,
-        start=motion.start,
-        pose=motion.pose,
-        payload_kg=0.0,
-        effects=arm_bench.of_joint(present, signal),
-    )[0]
+def _rolled_out(motion: JointMotion, signal: str, config: TwinConfig) -> None:
+    """Readings and, with the forces of each row, efforts of the arm with this joint alone, without effects, in MuJoCo."""
+    arm, joint = split_signal(signal)
+    model, hold = (
+        arm_spec(config, arm, motion.pose, [joint]).compile(),
+        round(1 / (RATE_HZ * config.physics.timestep_s)),
+    )
+    sent, state = np.repeat(motion.target, hold)[None, :, None], int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    done = Batch(model, 1, 1).rollout(sent.shape[1], sent, int(mujoco.mjtState.mjSTATE_CTRL), ("sensordata", state))
+    rows = Batch(model, len(motion.target), 1)
+    rows.state[:] = done[state][0, ::hold]
+    rows.forward()
 
 
 def _of_mujoco(name: str, times_s: list[float], rival_s: float) -> Row:
@@ -88,27 +78,22 @@ def joint_model() -> Iterator[Row]:
     motion, _ = sweep(signal, config)
     gains = model.gains._replace(torque_ff=0.0)  # in balance at its target
     motion = dataclasses.replace(motion, start=float(motion.target[0]))
-    known: list[Effect] = []
-    for name in effects:
-        cls = effects.get(name)
-        if issubclass(cls, JointEffect) and "joint2" in cls.possible:
-            effect = make_effect(name, **{p.name: p.typical for p in cls.parameters()})
-            known += [effect] * (effect.drive() is not None)
+    classes = {name: effects.get(name) for name in effects}
+    possible = {name: c for name, c in classes.items() if issubclass(c, JointEffect) and "joint2" in c.possible}
+    known = [make_effect(name, **{p.name: p.typical for p in c.parameters()}) for name, c in possible.items()]
     replace = dataclasses.replace  # a model keeps the responses to a recording: each is simulated with a copy
     plain = cpu_times_s(lambda: model.simulate(replace(motion), gains), 20)
-    rival = cpu_times_s(lambda: in_mujoco(motion, signal, gains, config), 5)
+    rival = cpu_times_s(lambda: _rolled_out(motion, signal, config), 5)
     yield _of_mujoco("one joint, 10 s at 200 Hz, 12 000 physics steps, CPU", plain, median(rival))
     costs = [median(cpu_times_s(lambda e=e: model.simulate(replace(motion), gains, [e]), 5)) for e in known]
     dearest = cpu_times_s(lambda: model.simulate(replace(motion), gains, [known[costs.index(max(costs))]]), 20)
     yield _of_mujoco(f"the same with the most expensive of {len(known)} effects of joints, CPU", dearest, median(rival))
     away = [
-        float(
-            np.abs(model.simulate(motion, gains, [e]).reported - in_mujoco(motion, signal, gains, config, (e,))).max()
-        )
+        np.abs(model.simulate(motion, gains, [e]).reported - in_mujoco(motion, signal, gains, [e]).reported).max()
         for e in known
     ]
     worst = f"largest difference from MuJoCo in 10 s, any of {len(known)} effects at its typical strength"
-    yield Row.of([1e6 * rad for rad in away], by=max, name=worst, unit="µrad", goal="≤ 10")
+    yield Row.of([1e6 * float(rad) for rad in away], by=max, name=worst, unit="µrad", goal="≤ 10")
 
 
 @benchmark("controller_sysid")
@@ -122,7 +107,7 @@ def controller_sysid() -> Iterator[Row]:
             torque_ff_nm=[REFERENCE.torque_ff] * ROBOT.num_joints,
         )
     )
-    cost, ratio, rival_cost, rival_ratio, kp_off = ([] for _ in range(5))
+    cost, ratio, kp_off = [], [], []
     for joint in ROBOT.joints:
         signal = f"left_{joint}"
         truth = JointModel(config, signal).gains
@@ -134,57 +119,11 @@ def controller_sysid() -> Iterator[Row]:
         cost.append(time.process_time() - begin)
         ratio.append(_ratio_error(fit.gains, truth))
         kp_off.append(100.0 * abs(fit.gains.kp / truth.kp - 1.0))
-        begin = time.process_time()
-        found = _mujoco_sysid(motion, signal, unknowing)
-        if found is not None:
-            rival_cost.append(time.process_time() - begin)
-            rival_ratio.append(_ratio_error(found, truth))
-    rival = "mujoco.sysid, its scipy optimiser" if rival_cost else "mujoco.sysid is not installed"
     yield against_reference("controller of one joint from a 10 s sweep", cost, "≤ 300,000")
-    if rival_cost:
-        yield against_reference(f"the same by {rival}", rival_cost)
-    name, worst = "K_d / K_p off by, worst of six joints", max(rival_ratio) if rival_ratio else None
-    yield Row.of(ratio, by=max, name=name, unit="%", goal="≤ 1", rival=rival, rival_value=worst)
+    yield Row.of(ratio, by=max, name="K_d / K_p off by, worst of six joints", unit="%", goal="≤ 1")
     yield Row.of(kp_off, by=max, name="K_p off by, worst of six joints", unit="%")
 
 
 def _ratio_error(found: Gains, truth: Gains) -> float:
     """Of K_d / K_p, in percent."""
     return 100.0 * abs(found.kd / found.kp / (truth.kd / truth.kp) - 1.0)
-
-
-def _mujoco_sysid(motion: JointMotion, signal: str, config: TwinConfig) -> Gains | None:
-    """The same three numbers by MuJoCo's own tool, from the same start within the same bounds; None if it is not installed."""
-    try:
-        from mujoco import sysid
-
-        parameters = sysid.ParameterDict()
-    except (ImportError, AttributeError):
-        return None
-    arm, joint = arm_bench.split_signal(signal)
-    spec = arm_bench.arm_spec(config, arm, motion.pose, [joint])
-
-    def write(spec: mujoco.MjSpec, parameter) -> None:
-        kp, kd, torque_ff = math.exp(parameter.value[0]), math.exp(parameter.value[1]), parameter.value[2]
-        motor = spec.actuator(signal)
-        motor.gainprm[0], motor.biasprm[:3] = kp, [torque_ff, -kp, -kd]
-
-    low, high = np.array([PAPER_BOUNDS[name] for name in ("kp", "kd", "torque_ff")]).T
-    logs = np.array([True, True, False])
-    into = [np.where(logs, np.log(np.where(logs, ends, 1.0)), ends) for ends in (np.array(REFERENCE), low, high)]
-    parameters.add(sysid.Parameter("eta", *into, modifier=write))
-    model, step_s = spec.compile(), config.physics.timestep_s
-    hold = round(1 / (RATE_HZ * step_s))
-    command = np.repeat(motion.target, hold)[:, None]
-    control = sysid.TimeSeries.from_control_names(np.arange(len(command)) * step_s, command, model)
-    # It stamps what was before a step with the time after it.
-    measured = sysid.TimeSeries.from_names(
-        motion.time_s + step_s, motion.measured[:, None], model, names=[f"{signal}_pos"]
-    )
-    begin = sysid.create_initial_state(model, np.array([motion.start]), np.zeros(1))
-    sequence = sysid.ModelSequences("arm", spec, "sweep", begin, control, measured)
-    residual = sysid.build_residual_fn(models_sequences=[sequence])
-    with contextlib.redirect_stdout(io.StringIO()):
-        found, _ = sysid.optimize(initial_params=parameters, residual_fn=residual, optimizer="scipy", verbose=False)
-    kp, kd, torque_ff = found["eta"].value
-    return Gains(math.exp(kp), math.exp(kd), float(torque_ff))

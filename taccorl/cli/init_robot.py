@@ -34,8 +34,7 @@ def main(argv: list[str]) -> int:
     for path in (out, beside) if config.dataset else (out,):
         if path.exists():
             raise TaccorlError(f"{path}: already exists; give another --out, or remove it")
-    from taccorl.alignment.machines.columns_draft import columns_draft
-    from taccorl.alignment.machines.robot_draft import robot_draft
+    from taccorl.alignment.machines.robot_draft import columns_draft, robot_draft
     from taccorl.alignment.machines.robot_file import TODO
 
     text, robot = robot_draft(config.model, out)

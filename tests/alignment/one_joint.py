@@ -6,9 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from taccorl.alignment.controller import arm_bench
-from taccorl.alignment.controller.arm_bench import of_joint
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse
+from pipelines.benchmarks.one_joint import in_mujoco
+from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint
@@ -66,28 +65,6 @@ def at_rest(motion: JointMotion, gains: Gains) -> JointMotion:
     return dataclasses.replace(motion, start=float(motion.target[0]) + gains.torque_ff / gains.kp)
 
 
-def in_mujoco(
-    motion: JointMotion, signal: str, gains: Gains, *effects: Effect, config: TwinConfig = TWIN
-) -> JointResponse:
-    """The joint's answer by MuJoCo's own steps, row by row; of rows of 200 Hz."""
-    hold = round(1 / (motion.rate_hz * config.physics.timestep_s))
-    steps = np.arange(len(motion.target) * hold) / hold
-    reported, effort = arm_bench.run(
-        config,
-        signal,
-        motion.target,
-        hold,
-        np.interp(steps, np.arange(len(motion.target)), motion.coupling_nm),
-        gains=gains,
-        start=motion.start,
-        pose=motion.pose,
-        payload_kg=motion.payload_kg,
-        payload_at_m=motion.payload_at_m,
-        effects=of_joint(effects, signal),
-    )
-    return JointResponse(reported, effort)
-
-
 def recorded(
     signal: str,
     seed: int,
@@ -102,7 +79,7 @@ def recorded(
     of so many rows before them: a clock that is off."""
     m = chirp(signal, seconds, high_hz=high_hz)
     gains = JointModel(TWIN, signal).gains
-    done = in_mujoco(at_rest(joint_motion(m, TWIN, signal), gains), signal, gains, *effects)
+    done = in_mujoco(at_rest(joint_motion(m, TWIN, signal), gains), signal, gains, effects)
     rng, j = np.random.default_rng(seed), m.column(signal)
     seen = done.reported + noise_rad * rng.normal(size=m.num_rows)
     m.measured[:, j] = seen

@@ -280,7 +280,7 @@ def test_a_columns_file_gives_other_names_and_units(tmp_path, said):
             "unit: kPa",
             "columns.yaml:3: load → unit: 'kPa' is not of the same kind as the cells file's unit N",
         ),
-        ("unit: count", "unit: mV", "columns.yaml:6: cells → thumb → reading → unit: 'mV' is no unit like"),
+        ("unit: count", "unit: mV", "columns.yaml:6: cells → thumb → reading → unit: 'mV' is not of the same kind"),
         ("thumb:", "finger:", "columns.yaml:6: cells → finger: the cells file has no cell 'finger'"),
     ):
         (tmp_path / "columns.yaml").write_text(columns.replace(old, new))

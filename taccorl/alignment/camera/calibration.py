@@ -6,9 +6,8 @@ camera pose, and matched with the edges of the pictures (``edges``). Least squar
 nothing about the table and the parts. It works for a fixed camera and for one on a wrist, whose pose is relative to the link to
 which it is fixed.
 
-The start is the twin's own mount, within about 3° and 30 mm along each axis; or, for larger errors, the PnP solution from known
-points of the arms that were found in the pictures. Intrinsics are those of the twin: set them to the camera_info of your own
-camera.
+The start is the twin's own mount, within about 3° and 30 mm along each axis. Intrinsics are those of the twin: set them to the
+camera_info of your own camera.
 
 Letters in shapes: F frames.
 """
@@ -19,8 +18,8 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from taccorl.alignment.camera.edges import twin_edges
 from taccorl.alignment.camera.fit import (
     Level,
     Solution,
@@ -33,7 +32,6 @@ from taccorl.alignment.camera.fit import (
     solve,
 )
 from taccorl.alignment.camera.interval import Covariance, covariance
-from taccorl.alignment.camera.overlay import overlay
 from taccorl.alignment.camera.view import TwinView, as_offset
 from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError
@@ -43,7 +41,6 @@ from taccorl.sim.twin import TwinConfig
 
 FEWEST_FRAMES = 4
 """Least number of frames of a calibration."""
-FEWEST_POINTS = 6  # known ones: three more than PnP needs
 _HOLD_OUT = 4  # one frame in so many is kept out of the fit
 _FEWEST_OUTLINES = 60  # points a frame: less is a fingertip
 _REACH_PX = 6.0  # a held-out outline without an edge within this counts as this far off
@@ -87,20 +84,6 @@ class CameraFrames:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownPoint:
-    """Point of an arm or of the bench that was found in a picture, by hand or from a marker."""
-
-    frame: int
-    """Index of the picture."""
-    body: str
-    """MuJoCo body of the point; "world" for the bench."""
-    position_m: tuple[float, float, float]
-    """Position of the point in the body's frame [m]."""
-    pixel: tuple[float, float]
-    """(u, v) in the picture as given, black bars included [pixels]; (0, 0) is the centre of its top left pixel."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class CameraFit:
     """Result of a calibration. Poses (6,) are relative to the nominal mount, as ``CameraOffset``: rotation vector [rad],
     translation [m]."""
@@ -121,10 +104,6 @@ class CameraFit:
     the pictures]."""
     after_px: float
     """The same after the calibration [px]."""
-    known_before_px: float
-    """RMS reprojection error of the known points in held-out frames, before the calibration [px]; NaN without such points."""
-    known_after_px: float
-    """The same after the calibration [px]."""
     problems: tuple[str, ...]
     """Reasons why the result is not a valid calibration (not converged, not identifiable); empty if it is valid."""
     overlays: dict[str, np.ndarray]
@@ -135,19 +114,11 @@ class CameraFit:
     """Number of frames that the fit did not use."""
     name: str
     """``CameraFrames.name``."""
-    origin: Origin
-    """Origin of the pictures."""
 
     @property
     def converged(self) -> bool:
         """True if ``problems`` is empty: the result is a valid calibration."""
         return not self.problems
-
-    @property
-    def change(self) -> tuple[float, float]:
-        """Size of the change from the twin's camera: rotation angle [rad] and distance [m]."""
-        start, end = (Rotation.from_rotvec(x[:3]) for x in (self.start, self.offset))
-        return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
 
     def twin(self, config: TwinConfig) -> TwinConfig:
         """``config`` with the calibrated camera. The new offset contains the whole error of the mount. So ``camera_pose`` effects
@@ -164,15 +135,12 @@ class CameraFit:
         return dataclasses.replace(config, cameras=cameras, effects=kept)
 
 
-def calibrate_camera(
-    frames: CameraFrames, config: TwinConfig, camera: str, known: Sequence[KnownPoint] = ()
-) -> CameraFit:
+def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> CameraFit:
     """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
 
     Every fourth frame and the frames of the stages are held out: they are not used in the fit, and errors and overlays are
-    computed from them. ``known``: at least ``FEWEST_POINTS`` points for a start by PnP; without them the fit starts at the twin's
-    mount. Points in held-out frames are used for validation only. Raises TaccorlError: there is no such camera, there are too
-    few frames or points, the pictures are of another stream, or no arm is in view."""
+    computed from them. The fit starts at the twin's mount. Raises TaccorlError: there is no such camera, there are too few
+    frames, the pictures are of another stream, or no arm is in view."""
     if len(frames.joints) < FEWEST_FRAMES:
         raise TaccorlError(
             f"{frames.name}: {len(frames.joints)} frames; a calibration needs at least {FEWEST_FRAMES}, with the arms in "
@@ -181,15 +149,10 @@ def calibrate_camera(
     with TwinView(config, camera, frames.pictures.shape[1:3]) as view:
         inside = view.inside(frames.pictures)
         held = _held_out(frames)
-        start = view.start if not known else pnp(view, frames.joints, [p for p in known if not held[p.frame]])
         fit, test = (levels(list(inside[rows]), view.intrinsics) for rows in (~held, held))
-        solution = _solved(view, frames, held, fit, start, search=not known)
+        solution = _solved(view, frames, held, fit)
         sure = covariance(view, frames.joints[~held], fit[-1], solution)
         before, after = (_judge(view, frames.joints[held], pose, test[-1]) for pose in (view.start, solution.offset))
-        errors = [
-            _reprojection(view, frames.joints, [p for p in known if held[p.frame]], x)
-            for x in (view.start, solution.offset)
-        ]
         problems = _problems(frames, solution, sure, before, after)
         shown = {
             stage: overlay(view, inside[k], frames.joints[k], view.start, solution.offset, frames.origin)
@@ -203,39 +166,12 @@ def calibrate_camera(
             correlation=sure.correlation if sure else np.full((6, 6), np.nan),
             before_px=before[0],
             after_px=after[0],
-            known_before_px=errors[0],
-            known_after_px=errors[1],
             problems=problems,
             overlays=shown,
             num_frames=int((~held).sum()),
             num_held_out=int(held.sum()),
             name=frames.name,
-            origin=frames.origin,
         )
-
-
-def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.ndarray:
-    """Pose (6,) = rotation vector [rad] and translation [m] relative to the nominal mount, from known points and their pixels
-    (OpenCV: SQPNP, then Levenberg–Marquardt). ``joints``: (F, 14) [rad, m] of the frames that ``KnownPoint.frame`` counts.
-    ``known``: at least ``FEWEST_POINTS`` points; their pixels include the black bars. Raises TaccorlError: there are too few
-    points, or no pose explains them."""
-    if len(known) < FEWEST_POINTS:
-        raise TaccorlError(
-            f"camera {view.camera.name}: {len(known)} known points in frames of the fit; give at least {FEWEST_POINTS}, on "
-            "several bodies, or none"
-        )
-    points = np.array([view.in_mount(joints[p.frame], p.body, np.array(p.position_m)) for p in known])
-    pixels = np.array([p.pixel for p in known]) - [view.window.left, view.window.top]
-    at = view.intrinsics
-    matrix = np.array([[at.fx_px, 0, at.cx_px], [0, at.fy_px, at.cy_px], [0, 0, 1]])
-    good, turned, moved = cv2.solvePnP(points, pixels, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
-    if not good or not np.isfinite(turned).all():
-        raise TaccorlError(
-            f"camera {view.camera.name}: no camera pose projects the {len(known)} known points to the given pixels"
-        )
-    turned, moved = cv2.solvePnPRefineLM(points, pixels, matrix, np.zeros(4), turned, moved)
-    turn = cv2.Rodrigues(turned)[0]  # of the optical frame, y down and z ahead
-    return view.offset_of((-turn.T @ moved).ravel(), turn.T @ np.diag([1.0, -1.0, -1.0]))
 
 
 def _held_out(frames: CameraFrames) -> np.ndarray:
@@ -247,17 +183,15 @@ def _held_out(frames: CameraFrames) -> np.ndarray:
     return held
 
 
-def _solved(
-    view: TwinView, frames: CameraFrames, held: np.ndarray, fit: Sequence[Level], start: np.ndarray, *, search: bool
-) -> Solution:
-    drawn = outlines(view, frames.joints[~held], start, view.intrinsics)
+def _solved(view: TwinView, frames: CameraFrames, held: np.ndarray, fit: Sequence[Level]) -> Solution:
+    drawn = outlines(view, frames.joints[~held], view.start, view.intrinsics)
     if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
         raise TaccorlError(
             f"camera {view.camera.name}: at its pose in the twin, the camera hardly shows the arms in {frames.name}: "
             f"{len(drawn.points)} points of their outlines in {(~held).sum()} frames. Record the arms in the middle of the "
-            "picture, correct the camera's mount in the twin by hand, or give known points"
+            "picture, or correct the camera's mount in the twin by hand"
         )
-    return solve(view, frames.joints[~held], fit, start, search=search)
+    return solve(view, frames.joints[~held], fit, view.start)
 
 
 def _judge(view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level) -> tuple[float, float]:
@@ -272,15 +206,6 @@ def _judge(view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level)
     return float((apart.sum() + _REACH_PX * (~matches.found).sum()) / len(seen)), float(matches.found.mean())
 
 
-def _reprojection(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint], offset: np.ndarray) -> float:
-    """RMS [px] of the known points at a pose (6,)."""
-    if not known:
-        return float("nan")
-    points = np.array([view.in_mount(joints[p.frame], p.body, np.array(p.position_m)) for p in known])
-    pixels = pixels_of(seen_from(view, offset, points), view.intrinsics) + np.array([view.window.left, view.window.top])
-    return float(np.sqrt(np.mean(np.sum((pixels - [p.pixel for p in known]) ** 2, axis=1))))
-
-
 def _problems(
     frames: CameraFrames,
     solution: Solution,
@@ -293,7 +218,7 @@ def _problems(
         found.append(
             f"not converged: in held-out frames {after[1]:.0%} of the outlines have an edge beside them, {after[0]:.1f} px "
             "away in the mean: the arms are not in the pictures, or not where the joints say, or the start is too far off. "
-            "Look at an overlay; check that pictures and joints are of the same instants; give known points"
+            "Look at an overlay; check that pictures and joints are of the same instants, and the camera's mount in the twin"
         )
     elif after[0] > before[0] + 0.1:
         found.append(
@@ -316,3 +241,45 @@ def _problems(
     elif width > _VAGUE:
         found.append(f"not identifiable: {direction} can hardly be told; record poses that differ more")
     return tuple(found)
+
+
+BEFORE_RGB, AFTER_RGB = (230, 60, 50), (40, 200, 90)
+"""Colours of the outlines."""
+_STRIP = 22  # rows for a panel's title
+
+
+def overlay(
+    view: TwinView, picture: np.ndarray, joints: np.ndarray, before: np.ndarray, after: np.ndarray, origin: Origin
+) -> np.ndarray:
+    """Figure of four panels side by side, (rows + 22, 4 · columns, 3) uint8 RGB: the picture; the twin after the calibration; the
+    picture with the twin's outlines before, and after.
+
+    Args:
+        picture: (rows, columns, 3) uint8 RGB without bars.
+        joints: (14,) rad, m.
+        before, after: poses (6,).
+        origin: of the picture; its domain is written above it.
+    """
+    kind = f"{origin.domain} picture" if origin.domain else "picture"
+    panels = [(kind, picture), ("twin, after", view.picture(joints, after))]
+    for title, pose, color in (("before", before, BEFORE_RGB), ("after", after, AFTER_RGB)):
+        panels.append((f"outlines {title}", _drawn_over(view, picture, joints, pose, color)))
+    return np.concatenate([_titled(title, image) for title, image in panels], axis=1)
+
+
+def _drawn_over(
+    view: TwinView, picture: np.ndarray, joints: np.ndarray, pose: np.ndarray, color: tuple[int, int, int]
+) -> np.ndarray:
+    at = view.intrinsics
+    edges = twin_edges(*view.labels(joints, pose, at.rows, at.columns), at)
+    gray = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+    image = (0.6 * gray + 50).astype(np.uint8)
+    u, v = np.round(pixels_of(edges.points, at)).astype(int).T
+    image[np.clip(v, 0, at.rows - 1), np.clip(u, 0, at.columns - 1)] = color
+    return image
+
+
+def _titled(title: str, image: np.ndarray) -> np.ndarray:
+    strip = np.full((_STRIP, image.shape[1], 3), 255, np.uint8)
+    cv2.putText(strip, title, (4, _STRIP - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (20, 20, 20), 1, cv2.LINE_AA)
+    return np.concatenate([strip, image])

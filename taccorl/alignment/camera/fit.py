@@ -165,13 +165,11 @@ def moved(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
     return np.r_[(turn * Rotation.from_rotvec(step[:3])).as_rotvec(), offset[3:] + turn.apply(step[3:])]
 
 
-def solve(view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray, *, search: bool) -> Solution:
+def solve(view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray) -> Solution:
     """Fit the pose (6,) at which the outlines of the arms at ``joints`` (F, 14) [rad, m] coincide with the edges in ``levels``.
-    ``start``: (6,) pose of the first iteration [rad, m]. ``search``: first compare many poses within 3° and 30 mm of ``start``
-    along each axis."""
+    ``start``: (6,) pose [rad, m]; many poses within 3° and 30 mm of it along each axis are compared first."""
     reaches = _REACH_PX[-len(levels) :] if len(levels) > 1 else [_REACH_PX[0] + _REACH_PX[-1]]
-    starts = _starts(view, joints, levels[0], start) if search else [start]
-    tried = [_descend(view, joints, levels[0], reaches[0], one) for one in starts]
+    tried = [_descend(view, joints, levels[0], reaches[0], one) for one in _starts(view, joints, levels[0], start)]
     tried.sort(key=lambda solution: misfit(view, solution.offset, solution.outlines, levels[0]))
     for level, reach_px in zip(levels[1:], reaches[1:], strict=True):
         tried = [_descend(view, joints, level, reach_px, one.offset) for one in _distinct(tried)]

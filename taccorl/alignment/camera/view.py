@@ -99,17 +99,6 @@ class TwinView:
         self._turn(joints, offset)
         return self._renderer(self.window.rows, self.window.columns).render([self.data])[0, 0]
 
-    def in_mount(self, joints: np.ndarray, body: str, point_m: np.ndarray) -> np.ndarray:
-        """Position (3,) [m] in the mount's frame of ``point_m`` (3,) [m] in a body's frame, with the arms at ``joints`` (14,)
-        [rad, m]. Raises TaccorlError: there is no such body."""
-        names = [self.model.body(i).name for i in range(self.model.nbody)]
-        if body not in names:
-            raise TaccorlError(f"no body {body!r} in the twin; {nearest(body, names)}")
-        self.place(joints)
-        its, mount = self.data.body(body), self.data.body(self.camera.body)
-        world = its.xpos + its.xmat.reshape(3, 3) @ point_m
-        return mount.xmat.reshape(3, 3).T @ (world - mount.xpos)
-
     def inside(self, pictures: np.ndarray) -> np.ndarray:
         """The pictures (F, rows, columns, 3) without their black bars. Raises TaccorlError: the pictures have another size, or
         the bars are not black."""

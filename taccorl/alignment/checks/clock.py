@@ -4,7 +4,7 @@
 * A measurement that comes **late** may have a late clock or a real delay. Positions alone do not distinguish them.
 * A joint that an object stops while its command goes on follows the command up to there; the rest of the command is left out.
 * Offsets below one row (5 ms) are found in the first movement after a step, or if the joint responds as a first-order lag
-  (``first_order``), or in the onset of its steps beside a replay (``onset``). Otherwise an offset of a row looks like a missing
+  (``first_order``), or in the onset of its steps beside a replay. Otherwise an offset of a row looks like a missing
   effect, and the finding states that it was not judged.
 """
 
@@ -22,10 +22,10 @@ from taccorl.alignment.checks.first_order import (
     far_delay,
     fit_first_order,
     left_by_change,
+    onset_delay,
     pure_shift,
 )
 from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
-from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
 from taccorl.alignment.checks.wiring import FOLLOWS_FROM

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from taccorl.alignment.checks.range_end import stood_at_stop
+from taccorl.alignment.checks.first_order import LEAST_ROWS, fit_first_order
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, without, write
 from taccorl.alignment.checks.wiring import in_other_unit
@@ -14,6 +14,7 @@ from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
+from taccorl.errors import TaccorlError
 
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
@@ -114,17 +115,6 @@ def _comes_to_rest(m: Measurement) -> bool:
     return bool(known.any() and (last[0] == 0.0).all() and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all())
 
 
-def no_motion(m: Measurement, name: str) -> Finding:
-    """A signal that must move is never commanded to."""
-    j = m.column(name)
-    unit = m.units[j]
-    text = (
-        f"{name} is never commanded to move (by {np.ptp(m.target[:, j]):.2g} {unit}, it takes {least_motion(m, name):.2g}): "
-        "nothing about it can be learnt here; record a sweep of it"
-    )
-    return find("no_motion", name, text)
-
-
 @check("no_motion", "error")
 @check("dead_channel", "error", needs="position")
 def check_motion(t: Trial) -> Iterator[Finding]:
@@ -138,7 +128,6 @@ def check_motion(t: Trial) -> Iterator[Finding]:
         )
         yield find("no_motion", "", text)
         return
-    yield from (no_motion(m, name) for name in t.joints if not t.moves[m.column(name)])
     for j in np.flatnonzero(t.moves):
         name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
         known = measured[np.isfinite(measured)]
@@ -404,3 +393,67 @@ def _plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
     if np.std(law[rows] * np.sign(effort[rows])) < 5.0 * sd or size.max() > level + 6.0 * max(sd, 1e-12):
         return nothing
     return rows, level, sd
+
+
+# Distinguish a joint at a mechanical stop from one whose encoder's range ended, by the time at which the reading changes again.
+#
+# In both cases the reading is constant while the command is beyond it. If the *reading* ended, the joint moved on: the reading
+# changes when the joint's free response comes back, about a lag τ (0.1 s on a PiPER) after the command. A joint that stood at a
+# *stop* was held there: it moves as soon as the command is back. With u = g q*(t − d) + b, everything mirrored for a lower end,
+# and τ, d, g from ``first_order``, fitted to the rows of free motion:
+#
+#     free      f ← u + (f − u) e^(−h/τ)                   comes back below the reading q_held
+#     stopped   q ← min(q_held, u + (q − u) e^(−h/τ))      leaves q_held
+#
+# The hypothesis whose time is nearer to the measured one is chosen.
+
+SETTLED_S = 0.3
+"""Time after a hold in which a stop still influences the motion [s] (three time constants τ of 0.1 s): its rows are not
+fitted."""
+
+
+def stood_at_stop(
+    target: np.ndarray, measured: np.ndarray, period_s: float, rows: tuple[int, int], sign: float, near: float
+) -> bool:
+    """True if the end of the hold shows a joint at a stop; False if it does not, or is unclear.
+
+    Args:
+        target: (T,) commands [rad].
+        measured: (T,) readings [rad]; NaN where not measured.
+        period_s: time between two rows.
+        rows: first row and last row + 1 of the constant readings.
+        sign: +1 for an upper end of the range, −1 for a lower end.
+        near: readings within this distance [rad] of the held one may also be at the end, and are not used as free motion.
+    """
+    first, end = rows
+    if end >= len(target):
+        return False
+    up, seen, held = sign * target, sign * measured, sign * float(measured[first])
+    free = np.isfinite(seen)
+    for start, stop in runs(np.asarray(seen >= held - near)):
+        free[start : stop + round(SETTLED_S / period_s)] = False
+    if free.sum() < LEAST_ROWS:
+        return False
+    try:
+        fit = fit_first_order(up, np.where(free, seen, np.nan), period_s)
+    except TaccorlError:
+        return False
+    keep = math.exp(-period_s / fit.time_constant_s)
+    at = np.arange(len(up))
+    answer = fit.response(up, period_s)
+    offset = float(np.mean((seen - answer)[free]))
+    command, answer = fit.gain * np.interp(at - fit.delay_s / period_s, at, up - up[0]) + offset, answer + offset
+    steps = np.abs(np.diff(seen[np.isfinite(seen)]))
+    below = held - 0.5 * float(np.min(steps[steps > 0]))  # a reading changes half a step from the held one
+    stopped = np.full(len(up), held)
+    for k in range(first, len(up) - 1):
+        stopped[k + 1] = min(held, command[k] + (stopped[k] - command[k]) * keep)
+    beyond = first + int(np.argmax(command[first:end]))  # both come back after this row
+    back = [_first(answer < below, beyond), _first(stopped < below, beyond)]
+    return abs(back[1] - end) < abs(back[0] - end)
+
+
+def _first(reached: np.ndarray, after: int) -> int:
+    """The first row from ``after`` on where ``reached`` is true; the number of rows if there is none."""
+    found = np.flatnonzero(reached[after:])
+    return after + int(found[0]) if len(found) else len(reached)

@@ -17,14 +17,13 @@ from functools import partial
 import numpy as np
 
 from taccorl.alignment.checks import cells, clock, effort_time, robot, time_stamps, wiring
-from taccorl.alignment.checks.motion import no_motion
 from taccorl.alignment.checks.registry import CHECKS, accepted, check, check_names, find, run
 from taccorl.alignment.checks.trial import MOVED, Trial, least_motion
 from taccorl.alignment.checks.unrepeated import check_repeatability
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.repeats import Overlay, overlay
 from taccorl.data.finding import Finding
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 
 __all__ = ["MOVED", "accepted", "check_measurement", "check_measurements", "check_names", "least_motion", "one_cause"]
@@ -39,8 +38,6 @@ NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
 
 def check_measurement(
     m: Measurement,
-    joints: Sequence[str] = (),
-    floor: dict[str, float] | None = None,
     accept: Sequence[str] = (),
     limits: Mapping[str, float] | None = None,
     rates: Mapping[str, float] | None = None,
@@ -49,25 +46,20 @@ def check_measurement(
     """All findings on one measurement, worst first.
 
     Args:
-        joints: signals to be fitted; each must move.
-        floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
         accept: names of checks whose errors are known and become warnings.
         limits: signal → largest effort that its machine states [N·m, N]; a plateau there is no finding.
         rates: as in ``Trial``.
         progress: function that is called with a text about the present check.
     """
     progress("checking times and values")
-    for name in joints:
-        if name not in m.signals:
-            raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
-    whole = Trial(m, joints, limits or {}, floor, rates or {})
+    whole = Trial(m, limits or {}, rates or {})
     findings = accepted([*m.findings, *run("rows", whole)], accept)
     if not any(f.check in NO_MORE for f in findings):
         progress("checking efforts, motion and wiring")
         findings += accepted(run("effort", whole), accept)
         followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
         if followed:
-            trial = Trial(m.only(followed), joints, limits or {}, floor, rates or {})
+            trial = Trial(m.only(followed), limits or {}, rates or {})
             findings += accepted(run("position", trial), accept)
             if not any(f.severity == "error" and f.check not in ("lost_samples", "dead_channel") for f in findings):
                 progress("checking its clock")
@@ -78,24 +70,19 @@ def check_measurement(
 
 def check_measurements(
     measurements: Sequence[Measurement],
-    joints: Sequence[str] = (),
     accept: Sequence[str] = (),
     limits: Mapping[str, float] | None = None,
     rates: Mapping[str, float] | None = None,
     progress: Callable[[str, str], None] = lambda name, text: None,
 ) -> dict[str, list[Finding]]:
-    """Check several measurements; each joint must move in one of them. Also finds measurements that repeat another without
-    stating it, and copies. Returns name of the measurement → its findings, worst first. ``joints``: signals to be fitted;
-    ``accept``: names of checks whose errors are known and become warnings; ``limits``, ``rates``: as in ``check_measurement``;
-    ``progress`` is called with (name of a measurement, text about the present check)."""
+    """Check several measurements. Also finds measurements that repeat another without stating it, and copies. Returns name of the
+    measurement → its findings, worst first. ``accept``, ``limits``, ``rates``: as in ``check_measurement``; ``progress`` is
+    called with (name of a measurement, text about the present check)."""
     found = {}
     for k, m in enumerate(measurements, 1):
         place = f"recording {k} of {len(measurements)}, "
         trial = partial(check_measurement, m, accept=accept, limits=limits, rates=rates)
         found[m.name] = trial(progress=lambda text, m=m, place=place: progress(m.name, place + text))
-    moved = {name for m in measurements for name, far in zip(m.signals, Trial(m).moves, strict=True) if far}
-    for m in measurements[:1]:
-        found[m.name] += [no_motion(m, name) for name in joints if name not in moved]
     clock.check_late_recordings(measurements, found)
     found = {m.name: accepted(found[m.name], accept) for m in measurements}
     sound = [m for m in measurements if not any(f.severity == "error" for f in found[m.name])]

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -71,12 +71,8 @@ class Trial:
     """One measurement, and what several checks compute from it."""
 
     m: Measurement
-    joints: Sequence[str] = ()
-    """Signals to be fitted; each must move."""
     limits: Mapping[str, float] = field(default_factory=dict)
     """Signal → largest effort that its machine states [N·m, N]."""
-    known_floor: Mapping[str, float] | None = None
-    """Signal → noise floor of positions [rad, m]; None: estimated from this measurement alone."""
     rates: Mapping[str, float] = field(default_factory=dict)
     """Signal → rate at which its drive receives targets [Hz], where its machine states one."""
 
@@ -87,8 +83,6 @@ class Trial:
     @cached_property
     def floor(self) -> Mapping[str, float]:
         """Signal → noise floor of positions [rad, m]; infinite for one that was not measured."""
-        if self.known_floor is not None:
-            return self.known_floor
         known = noise_floor([dataclasses.replace(self.m, repeat_of=None)])
         return {name: known[name].value if name in known else math.inf for name in self.m.signals}
 

@@ -1,4 +1,5 @@
-"""One joint of the PiPER's twin for the one-joint model: its arm compiled with the other joints held.
+"""One joint of the PiPER's twin for the one-joint model: its arm compiled with the other joints held, without contacts and with a
+fixed gripper.
 
 Letters in shapes: T rows.
 """
@@ -11,15 +12,129 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from taccorl.alignment.controller import arm_bench
-from taccorl.alignment.controller.arm_bench import of_joint, split_signal
-from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion, Surroundings, moved_by_others, resting
-from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, torque_along
+from taccorl.alignment.controller.joint_motion import (
+    AT_TCP,
+    JointMotion,
+    Position,
+    Surroundings,
+    moved_by_others,
+    resting,
+)
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, rigid_terms, torque_along
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
+from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
-from taccorl.sim.twin import TwinConfig
+from taccorl.sim.effects.load import Payload
+from taccorl.sim.twin import TwinConfig, empty_bench
+
+
+def split_signal(signal: str) -> tuple[str, str]:
+    """Split the name of an arm's joint: ``left_joint5`` → ("left", "joint5"). Raises TaccorlError: ``signal`` is not a joint of
+    an arm; grippers have no one-joint model."""
+    arm, _, joint = signal.partition("_")
+    if arm in ROBOT.arms and joint == "gripper":
+        raise TaccorlError(f"{signal}: there is no one-joint model of a gripper; choose a joint")
+    if arm not in ROBOT.arms or joint not in ROBOT.joints:
+        first, last = (ROBOT.action_names[k] for k in (ROBOT.joint_indices[0], ROBOT.joint_indices[-1]))
+        raise TaccorlError(f"{signal!r} is not a joint of the arms; their joints are {first} … {last}")
+    return arm, joint
+
+
+def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
+    """Those of ``effects`` that are not absent and act on joint ``signal``, for it alone, in the order in which they act."""
+    arm, joint = split_signal(signal)
+    own: list[Effect] = []
+    for effect in present(effects):
+        if isinstance(effect, JointEffect) and signal in effect.acts_on():
+            is_alone = effect.arm == arm and effect.joints == [joint]  # as in every hypothesis of a search
+            own.append(effect if is_alone else dataclasses.replace(effect, arm=arm, joints=[joint]))
+        elif isinstance(effect, ArmEffect) and not isinstance(effect, JointEffect) and arm in effect.acts_on():
+            own.append(dataclasses.replace(effect, arm=arm))
+        elif not isinstance(effect, ArmEffect) and effect.slot == "robot" and {arm, signal} & {*effect.acts_on()}:
+            own.append(effect)
+    return own
+
+
+def arm_spec(
+    config: TwinConfig,
+    arm: str,
+    pose: np.ndarray,
+    free: Sequence[str],
+    payload_kg: float = 0.0,
+    payload_at_m: Position = AT_TCP,
+) -> mujoco.MjSpec:
+    """One arm whose joints ``free`` have motors and encoders, and whose other joints and gripper are held at ``pose``.
+
+    Args:
+        pose: (7,) angles of the arm's six joints [rad] and its opening [m].
+        free: names of joints without the arm, such as ``joint5``.
+        payload_at_m: centre of mass of the known payload, in link 6's frame.
+    """
+    spec = empty_bench(config)
+    for other in ROBOT.arms:
+        if other != arm:
+            spec.delete(spec.body(f"{other}_base_link"))
+    for things in (spec.geoms, spec.equalities, spec.tendons):
+        for thing in list(things):
+            spec.delete(thing)
+    names = [f"{arm}_{joint}" for joint in free]
+    for actuator in list(spec.actuators):
+        if actuator.name not in names:
+            spec.delete(actuator)
+    for joint, link, angle in zip(ROBOT.joints, ROBOT.links, pose, strict=False):
+        if joint not in free:
+            body = spec.body(f"{arm}_{link.name}")
+            turn = np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+            quat = np.empty(4)
+            mujoco.mju_mulQuat(quat, np.asarray(body.quat), turn)
+            body.quat = quat
+    for finger, side in zip(ROBOT.fingers, (1.0, -1.0), strict=True):
+        body = spec.body(f"{arm}_finger_{finger}")
+        body.pos[1] += side * pose[ROBOT.num_joints] / 2
+    for joint in list(spec.joints):
+        if joint.name not in names:
+            spec.delete(joint)
+    for joint in spec.joints:
+        joint.limited = False
+    for name in names:
+        spec.add_sensor(
+            name=f"{name}_pos", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=name
+        )
+    if payload_kg > 0:
+        held_payload(arm, payload_kg, payload_at_m).edit(spec, config)
+        spec.body(f"{arm}_payload").name = f"{arm}_held"  # so that the arm may have another, hidden one
+    return spec
+
+
+def held_payload(arm: str, mass_kg: float, at_m: Position = AT_TCP) -> Payload:
+    """The effect ``payload`` of a known mass in the gripper of ``arm``, at ``at_m`` in link 6's frame."""
+    x_m, y_m, z_m = at_m
+    return Payload(arm=arm, mass_kg=mass_kg, x_m=x_m, y_m=y_m, z_m=z_m)
+
+
+def rigid(
+    config: TwinConfig,
+    signal: str,
+    pose: np.ndarray,
+    payload_kg: float,
+    effects: Sequence[Effect],
+    payload_at_m: Position = AT_TCP,
+) -> Rigid:
+    """Inertia and weight of joint ``signal`` with the others held at ``pose`` (7,) [rad, m], which is that of ``arm_spec``; of
+    ``effects`` only those that change bodies are used."""
+    arm, joint = split_signal(signal)
+    return rigid_of(arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m), config, signal, effects)
+
+
+def rigid_of(spec: mujoco.MjSpec, config: TwinConfig, signal: str, effects: Sequence[Effect]) -> Rigid:
+    """``rigid`` of the arm ``spec``, which is changed."""
+    for effect in effects:
+        effect.edit(spec, config)
+    return rigid_terms(spec.compile(), signal)
+
 
 BENCH_REST = np.concatenate([[*Bench.home_rad[arm], 0.0] for arm in ROBOT.arms])
 """(14,) positions [rad, m] of joints and grippers that a table does not contain."""
@@ -51,14 +166,14 @@ class ArmJoint(RigidJoint):
         self.gains = Gains(control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k])
         self._own = of_joint(config.effects, signal)
         # Cached: building a MuJoCo MjSpec takes about 10 ms, compiling it about 0.1 ms.
-        self._specified = lru_cache(lambda pose, *held: arm_bench.arm_spec(config, arm, np.array(pose), [joint], *held))
+        self._specified = lru_cache(lambda pose, *held: arm_spec(config, arm, np.array(pose), [joint], *held))
 
     def timestep_s(self, motion: JointMotion) -> float:
         return self._config.physics.timestep_s
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         spec = self._specified(tuple(motion.pose), motion.payload_kg, motion.payload_at_m).copy()
-        return arm_bench.rigid_of(spec, self._config, self.signal, bodies)
+        return rigid_of(spec, self._config, self.signal, bodies)
 
     def surroundings(self, m: Measurement) -> Surroundings:
         arm, _ = split_signal(self.signal)
@@ -91,25 +206,6 @@ class ArmJoint(RigidJoint):
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         return selectors(cls, self.signal)
 
-    def in_mujoco(
-        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        steps = np.arange(len(sent) * hold) / (parts * hold)
-        reported, effort = arm_bench.run(
-            self._config,
-            self.signal,
-            sent,
-            hold,
-            np.interp(steps, np.arange(len(motion.coupling_nm)), motion.coupling_nm),
-            gains=gains,
-            start=motion.start,
-            pose=motion.pose,
-            payload_kg=motion.payload_kg,
-            payload_at_m=motion.payload_at_m,
-            effects=effects,
-        )
-        return reported[::parts], effort[::parts]
-
     def _coupling(self, m: Measurement, known: Surroundings) -> np.ndarray:
         """(T,) torque beyond the joint's own inertia and weight, because other joints of its arm move."""
         arm, joint = split_signal(self.signal)
@@ -119,9 +215,7 @@ class ArmJoint(RigidJoint):
         angles |= moved_by_others(m, [self.signal], still=-1.0)
         both = []
         for free in ([name for name in ROBOT.joints if f"{arm}_{name}" in angles], [joint]):
-            model = arm_bench.arm_spec(
-                self._config, arm, known.pose, free, known.payload_kg, known.payload_at_m
-            ).compile()
+            model = arm_spec(self._config, arm, known.pose, free, known.payload_kg, known.payload_at_m).compile()
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
             q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
             needed, carried, _ = torque_along(model, q, m.period_s)
@@ -130,8 +224,11 @@ class ArmJoint(RigidJoint):
 
 
 def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
-    """Arguments (``arm``, ``joints``) with which an effect acts on one joint of the PiPER alone; None if it cannot act on it."""
+    """Arguments (``arm``, ``joints``) with which an effect acts on one joint of the PiPER alone; None if it cannot act on it, or
+    if the one-joint model lacks it: an outside effect with hooks alone."""
     arm, joint = signal.split("_", 1)
+    if cls().drive() is None:
+        return None
     if issubclass(cls, JointEffect):
         return {"arm": arm, "joints": [joint]} if joint in cls.possible else None
     return {"arm": arm} if issubclass(cls, ArmEffect) else None

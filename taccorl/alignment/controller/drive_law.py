@@ -31,7 +31,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from taccorl.alignment.controller.drive_numbers import POSITION, TORQUE, VELOCITY
-from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.controller.joint_motion import Surroundings
+from taccorl.alignment.controller.rigid_joint import Gains, RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
@@ -276,6 +277,34 @@ class DriveLaw:
                 f"{m.name}: a supply voltage of {signal} is stated, but law {self.law} does not use it; remove it"
             )
         return np.nan_to_num(np.append(volts[1:], volts[-1]) / self.supply_v, nan=1.0)
+
+
+class DriveJoint(RigidJoint):
+    """A joint whose drive has the law of a file."""
+
+    follows_line: ClassVar[bool] = True
+
+    def __init__(
+        self, law: DriveLaw, signal: str, unit: Literal["rad", "m"], loop_hz: float | None, command_hz: float | None
+    ) -> None:
+        self.law, self.signal, self.unit, self.gains = law, signal, unit, law.following
+        self.gain_names, self.target_kind, self.known_names = law.gain_names, law.target_kind, law.known
+        self.command_hz = math.inf if law.law == "effort" else command_hz or 0.0
+        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
+        # the output that a row shows before its own target acts. After it acts, the output is new.
+        loop_s = 1.0 / loop_hz if loop_hz else 0.0
+        self.facts = law.facts | {"effort_age": (-0.5 if law.effort_after_target else 0.5) * loop_s}
+        self.position_age_s, self.speed_delay_s = 0.5 * loop_s, loop_s
+
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self.law.gain_scales(self.signal, m)
+
+    def surroundings(self, m: Measurement) -> Surroundings:
+        """What the recording states of the drive: known load, added torque, the motor's supply, and whether it is on. Raises
+        TaccorlError: there is a supply voltage that the law does not use."""
+        on, added = (values[:, m.column(self.signal)] if values.size else None for values in (m.enabled, m.torque_ff))
+        known = {"supply": self.law.supply(self.signal, m), "on": on, "torque_ff_nm": added}
+        return Surroundings(coupling_nm=-m.known_load(self.signal), **known)
 
 
 def with_gains(m: Measurement, laws: Mapping[str, DriveLaw]) -> Measurement:

@@ -4,6 +4,7 @@ import math
 from collections import namedtuple
 from typing import NamedTuple
 
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid
 from taccorl.sim.effects import command, drive, encoder, friction, gear, load
 from taccorl.sim.effects.effect import JOINT_SLOTS, ArmEffect
 
@@ -14,29 +15,9 @@ POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
 
 
 class _Own(NamedTuple):
-    """Fields of ``Drive`` that no effect sets, in SI units, N·m and rad (for a sliding axis N and m)."""
+    """Fields of ``Drive`` besides those of ``Gains`` and ``Rigid`` that no effect sets, in SI units, N·m and rad (for a sliding
+    axis N and m)."""
 
-    # Controller: τ = K_p (q* − y) − K_d q̇ + T_ref.
-    kp: float
-    """K_p [N·m/rad]."""
-    kd: float
-    """K_d [N·m·s/rad]."""
-    torque_ff: float
-    """T_ref [N·m]."""
-    # Rigid body.
-    inertia: float
-    """Inertia about the joint: link and rotor [kg·m²]."""
-    rotor_inertia: float = 0.0
-    """Share of ``inertia`` on the motor's side of the gear [kg·m²]."""
-    gravity_sin: float = 0.0
-    """S [N·m] of the motor torque S sin q + C cos q that holds the link's weight at joint position q."""
-    gravity_cos: float = 0.0
-    """C [N·m] in the same torque."""
-    compensation_sin: float = 0.0
-    """S [N·m] in the torque S sin q + C cos q that the motor adds for gravity compensation."""
-    compensation_cos: float = 0.0
-    """C [N·m] in the same torque."""
-    # Drive.
     command: float = POSITION
     """Quantity that a command states: ``POSITION``, ``VELOCITY`` (τ = K_d (q̇* − q̇) + T_ref) or ``TORQUE`` (τ = τ* + T_ref)."""
     commands_speed: float = 0.0
@@ -70,10 +51,11 @@ def _numbers() -> dict[str, float]:
     return dict(sorted(pair for effect in absent for pair in (effect.drive() or {}).items()))
 
 
-_OF_EFFECTS = {name: value for name, value in _numbers().items() if name not in _Own._fields}
-Drive = namedtuple(
-    "Drive", (*_Own._fields, *_OF_EFFECTS), defaults=(*_Own._field_defaults.values(), *_OF_EFFECTS.values())
-)
-"""One joint with its drive: the fields of ``_Own``, and ``EFFECT__PARAMETER`` of the effects, which do nothing by default.
+_BODY = [name for name in Rigid._fields if name != "weight_n"]
+_DEFAULTS = {name: Rigid._field_defaults[name] for name in _BODY[1:]} | _Own._field_defaults
+_DEFAULTS |= {name: value for name, value in _numbers().items() if name not in _DEFAULTS}
+Drive = namedtuple("Drive", (*Gains._fields, _BODY[0], *_DEFAULTS), defaults=_DEFAULTS.values())
+"""One joint with its drive: the fields of ``Gains``, ``Rigid`` and ``_Own``, and ``EFFECT__PARAMETER`` of the effects, which do
+nothing by default.
 
 ``speed_delay__delay_s`` is the time constant of a low-pass on the speed that K_d multiplies; below 0 it adds to ``speed_age``."""

@@ -3,16 +3,19 @@
 The joints are strongly over-damped, so that positions determine the time constant K_d / K_p and the offset T_ref / K_p, but
 hardly K_p itself (the correlation of log K_p and log K_d is 0.9999): other errors of the model change K_p. So the ratios are
 reported with their own intervals, commanded gains are taken as true, and recorded torques are fitted, too.
+
+Letters in shapes: R residuals, P parameters.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import OptimizeResult, least_squares
 
-from taccorl.alignment.controller.identification_search import GainSearch, correlation_time, covariance
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -23,13 +26,15 @@ PAPER_BOUNDS = {"kp": (10.0, 1e5), "kd": (1.0, 1e3), "torque_ff": (-8.0, 8.0)}
 """Bounds of K_p, K_d and T_ref [N·m/rad, N·m·s/rad, N·m] (App. B.1)."""
 REFERENCE = Gains(500.0, 50.0, 0.0)
 """Gains of the paper's reference simulator, at which a search starts."""
-RATE_WEIGHT = 0.1  # of the finite differences in the paper's loss, eq. 9
 _NORMAL_95 = 1.96
 _AT_BOUND = 1e-3  # so near to a bound, as a share of the value or of the span, is at it
 _LEAST_MOTION = 5e-3  # rad, m
 _LEAST_SECONDS = 2.0
 _MOST_ROUNDS = 4  # of weighing positions and torques against each other
 _MOST_LOG = 50.0
+_STEPS = {"kp": 1e-3, "kd": 1e-4, "torque_ff": 1e-6}  # of log K_p, log K_d / K_p and T_ref / K_p [rad], for derivatives
+_LATE_STEP_S, _MOST_LATE_S = 1e-4, 0.5
+_DIVERGED = 1e3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +59,6 @@ class MotionError:
     name: str
     use: Literal["fit", "validation"]
     """Whether the gains were fitted to the recording, or not (validation)."""
-    loss_before: float
-    """Loss of eq. 9 of the paper before the fit [rad]."""
-    loss_after: float
-    """The same after the fit [rad]."""
     rmse_before: float
     """RMS error before the fit [rad]."""
     rmse_after: float
@@ -68,7 +69,6 @@ class MotionError:
 class ControllerFit:
     """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
-    signal: str
     gains: Gains
     """Gains in force in the first recording."""
     estimates: dict[str, Estimate]
@@ -84,21 +84,12 @@ class ControllerFit:
     """Remarks: reasons why it did not converge, numbers that cannot be determined, suspicious values."""
 
 
-def paper_loss(reported: np.ndarray, measured: np.ndarray) -> float:
-    """The paper's loss (eq. 9) [rad], Σ |e_sim − e_real| + 0.1 Σ |Δe_sim − Δe_real| over T rows, of the simulated angles
-    ``reported`` (T,) and ``measured`` (T,) [rad]. e = angle − target: the targets cancel. Rows with NaN are left out."""
-    difference = reported - measured
-    return float(np.nansum(np.abs(difference)) + RATE_WEIGHT * np.nansum(np.abs(np.diff(difference))))
-
-
 def identify_controller(
     motions_fit: Sequence[JointMotion],
     model: JointModel,
     *,
     free: Sequence[str] | None = None,
     validation: Sequence[JointMotion] = (),
-    start: Gains = REFERENCE,
-    bounds: Mapping[str, tuple[float, float]] = PAPER_BOUNDS,
 ) -> ControllerFit:
     """Fit the gains of ``model`` to recordings of its joint.
 
@@ -110,8 +101,6 @@ def identify_controller(
         free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. The others
             have the commanded values, or the twin's.
         validation: recordings that are not used in the fit; their errors are reported.
-        start: gains at which the search starts, besides the twin's.
-        bounds: ``kp``, ``kd``, ``torque_ff`` → (low, high) [N·m/rad, N·m·s/rad, N·m].
 
     Raises TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a
     parameter is unknown."""
@@ -124,18 +113,16 @@ def identify_controller(
         free = [name for name in PAPER_BOUNDS if not known.get(name, False)]
     if not free or not set(free) <= set(PAPER_BOUNDS):
         raise TaccorlError(f"{model.signal}: free parameters {list(free)}; choose among {', '.join(PAPER_BOUNDS)}")
-    search = GainSearch(motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free), bounds)
-    x, unfinished = _by_least_squares(search, start)
-    parts = search.parts(x)
-    correlated, residual = correlation_time(parts), np.concatenate(parts)
-    estimates, ridge = _estimates(search, x, covariance(search.jacobian(x), residual, correlated))
-    late, error = search.lateness(x)
+    search = _GainSearch(motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free))
+    x, unfinished = _by_least_squares(search)
+    estimates, ridge = _estimates(search, x, search.covariance(x))
+    later = search.solve(np.append(x, 1e-6), most=30).x  # with a delay of the rows as a further unknown
+    late, error = float(later[-1]), math.sqrt(search.covariance(later)[-1, -1])
     estimates["late"] = Estimate(value=late, low=late - _NORMAL_95 * error, high=late + _NORMAL_95 * error, unit="s")
     at_bound = [name for name in search.free if estimates[name].at_bound]
     if at_bound:
         unfinished = [*unfinished, f"{' and '.join(at_bound)} ended at a bound of the search"]
     return ControllerFit(
-        signal=model.signal,
         gains=search.gains(x),
         estimates=estimates,
         ridge=ridge,
@@ -145,9 +132,10 @@ def identify_controller(
     )
 
 
-def _by_least_squares(search: GainSearch, start: Gains) -> tuple[np.ndarray, list[str]]:
+def _by_least_squares(search: "_GainSearch") -> tuple[np.ndarray, list[str]]:
     """The best x, and why it is not to be trusted."""
-    found = min((search.solve(search.at(gains)) for gains in (start, search.model.gains)), key=lambda done: done.cost)
+    starts = (search.at(gains) for gains in (REFERENCE, search.model.gains))
+    found = min(map(search.solve, starts), key=lambda done: done.cost)
     if all(np.isfinite(motion.effort).any() for motion in search.motions):
         for _ in range(_MOST_ROUNDS):
             search.weigh(found.x)
@@ -155,7 +143,7 @@ def _by_least_squares(search: GainSearch, start: Gains) -> tuple[np.ndarray, lis
     return found.x, [] if found.status > 0 else [f"{found.nfev} steps of the solver were not enough"]
 
 
-def _estimates(search: GainSearch, x: np.ndarray, spread: np.ndarray) -> tuple[dict[str, Estimate], float]:
+def _estimates(search: "_GainSearch", x: np.ndarray, spread: np.ndarray) -> tuple[dict[str, Estimate], float]:
     """Intervals of the gains and of their ratios to K_p, and the correlation of log K_p and log K_d.
 
     Each number's (or its logarithm's) derivative by x, with x = log K_p, log K_d / K_p, T_ref / K_p: to first order its variance
@@ -187,7 +175,7 @@ def _estimates(search: GainSearch, x: np.ndarray, spread: np.ndarray) -> tuple[d
             high=high,
             unit=text,
             fixed=name in PAPER_BOUNDS and name not in unit,
-            at_bound=name in unit and _is_at_bound(value, *search.bounds[name], is_log=is_log),
+            at_bound=name in unit and _is_at_bound(value, *PAPER_BOUNDS[name], is_log=is_log),
         )
     if "kp" not in unit or "kd" not in unit:
         return estimates, math.nan
@@ -200,7 +188,7 @@ def _is_at_bound(value: float, low: float, high: float, *, is_log: bool) -> bool
     return min(value - low, high - value) < _AT_BOUND * (high - low)
 
 
-def _remarks(search: GainSearch, estimates: dict[str, Estimate], ridge: float) -> list[str]:
+def _remarks(search: "_GainSearch", estimates: dict[str, Estimate], ridge: float) -> list[str]:
     remarks = []
     kp, lag, late = estimates["kp"], estimates["lag"], estimates["late"]
     stated = [motion.name for motion in search.motions if motion.kp_known]
@@ -226,7 +214,7 @@ def _remarks(search: GainSearch, estimates: dict[str, Estimate], ridge: float) -
 
 
 def _errors(
-    search: GainSearch, motions: Sequence[JointMotion], use: Literal["fit", "validation"], x: np.ndarray
+    search: "_GainSearch", motions: Sequence[JointMotion], use: Literal["fit", "validation"], x: np.ndarray
 ) -> list[MotionError]:
     errors = []
     for motion in motions:
@@ -237,8 +225,6 @@ def _errors(
             MotionError(
                 name=motion.name,
                 use=use,
-                loss_before=paper_loss(before, motion.measured),
-                loss_after=paper_loss(after, motion.measured),
                 rmse_before=float(np.sqrt(np.nanmean((before - motion.measured) ** 2))),
                 rmse_after=float(np.sqrt(np.nanmean((after - motion.measured) ** 2))),
             )
@@ -269,3 +255,134 @@ def _check_usable(motion: JointMotion, model: JointModel) -> None:
             f"{motion.name}: {signal} moved by {moved:.2g} {unit} where its targets move by {span:.2g} {unit}: a dead or "
             "swapped channel, or a motor without power; correct that, then record again"
         )
+
+
+class _GainSearch:
+    """Residuals of recordings as a function of x, the free ones of log K_p, log (K_d / K_p) and T_ref / K_p. In these
+    coordinates the valley of the loss is straight: positions determine the ratios, and hardly K_p. Values beyond the bounds are
+    clipped. Gains are those in force in the first recording; the other recordings' gains are in proportion, if they were
+    commanded so. A coordinate beyond P is the time by which the rows' positions are older than their times [s]."""
+
+    def __init__(self, motions: Sequence[JointMotion], model: JointModel, free: tuple[str, ...]) -> None:
+        first = motions[0]
+        self._kp_scale, self._kd_scale = first.kp_scale, first.kd_scale
+        self.motions = [self.scaled(motion) for motion in motions]
+        self.model, self.free = model, free
+        own = model.gains
+        self.given = Gains(own.kp * self._kp_scale, own.kd * self._kd_scale, own.torque_ff)
+        """Values of the gains that are not free: commanded in the first recording, or the twin's own."""
+        self.sigma_rad = 1e-4  # near to what an encoder has: keeps the solver's tolerances meaningful
+        self.sigma_effort: float | None = None
+        """Noise of the effort [N·m]; None: efforts are not used."""
+
+    def scaled(self, motion: JointMotion) -> JointMotion:
+        """``motion`` with gain scales relative to those of the first recording."""
+        return replace(motion, kp_scale=motion.kp_scale / self._kp_scale, kd_scale=motion.kd_scale / self._kd_scale)
+
+    def gains(self, x: np.ndarray) -> Gains:
+        """Gains at coordinates ``x`` (P,), clipped to the bounds; gains that are not free have the values of ``given``."""
+        at = dict(zip(self.free, x, strict=False))
+        kp = self._within("kp", math.exp(min(at["kp"], _MOST_LOG))) if "kp" in at else self.given.kp
+        kd = self._within("kd", kp * math.exp(min(at["kd"], _MOST_LOG))) if "kd" in at else self.given.kd
+        torque_ff = self._within("torque_ff", kp * at["torque_ff"]) if "torque_ff" in at else self.given.torque_ff
+        return Gains(float(kp), float(kd), float(torque_ff))
+
+    def at(self, gains: Gains) -> np.ndarray:
+        """Coordinates x (P,) of ``gains``, clipped to the bounds."""
+        kp = self._within("kp", gains.kp) if "kp" in self.free else self.given.kp
+        every = {"kp": math.log(kp), "kd": math.log(self._within("kd", gains.kd) / kp)}
+        every["torque_ff"] = self._within("torque_ff", gains.torque_ff) / kp
+        low, high = self.x_bounds()
+        return np.clip(np.array([every[name] for name in self.free]), low + 1e-9, high - 1e-9)
+
+    def x_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest (P,) and highest (P,) coordinates x."""
+        (kp_low, kp_high), (kd_low, kd_high) = PAPER_BOUNDS["kp"], PAPER_BOUNDS["kd"]
+        least, most = PAPER_BOUNDS["torque_ff"]
+        every = {
+            "kp": (math.log(kp_low), math.log(kp_high)),
+            "kd": (math.log(kd_low / max(kp_high, self.given.kp)), math.log(kd_high / min(kp_low, self.given.kp))),
+            "torque_ff": (least / min(kp_low, self.given.kp), most / min(kp_low, self.given.kp)),
+        }
+        low, high = np.array([every[name] for name in self.free]).T
+        return low, high
+
+    def _within(self, name: str, value: float) -> float:
+        low, high = PAPER_BOUNDS[name]
+        return min(max(value, low), high)
+
+    def simulate(self, motion: JointMotion, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
+        """(T,) reported positions [rad] and (T,) efforts [N·m]; after a divergence both are far from any measurement."""
+        done = self.model.simulate(motion, gains)
+        return _finite(done.reported), _finite(done.effort)
+
+    def parts(self, x: np.ndarray) -> list[np.ndarray]:
+        """Residuals at ``x`` in units of the channel's noise, where something was measured: of each recording those of its
+        positions, one per measured row, then those of its efforts if efforts are used."""
+        late_s, parts = float(sum(x[len(self.free) :])), []
+        for motion in self.motions:
+            reported, effort = self.simulate(motion, self.gains(x))
+            if late_s:
+                reported = CubicSpline(motion.time_s, reported)(np.maximum(motion.time_s - late_s, motion.time_s[0]))
+            seen = np.isfinite(motion.measured)
+            parts.append((reported - motion.measured)[seen] / self.sigma_rad)
+            if self.sigma_effort is not None:
+                seen = np.isfinite(motion.effort)
+                parts.append((effort - motion.effort)[seen] / self.sigma_effort)
+        return parts
+
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        """(R,) ``parts``, concatenated."""
+        return np.concatenate(self.parts(x))
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Derivatives (R, P) of the residuals by ``x``, by central differences."""
+        steps = [*(_STEPS[name] for name in self.free), _LATE_STEP_S][: len(x)]
+        ends = [[self.residual(x + sign * step) for sign in (1, -1)] for step in np.diag(steps)]
+        return np.column_stack([(a - b) / (2 * step) for (a, b), step in zip(ends, steps, strict=True)])
+
+    def solve(self, start: np.ndarray, most: int = 100) -> OptimizeResult:
+        """Least squares from ``start``, a point within the bounds, in at most so many evaluations; returns SciPy's result."""
+        late_s = np.full(len(start) - len(self.free), _MOST_LATE_S)
+        bounds = tuple(np.append(end, sign * late_s) for end, sign in zip(self.x_bounds(), (-1, 1), strict=True))
+        jacobian: Any = self.jacobian
+        return least_squares(
+            self.residual, start, jacobian, bounds, x_scale="jac", max_nfev=most, xtol=1e-10, ftol=1e-12
+        )
+
+    def covariance(self, x: np.ndarray) -> np.ndarray:
+        """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, and σ² that of the residuals times their correlation time; very
+        large where J is singular."""
+        parts, jacobian = self.parts(x), self.jacobian(x)
+        residual, norms = np.concatenate(parts), np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30)
+        _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
+        half = right / np.maximum(singular, 1e-12)[:, None] / norms
+        variance = float(residual @ residual) / max(len(residual) - len(norms), 1) * correlation_time(parts)
+        return half.T @ half * variance
+
+    def weigh(self, x: np.ndarray) -> None:
+        """Set the noise of both channels to the RMS residuals at ``x`` (P,)."""
+        left = [(self.simulate(motion, self.gains(x)), motion) for motion in self.motions]
+        positions = np.concatenate([reported - motion.measured for (reported, _), motion in left])
+        efforts = np.concatenate([effort - motion.effort for (_, effort), motion in left])
+        self.sigma_rad = max(float(np.sqrt(np.nanmean(positions**2))), 1e-12)
+        self.sigma_effort = max(float(np.sqrt(np.nanmean(efforts**2))), 1e-12)
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(values, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+
+
+def correlation_time(parts: Sequence[np.ndarray]) -> float:
+    """Number of rows after which residuals are independent, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the largest over ``parts``.
+    ``parts``: residuals (R,) of one recording and channel each."""
+    longest = 1.0
+    for part in parts:
+        centred = part - part.mean()
+        size = 2 ** math.ceil(math.log2(2 * len(part)))
+        rho = np.fft.irfft(np.abs(np.fft.rfft(centred, size)) ** 2, size)[: len(part)]
+        if rho[0] > 0:
+            rho /= rho[0]
+            end = int(np.argmax(rho <= 0.0)) or len(rho)
+            longest = max(longest, 1.0 + 2.0 * float(rho[1:end].sum()))
+    return longest

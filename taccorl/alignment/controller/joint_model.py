@@ -72,7 +72,7 @@ class Numbers(NamedTuple):
     effects: Sequence[Effect] = ()
     """Effects in addition to those of the machine file; one with the name of an effect of the file replaces it."""
     lever: PayloadLever = AT_ITS_PLACE
-    """Correction of the payload's weight; not used if an effect requires simulation in MuJoCo."""
+    """Correction of the payload's weight."""
     age_s: float = 0.0
     """Additional age of the measured position when the drive's torque acts."""
     facts: Mapping[str, float] | None = None
@@ -80,13 +80,11 @@ class Numbers(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """``Numbers`` of a simulation; the effects that are present and those of them that change bodies; fields of ``Drive``, None
-    if only MuJoCo has all of the effects."""
+    """``Numbers`` of a simulation; the effects that change bodies; fields of ``Drive``."""
 
     case: Numbers
-    present: Sequence[Effect]
     bodies: Sequence[Effect]
-    numbers: Mapping[str, float] | None
+    numbers: Mapping[str, float]
 
 
 _ABSENT = dict.fromkeys(Drive._fields, 0.0) | Drive._field_defaults
@@ -118,20 +116,11 @@ class JointResponse:
 
 
 class JointModel:
-    """Model of one joint of a machine, with the machine's own effects on it. Raises TaccorlError: there is no such joint, or it
-    is a gripper of the PiPER."""
+    """Model of a joint, or of joint ``signal`` of a machine, with its own effects. Raises TaccorlError: there is no such joint,
+    or it is a gripper of the PiPER."""
 
-    def __init__(self, machine: TwinConfig | HasJoints, signal: str) -> None:
-        self._set(joint_of(machine, signal))
-
-    @classmethod
-    def of(cls, joint: RigidJoint) -> "JointModel":
-        """The model of a given ``RigidJoint``."""
-        model = cls.__new__(cls)
-        model._set(joint)
-        return model
-
-    def _set(self, joint: RigidJoint) -> None:
+    def __init__(self, of: TwinConfig | HasJoints | RigidJoint, signal: str = "") -> None:
+        joint = of if isinstance(of, RigidJoint) else joint_of(of, signal)
         self.joint, self.signal, self.unit, self.gains = joint, joint.signal, joint.unit, joint.gains
         self._rigid: dict[tuple, Rigid] = {}
         self._answers: Answers = {}
@@ -158,13 +147,13 @@ class JointModel:
     def _prepared(self, case: "Numbers") -> "_Prepared":
         """Prepare what does not depend on the recording."""
         present = self.joint.effects(case.effects)
-        drives = [(effect.name, effect.drive()) for effect in present]
-        of_effects = [(name, drive) for name, drive in drives if drive is not None]
+        drives = {effect.name: drive for effect in present if (drive := effect.drive()) is not None}
+        if unknown := [effect.name for effect in present if effect.name not in drives]:
+            raise TaccorlError(f"{self.signal}: the one-joint model does not have {' and '.join(unknown)}; remove it")
         known = {"speed_age": self.joint.speed_delay_s, **self.joint.facts, **(case.facts or {})}
-        known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
-        numbers = _combined([("the drive", known), *of_effects])
-        bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
-        return _Prepared(case, present, bodies, numbers if len(of_effects) == len(drives) else None)
+        known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for d in drives.values())}
+        bodies = [effect for effect in present if not drives[effect.name]]
+        return _Prepared(case, bodies, _combined({"the drive": known, **drives}))
 
     def motor_nm(self, motion: JointMotion, answer: JointResponse) -> np.ndarray:
         """(T,) whole torque of the motor, the gravity compensation included, of a response without effects [N·m]."""
@@ -246,18 +235,13 @@ def _side_by_side(
     carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
     keys: list[tuple] = []
     missing: dict[tuple, tuple[_Sent, dict[tuple, tuple[tuple, np.ndarray]]]] = {}
-    for model, (case, present, bodies, numbers) in zip(models, prepared, strict=True):
+    for model, (case, bodies, numbers) in zip(models, prepared, strict=True):
         joint, (sent, parts, hold, step_s) = model.joint, of_model[model]
         late_s = joint.target_late_s
         when = late_s, parts, hold, step_s
         kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
         # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
         gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
-        if numbers is None:
-            keys.append((*when, gains, *map(repr, present)))
-            if keys[-1] not in kept:
-                kept[keys[-1]] = joint.in_mujoco(motion, gains, present, sent.target, parts, hold)
-            continue
         body = model._body(motion, bodies)._asdict()
         held_n = body.pop("weight_n")
         drive = {**_ABSENT, **gains._asdict(), **body, **numbers}
@@ -391,10 +375,10 @@ def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarr
     return found
 
 
-def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:
-    """One set of numbers; None where two effects want one number that does not simply add up."""
+def _combined(drives: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """One set of numbers of ``drives``, effect → its numbers. Raises TaccorlError: two want one that does not simply add up."""
     numbers: dict[str, float] = {}
-    for name, drive in drives:
+    for name, drive in drives.items():
         for key, value in drive.items():
             if key not in Drive._fields:
                 raise TaccorlError(f"effect {name}: drive() names {key!r}, which the one-joint model lacks")
@@ -405,5 +389,5 @@ def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, fl
             elif key in _FACTORS:
                 numbers[key] *= value
             else:
-                return None
+                raise TaccorlError(f"effect {name}: another effect sets {key}, too; remove one of them")
     return numbers

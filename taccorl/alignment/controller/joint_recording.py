@@ -11,7 +11,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_law import FOLLOW_HZ
-from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings, resting, steps_at_once
+from taccorl.alignment.controller.joint_motion import JointMotion, resting, steps_at_once
 from taccorl.alignment.controller.rigid_joint import RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import NUMBER, noise_floor
@@ -34,35 +34,26 @@ MOST_YIELD = 0.05
 a model of law effort. A choice."""
 
 
-def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | None, signal: str) -> JointMotion:
-    """Data of one joint from a recording.
-
-    Args:
-        machine: machine whose other joints are coupled with this one; None for a single axis.
-
-    Raises TaccorlError: there is no such signal, its targets have gaps, nothing was measured at the start, the recording is
-    too short, or its time is uneven."""
-    return motion_of(measurement, signal, None if machine is None else joint_of(machine, signal))
+def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints, signal: str) -> JointMotion:
+    """``motion_of`` a joint of ``machine``."""
+    return motion_of(measurement, signal, joint_of(machine, signal))
 
 
-def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -> JointMotion:
-    """Data of one joint from a recording, as ``joint_motion``, for a given ``RigidJoint``.
-    ``joint``: None for a single axis that nothing is known about: targets are then positions."""
+def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> JointMotion:
+    """Data of one joint from a recording. Raises TaccorlError: there is no such signal, its targets have gaps or are not those of
+    its law, nothing was measured at the start, the recording is too short, or its time is uneven."""
     m, j = measurement, measurement.column(signal)
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:
         raise TaccorlError(f"{m.name}: {m.num_rows} rows are too few for a motion of {signal}; record some seconds")
-    wanted = "position" if joint is None else joint.target_kind
-    if m.target_kind(signal) == "effort" != wanted:
-        raise TaccorlError(
-            f"{m.name}: {signal} has no target, and its law takes a {wanted}; give the column {_TARGET_COLUMNS[wanted]}, or "
-            "write `law: effort` into its file: the measured effort is then the input"
-        )
-    if m.target_kind(signal) != wanted:
-        raise TaccorlError(
-            f"{m.name}: {signal} is commanded by {m.target_kind(signal)}, but its law requires a {wanted}; correct the law in "
-            f"its file, or give the column {_TARGET_COLUMNS[wanted]}"
-        )
+    kind, wanted = m.target_kind(signal), joint.target_kind
+    if kind != wanted:
+        what, way_out = f"is commanded by {kind}", "correct the law in its file"
+        if kind == "effort":
+            what = "has no target"
+            way_out = "write `law: effort` into its file: the measured effort is then the input"
+        text = f"{what}, but its law requires a {wanted}; give the column {_TARGET_COLUMNS[wanted]}, or {way_out}"
+        raise TaccorlError(f"{m.name}: {signal} {text}")
     if not np.isfinite(target).all():
         row = int(np.flatnonzero(~np.isfinite(target))[0])
         raise TaccorlError(f"{m.name}: {signal} has no target at {m.time_s[row]:.3f} s; cut the recording there")
@@ -75,16 +66,15 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
             "rate when they are read; this table exceeds these limits: log the driver's or the bus's own stamps, or cut the "
             "recording at the gap"
         )
-    rest = Surroundings(coupling_nm=np.zeros(m.num_rows)) if joint is None else joint.surroundings(m)
+    rest = joint.surroundings(m)
     effort = m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan)
     added = rest.torque_ff_nm
-    factor = m.gain_scale.get(signal, 1.0)
-    kp_scale, kd_scale = (factor, factor) if joint is None else joint.gain_scales(m)
-    if wanted == "effort" and joint is not None:
+    kp_scale, kd_scale = joint.gain_scales(m)
+    if wanted == "effort":
         target, added = _followed(m, signal, joint, effort)
         kp_scale = kd_scale = holding_stiffness(m, signal)
     start, start_speed = resting(m, j), 0.0
-    if joint is not None and joint.keeps_times and not steps_at_once(m, j):
+    if joint.keeps_times and not steps_at_once(m, j):
         start, start_speed = starting(measured, m.rate_hz) or (start, 0.0)
     return JointMotion(
         name=m.name,
@@ -94,13 +84,13 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         measured=measured,
         effort=effort,
         **vars(dataclasses.replace(rest, torque_ff_nm=added)),
-        command_s=m.command_s if m.command_s.size and joint is not None and joint.keeps_times else None,
+        command_s=m.command_s if m.command_s.size and joint.keeps_times else None,
         start=start,
         start_speed=start_speed,
         kp_scale=kp_scale,
         kd_scale=kd_scale,
-        kp_known=joint is not None and signal in m.kp,
-        kd_known=joint is not None and signal in m.kd,
+        kp_known=signal in m.kp,
+        kd_known=signal in m.kd,
     )
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
-from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import Effect
 
 NEED_ROTOR = ("backlash", "joint_compliance")
@@ -189,25 +188,6 @@ class RigidJoint(ABC):
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         """Arguments with which an effect acts on this joint alone; None for effects that it cannot have."""
         return None
-
-    def in_mujoco(
-        self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Response of the joint, simulated in MuJoCo because ``joint_kernel`` lacks one of ``effects``.
-
-        Args:
-            sent: (T · parts,) targets [rad], each held for ``hold`` physics steps.
-            parts: number of targets per row.
-
-        Returns:
-            Reported positions (T,) [rad] and efforts (T,) [N·m].
-
-        Raises TaccorlError: the machine has no model in MuJoCo."""
-        unknown = [effect.name for effect in effects if effect.drive() is None]
-        raise TaccorlError(
-            f"{self.signal}: effects on a single axis are computed in the one-joint model, which does not have "
-            f"{' and '.join(unknown or sorted(e.name for e in effects))}; remove it"
-        )
 
 
 # from MuJoCo -----------------------------------------------------------------------------------------------------------

@@ -29,10 +29,10 @@ from typing import Any, ClassVar, Literal
 
 import yaml
 
-from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.controller.drive_law import DriveJoint, DriveLaw
 from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
-from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint
-from taccorl.alignment.measurements.measurement import Measurement, TargetKind
+from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Rigid
+from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import TaccorlError, nearest, plain_name
 from taccorl.sim.effects import effects as registry
@@ -280,61 +280,15 @@ def axis_digest(config: AxisConfig) -> str:
 # the model -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class DrivenAxis(RigidJoint):
+class DrivenAxis(DriveJoint):
     """The axis of a file for the one-joint model."""
 
-    config: AxisConfig
-    follows_line: ClassVar[bool] = True
     keeps_times: ClassVar[bool] = True
 
-    @property
-    def signal(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.name
-
-    @property
-    def unit(self) -> Literal["rad", "m"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.unit
-
-    @property
-    def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.following
-
-    @property
-    def known_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.known
-
-    @property
-    def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return math.inf if self.config.law == "effort" else self.config.command_hz or 0.0
-
-    @property
-    def position_age_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return 0.5 / self.config.loop_hz if self.config.loop_hz else 0.0
-
-    @property
-    def target_late_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.target_late_s
-
-    @property
-    def speed_delay_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return 1.0 / self.config.loop_hz + self.config.speed_late_s if self.config.loop_hz and self.config.kd else 0.0
-
-    @property
-    def target_kind(self) -> TargetKind:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.target_kind
-
-    @property
-    def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Fields of ``drive_numbers.Drive`` that the file determines."""
-        # What acts is on average of positions half a period old. What a row shows before its target acts is half a period
-        # older than that; what it shows after is of the position at the row.
-        c = self.config
-        older = -0.5 if c.effort_after_target else 0.5
-        return c.facts | ({"effort_age": older / c.loop_hz} if c.loop_hz else {})
-
-    def gain_scales(self, m: Measurement) -> tuple[float, float]:
-        return self.config.gain_scales(self.signal, m)
+    def __init__(self, config: AxisConfig) -> None:
+        super().__init__(config, config.name, config.unit, config.loop_hz, config.command_hz)
+        self.config, self.target_late_s = config, config.target_late_s
+        self.speed_delay_s = self.speed_delay_s + config.speed_late_s if config.loop_hz and config.kd else 0.0
 
     def timestep_s(self, motion: JointMotion) -> float:
         return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)
@@ -348,9 +302,7 @@ class DrivenAxis(RigidJoint):
         return Rigid(c.inertia + motion.mounted_kgm2, c.rotor_inertia, c.weight_sin + sine, c.weight_cos + cosine)
 
     def surroundings(self, m: Measurement) -> Surroundings:
-        """External force (positive if the axis must push against it), mounted masses, and the motor's supply in a recording.
-        Raises TaccorlError: there is a payload without a lever, an arm on a slide, or a supply voltage that the law does not
-        use."""
+        """Mounted masses besides. Raises TaccorlError: there is a payload without a lever, or an arm on a slide."""
         c, name = self.config, self.signal
         payload, lever, arm = (
             getattr(m, key).get(name, getattr(c, key)) for key in ("payload_kg", "lever_m", "arm_kg")
@@ -362,11 +314,8 @@ class DrivenAxis(RigidJoint):
                 f"{m.name}: payload_kg or arm_kg of {name} is stated, but the length of its lever is not; write `lever_m: …` "
                 f"in the axis file, or `lever_m: {{{name}: …}}` in measurements.yaml"
             )
-        return Surroundings(
-            coupling_nm=-m.known_load(name),
-            torque_ff_nm=m.torque_ff[:, m.column(name)] if m.torque_ff.size else None,
-            supply=c.supply(name, m),
-            on=m.enabled[:, m.column(name)] if m.enabled.size else None,
+        return dataclasses.replace(
+            super().surroundings(m),
             payload_kg=payload,
             payload_at_known=True,
             moment_kgm=payload * lever + 0.5 * arm * lever,

@@ -99,11 +99,9 @@ def within_ends(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
     return (m.measured > config.low + half) & (m.measured < config.high - half)
 
 
-def calibrated(
-    config: CellsConfig, pairs: Sequence[tuple[np.ndarray, np.ndarray]], before: Calibration | None = None
-) -> Calibration:
+def calibrated(config: CellsConfig, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Calibration:
     """Fit gain and offset of every cell by least squares over pairs (response, reading), each (T, K), with NaN in rows that are
-    not used. Cells that were never loaded get the median gain of the others (``before`` if there is none).
+    not used. Cells that were never loaded get the median gain of the others.
 
     With places responses are (T, P) and gains (K, P); cells with too few rows have the gain 0.
     """
@@ -121,7 +119,7 @@ def calibrated(
     product = (off_r * np.where(use, reading - mean_y, 0.0)).sum(axis=0)
     gain = np.divide(product, power, out=np.full(len(power), np.nan), where=known)
     other = float(np.nanmedian(gain)) if known.any() else config.sign
-    gain = np.where(known, gain, before.gain if before is not None else other)
+    gain = np.where(known, gain, other)
     return Calibration(gain, mean_y - gain * mean_r)
 
 

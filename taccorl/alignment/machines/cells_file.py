@@ -34,54 +34,23 @@ from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import CELLS, Effect, TouchEffect
 from taccorl.sim.twin_file import EffectsDocument, effect_entry, write_whole
 
+_PREFIXES = {"": 1.0, "f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "h": 1e2, "k": 1e3, "M": 1e6}
+
+
+def _units(**prefixes: str) -> dict[str, tuple[str, float]]:
+    """Unit, and the unit with each of these prefixes → the unit and the factor to it."""
+    return {f"{p}{unit}": (unit, _PREFIXES[p]) for unit, some in prefixes.items() for p in ("", *some)}
+
+
+_QUANTITIES = {"N": "force_n", "Pa": "pressure_pa", "m": "depth_m"}
 LOADS: dict[str, tuple[str, float]] = {
-    "N": ("force_n", 1.0),
-    "mN": ("force_n", 1e-3),
-    "kN": ("force_n", 1e3),
-    "gf": ("force_n", 9.80665e-3),
-    "kgf": ("force_n", 9.80665),
-    "lbf": ("force_n", 4.4482216),
-    "Pa": ("pressure_pa", 1.0),
-    "hPa": ("pressure_pa", 1e2),
-    "kPa": ("pressure_pa", 1e3),
-    "MPa": ("pressure_pa", 1e6),
-    "mbar": ("pressure_pa", 1e2),
-    "bar": ("pressure_pa", 1e5),
-    "psi": ("pressure_pa", 6894.757),
-    "m": ("depth_m", 1.0),
-    "mm": ("depth_m", 1e-3),
-    "um": ("depth_m", 1e-6),
-    "µm": ("depth_m", 1e-6),
+    unit: (_QUANTITIES[own], factor) for unit, (own, factor) in _units(N="mk", Pa="hkM", m="muµ").items()
 }
+LOADS |= {"gf": ("force_n", 9.80665e-3), "kgf": ("force_n", 9.80665), "lbf": ("force_n", 4.4482216)}
+LOADS |= {"mbar": ("pressure_pa", 1e2), "bar": ("pressure_pa", 1e5), "psi": ("pressure_pa", 6894.757)}
 """Unit of a load → its column in tables without a columns file, and the factor to that column's unit."""
-READINGS: dict[str, tuple[str, float]] = {
-    "count": ("count", 1.0),
-    "V": ("V", 1.0),
-    "mV": ("V", 1e-3),
-    "uV": ("V", 1e-6),
-    "µV": ("V", 1e-6),
-    "ohm": ("ohm", 1.0),
-    "Ω": ("ohm", 1.0),
-    "kohm": ("ohm", 1e3),
-    "kΩ": ("ohm", 1e3),
-    "Mohm": ("ohm", 1e6),
-    "S": ("S", 1.0),
-    "mS": ("S", 1e-3),
-    "uS": ("S", 1e-6),
-    "µS": ("S", 1e-6),
-    "F": ("F", 1.0),
-    "nF": ("F", 1e-9),
-    "pF": ("F", 1e-12),
-    "fF": ("F", 1e-15),
-    "A": ("A", 1.0),
-    "mA": ("A", 1e-3),
-    "uA": ("A", 1e-6),
-    "µA": ("A", 1e-6),
-    "N": ("N", 1.0),
-    "mN": ("N", 1e-3),
-    "Pa": ("Pa", 1.0),
-    "kPa": ("Pa", 1e3),
-}
+READINGS = _units(count="", V="muµ", ohm="kM", S="muµ", F="npf", A="muµ", N="m", Pa="k")
+READINGS |= {"Ω": ("ohm", 1.0), "kΩ": ("ohm", 1e3)}
 """Unit of a reading → the quantity's own unit and the factor to it."""
 READINGS_OF_RATED = 10.0
 """Reading of the rated load in the unit ``reading``. Touch effects have bounds for readings of this size."""

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from taccorl.alignment.controller.drive_law import with_gains
+from taccorl.alignment.controller.drive_law import DriveJoint, with_gains
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings, beside_model, moved_by_others, resting
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -22,7 +22,6 @@ from taccorl.alignment.controller.rigid_joint import (
     MassTorque,
     PointMass,
     Rigid,
-    RigidJoint,
     mass_torque_along,
     rates,
     rigid_terms,
@@ -85,12 +84,11 @@ def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool
     return bool(make_effect(cls.name, **typical).drive())
 
 
-class RobotJoint(RigidJoint):
+class RobotJoint(DriveJoint):
     """One joint of a robot file. A pose holds the model's ``qpos``."""
 
     effort_holds_weight: ClassVar[bool] = True
     exact_timing: ClassVar[bool] = True
-    follows_line: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -100,31 +98,19 @@ class RobotJoint(RigidJoint):
         stated: "Robot | None" = None,
         along: "Along | None" = None,
     ) -> None:
-        self._robot, self._config = robot, robot.config.joints[signal]
+        self._robot, self._config = robot, (law := robot.config.joints[signal])
+        super().__init__(law, signal, robot.rigid.joints[signal].unit, law.loop_hz, law.command_hz)
         self._stated, self._along = robot if stated is None else stated, along
-        self.signal, self.unit = signal, robot.rigid.joints[signal].unit
         self._masses = robot.masses() if masses is None else masses
-        self.gains = self._config.following
-        self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
-        self.known_names = self._config.known
-        self.command_hz = math.inf if self._config.law == "effort" else self._config.command_hz or 0.0
-        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
-        # the output that a row shows before its own target acts. After it acts, the output is new.
-        loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
-        newer = -1.0 if self._config.effort_after_target else 1.0
-        self.facts = self._config.facts | {"effort_age": 0.5 * newer * loop_s}
         # At a slide the weight of an unknown mass is a constant force, too.
         self.holds_torque_ff = self.unit == "m" and robot.last_body(signal) in robot.assumed
-        self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
+        self.position_age_s += law.position_age_s
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
 
     @property
     def known(self) -> JointFacts:
         """Limits, inertia, damping, friction and actuators of the joint as stated in the MJCF or URDF file."""
         return self._robot.rigid.joints[self.signal]
-
-    def gain_scales(self, m: Measurement) -> tuple[float, float]:
-        return self._config.gain_scales(self.signal, m)
 
     @property
     def winding(self) -> dict[str, float]:
@@ -210,16 +196,15 @@ class RobotJoint(RigidJoint):
         pose, along = self.pose(m), self._along or moved_together(self._stated, m)
         coupling, carrying = self._coupling(m, pose, along)
         rows = np.arange(len(coupling)) * m.num_rows / len(coupling)
-        coupling = coupling - np.interp(rows, np.arange(m.num_rows), m.known_load(self.signal))
+        drive = super().surroundings(m)
+        coupling = coupling + np.interp(rows, np.arange(m.num_rows), drive.coupling_nm)
         positions = None if along is None else along.positions
-        on, added = (values[:, m.column(self.signal)] if values.size else None for values in (m.enabled, m.torque_ff))
-        drive = {"supply": self._config.supply(self.signal, m), "on": on, "torque_ff_nm": added}
-        return Surroundings(coupling_nm=coupling, carrying_nm=carrying, pose=pose, positions=positions, **drive)
+        return dataclasses.replace(drive, coupling_nm=coupling, carrying_nm=carrying, pose=pose, positions=positions)
 
     def whole(self, m: Measurement) -> Measurement:
         """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording states
         none. Raises TaccorlError: the model lacks a signal, or has it in another unit."""
-        names, units = tuple(self._robot.units), tuple(self._robot.units.values())
+        names = tuple(self._robot.units)
         for name, unit in zip(m.signals, m.units, strict=True):
             if name not in names:
                 model = self._robot.rigid.path.name
@@ -243,21 +228,8 @@ class RobotJoint(RigidJoint):
         m = with_gains(m, {n: joint for n, joint in self._robot.config.joints.items() if joint.gains == "commanded"})
         if m.signals == names:
             return m
-        kinds = tuple(m.target_kind(name) if name in m.signals else "position" for name in names)
-        absent = {"load": 0.0, "torque_ff": 0.0, "supply_v": np.nan, "enabled": 1.0}
-        arrays: dict[str, np.ndarray] = {
-            name: np.full((m.num_rows, len(names)), absent.get(name, np.nan))
-            for name in ("measured", "velocity", "effort", *m.extra_columns)
-        }
         model = self._robot.rigid.model
-        arrays["target"] = np.tile([model.qpos0[model.joint(name).qposadr[0]] for name in names], (m.num_rows, 1))
-        quantum = np.zeros(len(names))
-        for j, name in enumerate(names):
-            if name in m.signals:
-                quantum[j] = m.quantum[m.column(name)]
-                for key, values in arrays.items():
-                    values[:, j] = getattr(m, key)[:, m.column(name)]
-        return dataclasses.replace(m, **arrays, quantum=quantum, signals=names, units=units, target_kinds=kinds)
+        return m.extended(self._robot.units, [model.qpos0[model.joint(name).qposadr[0]] for name in names])
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
         names = {effect.name for effect in more}
@@ -373,7 +345,7 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         q[:, model.joint(name).qposadr[0]] = CubicSpline(rows, values)(times) if fine > 1 else values
     needed, carried, masses = needed_along(robot, q, m.period_s / fine)
     found = Along(frozenset(angles), q, needed, carried)
-    models = {name: JointModel.of(RobotJoint(robot, name, along=found)) for name in driven}
+    models = {name: JointModel(RobotJoint(robot, name, along=found)) for name in driven}
     motions = {name: motion_of(m, name, one.joint) for name, one in models.items()}
     for name in driven * SWEEPS:
         one, moved, joint = models[name], motions[name], model.joint(name)

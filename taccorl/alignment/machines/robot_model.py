@@ -50,8 +50,6 @@ class ActuatorFacts:
     """Velocity gain at the joint [N·m·s/rad or N·s/m]."""
     effort_limit: float | None
     """Largest torque or force at the joint [N·m or N]; None if unlimited."""
-    gear: float
-    """Transmission ratio ``gear`` of the MJCF actuator."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,7 +314,7 @@ def _facts(
     dof = model.jnt_dofadr[k]
     own = [_actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
     if not own and (held := held_by(omitted, name)):
-        own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None, gear=1.0)]
+        own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None)]
     effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
     return JointFacts(
         name=name,
@@ -341,4 +339,4 @@ def _actuator(model: mujoco.MjModel, a: int) -> ActuatorFacts:
     if limit is None and not affine and model.actuator_ctrllimited[a]:
         limit = abs(gear * float(model.actuator_gainprm[a, 0])) * float(np.abs(model.actuator_ctrlrange[a]).max())
     name = model.actuator(a).name or str(a)
-    return ActuatorFacts(name=name, kp=kp + 0.0, kd=kd + 0.0, effort_limit=limit, gear=gear)
+    return ActuatorFacts(name=name, kp=kp + 0.0, kd=kd + 0.0, effort_limit=limit)

@@ -24,12 +24,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 
 from taccorl.alignment.measurements.dataset_rows import read_dataset
-from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.measurement import Measurement, Stated
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.measurements.recorded import read_recording
 from taccorl.alignment.measurements.table_files import SUFFIXES, EmptyColumns
@@ -76,13 +76,11 @@ class PressedNote:
 
     def made(self) -> PressedObject:
         """The object as a ``PressedObject``, for ``touch_motion``."""
-        size = {} if self.length_m is None else {"length_m": self.length_m}
-        place = {"position_m": self.position_m, "rpy_rad": self.rpy_rad, "frame": self.frame}
-        return indenter(self.shape, self.radius_m, self.arm, **size, **place)
+        return indenter(**{name: value for name, value in vars(self).items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordingNote:
+class RecordingNote(Stated):
     """Facts about one recording that its file does not state."""
 
     use: Use | None = None
@@ -90,23 +88,8 @@ class RecordingNote:
     depends on it. None: as ``validation_every`` or the command line decides, else fit."""
     repeat_of: str | None = None
     """Name of the recording of the same motion that this one repeats; None if it is no repeat."""
-    kp: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_p [N·m/rad, N/m]."""
-    kd: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_d [N·m·s/rad, N·s/m]."""
-    gain_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
-    payload_kg: dict[str, float] = field(default_factory=dict)
-    """Arm, or name of an axis → mass of the payload [kg]."""
-    lever_m: dict[str, float] = field(default_factory=dict)
-    """Name of an axis → distance from the axis to the payload [m], if it differs from that in the axis file."""
-    arm_kg: dict[str, float] = field(default_factory=dict)
-    """Name of an axis → mass of the arm that holds the payload [kg], a uniform rod as long as the lever."""
     supply_v: dict[str, float] = field(default_factory=dict)
     """Name of an axis → voltage of its motor's supply [V], if no column has it."""
-    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
-    [0, 0, 0.168]."""
     effort_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor from the recorded effort to N·m or N; 0: the effort is not used. PiPER's firmware 1.5 to 1.8 reports
     joints 1 to 3 four times too large (piper_sdk issue 73)."""
@@ -160,8 +143,6 @@ def read_measurements(
     *,
     spec: str | Path | RecordingSpec | None = None,
     columns: Path | TableSpec | None = None,
-    validation: Sequence[str] = (),
-    test: Sequence[str] = (),
     validation_every: int | None = None,
     units: Mapping[str, str] | None = None,
     table: "TableReader | None" = None,
@@ -173,8 +154,7 @@ def read_measurements(
         spec: recording spec; else the index's, else the only shipped one that reads the format.
         columns: columns file of the tables, and of datasets that do not state their units; else the index's, else taccorl's own
             names.
-        validation, test: names of measurements; with them the index's ``use`` is ignored.
-        validation_every: every k-th motion that is not named is for validation; else the index's.
+        validation_every: every k-th motion that the index does not name is for validation; else the index's.
         units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
         table: for machines whose tables hold no joints: function that reads a table from its path and that of the columns file;
             ``columns`` is then a path.
@@ -202,14 +182,11 @@ def read_measurements(
     )
     found = sorted(found, key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
-    whole = path.is_dir()
-    if validation or test or not whole:  # who asks for one file wants to fit it
-        named = {"validation": list(validation), "test": list(test)}
-    else:
-        named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
+    whole, uses = path.is_dir(), ("fit", "validation", "test")  # who asks for one file wants to fit it
+    named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
     every = index.validation_every * whole if validation_every is None else validation_every
     divided = split(found, **named, validation_every=every, fit_needed=fit_needed)
-    states_uses = whole and not (validation or test) and any(note.use for note in index.recordings.values())
+    states_uses = whole and any(note.use for note in index.recordings.values())
     unlisted = tuple(m.name for m in divided.fit if states_uses and m.name not in index.recordings)
     return dataclasses.replace(divided, skipped=tuple(skipped), unlisted=unlisted)
 
@@ -345,65 +322,50 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
         raise TaccorlError(
             f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
         )
-    noted = []
-    for m in found:
-        note = _note(index, m)
-        if whole and note.repeat_of is not None and note.repeat_of not in names:
-            raise TaccorlError(
-                f"{folder / INDEX}: recordings → {m.name} → repeat_of: there is no recording {note.repeat_of!r} in this "
-                f"folder; {nearest(note.repeat_of, names)}"
-            )
-        for key in ("kp", "kd", "effort_scale", "supply_v"):
-            for name in getattr(note, key):
-                if name not in m.signals:
-                    raise TaccorlError(
-                        f"{folder / INDEX}: recordings → {m.name} → {key}: no signal {name!r}; {nearest(name, m.signals)}"
-                    )
-        for arm in note.payload_position_m:
-            if not (m.payload_kg | note.payload_kg).get(arm):
-                raise TaccorlError(
-                    f"{folder / INDEX}: recordings → {m.name} → payload_position_m: {arm} holds no payload; state payload_kg, "
-                    "or leave it out"
-                )
-        if note.pressed is not None and m.touch is None:
-            why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
-            raise TaccorlError(
-                f"{folder / INDEX}: recordings → {m.name} → pressed: the recording holds no frames of the pads{why}; record "
-                "them, or remove pressed"
-            )
-        repeat_of = note.repeat_of or m.repeat_of
-        if repeat_of and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed:
-            raise TaccorlError(
-                f"{folder / INDEX}: recordings → {m.name} → pressed: this recording repeats {repeat_of}, whose pressed "
-                "differs; correct pressed, or repeat_of"
-            )
-        supply_v = m.supply_v
-        if note.supply_v:
-            if supply_v.size:
-                raise TaccorlError(
-                    f"{folder / INDEX}: recordings → {m.name} → supply_v: the recording also has a column with the supply "
-                    "voltage; remove one of them"
-                )
-            supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
-        scale = np.array([note.effort_scale.get(name, 1.0) or np.nan for name in m.signals])  # 0: as if not recorded
-        noted.append(
-            dataclasses.replace(
-                m,
-                origin=m.origin.agreed(index.domain, f"{folder / INDEX}: {m.name}"),
-                repeat_of=repeat_of,
-                kp=m.kp | note.kp,
-                kd=m.kd | note.kd,
-                gain_scale=m.gain_scale | note.gain_scale,
-                payload_kg=m.payload_kg | note.payload_kg,
-                lever_m=note.lever_m,
-                arm_kg=note.arm_kg,
-                supply_v=supply_v,
-                payload_position_m=m.payload_position_m | note.payload_position_m,
-                pressed=note.pressed.made() if note.pressed is not None else None,
-                effort=m.effort * scale,
-            )
+    return [_with_note(m, index, folder, names if whole else None) for m in found]
+
+
+def _with_note(m: Measurement, index: MeasurementIndex, folder: Path, names: Sequence[str] | None) -> Measurement:
+    """``m`` with what the index says of it; ``names``: of all recordings of the folder, None if not all were read."""
+    note = _note(index, m)
+
+    def refuse(key: str, text: str) -> NoReturn:
+        raise TaccorlError(f"{folder / INDEX}: recordings → {m.name} → {key}: {text}")
+
+    if names is not None and note.repeat_of is not None and note.repeat_of not in names:
+        refuse(
+            "repeat_of", f"there is no recording {note.repeat_of!r} in this folder; {nearest(note.repeat_of, names)}"
         )
-    return noted
+    for key in ("kp", "kd", "effort_scale", "supply_v"):
+        for name in getattr(note, key):
+            if name not in m.signals:
+                refuse(key, f"no signal {name!r}; {nearest(name, m.signals)}")
+    for arm in note.payload_position_m:
+        if not (m.payload_kg | note.payload_kg).get(arm):
+            refuse("payload_position_m", f"{arm} holds no payload; state payload_kg, or leave it out")
+    if note.pressed is not None and m.touch is None:
+        why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
+        refuse("pressed", f"the recording holds no frames of the pads{why}; record them, or remove pressed")
+    repeat_of = note.repeat_of or m.repeat_of
+    if repeat_of and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed:
+        text = f"this recording repeats {repeat_of}, whose pressed differs; correct pressed, or repeat_of"
+        refuse("pressed", text)
+    supply_v = m.supply_v
+    if note.supply_v:
+        if supply_v.size:
+            refuse("supply_v", "the recording also has a column with the supply voltage; remove one of them")
+        supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
+    scale = np.array([note.effort_scale.get(name, 1.0) or np.nan for name in m.signals])  # 0: as if not recorded
+    facts: dict[str, Any] = {name: getattr(m, name) | getattr(note, name) for name in Stated.names()}
+    return dataclasses.replace(
+        m,
+        **facts,
+        origin=m.origin.agreed(index.domain, f"{folder / INDEX}: {m.name}"),
+        repeat_of=repeat_of,
+        supply_v=supply_v,
+        pressed=note.pressed.made() if note.pressed is not None else None,
+        effort=m.effort * scale,
+    )
 
 
 def _read(

@@ -8,10 +8,10 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -50,7 +50,33 @@ class Touch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measurement:
+class Stated:
+    """Facts about one recording that its rows do not hold."""
+
+    kp: dict[str, float] = field(default_factory=dict)
+    """Signal → commanded K_p [N·m/rad, N/m], if stated."""
+    kd: dict[str, float] = field(default_factory=dict)
+    """Signal → commanded K_d [N·m·s/rad, N·s/m], if stated."""
+    gain_scale: dict[str, float] = field(default_factory=dict)
+    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
+    payload_kg: dict[str, float] = field(default_factory=dict)
+    """Arm, or name of an axis → known mass of the payload [kg]."""
+    lever_m: dict[str, float] = field(default_factory=dict)
+    """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
+    arm_kg: dict[str, float] = field(default_factory=dict)
+    """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
+    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
+    (0, 0, 0.168)."""
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of these facts."""
+        return [f.name for f in dataclasses.fields(Stated)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement(Stated):
     """One recording on one clock, at the rate at which commands were sent. Raises TaccorlError: the shapes do not fit
     together."""
 
@@ -99,21 +125,6 @@ class Measurement:
     """Time of row 0 on the recording's clock [ns]."""
     repeat_of: str | None = None
     """Name of the measurement whose commands this one repeats; None if it is no repeat."""
-    kp: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_p [N·m/rad, N/m], if stated."""
-    kd: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_d [N·m·s/rad, N·s/m], if stated."""
-    gain_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
-    payload_kg: dict[str, float] = field(default_factory=dict)
-    """Arm → known mass in its gripper [kg]."""
-    lever_m: dict[str, float] = field(default_factory=dict)
-    """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
-    arm_kg: dict[str, float] = field(default_factory=dict)
-    """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
-    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
-    (0, 0, 0.168)."""
     pressed: PressedObject | None = None
     """Known object between the fingers of one arm, if stated; the arm's pads are compared with the twin's for it."""
     time_error_s: float = 0.0
@@ -257,27 +268,27 @@ class Measurement:
                 raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
             if extra := self.twin_cannot_take(name):
                 raise TaccorlError(f"{self.name}: {name} has {extra}: the PiPER's twin cannot use this")
-        at = [ROBOT.action_names.index(name) for name in self.signals]
-        arrays: dict[str, np.ndarray] = {
-            name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")
-        }
-        arrays["target"] = np.tile(np.asarray(rest, dtype=float), (self.num_rows, 1))
+        nothing = np.empty(0)
+        plain = dataclasses.replace(
+            self, load=nothing, torque_ff=nothing, supply_v=nothing, enabled=nothing, target_kinds=()
+        )
+        return plain.extended(dict(zip(ROBOT.action_names, ROBOT_UNITS, strict=True)), rest)
+
+    def extended(self, units: Mapping[str, str], rest: Sequence[float] | np.ndarray) -> Self:
+        """The measurement extended to the signals ``units`` (signal → unit of its position), in their order: missing ones stay at
+        ``rest`` [rad, m] and count as not measured."""
+        at, names = [list(units).index(name) for name in self.signals], tuple(units)
+        absent = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
+        columns = ("measured", "velocity", "effort", *self.extra_columns)
+        arrays = {name: np.full((self.num_rows, len(units)), absent.get(name, np.nan)) for name in columns}
+        arrays |= {"target": np.tile(np.asarray(rest, float), (self.num_rows, 1))}
         for name, values in arrays.items():
             values[:, at] = getattr(self, name)
-        quantum = np.zeros(ROBOT.num_actions)
+        kinds = tuple(self.target_kind(name) if name in self.signals else "position" for name in names)
+        quantum = np.zeros(len(units))
         quantum[at] = self.quantum
-        return dataclasses.replace(
-            self,
-            **arrays,
-            quantum=quantum,
-            load=np.empty(0),
-            torque_ff=np.empty(0),
-            supply_v=np.empty(0),
-            enabled=np.empty(0),
-            signals=ROBOT.action_names,
-            units=ROBOT_UNITS,
-            target_kinds=(),
-        )
+        more: dict[str, Any] = {"signals": names, "units": tuple(units.values()), "quantum": quantum}
+        return dataclasses.replace(self, **arrays, **more, target_kinds=kinds if self.target_kinds else ())
 
 
 def other_arm(signal: str) -> str:

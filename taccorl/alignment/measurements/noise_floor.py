@@ -27,10 +27,9 @@ from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from taccorl.alignment.measurements.cycles import cycles
 from taccorl.alignment.measurements.folder import motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.repeats import Overlay, overlay
+from taccorl.alignment.measurements.repeats import Overlay, cycles, overlay
 from taccorl.errors import TaccorlError
 
 Kind = Literal["position", "velocity", "effort"]

@@ -51,16 +51,9 @@ def indenter(
     rpy_rad: Sequence[float] = (0.0, 0.0, 0.0),
     frame: Literal["tcp", "world"] = "tcp",
 ) -> PressedObject:
-    """Make a sphere, or a rod with flat ends along its own z, centred at ``position_m`` [m] in ``frame``.
-
-    Args:
-        radius_m: radius of the sphere or rod [m].
-        arm: name of the arm whose fingers press it, ``left`` or ``right``.
-        length_m: length of a rod [m].
-        rpy_rad: fixed-axis roll, pitch, yaw [rad]; (0, π/2, 0) lays a rod across the pads.
-        frame: tcp: fixed relative to the hand; world: fixed to the bench.
-
-    Raises TaccorlError: the shape is unknown, or a size is not above 0."""
+    """Make a sphere, or a rod with flat ends along its own z, of ``radius_m`` [m], between the fingers of ``arm``, centred at
+    ``position_m`` [m] in ``frame`` (``PressedObject``) and turned by ``rpy_rad`` [rad], fixed-axis roll, pitch, yaw; (0, π/2, 0)
+    lays a rod across the pads. Raises TaccorlError: the shape is unknown, or a size is not above 0."""
     if shape not in ("sphere", "rod"):
         raise TaccorlError(f"indenter: no shape {shape!r}; {nearest(shape, ('sphere', 'rod'))}")
     if not (0 < radius_m < math.inf and 0 < length_m < math.inf):

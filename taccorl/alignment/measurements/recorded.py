@@ -145,7 +145,7 @@ class _Notes:
     origin: Origin
     instruction: str
     repeat_of: str | None
-    numbers: dict[str, dict[str, float]]
+    numbers: dict[str, Any]
     """``kp``, ``kd``, ``gain_scale`` (signal → number) and ``payload_kg`` (arm → number), each as JSON."""
     payload_position_m: dict[str, tuple[float, float, float]]
     """Arm → centre of mass in link 6's frame, as JSON."""
@@ -267,10 +267,7 @@ class _Rows:
             instruction=notes.instruction,
             start_ns=int(self.grid_ns[0]),
             repeat_of=notes.repeat_of,
-            kp=notes.numbers["kp"],
-            kd=notes.numbers["kd"],
-            gain_scale=notes.numbers["gain_scale"],
-            payload_kg=notes.numbers["payload_kg"],
+            **notes.numbers,
             payload_position_m=notes.payload_position_m,
             time_error_s=self.period_ns / NS_PER_S if no_clock else 0.0,
             timing=tuple(self._timing(c, key) for key in (STATE, ACTION) for c in self.spec.features[key].channels),

@@ -9,7 +9,6 @@ k_n and the sensor's gain (counts for a reading of 1) cannot be separated by cou
 Letters in shapes: T frames, P pads, R × C taxels.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,8 +46,6 @@ class NoiseLevel:
     """(P, R, C) standard deviation of each taxel's counts."""
     threshold_count: float
     """λ_noise common to all taxels [counts]: the 0.999 quantile of their readings."""
-    num_frames: tuple[int, ...]
-    """Number of frames without contact of each pad."""
 
     @property
     def pooled_std_count(self) -> float:
@@ -76,8 +73,6 @@ class TouchMatch:
     """RMS difference of counts [counts], over taxels that are ever active in either."""
     mask_iou: float
     """Masks of active taxels: intersection over union, all frames together."""
-    num_frames: int
-    """Number of compared frames: frames of single pads with contact."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +85,6 @@ class TouchCalibration:
     """k_n [reading per metre]."""
     damping: Number
     """k_d [reading per m/s]."""
-    correlation: float
-    """Correlation of the two estimates. Near ±1 the recordings determine only a combination; press at two speeds."""
     before: TouchMatch
     """Match on the validation recordings with the twin's own k_n and k_d."""
     after: TouchMatch
@@ -100,11 +93,6 @@ class TouchCalibration:
     validation: tuple[str, ...]
     trouble: str
     """Reason why the result is not reliable; empty if there is none."""
-
-    def mended(self, config: TwinConfig) -> TwinConfig:
-        """Copy of ``config`` whose sensor has the fitted k_n and k_d."""
-        fitted = {"normal_stiffness_per_m": self.stiffness.value, "normal_damping_s_per_m": self.damping.value}
-        return dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, **fitted))
 
 
 def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
@@ -133,7 +121,6 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
         mean_count=means,
         std_count=np.maximum(std, 1 / math.sqrt(12)),
         threshold_count=float(np.quantile(np.concatenate([f.ravel() for f in frames]), QUANTILE)),
-        num_frames=tuple(map(len, frames)),
     )
 
 
@@ -152,7 +139,6 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
     return TouchMatch(
         rms_count=_rms(differences),
         mask_iou=sum(int((a & b).sum()) for a, b in masks) / union,
-        num_frames=int(sum(motion.near(0.0).any(axis=(2, 3)).sum() for motion in motions)),
     )
 
 
@@ -207,7 +193,6 @@ def calibrate_touch(
         noise=noise,
         stiffness=Number(float(value[0]), float(low[0]), float(high[0]), "1/m"),
         damping=Number(float(value[1]), float(max(low[1], 0.0)), float(high[1]), "s/m"),
-        correlation=float(covariance[0, 1] / (std[0] * std[1])) if std.all() else math.nan,
         before=matches[0],
         after=matches[1],
         fitted_to=tuple(m.name for m in fit),

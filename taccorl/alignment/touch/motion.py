@@ -12,25 +12,27 @@ Letters in shapes: T frames, P pads, R × C taxels, I instants of a scan, S rows
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject
-from taccorl.alignment.touch.felt_solids import shapes_in_object
 from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
 from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.robots.robot_spec import PadLayout
-from taccorl.sim.felt_shapes import ShapeTables
+from taccorl.sim.felt_shapes import ShapeTables, shapes_of
 from taccorl.sim.robot import RobotConfig, link_poses, mount_pos_world_m
 from taccorl.sim.sensors import as_wire
 from taccorl.sim.sensors.flexitac import scan_instants_s
+from taccorl.sim.shapes import Capsule, Solid, add_geom
 from taccorl.sim.touch_kernel import depth_in_body
 from taccorl.sim.twin import TwinConfig
 
@@ -39,6 +41,7 @@ SMOOTH_S, SMOOTH_ORDER = 0.045, 3
 and 0.5 mm/s."""
 _STEP_S = 5e-4  # of central differences of the pads' poses, along splines through the smoothed rows
 _KEPT = 4  # depths of a motion with its pads moved: what a fit asks for again and again
+_DISTURBED_M = 3e-4  # an object this near to a pad may touch it
 _NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
 
 
@@ -145,9 +148,9 @@ class TouchMotion:
         """(T, P, R, C) bool: the taxel would touch if it were ``margin_m`` further out of the pad."""
         return self.depth(((0.0, 0.0, margin_m),) * len(self.pads))[0] > 0
 
-    def undisturbed(self, margin_m: float = 3e-4, after_s: float = 1.0) -> np.ndarray:
+    def undisturbed(self, after_s: float = 1.0) -> np.ndarray:
         """(T, P) bool: nothing is near the pad, and nothing touched it during the last ``after_s`` [s]."""
-        near = self.near(margin_m).any(axis=(2, 3))
+        near = self.near(_DISTURBED_M).any(axis=(2, 3))
         last = np.where(near, self.time_s, -np.inf)
         return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
 
@@ -218,15 +221,8 @@ def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
         name: np.ascontiguousarray(getattr(motion, name)[:, pads])
         for name in ("time_s", "measured", "object_from_pad", "velocity", "clearance_m")
     }
-    return TouchMotion(
-        measurement=motion.measurement,
-        pads=tuple(motion.pads[p] for p in pads),
-        baseline=motion.baseline[pads],
-        groups=motion.groups,
-        shapes=motion.shapes,
-        layout=motion.layout,
-        **arrays,
-    )
+    kept = tuple(motion.pads[p] for p in pads)
+    return dataclasses.replace(motion, pads=kept, baseline=motion.baseline[pads], **arrays)
 
 
 def _taxel_xy(layout: PadLayout) -> np.ndarray:
@@ -287,3 +283,25 @@ def _compose(a_from_b: np.ndarray, b_from_c: np.ndarray) -> np.ndarray:
     composed = a_from_b[..., :3, :3] @ b_from_c
     composed[..., 3] += a_from_b[..., :3, 3]
     return composed
+
+
+def shapes_in_object(solids: Sequence[Solid]) -> tuple[ShapeTables, np.ndarray]:
+    """The G solids that touch (no ballast).
+
+    Returns:
+        The solids in double precision, for ``depth_in_body``; and the corners (8 G, 3) [m] of their bounding boxes.
+    """
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="pressed")
+    for k, solid in enumerate(s for s in solids if s.touches):
+        if isinstance(solid, Capsule) and solid.half_height_m == 0:
+            pos, size = solid.part_from_solid[:3, 3], [solid.radius_m, 0, 0]
+            body.add_geom(name=f"{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=pos, size=size)
+        else:
+            add_geom(spec, body, solid, f"pressed_{k}")
+    model = spec.compile()
+    shapes = shapes_of(model, list(range(model.ngeom)), np.float64)
+    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    boxes = [model.geom_aabb[g, :3] + signs * model.geom_aabb[g, 3:] for g in shapes.geom]
+    corners = [box @ pose[:, :3].T + pose[:, 3] for box, pose in zip(boxes, shapes.body_from_geom, strict=True)]
+    return shapes, np.concatenate(corners)

@@ -11,9 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from taccorl.alignment.controller.arm_bench import held_payload
 from taccorl.alignment.controller.arm_joint import BENCH_REST as BENCH_REST
-from taccorl.alignment.controller.arm_joint import HasJoints
+from taccorl.alignment.controller.arm_joint import HasJoints, held_payload
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import AT_TCP
 from taccorl.alignment.controller.joint_recording import motion_of

@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller import arm_joint
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.motions import (
@@ -306,7 +306,7 @@ def arm_ground(config: TwinConfig, signal: str, pose: np.ndarray) -> Ground:
     middle of its motions: within its limits, and with a sweep whose torque is within ``motions.TORQUE_NM``. Raises TaccorlError:
     there is no such joint, or it cannot move about its pose."""
     number, arm = joint_number(signal), signal.split("_", 1)[0]
-    body, middle = arm_bench.rigid(config, signal, pose, 0.0, []), float(pose[number - 1])
+    body, middle = arm_joint.rigid(config, signal, pose, 0.0, []), float(pose[number - 1])
     weight = body.gravity_sin * math.sin(middle) + body.gravity_cos * math.cos(middle)
     room = Room.of(number, middle, body.inertia, weight)
     if min(room.wide_rad, room.sweep_rad) <= 0:

@@ -133,7 +133,7 @@ class Axis(Machine):
             if self.config.target_kind == "position" and np.isfinite(motion.measured).any():
                 floor = {signal: floors["position"][signal].value}
                 uncertain = [signal] if self.config.law == "pwm" or self.config.gains == "fitted" else []
-                model = JointModel.of(DrivenAxis(self.config))
+                model = JointModel(DrivenAxis(self.config))
                 changed, rivals = partial(with_other_numbers, model, motion), partial(with_more_lead, model, motion)
                 clock[m.name] = tuple(
                     check_against_twin(

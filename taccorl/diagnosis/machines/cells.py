@@ -10,7 +10,6 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_set import CellSet
 from taccorl.alignment.checks.cells import LOADED, check_cells, warnings_of_all
-from taccorl.alignment.machines.cell_columns import load_cell_columns
 from taccorl.alignment.machines.cell_model import (
     calibrated,
     file_numbers,
@@ -21,7 +20,7 @@ from taccorl.alignment.machines.cell_model import (
     within_ends,
 )
 from taccorl.alignment.machines.cell_places import with_places
-from taccorl.alignment.machines.cell_tables import CellMeasurement, read_cell_table
+from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs

@@ -116,7 +116,7 @@ class AxisProblem(WithoutMaps):
 
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
-        models = [JointModel.of(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
+        models = [JointModel(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
         numbers = [Numbers(model.gains, effects) for model, (_, effects) in zip(models, cases, strict=True)]
         motions = [measured_part(recording) for recording in recordings]
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
@@ -242,5 +242,5 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
 def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:
     """Simulated response of the axis to a recording's targets, with the effects of its file and ``effects``, one value per
     row."""
-    model = JointModel.of(DrivenAxis(axis))
+    model = JointModel(DrivenAxis(axis))
     return model.simulate(motion, model.gains, effects)

@@ -123,7 +123,7 @@ class JointProblem(WithoutMaps):
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
         self.present = tuple(effect.name for effect in own)
-        self.model = JointModel.of(bare)
+        self.model = JointModel(bare)
         self._speed_where = self.model.joint.selectors(SpeedDelay) or {}
         self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
         self._first = int(self.model.joint.target_kind == "effort")  # then the position is the input, and no channel

@@ -48,7 +48,7 @@ def test_a_camera_is_calibrated_from_an_episode():
     assert angle_deg < 0.3
     assert distance_mm < 4
     assert set(fit.overlays) == set(frames.stages)
-    assert fit.origin == Origin("surrogate", "a twin whose camera is off")
+    assert frames.origin == Origin("surrogate", "a twin whose camera is off")
 
 
 def test_frames_are_slow_rows_and_differ():

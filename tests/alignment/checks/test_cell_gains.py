@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.checks.cell_gains import exchanged_cells
-from taccorl.alignment.checks.cell_readings import shifted_loads
 from taccorl.alignment.checks.cell_set import CellSet
-from taccorl.alignment.checks.cells import check_cells
+from taccorl.alignment.checks.cells import check_cells, shifted_loads
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
 from taccorl.alignment.measurements.folder import Measurements

@@ -12,9 +12,8 @@ from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
-from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
+from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, onset_delay, pure_shift
 from taccorl.alignment.checks.held_commands import _second_order
-from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import check_measurement, check_measurements, check_names
 from taccorl.alignment.checks.trial import Trial
@@ -223,7 +222,7 @@ def test_a_step_from_rest_shows_one_row_under_any_friction():
 
 def test_where_nothing_can_be_known_it_says_so():
     m = shifted(sweep(2, friction_nm=3.0, joints=[4, 5]), 1)
-    findings = list(check_clock(Trial(m, known_floor=floors(m))))
+    findings = list(check_clock(Trial(m)))
     assert [(f.check, f.feature) for f in findings] == [("not_judged", "left_joint5"), ("not_judged", "left_joint6")]
     for f in findings:
         # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
@@ -703,10 +702,7 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
 
 def test_a_sweep_that_never_moves_the_joint():
     m = sweep(0, joints=[4])
-    assert found(m, joints=["left_joint4", "left_joint5"])["no_motion"] == ["left_joint4"]
     assert "record a sweep" in text_of(dataclasses.replace(m, target=np.tile(HOME, (m.num_rows, 1))), "no_motion")
-    with pytest.raises(TaccorlError, match="did you mean 'left_joint5'"):
-        check_measurement(m, joints=["left_joint_5"])
 
 
 def test_too_short(clean):
@@ -775,7 +771,7 @@ def test_an_untold_repeat_is_pointed_out(clean):
     noise = np.random.default_rng(1).normal(0, 2e-5, clean.measured.shape)
     again = dataclasses.replace(clean, name="again", measured=clean.measured + noise)
     other = dataclasses.replace(sweep(3), name="other")
-    by = check_measurements([clean, again, other], joints=["left_joint5"])
+    by = check_measurements([clean, again, other])
     assert [f.check for f in by["again"]] == ["same_motion"] and "repeat_of: sweep" in by["again"][0].text
     assert by["other"] == []
     assert [f.check for f in by["sweep"]] == ["not_judged"]  # what does not repeat, without repeats

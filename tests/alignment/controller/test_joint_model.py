@@ -7,10 +7,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from made_rows import of_joint, of_signal
-from one_joint import HOME, TWIN, AxisJoint, at_rest, chirp, in_mujoco
+from one_joint import HOME, TWIN, AxisJoint, at_rest, chirp
 from scipy.linalg import expm
 
-from taccorl.alignment.controller import arm_bench, joint_model
+from pipelines.benchmarks.one_joint import in_mujoco
+from taccorl.alignment.controller import arm_joint, joint_model
 from taccorl.alignment.controller.drive_numbers import TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.alignment.controller.joint_model import JointModel, Numbers
@@ -87,7 +88,7 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
     motion = at_rest(joint_motion(chirp(signal, 3.0, high_hz=3.0), TWIN, signal), gains)
     quick, plain = model.simulate_all([motion], [Numbers(gains, [effect]), Numbers(gains)])[0]
     np.testing.assert_array_equal(plain.reported, JointModel(TWIN, signal).simulate(motion, gains).reported)
-    exact = in_mujoco(motion, signal, gains, effect)
+    exact = in_mujoco(motion, signal, gains, [effect])
     away = np.abs(quick.reported - exact.reported)
     assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
     assert away[100:].max() < (2e-5 if name == "speed_delay" else 1e-6)  # MuJoCo's is exact to the first order
@@ -108,7 +109,7 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
 
 def test_every_effect_of_joints_is_known_to_the_model() -> None:
     unknown = [name for name in effects if _on_joints(name) and name not in KNOWN]
-    assert unknown == [], "identification would run MuJoCo for these, fifty times slower"
+    assert unknown == [], "no recording of a joint can be simulated with these"
     assert len(KNOWN) >= 18
 
 
@@ -123,7 +124,7 @@ def test_effects_act_together_as_in_mujoco() -> None:
         make_effect("velocity_feedforward", share=0.5, **at),
         make_effect("joint_compliance", **at, compliance_rad_per_nm=0.01),
     ]
-    quick, exact = model.simulate(motion, model.gains, together), in_mujoco(motion, signal, model.gains, *together)
+    quick, exact = model.simulate(motion, model.gains, together), in_mujoco(motion, signal, model.gains, together)
     np.testing.assert_allclose(quick.reported, exact.reported, atol=1e-5)
     # In the twin's own config they do the same.
     own = JointModel(TwinConfig(effects=together), signal).simulate(motion, model.gains)
@@ -162,7 +163,7 @@ def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
         make_effect("presliding", presliding_rad=1e-3, **at),
     )
     quick = model.simulate(motion, model.gains, [dry, bristles]).reported
-    exact = in_mujoco(motion, signal, model.gains, dry, bristles).reported
+    exact = in_mujoco(motion, signal, model.gains, [dry, bristles]).reported
     np.testing.assert_allclose(quick, exact, atol=1e-5)
     assert np.abs(quick - model.simulate(motion, model.gains, [dry]).reported).max() > 1e-4
     np.testing.assert_array_equal(
@@ -170,7 +171,7 @@ def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
     )
     own = make_effect("coulomb_friction", torque_nm=0.3, presliding_rad=1e-3, **at)
     np.testing.assert_array_equal(model.simulate(motion, model.gains, [own]).reported, quick)
-    np.testing.assert_array_equal(in_mujoco(motion, signal, model.gains, own).reported, exact)
+    np.testing.assert_array_equal(in_mujoco(motion, signal, model.gains, [own]).reported, exact)
     for twin, said in (
         ([bristles, dry], "left_joint5: coulomb_friction comes after"),
         ([own, bristles], "bristles of its own"),
@@ -203,7 +204,7 @@ def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
 
 def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     """−K_d (q̇ − τ q̈) on a free mass: what the motor gives is J q̈, not (J − K_d τ) q̈, which is 5 % less here."""
-    joint = JointModel.of(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-3))
+    joint = JointModel(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-3))
     time_s = np.arange(2000) * 1e-3
     target = 0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0)
     m = of_signal("made", 1000.0, target, np.zeros(2000), "mass")
@@ -216,7 +217,7 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
 
 def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_reports_the_limit() -> None:
     """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
-    joint = JointModel.of(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
+    joint = JointModel(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
     time_s = np.arange(200) * 1e-3
     m = of_signal("made", 1000.0, np.where(time_s > 0.0095, 1.0, 0.0), np.zeros(200), "mass")
     effects = [make_effect("speed_delay", delay_s=1.5e-3), make_effect("torque_saturation", torque_max_nm=1.0)]
@@ -246,45 +247,23 @@ def test_of_an_effect_of_all_joints_the_model_takes_what_acts_on_its_own() -> No
 
 
 @dataclasses.dataclass(kw_only=True)
-class _Late(JointEffect):
-    """An outsider's effect that the one-joint model has never heard of: each command arrives one sending late, and the
-    encoder reads 2 mrad too much."""
+class _Hooks(JointEffect):
+    """An outsider's effect that the one-joint model has never heard of."""
 
-    name = "test_late"
+    name = "test_hooks"
     late: float = number("n", "1", 0.0, 1.0, (0.0, 1.0), "a test")
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> dict[str, np.ndarray]:
-        return {"last": np.full((num_sims, 14), np.nan)}
 
-    def command(self, targets: np.ndarray, memory: dict[str, np.ndarray], dt_s: np.ndarray) -> np.ndarray:
-        last = np.where(np.isnan(memory["last"]), targets, memory["last"])
-        memory["last"][:] = targets
-        arriving = targets.copy()
-        arriving[:, self.columns] = last[:, self.columns]
-        return arriving
-
-    def encoder(self, values: np.ndarray) -> np.ndarray:
-        values = values.copy()
-        values[:, self.columns] += 0.002
-        return values
-
-
-def test_an_effect_that_only_has_hooks_runs_in_mujoco() -> None:
-    signal = "left_joint5"
-    model, motion = from_rest(signal)
-    plain = model.simulate(motion, model.gains)
-    late = model.simulate(motion, model.gains, [_Late(late=1.0, arm="left", joints=["joint5"])])
-    # Where it starts it reports what was measured, so it stands 2 mrad lower and comes up from there within K_d / K_p.
-    np.testing.assert_allclose(late.reported[150:], 0.002 + plain.reported[149:-1], atol=1e-4)
-    assert late.reported[0] == pytest.approx(motion.start, abs=1e-12)
+def test_an_effect_that_only_has_hooks_is_not_searched_and_refused_by_name() -> None:
+    model, motion = from_rest("left_joint5")
+    assert model.joint.selectors(_Hooks) is None and model.joint.selectors(effects.get("coulomb_friction")) is not None
+    with pytest.raises(TaccorlError, match="left_joint5: the one-joint model does not have test_hooks"):
+        model.simulate(motion, model.gains, [_Hooks(late=1.0, arm="left", joints=["joint5"])])
 
 
 def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
     model, slow = from_rest("left_joint5", rate_hz=30.0)
-    late = _Late(late=1e-9, arm="left", joints=["joint5"])  # forces MuJoCo; it delays and shifts as above
     assert len(model.simulate(slow, model.gains).reported) == len(slow.target) == 90
-    sent = model.simulate(slow, model.gains, [late])
-    assert len(sent.reported) == 90
     # By hand: 30 Hz are five commands a row, on the line to the next row.
     line = np.interp(np.arange(90 * 5) + 1.0, 5 * np.arange(90), slow.target)
     fine = dataclasses.replace(slow, target=line, rate_hz=150.0, coupling_nm=np.zeros(450))
@@ -350,9 +329,9 @@ def test_a_payload_s_position_sets_its_lever_arm() -> None:
     # The same weight further out: joint 5's axis is 0.091 m behind the flange.
     signal = "left_joint5"
     pose = np.array([0.0, 1.2, -1.4, 0.0, 0.0, 0.0, 0.02])
-    masses = {at: arm_bench.rigid(TWIN, signal, pose, 0.5, [], (0.0, 0.0, at)) for at in (0.0, 0.1, 0.168)}
-    bare = arm_bench.rigid(TWIN, signal, pose, 0.0, [])
-    assert arm_bench.rigid(TWIN, signal, pose, 0.5, []) == masses[0.168]
+    masses = {at: arm_joint.rigid(TWIN, signal, pose, 0.5, [], (0.0, 0.0, at)) for at in (0.0, 0.1, 0.168)}
+    bare = arm_joint.rigid(TWIN, signal, pose, 0.0, [])
+    assert arm_joint.rigid(TWIN, signal, pose, 0.5, []) == masses[0.168]
     for at, body in masses.items():
         weight_nm = np.hypot(body.gravity_sin - bare.gravity_sin, body.gravity_cos - bare.gravity_cos)
         assert weight_nm == pytest.approx(0.5 * 9.81 * (0.091 + at), rel=0.01)
@@ -373,17 +352,18 @@ def test_commanded_gains_scale_what_the_model_is_given() -> None:
 
 def test_a_sliding_axis_follows_its_closed_form() -> None:
     # 95 kg, K_p 1e4 N/m, K_d 4e3 N s/m: overdamped, poles at −2.7 and −39.4 1/s.
-    model = JointModel.of(AxisJoint("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", step_s=1e-4))
+    model = JointModel(AxisJoint("slide", 95.0, gains=Gains(1e4, 4e3, 0.0), unit="m", step_s=1e-4))
     time_s = np.arange(5000) / 1000
-    motion = joint_motion(of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m"), None, "slide")
+    m = of_signal("made", 1000.0, np.full(5000, 0.02), np.zeros(5000), "slide", "m")
+    motion = motion_of(m, "slide", model.joint)
     answer = model.simulate(motion, model.gains).reported
     fast, slow = np.sort(np.roots([95.0, 4e3, 1e4]))
     expected = 0.02 * (1 - (slow * np.exp(fast * time_s) - fast * np.exp(slow * time_s)) / (slow - fast))
     np.testing.assert_allclose(answer, expected, atol=2e-5)
     with_friction = model.simulate(motion, model.gains, [make_effect("coulomb_friction", torque_nm=20)])
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
-    with pytest.raises(TaccorlError, match="test_late"):
-        model.simulate(motion, model.gains, [_Late(late=1.0)])
+    with pytest.raises(TaccorlError, match="slide: the one-joint model does not have touch_lag"):
+        model.simulate(motion, model.gains, [make_effect("touch_lag", time_constant_s=0.02)])
 
 
 class _Geared(AxisJoint):
@@ -400,7 +380,7 @@ class _Geared(AxisJoint):
 def test_a_late_speed_is_behind_a_low_pass(kd: float) -> None:
     """J q̈ = K_p (q* − q) − K_d w, τ ẇ = q̇ − w after a step of the target; also where K_d τ is 1.2 J, as of a light wrist."""
     inertia, kp, late_s = 3.3, 1320.0, 1.5e-3
-    model = JointModel.of(_Geared("pan", inertia, Gains(kp, kd, 0.0), "rad", 1e-4))
+    model = JointModel(_Geared("pan", inertia, Gains(kp, kd, 0.0), "rad", 1e-4))
     motion = of_joint("step", 200.0, np.where(np.arange(60) > 0, 1.0, 0.0), np.full(60, np.nan))
     found = model.simulate(motion, model.gains, [make_effect("speed_delay", delay_s=late_s)])
     law = np.array([[0.0, 1.0, 0.0], [-kp / inertia, 0.0, -kd / inertia], [0.0, 1.0 / late_s, -1.0 / late_s]])
@@ -412,7 +392,7 @@ def test_a_late_speed_is_behind_a_low_pass(kd: float) -> None:
 def test_a_rotor_on_a_stiff_gear_swings_as_its_two_masses_do() -> None:
     """0.6 q̈ = K_p (q* − q) − K_d q̇ − t, 2.7 p̈ = t, t = k (q − p) + d (q̇ − ṗ): 71 Hz and a damping ratio of 0.33 in the gear."""
     kp, kd, k, d = 6000.0, 190.0, 1e5, 150.0
-    model = JointModel.of(_Geared("pan", 3.3, Gains(kp, kd, 0.0), "rad", 1e-3))
+    model = JointModel(_Geared("pan", 3.3, Gains(kp, kd, 0.0), "rad", 1e-3))
     target = np.where(np.arange(60) > 0, 0.01, 0.0)
     motion = of_joint("step", 200.0, target, np.full(60, np.nan))
     gear = make_effect("joint_compliance", compliance_rad_per_nm=1 / k, damping_s=d / k)

@@ -34,7 +34,7 @@ def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: flo
 
 
 def answer(axis: AxisConfig, m: Measurement) -> JointResponse:
-    model = JointModel.of(DrivenAxis(axis))
+    model = JointModel(DrivenAxis(axis))
     return model.simulate(motion_of(m, "servo", DrivenAxis(axis)), model.gains)
 
 

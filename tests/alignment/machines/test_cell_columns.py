@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.alignment.machines.cell_columns import load_cell_columns
-from taccorl.alignment.machines.cell_tables import CellMeasurement, read_cell_table
+from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
 from taccorl.errors import RecordingError, SpecError
 

@@ -12,6 +12,7 @@ from taccorl.alignment.measurements.even_rows import even_rows
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import read_table
 from taccorl.errors import TaccorlError
+from taccorl.sim.twin import TwinConfig
 
 RATE_HZ = 200.0
 
@@ -36,7 +37,7 @@ def test_half_a_millisecond_of_jitter_is_taken_out():
     time_s = rows / RATE_HZ + np.random.default_rng(0).normal(0, 5e-4, 1200).clip(-1e-3, 1e-3)
     m = table(time_s - time_s[0], rows)
     with pytest.raises(TaccorlError, match="not even"):
-        joint_motion(m, None, "left_joint5")
+        joint_motion(m, TwinConfig(), "left_joint5")
     even = even_rows(m)
     assert even.rate_hz == RATE_HZ
     np.testing.assert_allclose(np.diff(even.time_s), 1 / RATE_HZ, rtol=1e-9)
@@ -52,7 +53,7 @@ def test_half_a_millisecond_of_jitter_is_taken_out():
     assert np.abs(even.command_s[:1200] + start_s - (time_s - time_s[0]))[1:].max() < 1e-9
     (finding,) = even.findings
     assert (finding.check, finding.severity) == ("resampled", "warning")
-    assert joint_motion(even, None, "left_joint5").rate_hz == RATE_HZ
+    assert joint_motion(even, TwinConfig(), "left_joint5").rate_hz == RATE_HZ
 
 
 def test_three_lost_rows_are_a_gap_and_no_line():
@@ -67,7 +68,7 @@ def test_three_lost_rows_are_a_gap_and_no_line():
         "3 rows lost in 1 gaps" in even.findings[0].text and "3 of them without a measurement" in even.findings[0].text
     )
     assert {f.check for f in check_measurement(even) if f.severity == "error"} == set()
-    assert np.isnan(joint_motion(even, None, "left_joint5").measured).sum() == 3
+    assert np.isnan(joint_motion(even, TwinConfig(), "left_joint5").measured).sum() == 3
 
 
 def test_a_command_that_changes_now_and_then_is_held_across_a_gap():
@@ -90,7 +91,7 @@ def test_too_much_is_left_as_it_is_and_refused_with_a_way_out(fault):
     m = table(time_s - time_s[0], rows)
     assert even_rows(m) is m
     with pytest.raises(TaccorlError, match="log the driver's or the bus's own stamps"):
-        joint_motion(m, None, "left_joint5")
+        joint_motion(m, TwinConfig(), "left_joint5")
 
 
 def test_a_csv_file_is_read_that_way(tmp_path):

@@ -8,11 +8,10 @@ import pytest
 from made_rows import of_signal
 from made_sweep import ARMS_JOINTS, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
 
-from taccorl.alignment.measurements.cycles import cycles
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, Touch
 from taccorl.alignment.measurements.noise_floor import motion_hz, noise_floor, rest_stretches, touch_floor
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.repeats import overlay
+from taccorl.alignment.measurements.repeats import cycles, overlay
 from taccorl.errors import TaccorlError
 
 NOISE = 2e-4

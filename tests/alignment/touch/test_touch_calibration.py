@@ -11,7 +11,6 @@ from taccorl.alignment.touch.calibration import TouchCalibration, calibrate_touc
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
 CONFIG = TwinConfig()
@@ -38,7 +37,6 @@ def test_the_noise_is_found_where_nothing_touches(presses: list[TouchMotion]) ->
     assert noise.pooled_std_count == pytest.approx(math.hypot(1.3, 1 / math.sqrt(12)), rel=0.01)
     # 0.999 of a normal distribution: 3.09 σ = 4.1, in whole counts
     assert noise.threshold_count in (4.0, 5.0)
-    assert all(400 < n < 900 for n in noise.num_frames)
 
 
 def test_stiffness_and_damping_are_recovered_within_their_intervals(found: TouchCalibration) -> None:
@@ -50,7 +48,6 @@ def test_stiffness_and_damping_are_recovered_within_their_intervals(found: Touch
         half = (number.high - number.low) / 2
         assert 0 < half < 0.03 * truth
         assert abs(number.value - truth) < 2 * half
-    assert abs(found.correlation) < 0.5
 
 
 def test_the_validation_recording_is_matched_up_to_the_noise(found: TouchCalibration) -> None:
@@ -61,13 +58,6 @@ def test_the_validation_recording_is_matched_up_to_the_noise(found: TouchCalibra
     assert after.rms_count == pytest.approx(1.33, rel=0.05), "what is left is noise"
     assert after.mask_iou >= before.mask_iou
     assert after.mask_iou > 0.97
-
-
-def test_the_mended_twin_has_the_numbers(found: TouchCalibration) -> None:
-    sensor = found.mended(CONFIG).sensor
-    assert sensor.normal_stiffness_per_m == found.stiffness.value
-    assert sensor.normal_damping_s_per_m == found.damping.value
-    assert sensor.gain_count == FlexiTacConfig().gain_count
 
 
 def test_the_twins_own_effects_act_in_the_fit(presses: list[TouchMotion]) -> None:

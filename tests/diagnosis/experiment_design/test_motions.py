@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from imagined_motions import SIGNAL, recorded
 
-from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller import arm_joint
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.motions import CHIRP, LIBRARY, MARGIN_RAD, POSES, REST_S, STIFFER_CHIRP
 from taccorl.cli.plan_words import words
@@ -155,7 +155,7 @@ def test_peak_torque_includes_the_carried_weight_and_the_pose_is_stated():
     pose = rest_pose(signal, None)
     still = dataclasses.replace(CHIRP, target=lambda room: np.full(200, room.middle_rad))
     part = JointPart(arm_ground(NOMINAL, signal, pose), FLOOR_RAD)
-    body = arm_bench.rigid(NOMINAL, signal, pose, 0.0, [])
+    body = arm_joint.rigid(NOMINAL, signal, pose, 0.0, [])
     weight_nm = abs(body.compensation_sin * np.sin(pose[2]) + body.compensation_cos * np.cos(pose[2]))
     assert weight_nm > 0.5
     assert part.offer(still, {}).peak == pytest.approx(weight_nm, rel=0.02)

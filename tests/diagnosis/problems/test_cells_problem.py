@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from made_rows import of_cells, play
 
-from taccorl.alignment.checks.cell_readings import plateaus
 from taccorl.alignment.checks.cell_set import CellSet
+from taccorl.alignment.checks.cells import plateaus
 from taccorl.alignment.machines.cell_model import Calibration, calibrated, readings, responses, thinned, within_ends
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading, make_cells_effect

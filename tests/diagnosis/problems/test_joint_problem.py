@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from imagined_motions import NOISE_NM, NOISE_RAD, RATE_HZ, SIGNAL, recorded
 
-from taccorl.alignment.controller.arm_bench import AT_TCP
+from taccorl.alignment.controller.arm_joint import AT_TCP
 from taccorl.alignment.measurements.folder import Measurements, split
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.machines.piper import PiperTwin

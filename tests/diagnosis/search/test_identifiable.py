@@ -43,7 +43,7 @@ class OneJoint(MadeProblem):
 
     def __init__(self, *names: str) -> None:
         self.candidates: dict[str, Candidate] = {name: candidate(effects.get(name), SEEN) for name in names}
-        self.model = JointModel.of(AxisJoint("left_joint5", J_KGM2, gains=Gains(151.0, 12.0, 0.5)))
+        self.model = JointModel(AxisJoint("left_joint5", J_KGM2, gains=Gains(151.0, 12.0, 0.5)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         gains = Gains(base.get("kp", TRUTH["kp"]), base.get("kd", TRUTH["kd"]), base["torque_ff"])
