@@ -16,6 +16,8 @@ from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
+WRAPPED = 0.5
+"""Largest difference from a full turn of a jump between rows, in an angle that is wrapped [rad]. A choice."""
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
 10 s."""
@@ -63,7 +65,7 @@ rows: beyond it the friction would have given way. A choice."""
 @check("not_finite", "error")
 @check("lost_samples", "error", needs="rows")
 def check_values(t: Trial) -> Iterator[Finding]:
-    """Targets that are not finite, and gaps of the measurement."""
+    """Targets that are not finite, angles that jump by a full turn, and gaps of the measurement."""
     m = t.m
     for name, values in zip(m.signals, m.target.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
@@ -73,6 +75,14 @@ def check_values(t: Trial) -> Iterator[Finding]:
                 f"s); {without(m, int(bad[0]))}"
             )
             yield find("not_finite", name, text, (int(bad[0]), int(bad[-1]) + 1))
+    for name, unit, values in zip(m.signals, m.units, m.measured.T, strict=True):
+        turns = np.flatnonzero(np.abs(np.abs(np.diff(values)) - 2 * np.pi) < WRAPPED) if unit == "rad" else []
+        if len(turns):
+            text = (
+                f"{name} jumps by a full turn in {len(turns)} rows, first after row {turns[0]} ({m.time_s[turns[0]]:.3f} s): its "
+                f"angle is wrapped. Unwrap the columns {name}.q and {name}.q_target (numpy.unwrap)"
+            )
+            yield find("unit", name, text, (int(turns[0]), int(turns[0]) + 2))
     known = np.asarray(np.isfinite(m.measured))
     compared = np.asarray(known.any(axis=0))  # a signal that was never measured is not compared
     holes = runs(np.asarray(~known[:, compared].all(axis=1)))

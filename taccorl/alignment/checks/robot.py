@@ -19,8 +19,9 @@ from taccorl.data.finding import Finding, listed
 
 BEYOND = 0.02
 """Share of a joint's range by which a measured position may exceed its limits."""
-DEGREES = math.pi / 180
-"""Velocity in rad/s over the slope of a position in degrees."""
+DEGREES, NEAR_DEGREES = math.pi / 180, 0.3
+"""Velocity in rad/s over the slope of a position in degrees; largest difference of the logarithms of this and of a ratio of
+inertias that positions in degrees explain (a choice)."""
 EFFORT_BEYOND = 1.5
 """Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0
@@ -182,6 +183,14 @@ def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) 
     return [find("reversed_effort", name, f"effort of {name} {why}. {way}", severity="error" if sure else "warning")]
 
 
+def in_degrees(ratio: float, signal: str, unit: str) -> str:
+    """Text: the line to write if an inertia that is ``ratio`` times the stated one may come of positions in degrees."""
+    if unit != "rad" or abs(math.log(ratio / DEGREES)) > NEAR_DEGREES:
+        return ""
+    line = f"`unit: deg` for {signal}.q and {signal}.q_target in a columns file"
+    return f" Positions in degrees make it 0.0175 times: then write {line}."
+
+
 @check("wrong_inertia", "error")
 def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: LawFit | None) -> list[Finding]:
     """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
@@ -214,7 +223,8 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: 
     hint = f" That is the size of {nearest}: are columns exchanged?" if nearest != name else ""
     text = (
         f"effort and acceleration of {name} say {seen:.3g} {'kg·m²' if m.units[j] == 'rad' else 'kg'}, the model with its rotor "
-        f"{known:.3g}: {seen / known:.2g} times.{hint} Else its effort is in another unit: write {_line(m, name)}, or "
+        f"{known:.3g}: {seen / known:.2g} times.{hint}{in_degrees(seen / known, name, m.units[j])} Else its effort is in another "
+        f"unit: write {_line(m, name)}, or "
         f"rotor_inertia and gear of {name} in {robot.path.name}"
     )
     return [find("wrong_inertia", name, text)]

@@ -30,7 +30,7 @@ MOST_JITTER = 0.5
 """Largest jitter [periods] of 95 % of the steps that are no gaps."""
 LONGEST_GAP_S = 0.25
 """Longest gap of a table that is resampled [s]."""
-MOST_LOST = 0.05
+MOST_LOST = 0.1
 """Largest share of lost rows of a table that is resampled."""
 RATE_TOLERANCE = 0.02
 """Largest relative difference from a rate with a whole number of physics steps at which the rate is set to it."""

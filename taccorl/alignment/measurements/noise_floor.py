@@ -225,7 +225,7 @@ def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
 
 def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
     """(K,) noise of each column by the residue method, in the unit of the values; NaN if all channels are too short. The median
-    over blocks is used, because contact changes in few of them. Blocks with NaN are not used.
+    over blocks is used, because contact changes in few of them. Blocks of more than half NaN are not used.
     ``channels``: several (values (T, K), rate [Hz]), with the same K columns."""
     found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
     if not found:
@@ -349,8 +349,8 @@ def motion_hz(m: Measurement) -> np.ndarray:
     window = np.hanning(m.num_rows)
     frequency = np.fft.rfftfreq(m.num_rows, m.period_s)
     for j in np.flatnonzero(np.ptp(m.target, axis=0) > MOVING):
-        x = m.measured[:, j]
-        x = np.where(np.isfinite(x), x, np.nanmean(x)) if np.isfinite(x).any() else np.zeros(m.num_rows)
+        known = np.isfinite(m.measured[:, j])
+        x = np.interp(m.time_s, m.time_s[known], m.measured[known, j]) if known.any() else np.zeros(m.num_rows)
         power = np.cumsum(np.abs(np.fft.rfft((x - x.mean()) * window)) ** 2)
         found[j] = frequency[int(np.searchsorted(power, MOTION_POWER * power[-1]))] if power[-1] > 0 else 0.0
     return found
@@ -361,9 +361,12 @@ def _block_rows(rate_hz: float) -> int:
 
 
 def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
-    """(B, J) of the whole blocks in ``values`` (T, J); (0, J) if T is less than ``rows``."""
+    """(B, J) of the whole blocks in ``values`` (T, J), NaN where most rows are NaN; (0, J) if T is less than ``rows``."""
     count = len(values) // rows
-    return (values[: count * rows].reshape(count, rows, values.shape[1]) ** 2).mean(axis=1)
+    squares = values[: count * rows].reshape(count, rows, values.shape[1]) ** 2
+    known = np.isfinite(squares)
+    enough = known.mean(axis=1) >= 0.5  # lost rows leave gaps everywhere
+    return np.where(enough, np.where(known, squares, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
 
 
 # estimates -------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_fit
-from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
+from taccorl.alignment.checks.robot import beyond_effort, in_degrees, reversed_effort
 from taccorl.alignment.checks.telemetry import least_motion
 from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S, with_gains
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
@@ -237,8 +237,8 @@ def _wrong_inertia(axis: AxisConfig, m: Measurement, fit: LawFit | None) -> list
     if 1 / INERTIA_OFF <= inertia / stated <= INERTIA_OFF:
         return []
     text = (
-        f"effort and acceleration of {axis.name} say {inertia:.3g} {unit}, its file {stated:.3g}: {inertia / stated:.2g} times. "
-        f"Write `inertia: {max(inertia - stated + axis.inertia, 1e-3 * inertia):.3g}`, or the right unit or factor of q and tau "
-        "in a columns file"
+        f"effort and acceleration of {axis.name} say {inertia:.3g} {unit}, its file {stated:.3g}: {inertia / stated:.2g} times."
+        f"{in_degrees(inertia / stated, axis.name, axis.unit)} Else write the right unit or factor of q and tau in a columns "
+        f"file, or `inertia: {max(inertia - stated + axis.inertia, 1e-3 * inertia):.3g}`"
     )
     return [DataFinding("wrong_inertia", "error", axis.name, text)]

@@ -728,6 +728,13 @@ def test_time_that_runs_backwards_or_in_milliseconds_stops_everything_else(clean
     assert found(dataclasses.replace(clean, time_s=clean.time_s * 1e3)) == {"time_unit": ["time"]}
 
 
+def test_a_wrapped_angle_is_named_and_a_fast_joint_is_not(clean):
+    turned = clean.measured[:, 4] + np.pi - clean.measured[:, 4].mean()
+    m = with_column(clean, clean.signals[4], (turned + np.pi) % (2 * np.pi) - np.pi)
+    assert "jumps by a full turn" in text_of(m, "unit") and "numpy.unwrap" in text_of(m, "unit")
+    assert "unit" not in found(clean)
+
+
 def test_dropped_rows_are_counted_and_placed(clean):
     keep = np.delete(np.arange(clean.num_rows), [*range(700, 712), 900])
     text = text_of(some(clean, keep), "dropped_rows")

@@ -482,7 +482,8 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     for factor, qd in ((1.0, " (`deg/s` for elbow.qd)"), (np.pi / 180, "")):  # in deg/s and in rad/s
         assert f"{line}{qd} in" in checks(dataclasses.replace(degrees, velocity=factor * slope))["beyond_limits"]
     assert "`effort_scale: {elbow: -1}`" in checks(with_effort(-1.0))["reversed_effort"]
-    assert "8 times" in checks(with_effort(8.0))["wrong_inertia"]
+    assert "8 times. That is" in checks(with_effort(8.0))["wrong_inertia"]
+    assert "`unit: deg` for elbow.q and" in checks(with_effort(np.pi / 180))["wrong_inertia"]  # as of q in degrees
     assert "mA" in checks(with_effort(1000.0))["beyond_effort"]
     # Efforts of the law, kp (q* − q) − kd q̇, in mA at 0.5 N·m/A: the unit follows from the gains, whatever the inertia is.
     late = 0.4 * np.sin(2 * np.pi * (0.2 + 0.2 * (time_s - 0.05)) * (time_s - 0.05))

@@ -85,7 +85,7 @@ def test_too_much_is_left_as_it_is_and_refused_with_a_way_out(fault):
         time_s = np.sort(rows / RATE_HZ + np.random.default_rng(0).uniform(-4e-3, 4e-3, 1200))
     else:
         rows = (
-            rows[(rows < 400) | (rows >= 460)] if fault == "gap" else rows[np.random.default_rng(1).random(1200) > 0.1]
+            rows[(rows < 400) | (rows >= 460)] if fault == "gap" else rows[np.random.default_rng(1).random(1200) > 0.15]
         )
         time_s = rows / RATE_HZ
     m = table(time_s - time_s[0], rows)

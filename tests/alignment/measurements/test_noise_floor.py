@@ -44,6 +44,16 @@ def test_rest_residue_and_repeats_each_recover_a_known_noise(motion):
         assert np.max(np.abs(np.array(values) / NOISE - 1)) < 0.15, method
 
 
+def test_rows_that_are_lost_all_over_leave_the_floor_as_it_is(motion):
+    """One row of 20 in each: every block of 50 rows has gaps."""
+    pair = [measured(*motion, np.random.default_rng(k), NOISE, name=name) for k, name in enumerate("ab")]
+    for k, m in enumerate(pair):
+        m.measured[7 * k :: 20] = np.nan
+    floor = noise_floor([pair[0], dataclasses.replace(pair[1], repeat_of="a")])["left_joint5"]
+    assert floor.used.method == "repeats" and floor.value == pytest.approx(NOISE, rel=0.15)
+    assert by_method(floor)["residue"] == pytest.approx(NOISE, rel=0.15)
+
+
 def test_interval_holds_the_truth_about_as_often_as_it_says(motion):
     held, total = {"rest": 0, "residue": 0}, 0
     for seed in range(20):
