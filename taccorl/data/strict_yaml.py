@@ -165,7 +165,9 @@ class Document[T]:
         for name, child in self._items(node, key):
             path = f"{key}/{name}" if key else name
             if name not in known:
-                raise self.error(path, f"unknown key {_quoted(name)}; {nearest(name, known)}")
+                entries = [(f, getattr(k, "__dataclass_fields__", ())) for f in hints for k in get_args(hints[f])[1:]]
+                inside = [f"write `{f}: {{NAME: {{{name}: …}}}}`, in each entry" for f, own in entries if name in own]
+                raise self.error(path, f"unknown key {_quoted(name)}; {(inside or [nearest(name, known)])[0]}")
             values[known[name]] = self._build(hints[known[name]], child, path)
         for name, field in fields.items():
             if field.default is dataclasses.MISSING is field.default_factory and name not in values:
