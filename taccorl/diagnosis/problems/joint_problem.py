@@ -14,9 +14,10 @@ from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import LANES
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse, Numbers, PayloadLever
+from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.controller.rigid_joint import RigidJoint
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
@@ -118,7 +119,8 @@ class JointProblem(WithoutMaps):
             )
         self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
         own, bare = joint.freed(held)
-        self.known = joint.known_names
+        self.known, loop_s = joint.known_names, joint.speed_delay_s * joint.exact_timing
+        self.loop_s = unlike_rows(1.0 / loop_s if loop_s else None, everything)
         self._stated = {
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
@@ -210,10 +212,9 @@ class JointProblem(WithoutMaps):
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
         facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
-            waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
-            effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
-            speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
-            facts |= {"effort_age": effort_age, "speed_age": speed_age, "command_delay__delay_s": waits_s}
+            newer = bool(self.model.joint.facts["effort_after"])
+            facts |= {"effort_age": -half_s if newer else half_s, "speed_age": 2.0 * half_s}
+        facts |= waiting(self.model.joint, base.get("loop_waits_s", 0.0), facts)
         return Numbers(gains, effects, lever, age_s, facts)
 
     def learn(self, values: Mapping[str, float]) -> None:
@@ -316,6 +317,21 @@ def seen_in(
         "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
         "duration_s": max(float(m.time_s[-1]) for m in motions),
     }
+
+
+def waiting(joint: RigidJoint, wait_s: float, facts: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Fields of ``drive_numbers.Drive`` of a joint whose targets wait ``wait_s`` [s] for the next period of its loop, so that
+    efforts of rows are as much newer. ``facts``: fields that replace the joint's own."""
+    own = {**joint.facts, **(facts or {})}
+    effort_age = own.get("effort_age", 0.0) - wait_s
+    return {"command_delay__delay_s": wait_s, "effort_age": effort_age} if wait_s else {}
+
+
+def unlike_rows(loop_hz: float | None, recordings: Sequence[Measurement]) -> float:
+    """Period [s] of a loop whose rate is no multiple of the rows' of a recording; 0 of another one, or of none."""
+    counts = [loop_hz / m.rate_hz for m in recordings] if loop_hz else []
+    off = [n for n in counts if abs(n - round(n)) > SAME_RATE * n or n < 1.0 - SAME_RATE]
+    return 1.0 / loop_hz if loop_hz and off else 0.0
 
 
 def _around(gain: Free, start: float) -> Free:
