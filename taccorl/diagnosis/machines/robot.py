@@ -115,7 +115,8 @@ class RobotMachine(Machine):
             found[m.name] = check_robot(self.robot, m, self._whole(m), [name for name in own if moves(m, name)], fits)
         check_columns(self.robot, own, found)
         for name, law in self.robot.config.joints.items():
-            check_effort_time(law, own[name], found, name, self.robot.path.name)
+            at = self.robot.joint(name)
+            check_effort_time(law, own[name], found, name, self.robot.path.name, at.inertia_kgm2)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:

@@ -180,7 +180,7 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
     def checks(made: Robot, m: Measurement) -> list[str]:
         whole = made.joint("swing").whole(m)
         found = {m.name: check_robot(made, m, whole, ["swing"])}
-        check_effort_time(made.config.joints["swing"], [whole], found, "swing", made.path.name)
+        check_effort_time(made.config.joints["swing"], [whole], found, "swing", made.path.name, lambda m: INERTIA)
         return [f.text for f in found[m.name] if f.severity == "error"]
 
     assert checks(plain, before) == [] and checks(declared, after[0]) == []
