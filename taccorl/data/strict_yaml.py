@@ -151,14 +151,12 @@ class Document[T]:
             if name in items:
                 raise self.error(path, "stands here twice; keep one")
             if name == "<<":
-                text = "merge keys are not read; write the keys out, or share one whole value by an anchor"
-                raise self.error(path, text)
+                raise self.error(path, "merge keys are not read; write the keys out, or share one value by an anchor")
             items[name] = child
         return [(name, child) for name, child in items.items() if not name.startswith("x-")]
 
     def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
-        hints = _hints(cls)
-        fields = {f.name: f for f in dataclasses.fields(cls)}
+        hints, fields = _hints(cls), {f.name: f for f in dataclasses.fields(cls)}
         # A trailing underscore keeps a YAML key free of Python's own words (`from` is `from_` in the dataclass).
         known = {name.rstrip("_"): name for name in fields}
         values: dict[str, Any] = {}

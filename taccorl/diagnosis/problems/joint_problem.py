@@ -17,7 +17,6 @@ from taccorl.alignment.controller.joint_kernel import LANES
 from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.controller.rigid_joint import RigidJoint
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
@@ -119,8 +118,7 @@ class JointProblem(WithoutMaps):
             )
         self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
         own, bare = joint.freed(held)
-        self.known, loop_s = joint.known_names, joint.speed_delay_s * joint.exact_timing
-        self.loop_s = unlike_rows(1.0 / loop_s if loop_s else None, everything)
+        self.known, self.loop_s = joint.known_names, unlike_rows(joint.speed_delay_s * joint.exact_timing, everything)
         self._stated = {
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
@@ -212,10 +210,9 @@ class JointProblem(WithoutMaps):
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
         facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
-            newer = bool(self.model.joint.facts["effort_after"])
-            facts |= {"effort_age": -half_s if newer else half_s, "speed_age": 2.0 * half_s}
-        facts |= waiting(self.model.joint, base.get("loop_waits_s", 0.0), facts)
-        return Numbers(gains, effects, lever, age_s, facts)
+            newer = 2.0 * bool(self.model.joint.facts["effort_after"])
+            facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": 2.0 * half_s}
+        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0))
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -319,19 +316,10 @@ def seen_in(
     }
 
 
-def waiting(joint: RigidJoint, wait_s: float, facts: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Fields of ``drive_numbers.Drive`` of a joint whose targets wait ``wait_s`` [s] for the next period of its loop, so that
-    efforts of rows are as much newer. ``facts``: fields that replace the joint's own."""
-    own = {**joint.facts, **(facts or {})}
-    effort_age = own.get("effort_age", 0.0) - wait_s
-    return {"command_delay__delay_s": wait_s, "effort_age": effort_age} if wait_s else {}
-
-
-def unlike_rows(loop_hz: float | None, recordings: Sequence[Measurement]) -> float:
-    """Period [s] of a loop whose rate is no multiple of the rows' of a recording; 0 of another one, or of none."""
-    counts = [loop_hz / m.rate_hz for m in recordings] if loop_hz else []
-    off = [n for n in counts if abs(n - round(n)) > SAME_RATE * n or n < 1.0 - SAME_RATE]
-    return 1.0 / loop_hz if loop_hz and off else 0.0
+def unlike_rows(loop_s: float, recordings: Sequence[Measurement]) -> float:
+    """``loop_s``, period of a drive's loop [s], if its rate is no multiple of the rows' of a recording; else 0."""
+    counts = [1.0 / (m.rate_hz * loop_s) for m in recordings if loop_s > 0.0]
+    return loop_s if any(abs(n - max(round(n), 1)) > SAME_RATE * n for n in counts) else 0.0
 
 
 def _around(gain: Free, start: float) -> Free:

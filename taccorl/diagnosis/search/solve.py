@@ -16,9 +16,8 @@ from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
 
 WAITS, SHARE = 0.5, 0.15
-"""Targets that wait for the loop are named where waits of any length make at least ``WAITS`` of the error that is left, and, if
-the file does not state the loop, one wait for each half second explains ``SHARE`` of its square. Choices: waits were seen to
-explain 0.25 or more, an unknown friction 0.05."""
+"""Least share of the error that waits for the loop can make, and, of a loop that is fitted, share of its square that one wait for
+each half second explains, for which they are named. Choices: of waits 0.25 and more was seen, of an unknown friction 0.05."""
 
 
 class Startable(Problem, Protocol):
@@ -96,8 +95,7 @@ def solve(
         config=search,
         progress=progress,
     )
-    waiting = _of_loop(problem, found, (*fit_to, *validation))
-    found = dataclasses.replace(found, remarks=(*waiting, *found.remarks))
+    found = dataclasses.replace(found, remarks=(*_of_loop(problem, found, (*fit_to, *validation)), *found.remarks))
     if problem.known:
         progress("what the known numbers cost")
         limits = limits_of_known(problem, problem.known, found, fit_to, validation, search or SearchConfig())
@@ -112,24 +110,19 @@ def _of_loop(problem: Problem, found: Diagnosis, recordings: Sequence[Recording]
         return []
     squares = np.zeros(
         3
-    )  # of what is left, of a wait of a whole period, of what such waits of half seconds make up for
+    )  # of what is left, of what one wait of a period changes, of what a wait of each half second explains
     for r in recordings:
-        left, late = (
-            np.nan_to_num(residuals(problem, model.values | {"loop_waits_s": wait_s}, model.effects, r))
-            for wait_s in (0.0, period_s)
-        )
+        cases = [(model.values | {"loop_waits_s": wait_s}, model.effects) for wait_s in (0.0, period_s)]
+        left, late = (np.nan_to_num(residuals(problem, *case, r)) for case in cases)
         starts = np.arange(0, len(left), max(1, round(0.5 / (r.time_s[1] - r.time_s[0]))))
-        sums = [
-            np.add.reduceat((x * y).sum(axis=1), starts)
-            for x, y in ((left, left), (late - left, late - left), (left, late - left))
-        ]
-        squares += [sums[0].sum(), sums[1].sum(), (sums[2] ** 2 / np.maximum(sums[1], 1e-9)).sum()]
-    spread = math.sqrt(squares[1] / 12.0 / sum(np.isfinite(r.measured).sum() for r in recordings))
+        rows = np.sum([left**2, (late - left) ** 2, left * (late - left)], axis=2)
+        own, change, along = np.add.reduceat(rows, starts, axis=1)
+        squares += [own.sum(), change.sum(), (along**2 / np.maximum(change, 1e-9)).sum()]
     if squares[1] / 12.0 < WAITS**2 * squares[0] or (not problem.loop_s and squares[2] < SHARE * squares[0]):
         return []
+    spread = math.sqrt(squares[1] / 12.0 / sum(np.isfinite(r.measured).sum() for r in recordings))
     return [
-        f"A target waits 0 … {1e3 * period_s:.2g} ms for the loop's next period, each row's another time where the loop's rate "
-        f"({1.0 / period_s:.4g} Hz{' by the fit' * (not problem.loop_s)}) is no multiple of the rows': that alone can leave "
-        f"{spread:.2g} noise floors, which no effect explains. Log rows at the loop's rate or a whole fraction of it, from its "
-        "clock."
+        f"A target waits 0 … {1e3 * period_s:.2g} ms for the next period of the loop ({1.0 / period_s:.4g} Hz"
+        f"{' by the fit' * (not problem.loop_s)}), each row's another time if it is no multiple of the rows' rate: this leaves "
+        f"{spread:.2g} noise floors, and is no effect. Log rows at the loop's rate or a whole fraction of it, on its clock."
     ]

@@ -496,24 +496,34 @@ def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweigh
     assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), [m], "servo") is None
 
 
-@pytest.mark.parametrize(
-    ("kp", "kd", "named"), [(25.0, 8.0, True), (400.0, 8.0, True), (100.0, 8.0, False), (25.0, 2.0, False)]
-)
-def test_positions_show_a_wrong_kp_but_not_both_gains_off_alike_as_of_another_inertia(
-    kp: float, kd: float, named: bool
-):
-    """0.4 kg·m² q̈ = 100 (q* − q) − 8 q̇, rows of 5 ms; efforts were not recorded."""
+def moved_by_law(seed: int, kp: float = 100.0) -> Measurement:
+    """0.4 kg·m² q̈ = ``kp`` (q* − q) − 8 q̇, rows of 5 ms; efforts were not recorded."""
     time_s = np.arange(2000) / 200
-    target = 0.1 * np.sin(2 * np.pi * (0.1 * time_s + 0.12 * time_s**2)) + 0.2 * np.sign(np.sin(4.0 * time_s))
-    q = lsim(([100.0], [0.4, 8.0, 100.0]), np.repeat(target, 5)[:-4], np.arange(9996) / 1000)[1][::5]
-    q = q + 5e-5 * np.random.default_rng(1).standard_normal(2000)
-    m = dataclasses.replace(servo(time_s, q, target), name="chirp", kp={"servo": kp}, kd={"servo": kd})
-    law, findings = DriveLaw(law="impedance", kp=kp, kd=kd), {"chirp": []}
+    target = 0.1 * np.sin(2 * np.pi * (0.1 * time_s + 0.12 * time_s**2)) + 0.2 * np.sign(np.sin((4.0 + seed) * time_s))
+    q = lsim(([kp], [0.4, 8.0, kp]), np.repeat(target, 5)[:-4], np.arange(9996) / 1000)[1][::5]
+    q = q + 5e-5 * np.random.default_rng(seed).standard_normal(2000)
+    return dataclasses.replace(servo(time_s, q, target), name=f"{seed}.csv")
+
+
+@pytest.mark.parametrize("kp", [25.0, 400.0, 100.0])
+@pytest.mark.parametrize("kd", [8.0, 2.0])
+def test_positions_show_a_wrong_kp_but_not_both_gains_off_alike_as_of_another_inertia(kp: float, kd: float):
+    m = dataclasses.replace(moved_by_law(0), kp={"servo": kp}, kd={"servo": kd})
+    law, findings = DriveLaw(law="impedance", kp=kp, kd=kd), {"0.csv": []}
     check_effort_time(law, [m], findings, "servo", "servo.yaml", lambda _: 0.4)
-    assert [f.check for f in findings["chirp"]] == ["other_gains"] * named
-    assert not named or [float(x) for x in re.findall(r"k[pd]: ([\d.]+)", findings["chirp"][0].text)] == pytest.approx(
-        [100.0, 8.0], rel=0.05
-    )
+    named = abs(math.log(100.0 / kp)) > 1.0 and kp / kd != 100.0 / 8.0
+    assert [f.check for f in findings["0.csv"]] == ["other_gains"] * named
+    found = [float(x) for f in findings["0.csv"] for x in re.findall(r"k[pd]: ([\d.]+)", f.text)]
+    assert found == pytest.approx([100.0, 8.0] * named, rel=0.05)
+
+
+@pytest.mark.parametrize(("kp", "named"), [(100.0, False), (200.0, True)])
+def test_recordings_of_two_machines_are_told_by_what_differs(kp: float, named: bool):
+    every = [moved_by_law(0), moved_by_law(1), moved_by_law(2, kp)]
+    law, findings = DriveLaw(law="impedance", kp=120.0, kd=8.0), {m.name: [] for m in every}
+    check_effort_time(law, every, findings, "servo", "servo.yaml", lambda _: 0.4)
+    told = {f.text for own in findings.values() for f in own}
+    assert len(told) == named and all("2 times as large in 2.csv as in" in text for text in told)
 
 
 def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
