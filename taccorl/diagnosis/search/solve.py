@@ -123,6 +123,6 @@ def _of_loop(problem: Problem, found: Diagnosis, recordings: Sequence[Recording]
     spread = math.sqrt(squares[1] / 12.0 / sum(np.isfinite(r.measured).sum() for r in recordings))
     return [
         f"A target waits 0 … {1e3 * period_s:.2g} ms for the next period of the loop ({1.0 / period_s:.4g} Hz"
-        f"{' by the fit' * (not problem.loop_s)}), each row's another time if it is no multiple of the rows' rate: this leaves "
+        f"{' by the fit' * (not problem.loop_s)}), each row's another time if no multiple of the rows' rate: this can leave "
         f"{spread:.2g} noise floors, and is no effect. Log rows at the loop's rate or a whole fraction of it, on its clock."
     ]
