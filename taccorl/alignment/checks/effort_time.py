@@ -44,14 +44,13 @@ without a shift, for which the shift is reported. Choices."""
 GAINS_LEFT, GAINS_OFF, ALIKE_GAINS = 0.25, 1.3, 1.1
 """Largest residual of the fitted law as a share of the RMS effort, for which its gains are reported; least ratio of a fitted gain
 to the stated one, or its inverse; and largest ratio of both ratios that a wrong unit of the effort explains, too. Choices."""
-MOVED = 2.0
-"""Least ratio of K_p to the stated one, or its inverse, that is believed of accelerations. A choice."""
 STATED_LEFT, SHARES = 2.0, (-0.5, 1.5)
 """Fitted gains are reported if the residual of the stated ones, with the best delay and lag of the targets, is at least so many
 times that of the fitted ones, and r is in this range. Of 378 simulated joints with the stated gains none was reported."""
-ALONE_LEFT, APART = 0.15, 1.5
-"""Largest residual of the law of one recording alone that is compared with others', and least ratio of two neighbouring gains
-that are not of one machine. Gains of one simulated machine with one effect of 7 kinds were within 1.34. Choices."""
+ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
+"""Largest residual of the law of one recording alone that is compared with others', least ratio of two neighbouring gains that
+are not of one machine (with one of 7 effects they were within 1.34), and least ratio of K_p to the stated one that is believed of
+accelerations. Choices."""
 LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)
 """Lags and delays of targets that are tried."""
 ALIKE = 1e-3

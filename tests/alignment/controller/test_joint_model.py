@@ -218,7 +218,7 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
 def test_a_late_position_is_less_damping_and_more_inertia() -> None:
     """K_p (q* − q(t − a)) − K_d q̇(t − s) at 3 Hz, K_p a² = 0.16 J, against its transfer function."""
     gains, age_s, late_s, time_s = Gains(8250.0, 165.0, 0.0), 8e-3, 2e-3, np.arange(3000) * 1e-3
-    model, rate = JointModel.of(_Geared("late", 3.3, gains, "rad", 1e-4)), 6.0 * np.pi
+    model, rate = JointModel(_Geared("late", 3.3, gains, "rad", 1e-4)), 6.0 * np.pi
     case = Numbers(gains, age_s=age_s, facts={"speed_age": late_s})
     ((answer,),) = model.simulate_all([of_joint("sine", 1000.0, np.sin(rate * time_s), np.zeros(3000))], [case])
     found = 2.0 * np.mean((answer.reported * np.exp(-1j * rate * time_s))[2000:]) * 1j

@@ -147,8 +147,7 @@ def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(stated: bool
 @pytest.mark.parametrize("held_steps", [50, 100])
 def test_targets_that_wait_for_a_loop_unlike_the_rows_are_named(held_steps: int, tmp_path: Path) -> None:
     """Rows of 5 ms. A loop of 1 ms takes each row's target at once; one of 2 ms every other target 1 ms late."""
-    hz = 1.0 / (held_steps * DT_S)
-    machine = RobotMachine(robot(tmp_path, f"{FILES['impedance']}, loop_hz: {hz:.0f}"), "robot")
+    machine = RobotMachine(robot(tmp_path, f"{FILES['impedance']}, loop_hz: {1.0 / (held_steps * DT_S):.0f}"), "robot")
     one, other = (recording("impedance", *own, 1, 0.0, held_steps=held_steps) for own in (("a", 2.5), ("b", 2.0)))
     d = machine.diagnose(
         "swing", Measurements((one,), (other,)), without=[n for n in effects if n != "backlash"]
