@@ -151,21 +151,21 @@ class Document[T]:
             if name in items:
                 raise self.error(path, "stands here twice; keep one")
             if name == "<<":
-                text = "merge keys are not read; write the keys out, or share one whole value by an anchor"
-                raise self.error(path, text)
+                raise self.error(path, "merge keys are not read; write the keys out, or share one value by an anchor")
             items[name] = child
         return [(name, child) for name, child in items.items() if not name.startswith("x-")]
 
     def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
-        hints = _hints(cls)
-        fields = {f.name: f for f in dataclasses.fields(cls)}
+        hints, fields = _hints(cls), {f.name: f for f in dataclasses.fields(cls)}
         # A trailing underscore keeps a YAML key free of Python's own words (`from` is `from_` in the dataclass).
         known = {name.rstrip("_"): name for name in fields}
         values: dict[str, Any] = {}
         for name, child in self._items(node, key):
             path = f"{key}/{name}" if key else name
             if name not in known:
-                raise self.error(path, f"unknown key {_quoted(name)}; {nearest(name, known)}")
+                entries = [(f, getattr(k, "__dataclass_fields__", ())) for f in hints for k in get_args(hints[f])[1:]]
+                inside = [f"write `{f}: {{NAME: {{{name}: …}}}}`, in each entry" for f, own in entries if name in own]
+                raise self.error(path, f"unknown key {_quoted(name)}; {(inside or [nearest(name, known)])[0]}")
             values[known[name]] = self._build(hints[known[name]], child, path)
         for name, field in fields.items():
             if field.default is dataclasses.MISSING is field.default_factory and name not in values:

@@ -36,8 +36,7 @@ def penetration_m(time_s: np.ndarray, seed: int) -> np.ndarray:
     depths = np.random.default_rng(seed).permutation([0.3e-3, 0.6e-3, 1.0e-3, 0.6e-3, 1.0e-3])
     knots_s, knots_m, at = [0.0, 2.0], [-1e-3, -1e-3], 2.0
     for k, depth in enumerate(depths):
-        rise = (0.1, 0.6)[k % 2]
-        hold = (0.5, 1.6)[k % 3 == 0]
+        rise, hold = (0.1, 0.6)[k % 2], (0.5, 1.6)[k % 3 == 0]
         knots_s += [at + rise, at + rise + hold, at + 2 * rise + hold, at + 2 * rise + hold + 0.5]
         knots_m += [depth, depth, -1e-3, -1e-3]
         at += 2 * rise + hold + 0.5
@@ -59,8 +58,7 @@ def press(
     motion_seed: int | None = None,
 ) -> Measurement:
     """About 12 s: openings at 200 Hz, both left pads at 100 Hz, each column read at its own instant of the scan."""
-    ball = ball or ball_at(0.001, 0.003)
-    rng = np.random.default_rng(1000 + seed)
+    ball, rng = ball or ball_at(0.001, 0.003), np.random.default_rng(1000 + seed)
     end_s = 12.0
     rows_s = np.arange(0.0, end_s, 0.005)
     motion = seed if motion_seed is None else motion_seed

@@ -85,8 +85,7 @@ def sweep(
     **fields: Any,
 ) -> Measurement:
     """A sweep of ``joints`` (all by default), with noise and quantisation."""
-    rng = np.random.default_rng(seed)
-    amplitude = np.zeros(14)
+    rng, amplitude = np.random.default_rng(seed), np.zeros(14)
     moved = ARMS_JOINTS if joints is None else joints
     amplitude[moved] = rng.uniform(0.1, 0.3, len(moved))
     target = rested(chirp(seconds, amplitude, np.pi * rng.integers(0, 2, 14), high_hz))

@@ -72,6 +72,7 @@ def test_a_complete_file_becomes_the_dataclass(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        (GOOD + "count: 3\n", "a.yaml:3: count: unknown key 'count'; write `many: {NAME: {count: …}}`, in each entry"),
         ("name: pad\nrate: 100\n", "a.yaml:2: rate: unknown key 'rate'; did you mean 'rate_hz'?"),
         ("name: pad\n", "a.yaml:1: key 'rate_hz' is missing"),
         (GOOD + "inner: {kind: log}\n", "a.yaml:3: inner: key 'count' is missing"),

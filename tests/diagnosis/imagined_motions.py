@@ -49,12 +49,10 @@ def recorded(
     the usual ones. ``effort``: it was recorded."""
     ground = arm_ground(config, signal, rest_pose(signal, None))
     m = ground.commanded(motion.name, ground.positions(motion), motion.gain, motion.payload_kg)
-    model = JointModel(config, signal)
-    seen = joint_motion(m, config, signal)
+    model, seen = JointModel(config, signal), joint_motion(m, config, signal)
     # A robot has been at rest for long: where K_p (q* − q) + T_ref = 0.
     rest = dataclasses.replace(seen, start=seen.target[0] + model.gains.torque_ff / (motion.gain * model.gains.kp))
-    answer = model.simulate(rest, model.gains)
-    rng = np.random.default_rng([seed, 77])
+    answer, rng = model.simulate(rest, model.gains), np.random.default_rng([seed, 77])
     j = m.column(signal)
     measured = m.measured + noise_rad * rng.standard_normal(m.measured.shape)
     measured[:, j] = answer.reported + noise_rad * rng.standard_normal(m.num_rows)

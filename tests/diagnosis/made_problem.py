@@ -112,8 +112,7 @@ def record(
     seconds: float = 10.0,
     extra: np.ndarray | float = 0.0,
 ) -> Recording:
-    t = np.arange(0.0, seconds, 1.0 / RATE_HZ)
-    rng = np.random.default_rng(1000 + seed)
+    t, rng = np.arange(0.0, seconds, 1.0 / RATE_HZ), np.random.default_rng(1000 + seed)
     total = gain * drive(t, seed) + offset + extra + noise * rng.standard_normal(len(t))
     for effect in effects:
         total = total + vars(effect)["strength"] * effect.signal(t, seed)

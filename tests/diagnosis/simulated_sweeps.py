@@ -30,8 +30,7 @@ def friction(torque_nm: float = 1.0) -> TwinConfig:
 
 def chirp(seed: int, seconds: float = 6.0, signals: tuple[str, ...] = (SIGNAL,)) -> np.ndarray:
     """(T, 14) commands: a second of rest, a chirp of up to 1.5 Hz of ``signals``, half a second of rest."""
-    rng = np.random.default_rng(seed)
-    sim = Simulation(Bench())
+    rng, sim = np.random.default_rng(seed), Simulation(Bench())
     sim.reset([0])
     time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     angle = 2 * np.pi * (0.2 * time_s + 1.3 * time_s**2 / (2 * seconds))

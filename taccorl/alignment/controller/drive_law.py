@@ -1,25 +1,12 @@
 """Control law of a drive, the same for an axis file and for each joint of a robot file.
 
-==============  =================================================  ========================================================
-law             motor's torque                                     meaning of the target
-==============  =================================================  ========================================================
-``impedance``   kp (q* − q) − kd q̇ + torque_ff                     position; kp in N·m/rad, kd in N·m·s/rad
-``cascade``     kd (kp (q* − q) − q̇) + torque_ff                   position; kp in 1/s, kd in N·m·s/rad
-``velocity``    kd (q̇* − q̇) + torque_ff                            velocity; no kp
-``torque``      τ* + torque_ff                                     torque; no gains. 0: the motor is off
-``effort``      the recorded effort, and what holds the model       none: the measured ``tau`` is the input
-                at the measured position
-``pwm``         k_t (V d − k_e q̇) / R,  d = kp (q* − q) − kd q̇     position; duty d is clipped to ± 1, kp in 1/rad, kd in s/rad
-                within ± 1
-==============  =================================================  ========================================================
-
 A controller that computes its torque elsewhere (a PD on a torque interface) is law ``impedance`` where its position target was
 logged, and law ``torque`` where the torque was. Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of
 law torque in ``tau_target``. Law ``effort`` is for logs without a command: the recorded effort drives the model, a spring and
 damper hold it at the measured position, and what they must give is the error of the effort, up to about ``FOLLOW_HZ``. Their
-stiffness follows from the recording alone (``joint_recording.holding_stiffness``), so that no number of the model changes it.
-V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While
-``NAME.enabled`` is 0 the motor neither drives nor brakes.
+stiffness follows from the recording alone (``joint_recording.holding_stiffness``), so that no number of the model changes it. V
+is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While ``NAME.enabled`` is 0 the motor
+neither drives nor brakes. The equations are in the table of ``docs/your_robot.md``, An axis.
 """
 
 import dataclasses
@@ -82,7 +69,7 @@ class DriveLaw:
     """Control law and numbers of one drive. Units are for a hinge; for a sliding joint read N for N·m and m for rad."""
 
     law: Law = "impedance"
-    """Control law, a row of the module's table."""
+    """Control law, a row of the table in ``docs/your_robot.md``."""
     kp: float | None = None
     """Gain in the law's unit divided by ``kp_factor``; None for laws without it."""
     kd: float | None = None

@@ -77,6 +77,8 @@ class Numbers(NamedTuple):
     """Additional age of the measured position when the drive's torque acts."""
     facts: Mapping[str, float] | None = None
     """Overrides: name of a field of ``drive_numbers.Drive`` → value that is used instead of the joint's own."""
+    waits_s: float = 0.0
+    """How long targets wait for the next period of a loop; efforts of rows are as much newer."""
 
 
 class _Prepared(NamedTuple):
@@ -240,14 +242,15 @@ def _side_by_side(
         late_s = joint.target_late_s
         when = late_s, parts, hold, step_s
         kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
-        # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
-        gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
+        age_s = joint.position_age_s + case.age_s if kp else 0.0
         body = model._body(motion, bodies)._asdict()
         held_n = body.pop("weight_n")
-        drive = {**_ABSENT, **gains._asdict(), **body, **numbers}
+        drive = {**_ABSENT, **case.gains._asdict(), "kp": kp, "kd": kd, "position_age": age_s, **body, **numbers}
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive["gravity_sin"] += weight * case.lever.sin_m
         drive["gravity_cos"] += weight * case.lever.cos_m
+        drive["command_delay__delay_s"] += case.waits_s
+        drive["effort_age"] -= case.waits_s
         drive["effort_holds_weight"] = float(joint.effort_holds_weight)
         if drive["effort_after"] and late_s > 0.0:
             # A row's target arrives late_s after the row: the effort that it causes begins then, from the position at that time.

@@ -1,21 +1,8 @@
-"""An axis file: a single driven axis, such as a slide on a bench, a wheel, or a servo with a pendulum.
+"""An axis file: a single driven axis, such as a slide on a bench, a wheel, or a servo with a pendulum. ``docs/your_robot.md`` has
+one with its keys. Laws and targets are those of ``drive_law``.
 
-::
-
-    kind: axis
-    name: drive            # signal: columns drive.q, drive.q_target, drive.qd, drive.tau, drive.load
-    unit: m                # of its position: rad, or m of a slide; forces are then N for N·m, masses kg for kg·m²
-    inertia: 95.0          # kg, or kg·m²: where the fit starts
-    law: cascade           # what the drive does with its target; impedance if not given
-    kp: 160.18
-    kd: 8557.4
-    limits: [-0.01, 0.26]  # stroke
-    effort_limit: 350.0    # N or N·m that the drive can give
-    effects:               # physics beyond that; taccorl add-effect writes them
-    - {effect: coulomb_friction, torque_nm: 20.4}    # in N on a slide
-
-Laws and targets are those of ``drive_law``. A mass that a recording mounts on a turning axis adds the inertia m l² and the
-weight m g l sin(q − q₀): ``payload_kg`` at ``lever_m``, and an arm of ``arm_kg``, a uniform rod of that length.
+A mass that a recording mounts on a turning axis adds the inertia m l² and the weight m g l sin(q − q₀): ``payload_kg`` at
+``lever_m``, and an arm of ``arm_kg``, a uniform rod of that length.
 """
 
 import copy

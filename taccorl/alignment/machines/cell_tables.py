@@ -1,20 +1,11 @@
 """Measurements of a sensor of cells from CSV and parquet files: time, load and readings, one row an instant.
 
 Without a columns file a table has ``t`` [s], the load as ``force_n``, ``pressure_pa`` or ``depth_m`` (``thumb.force_n`` … where
-cells have loads of their own), for each cell ``thumb.reading`` in the unit of the cells file, and if recorded ``temperature_c``.
-A columns file states other names and units::
-
-    time: {column: stamp, unit: ms}
-    load: {column: Fz, unit: N}                   # of all cells; with shared: false instead one of each cell, see index
-    temperature: {column: T}                      # °C
-    position: {x: {column: px, unit: mm}, y: {column: py, unit: mm}}    # of the probe; for a cells file with same_place_mm
-    cells:
-      thumb: {reading: {column: adc3, unit: count}}
-      index: {reading: {column: adc4, unit: count}, load: {column: Fz4, unit: gf}}      # a cell with a load of its own
-
-For an array one pattern states the columns of all cells, in place of ``cells:``. ``first`` is the number of the first cell;
-``{row}`` and ``{column}`` are numbers of a grid. With ``{index}`` the cells of a grid are numbered ``order: row by row`` or
-``order: column by column``, and cells with names in the order of the cells file::
+cells have loads of their own), for each cell ``thumb.reading`` in the unit of the cells file, and if recorded
+``temperature_c``. A columns file states other names and units: ``docs/your_robot.md``, A force cell. For an array one pattern
+states the columns of all cells, in place of ``cells:``. ``first`` is the number of the first cell; ``{row}`` and ``{column}``
+are numbers of a grid. With ``{index}`` the cells of a grid are numbered ``order: row by row`` or ``order: column by column``,
+and cells with names in the order of the cells file::
 
     array: {reading: {column: "taxel_{row}_{column}", unit: count}, first: 0}
     array: {reading: {column: "t{index}", unit: count}, first: 1, order: row by row}

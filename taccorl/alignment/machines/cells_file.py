@@ -1,22 +1,9 @@
-"""The file of a sensor with one or more cells that known loads press.
+"""The file of a sensor with one or more cells that known loads press; ``docs/your_robot.md`` has one with its keys.
 
-::
-
-    kind: cells
-    cells: [thumb]                    # names; of a grid: rows: 4 and columns: 6, cells are then r0c0 … r3c5
-    load: {unit: N, rated: 20}        # what presses: a force, a pressure or a depth, and what the sensor is made for
-    reading: {unit: count, lowest: 0, highest: 1023}    # ends of the converter; falls: true where it falls under load;
-                                      # below_rest: true where it is below its offset after a release
-    rate_hz: 100                      # of the recordings
-    same_place_mm: 0.5                # where a probe presses several places: presses no farther apart are at one place
-    gain: [41.2]                      # count per N, cell by cell; taccorl diagnose --until=noise_floor and add-effect write it
-    offset: [12.0]                    # count without load
-    effects:
-    - {effect: taxel_creep, share: 0.2, time_constant_s: 1.1}
-
-The model is y = clip(g r + o, lowest … highest): the effects make r of the load, each cell has its gain g and offset o. In the
-unit ``reading``, in which effects have their numbers, 1 is a tenth of the rated load. Clipping at the converter's ends is
-described by the file, not by an effect.
+Once they are fitted, the gain and offset of each cell stand there, too (``gain: [41.2]``, ``offset: [12.0]``). The model is y =
+clip(g r + o, lowest … highest): the effects make r of the load, each cell has its gain g and offset o. In the unit ``reading``,
+in which effects have their numbers, 1 is a tenth of the rated load. Clipping at the converter's ends is described by the file,
+not by an effect.
 """
 
 import dataclasses

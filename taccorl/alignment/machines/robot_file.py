@@ -1,27 +1,8 @@
 """A robot file: any robot as a kinematic tree of an MJCF or URDF file, with facts about each joint's drive that only its user
 knows.
 
-::
-
-    kind: robot
-    model: my_arm.xml                 # MJCF or URDF, relative to this file; meshes are not needed
-    gravity_compensation: 1.0         # share of the weight that the controller adds to its torque; 0 if it adds none
-    gravity: [0.05, 0, -1]            # its direction in the model's frame, if the base is not mounted as the model has it
-    joints:
-      elbow:                          # as the model calls it, and as the tables' columns do: elbow.q, elbow.q_target
-        law: impedance                # τ = kp (q* − q) − kd q̇ + torque_ff; others: drive_law
-        kp: 40.0                      # N·m/rad; of a sliding joint N/m
-        kd: 1.5                       # N·m·s/rad
-        gains: commanded              # kp and kd are what the controller runs; fitted: nobody knows, these are a start
-        rotor_inertia: 1.2e-5         # kg·m² of the motor, and …
-        gear: 100.0                   # … turns of the motor for one of the joint: 0.12 kg·m² at the joint
-        effort_limit: 30.0            # N·m; torques beyond are clipped
-        loop_hz: 1000.0               # of the drive's own control loop, where it is known
-        effects:                      # physics beyond rigid bodies and control; taccorl add-effect writes them
-        - {effect: coulomb_friction, torque_nm: 0.41}
-        known: [torque_ff]            # numbers and effects that diagnose leaves as they are here (DriveLaw.known)
-
-``taccorl init-robot my_arm.xml`` writes such a file with the facts of the model, and ``TODO`` for the others.
+``docs/your_robot.md`` has one with its keys. ``taccorl init-robot my_arm.xml`` writes one with the facts of the model, and
+``TODO`` for the others.
 """
 
 import dataclasses

@@ -134,6 +134,10 @@ class RobotJoint(DriveJoint):
         terms = self._terms(motion.pose, self._every_mass(bodies))
         return terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
 
+    def inertia_kgm2(self, m: Measurement) -> float:
+        """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""
+        return self._terms(self.pose(m), self._every_mass(self.effects(()))).inertia + self._config.armature
+
     def _terms(self, pose: np.ndarray, masses: Sequence[PointMass] = ()) -> Rigid:
         """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor."""
         model = self._robot.rigid.model

@@ -88,7 +88,8 @@ class Axis(Machine):
             found[m.name] = wrong or _wrong_inertia(config, m, fit)
         stated = {config.name: config} if config.gains == "commanded" else {}
         every = [with_gains(m, stated) for m in measurements.all]
-        check_effort_time(config, every, found, config.name, file)
+        whole = {m.name: config.inertia + axis_motion(config, m).mounted_kgm2 for m in every}
+        check_effort_time(config, every, found, config.name, file, lambda m: whole[m.name])
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:

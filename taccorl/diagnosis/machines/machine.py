@@ -20,7 +20,8 @@ from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.data.finding import listed
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.problems.joints import each
+from taccorl.diagnosis.problems.joints import JointFinding, each
+from taccorl.diagnosis.problems.pads import PadFinding
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.problem import Progress, Recording, no_progress
@@ -34,75 +35,33 @@ GainsAre = Literal["auto", "commanded", "fitted"]
 """Treatment of gains. ``auto``: gains that every recording states stay fixed, others are fitted."""
 
 
-class Finding(Protocol):
-    """Interface of the finding about one part of a machine: result of the search, and texts about it for reports."""
-
-    @property
-    def part(self) -> str:
-        """Name of the part in tables and reports."""
-        ...
-
-    @property
-    def diagnosis(self) -> Diagnosis:
-        """Result of the search."""
-        ...
-
-    @property
-    def can_tell(self) -> Identifiability:
-        """Effects that the recordings can show and separate, independent of the measured values."""
-        ...
-
-    @property
-    def known(self) -> Known | None:
-        """Numbers that the recordings identify; None for parts for which they are not computed."""
-        ...
-
-    @property
-    def noise(self) -> str:
-        """Text of the noise floors."""
-        ...
-
-    @property
-    def numbers(self) -> str:
-        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-        ...
-
-    @property
-    def measured(self) -> str:
-        """Text that names the channels whose errors are minimised and reported, such as positions."""
-        ...
-
-    @property
-    def recordings(self) -> dict[str, tuple[str, ...]]:
-        """fit, validation, test → names."""
-        ...
-
-    @property
-    def rows_split(self) -> bool:
-        """True if no recording was marked for validation, so that the last rows of each were used."""
-        ...
-
-    @property
-    def remark(self) -> str:
-        """Text on what the search could not decide; empty if there is nothing."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class PartFinding:
-    """A ``Finding`` with the facts as plain fields, for axes and sensors of cells."""
+    """Finding about an axis or a sensor of cells: result of the search, and texts about it for reports."""
 
     part: str
-    """Name of the part; the other fields are those of ``Finding``."""
+    """Name of the part in tables and reports."""
     diagnosis: Diagnosis
     can_tell: Identifiability
+    """Effects that the recordings can show and separate, independent of the measured values."""
     noise: str
+    """Text of the noise floors."""
     numbers: str
+    """Text that states which numbers are always fitted, and from where the other numbers are taken."""
     measured: str
+    """Text that names the channels whose errors are minimised and reported, such as positions."""
     recordings: dict[str, tuple[str, ...]]
+    """fit, validation, test → names."""
     rows_split: bool
+    """True if no recording was marked for validation, so that the last rows of each were used."""
     known: Known | None = None
+    """Numbers that the recordings identify; None for parts for which they are not computed."""
     remark: str = ""
+    """Text on what the search could not decide; empty if there is nothing."""
+
+
+type Finding = PartFinding | JointFinding | PadFinding
+"""Finding about one part of a machine; all have the fields of ``PartFinding``."""
 
 
 class Addition(NamedTuple):

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
 
@@ -14,6 +15,7 @@ from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_fit
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
+from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
 from taccorl.alignment.machines.robot_file import Robot, load_robot
@@ -115,7 +117,7 @@ class RobotMachine(Machine):
             found[m.name] = check_robot(self.robot, m, self._whole(m), [name for name in own if moves(m, name)], fits)
         check_columns(self.robot, own, found)
         for name, law in self.robot.config.joints.items():
-            check_effort_time(law, own[name], found, name, self.robot.path.name)
+            check_effort_time(law, own[name], found, name, self.robot.path.name, self.robot.joint(name).inertia_kgm2)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
@@ -166,14 +168,11 @@ class RobotMachine(Machine):
                 uncertain = [s for s in known if self.robot.config.joints[s].is_uncertain]
                 at = [m.column(s) for s in known]
 
-                def changed(signal: str, m: Measurement = m) -> list[np.ndarray]:
+                def with_more[T](change: Callable[[JointModel, JointMotion], T], signal: str, m: Measurement = m) -> T:
                     model = JointModel(self.robot, signal)
-                    return with_other_numbers(model, motion_of(m, signal, model.joint))
+                    return change(model, motion_of(m, signal, model.joint))
 
-                def rivals(signal: str, m: Measurement = m) -> dict[str, np.ndarray]:
-                    model = JointModel(self.robot, signal)
-                    return with_more_lead(model, motion_of(m, signal, model.joint))
-
+                changed, rivals = partial(with_more, with_other_numbers), partial(with_more, with_more_lead)
                 reported = response.reported[:, at]
                 clock[m.name] = tuple(
                     check_against_twin(commanded.only(known), reported, levels, uncertain, changed, rivals)

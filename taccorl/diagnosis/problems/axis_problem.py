@@ -30,7 +30,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, seen_in
+from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, seen_in, unlike_rows
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -76,7 +76,7 @@ class AxisProblem(WithoutMaps):
         sides = (measurements.fit, measurements.validation, measurements.test)
         recordings = [[self._recording(m) for m in side] for side in sides]
         self.fit, self.validation, self.test = with_regimes(recordings, everything, self.floors[0])
-        self.known = axis.known
+        self.known, self.loop_s = axis.known, unlike_rows(2.0 * DrivenAxis(axis).position_age_s, everything)
         self.law_error = math.inf
         if axis.gains == "commanded" and axis.loop_hz and self.effort:
             age_s, used = DrivenAxis(axis).speed_delay_s, (*measurements.fit, *measurements.validation)
@@ -117,7 +117,8 @@ class AxisProblem(WithoutMaps):
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
         models = [JointModel(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
-        numbers = [Numbers(model.gains, effects) for model, (_, effects) in zip(models, cases, strict=True)]
+        waits = [base.get("loop_waits_s", 0.0) for base, _ in cases]
+        numbers = [Numbers(m.gains, c[1], waits_s=w) for m, c, w in zip(models, cases, waits, strict=True)]
         motions = [measured_part(recording) for recording in recordings]
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
         channels = slice(self._kinds[0] == "effort", 1 + self.effort)

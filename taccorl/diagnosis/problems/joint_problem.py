@@ -14,7 +14,7 @@ from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import LANES
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse, Numbers, PayloadLever
+from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
@@ -118,7 +118,7 @@ class JointProblem(WithoutMaps):
             )
         self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
         own, bare = joint.freed(held)
-        self.known = joint.known_names
+        self.known, self.loop_s = joint.known_names, unlike_rows(joint.speed_delay_s * joint.exact_timing, everything)
         self._stated = {
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
         }
@@ -210,11 +210,9 @@ class JointProblem(WithoutMaps):
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
         facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
-            waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
-            effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
-            speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
-            facts |= {"effort_age": effort_age, "speed_age": speed_age, "command_delay__delay_s": waits_s}
-        return Numbers(gains, effects, lever, age_s, facts)
+            newer = 2.0 * bool(self.model.joint.facts["effort_after"])
+            facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": 2.0 * half_s}
+        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0))
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -316,6 +314,12 @@ def seen_in(
         "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
         "duration_s": max(float(m.time_s[-1]) for m in motions),
     }
+
+
+def unlike_rows(loop_s: float, recordings: Sequence[Measurement]) -> float:
+    """``loop_s``, period of a drive's loop [s], if its rate is no multiple of the rows' of a recording; else 0."""
+    counts = [1.0 / (m.rate_hz * loop_s) for m in recordings if loop_s > 0.0]
+    return loop_s if any(abs(n - max(round(n), 1)) > SAME_RATE * n for n in counts) else 0.0
 
 
 def _around(gain: Free, start: float) -> Free:

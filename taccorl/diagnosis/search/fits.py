@@ -339,7 +339,7 @@ class Fits:
         """(p,) standard deviation of the fitted coordinates because recordings do not state how long a target waits for the
         next period of the control loop, 0 … ``loop_s``; a fit makes up for a wrong wait by another period. 0 for
         ``speed_delay_s``: robot files state the part of it beyond half a period, which hardly depends on the wait."""
-        period_s = model.values.get("loop_s", 0.0)
+        period_s = model.values.get("loop_s", 0.0) or problem.loop_s
         moved = np.zeros(len(model.frees))
         if period_s > 0.0:
             late = stacked(problem, model.values | {"loop_waits_s": period_s}, model.effects, self.fit_to)

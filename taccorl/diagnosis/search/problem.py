@@ -167,6 +167,9 @@ class Problem(Protocol):
     """Name of the effect → candidate."""
     at_once: int
     """Number of parameter sets that ``simulate_all`` simulates side by side in about the time of one."""
+    loop_s: float
+    """Period [s] of a drive's loop that the file states and whose rate is no multiple of the rows'; 0: none. ``simulate`` then
+    takes ``loop_waits_s``, how long a row's target waits for the next period, beside the numbers of ``base``."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
@@ -199,6 +202,7 @@ class WithoutMaps:
     it does not say otherwise."""
 
     at_once = 1
+    loop_s = 0.0
 
     def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """Simulate one case after another, (T, C) each."""

@@ -88,8 +88,7 @@ def test_a_camera_pose_effect_is_where_it_starts_and_goes_into_the_offset():
 
 
 def test_an_effect_on_several_cameras_moves_each_as_an_own_entry_would():
-    config = twin()
-    views = []
+    config, views = twin(), []
     for cameras in (["front"], ["left_wrist", "front"]):
         config.effects = [make_effect("camera_pose", turn_x_rad=0.01, shift_z_m=0.004, cameras=cameras)]
         with TwinView(config, "front", SIZE) as view:

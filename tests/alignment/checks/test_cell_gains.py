@@ -38,8 +38,7 @@ def presses(
     """Three presses of 6 s at 50 Hz. The cells read ``gains`` · ``law``(their share of the load) + 20, with 1 count of noise.
     ``share``: share of the load of each cell in each press, (3, K); 1 by default. ``load_factor``: factor on the recorded
     load."""
-    rng = np.random.default_rng(len(name))
-    t = np.arange(0.0, 18.0, 0.02)
+    rng, t = np.random.default_rng(len(name)), np.arange(0.0, 18.0, 0.02)
     each = [np.interp(t - 6 * n, [0, 2, 3, 5, 6], [0, 0, 1, 1, 0]) * peak for n, peak in enumerate(PEAKS_N[name])]
     force = np.sum(each, axis=0)
     own = force[:, None] * (np.ones((3, K)) if share is None else share)[(t // 6).astype(int)]
@@ -99,8 +98,7 @@ def test_a_light_press_of_a_bent_cell_is_no_other_unit(monkeypatch):
 def test_dead_and_reversed_cells_are_named_left_out_and_written_without_gain(shared):
     gains = GAINS.copy()
     gains[[3, 7, 11]] = 0.0086, 0.0, -3.0
-    names = [config().names[k] for k in (3, 7, 11)]
-    recordings = array(gains=gains)
+    names, recordings = [config().names[k] for k in (3, 7, 11)], array(gains=gains)
     own = [f for findings in found(recordings, shared).values() for f in findings if f.check == "dead_cells"]
     assert [f.severity for f in own] == ["warning"]
     assert all(name in own[0].text for name in names) and "3 of 20" in own[0].text
@@ -197,12 +195,10 @@ def loaded_apart(
     ``crosstalk``: share of a cell's load that its four neighbours read in its place. ``order``: reading column k holds the
     reading of cell ``order[k]``; none: its own. ``off``: rows and columns by which the probe is farther on than the places
     from which the loads were computed."""
-    rng = np.random.default_rng(seed)
-    found = []
+    rng, found = np.random.default_rng(seed), []
     i, j = np.divmod(np.arange(K), 5)
     for name in PEAKS_N:
-        t = np.arange(0.0, 24.0, 0.02)
-        places = rng.uniform((0, 0), (3, 4), (8, 2))
+        t, places = np.arange(0.0, 24.0, 0.02), rng.uniform((0, 0), (3, 4), (8, 2))
         press = np.interp(t % 3, [0, 1, 1.5, 2, 3], [0, 0, 1, 1, 0]) * rng.uniform(5, 19, 8)[(t // 3).astype(int)]
         stated, force = (
             press[:, None] * np.exp(-((i - at[:, :1]) ** 2 + (j - at[:, 1:]) ** 2) / 2 / 1.5**2)[(t // 3).astype(int)]

@@ -2,13 +2,14 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_rows import of_signal, play
 from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
-from scipy.signal import lfilter
+from scipy.signal import lfilter, lsim
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
@@ -495,6 +496,35 @@ def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweigh
     assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), [m], "servo") is None
 
 
+def moved_by_law(seed: int, kp: float = 100.0) -> Measurement:
+    """0.4 kg·m² q̈ = ``kp`` (q* − q) − 8 q̇, rows of 5 ms; efforts were not recorded."""
+    time_s = np.arange(2000) / 200
+    target = 0.1 * np.sin(2 * np.pi * (0.1 * time_s + 0.12 * time_s**2)) + 0.2 * np.sign(np.sin((4.0 + seed) * time_s))
+    q = lsim(([kp], [0.4, 8.0, kp]), np.repeat(target, 5)[:-4], np.arange(9996) / 1000)[1][::5]
+    q = q + 5e-5 * np.random.default_rng(seed).standard_normal(2000)
+    return dataclasses.replace(servo(time_s, q, target), name=f"{seed}.csv")
+
+
+@pytest.mark.parametrize("kp", [25.0, 400.0, 100.0])
+@pytest.mark.parametrize("kd", [8.0, 2.0])
+def test_positions_show_a_wrong_kp_but_not_both_gains_off_alike_as_of_another_inertia(kp: float, kd: float):
+    m = dataclasses.replace(moved_by_law(0), kp={"servo": kp}, kd={"servo": kd})
+    law, findings = DriveLaw(law="impedance", kp=kp, kd=kd), {"0.csv": []}
+    check_effort_time(law, [m], findings, "servo", "servo.yaml", lambda _: 0.4)
+    named = abs(math.log(100.0 / kp)) > 1.0 and kp / kd != 100.0 / 8.0
+    assert [f.check for f in findings["0.csv"]] == ["other_gains"] * named
+    found = [float(x) for f in findings["0.csv"] for x in re.findall(r"k[pd]: ([\d.]+)", f.text)]
+    assert found == pytest.approx([100.0, 8.0] * named, rel=0.05)
+
+
+@pytest.mark.parametrize(("kp", "named"), [(100.0, False), (200.0, True)])
+def test_recordings_of_two_machines_are_told_by_what_differs(kp: float, named: bool):
+    every = [moved_by_law(0), moved_by_law(1), moved_by_law(2, kp)]
+    law, findings = DriveLaw(law="impedance", kp=120.0, kd=8.0), {m.name: [] for m in every}
+    check_effort_time(law, every, findings, "servo", "servo.yaml", lambda _: 0.4)
+    assert ["2 times as large in 2.csv as in" in f.text for f in findings["0.csv"]] == [True] * named
+
+
 def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
     """K_p v / rate = 100 · 0.04 / 200 = 0.02 N·m, as much as a torque with the sign of the motion: r would be 1 instead of 0."""
     time_s, law, rng = np.arange(4000) / 200, DriveLaw(law="impedance", kp=100.0, kd=5.0), np.random.default_rng(0)
@@ -513,12 +543,12 @@ def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
     share, sd = target_share(law, [triangle, chirp], "servo") or (1.0, np.inf)
     assert abs(share) < 0.1 and sd < 0.1
     late, findings = DriveLaw(law="impedance", kp=100.0, kd=5.0, effort_after_target=True), {"tri": [], "chirp": []}
-    check_effort_time(law, [triangle, chirp], findings, "servo", "servo.yaml")
+    check_effort_time(law, [triangle, chirp], findings, "servo", "servo.yaml", lambda m: 0.02)
     assert findings == {"tri": [], "chirp": []}
-    check_effort_time(late, [triangle, chirp], findings, "servo", "servo.yaml")
+    check_effort_time(late, [triangle, chirp], findings, "servo", "servo.yaml", lambda m: 0.02)
     assert [[f.check for f in own] for own in findings.values()] == [["effort_time"], ["effort_time"]]
     early = dataclasses.replace(chirp, effort=np.roll(chirp.effort, -3, axis=0))  # the position is late, too
-    check_effort_time(law, [early], findings := {"chirp": []}, "servo", "servo.yaml")
+    check_effort_time(law, [early], findings := {"chirp": []}, "servo", "servo.yaml", lambda m: 0.02)
     (said,) = findings["chirp"]
     assert said.check == "effort_time" and "3 rows (15 ms)" in said.text and "Write `effort_after" not in said.text
 

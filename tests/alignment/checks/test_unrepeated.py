@@ -57,8 +57,7 @@ def joint(
 
 
 def recording(name: str, seed: int, *, drop=0.0, longest=1, rate_hz=200.0, repeat_of=None, **physics) -> Measurement:
-    rng = np.random.default_rng(seed)
-    target = sweep(rate_hz)
+    rng, target = np.random.default_rng(seed), sweep(rate_hz)
     measured = joint(held(target, drop, longest, rng), rate_hz, rng, **physics)
     columns = {"time_s": np.arange(len(target)) / rate_hz, "target": target[:, None], "measured": measured[:, None]}
     return Measurement(name=name, signals=("left_joint5",), units=("rad",), repeat_of=repeat_of, **columns)
@@ -146,12 +145,10 @@ def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recordin
 
 def test_a_single_long_hold_is_found_where_it_was():
     target = sweep(200.0)
-    applied = target.copy()
-    truth = [500, 900, 1100, 1300, 1500, 1700, 1900]
+    applied, truth = target.copy(), [500, 900, 1100, 1300, 1500, 1700, 1900]
     for row in truth:
         applied[row : row + 6] = applied[row - 1]
-    m = recording("a", 0)
-    measured = joint(applied, 200.0, np.random.default_rng(0))
+    m, measured = recording("a", 0), joint(applied, 200.0, np.random.default_rng(0))
     dropped = find_dropped([dataclasses.replace(m, measured=measured[:, None])], 0)
     found = np.array(dropped.times_s["a"])
     near = [np.abs(found - row / 200.0).min() < 0.03 for row in truth]

@@ -215,6 +215,18 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     np.testing.assert_allclose(answer.effort[2:], 0.05 * acceleration, rtol=0, atol=1e-9 * np.abs(answer.effort).max())
 
 
+def test_a_late_position_is_less_damping_and_more_inertia() -> None:
+    """K_p (q* − q(t − a)) − K_d q̇(t − s) at 3 Hz, K_p a² = 0.16 J, against its transfer function."""
+    gains, age_s, late_s, time_s = Gains(8250.0, 165.0, 0.0), 8e-3, 2e-3, np.arange(3000) * 1e-3
+    model, rate = JointModel(_Geared("late", 3.3, gains, "rad", 1e-4)), 6.0 * np.pi
+    case = Numbers(gains, age_s=age_s, facts={"speed_age": late_s})
+    ((answer,),) = model.simulate_all([of_joint("sine", 1000.0, np.sin(rate * time_s), np.zeros(3000))], [case])
+    found = 2.0 * np.mean((answer.reported * np.exp(-1j * rate * time_s))[2000:]) * 1j
+    late, damping = np.exp(-1j * rate * age_s), 165.0 * 1j * rate * np.exp(-1j * rate * late_s)
+    expected = 8250.0 * np.exp(-1j * rate * 0.5e-3) / (8250.0 * late + damping - 3.3 * rate**2)
+    assert abs(found - expected) < 1e-3
+
+
 def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_reports_the_limit() -> None:
     """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
     joint = JointModel(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
@@ -274,8 +286,7 @@ def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
 
 def test_row_k_is_before_command_k_acts() -> None:
     signal = "left_joint4"
-    model = JointModel(TWIN, signal)
-    m = chirp(signal, 2.0, amplitude=0.0)
+    model, m = JointModel(TWIN, signal), chirp(signal, 2.0, amplitude=0.0)
     m.target[10:, 3] += 0.02
     answer = model.simulate(at_rest(joint_motion(m, TWIN, signal), model.gains), model.gains).reported
     np.testing.assert_allclose(answer[:11], answer[0], atol=1e-12)
@@ -285,8 +296,7 @@ def test_row_k_is_before_command_k_acts() -> None:
 
 def test_the_whole_twin_agrees_with_its_joints_one_by_one() -> None:
     # All joints of an arm move at once; each alone, with the others' measured motion as a known torque, does the same.
-    m = chirp("left_joint1", 4.0, amplitude=0.0)
-    rng = np.random.default_rng(0)
+    m, rng = chirp("left_joint1", 4.0, amplitude=0.0), np.random.default_rng(0)
     fade = np.clip((m.time_s - 0.5) / 0.5, 0, 1)
     for j in range(6):
         m.target[:, j] += 0.25 * fade * np.sin(2 * np.pi * (0.3 + 0.25 * j) * m.time_s + rng.uniform(0, 6))
@@ -312,8 +322,7 @@ def test_the_whole_twin_agrees_with_its_joints_one_by_one() -> None:
 def test_a_known_payload_is_carried_and_weighs() -> None:
     # 0.5 kg at the TCP, 0.168 m along the hand's z: its weight turns the joint by torque / K_p.
     signal = "left_joint5"
-    model = JointModel(TWIN, signal)
-    m = chirp(signal, 4.0, amplitude=0.0)
+    model, m = JointModel(TWIN, signal), chirp(signal, 4.0, amplitude=0.0)
     m.target[3:, 4] += 1e-3  # so that it does not only rest
     bare, loaded = (joint_motion(dataclasses.replace(m, payload_kg=kg), TWIN, signal) for kg in ({}, {"left": 0.5}))
     sag = model.simulate(loaded, model.gains).reported[-1] - model.simulate(bare, model.gains).reported[-1]
@@ -343,8 +352,7 @@ def test_commanded_gains_scale_what_the_model_is_given() -> None:
     motion = joint_motion(m, TWIN, signal)
     assert (motion.kp_scale, motion.kd_scale) == pytest.approx((2.0, 1.0))
     assert motion.kp_known and motion.kd_known
-    model = JointModel(TWIN, signal)
-    plain = dataclasses.replace(motion, kp_scale=1.0)
+    model, plain = JointModel(TWIN, signal), dataclasses.replace(motion, kp_scale=1.0)
     np.testing.assert_array_equal(
         model.simulate(motion, model.gains).reported, model.simulate(plain, Gains(302.2, 17.1, 1.73)).reported
     )
@@ -480,8 +488,7 @@ def test_what_cannot_be_replayed_is_refused_by_name() -> None:
 def test_a_response_that_was_computed_is_kept_and_is_that_of_a_new_model(monkeypatch: pytest.MonkeyPatch) -> None:
     """13 gains are one more than a recording keeps: the first is computed again, the last is not."""
     motion, asked = joint_motion(chirp("left_joint5", 3.0), TWIN, "left_joint5"), []
-    model = JointModel(TWIN, "left_joint5")
-    plain = joint_model.simulate_all
+    model, plain = JointModel(TWIN, "left_joint5"), joint_model.simulate_all
     monkeypatch.setattr(joint_model, "simulate_all", lambda d, *rest: (asked.append(d[0]), plain(d, *rest))[1])
     gains = [model.gains._replace(kp=model.gains.kp * (1 + 0.01 * k)) for k in range(joint_model.KEPT + 1)]
     found = [model.simulate(motion, g) for g in gains]

@@ -25,8 +25,7 @@ NAMES, NOISE_RAD = ("upper", "fore"), 1.5e-4
 def steps(late_rows: int = 0) -> Measurement:
     """6 s of steps at 100 rows per second, each joint's 0.2 s after the other's: a target acts from its row to the next, and on
     ``upper`` so many rows later than it is logged."""
-    rng = np.random.default_rng(5)
-    target = np.tile([-0.3, 0.5], (600, 1))
+    rng, target = np.random.default_rng(5), np.tile([-0.3, 0.5], (600, 1))
     for k in range(12):
         target[50 * k + 30 + 20 * (k % 2) :, k % 2] = [-0.3, 0.5][k % 2] + rng.uniform(-0.25, 0.25)
     model = mujoco.MjModel.from_xml_string(ARM)

@@ -439,8 +439,7 @@ def test_exact_inverse_dynamics_of_a_moving_arm_has_no_reversed_effort(phase: fl
     fade = 0.5 * (1 - np.cos(np.pi * np.minimum(time_s, 1.0)))
     rate = 2 * np.pi * 0.4
     q = np.column_stack([1.2 * np.sin(rate * time_s), 0.5 * np.sin(ratio * rate * time_s + phase)]) * fade[:, None]
-    v = np.gradient(q, time_s, axis=0)
-    effort = np.empty_like(q)
+    v, effort = np.gradient(q, time_s, axis=0), np.empty_like(q)
     for k, a in enumerate(np.gradient(v, time_s, axis=0)):
         data.qpos[:], data.qvel[:], data.qacc[:] = q[k], v[k], a
         mujoco.mj_inverse(model, data)
@@ -487,8 +486,7 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     assert "mA" in checks(with_effort(1000.0))["beyond_effort"]
     # Efforts of the law, kp (q* − q) − kd q̇, in mA at 0.5 N·m/A: the unit follows from the gains, whatever the inertia is.
     late = 0.4 * np.sin(2 * np.pi * (0.2 + 0.2 * (time_s - 0.05)) * (time_s - 0.05))
-    law = made.config.joints["elbow"]
-    speed = np.gradient(late, 1 / 200)
+    law, speed = made.config.joints["elbow"], np.gradient(late, 1 / 200)
     asked = law.loop_gains.kp * (np.append(angle[:1], angle[:-1]) - late) - law.loop_gains.kd * speed
     whole = swept(shoulder=np.zeros(1200), elbow=angle)
     current = dataclasses.replace(

@@ -71,8 +71,7 @@ def lag_rows(action: np.ndarray, state: np.ndarray) -> float:
 
     Both are smooth on the scale of a row, so that action between two rows is the straight line.
     """
-    shifts = np.arange(-3.0, 6.0, 0.02)
-    rows = np.arange(10, len(state) - 10, dtype=float)
+    shifts, rows = np.arange(-3.0, 6.0, 0.02), np.arange(10, len(state) - 10, dtype=float)
     errors = []
     for shift in shifts:
         at = np.stack([np.interp(rows - shift, np.arange(len(action)), column) for column in action.T], axis=1)

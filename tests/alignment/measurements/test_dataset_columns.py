@@ -61,8 +61,7 @@ def dataset(tmp_path: Path) -> Path:
     }
     table |= {"data/chunk_index": [0, 0], "data/file_index": [0, 0], "tasks": [["lift it"]] * 2}
     pq.write_table(pa.table(table), root / "meta/episodes/chunk-000/file-000.parquet")
-    rows = [numbers(k) for k in range(2)]
-    lists = pa.list_(pa.float32(), 3)
+    rows, lists = [numbers(k) for k in range(2)], pa.list_(pa.float32(), 3)
     frame = np.tile(np.arange(ROWS), 2)
     columns = {
         "observation.state": pa.array([list(r) for s, _ in rows for r in s], lists),

@@ -151,8 +151,7 @@ def test_effort_has_a_floor_where_it_was_recorded(motion):
 
 
 def test_touch_floor_of_every_taxel():
-    rng = np.random.default_rng(7)
-    sigma = np.where(np.arange(1536) < 768, 1.3, 0.0)
+    rng, sigma = np.random.default_rng(7), np.where(np.arange(1536) < 768, 1.3, 0.0)
     counts = np.round(rng.normal(size=(1000, 1536)) * sigma).astype(np.int16)
     counts[300:500] += 80  # a touch
     touch = Touch(time_s=np.repeat(np.arange(1000)[:, None] / 100, 4, axis=1), counts=counts, baseline=np.zeros(1536))
@@ -237,8 +236,7 @@ def test_a_joint_that_began_elsewhere_does_not_raise_the_floor_nor_does_one_late
     first, second = (measured(*motion, rng, NOISE, name=name) for name in "ab")
     again = dataclasses.replace(second, repeat_of="a")
     plain = noise_floor([first, again])["left_joint1"].value
-    j = first.column("left_joint1")
-    rows = round(3.0 * first.rate_hz)
+    j, rows = first.column("left_joint1"), round(3.0 * first.rate_hz)
     elsewhere = again.measured.copy()
     elsewhere[:rows, j] += 0.01
     assert noise_floor([first, dataclasses.replace(again, measured=elsewhere)])["left_joint1"].value == pytest.approx(

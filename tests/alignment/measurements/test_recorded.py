@@ -78,8 +78,7 @@ def driven(moved) -> Moved:
     """Commanded at 200 Hz, so that the recording has every command when it was sent."""
     sim = moved.sim
     sim.reset([1])
-    dense = DenseRecorder(sim)
-    home = sim.targets[0].copy()
+    dense, home = DenseRecorder(sim), sim.targets[0].copy()
     for k in range(600):
         fade = min(1.0, max(0.0, min(k - 20, 400 - k) / 100))
         wave = 0.15 * fade * np.sin(2 * np.pi * 1.1 * k / 200 + np.arange(14)) * (np.arange(14) % 7 != 6)

@@ -63,12 +63,10 @@ def test_rate_is_the_derivative_of_depth(motion: TouchMotion) -> None:
 
 
 def test_taxels_moved_along_the_pad_feel_what_others_would_and_out_of_it_they_go_deeper(motion: TouchMotion) -> None:
-    plain = motion.depth()[0]
-    by_a_taxel = motion.depth(((0.002, 0.0, 0.0),) * 2)[0]
+    plain, by_a_taxel = motion.depth()[0], motion.depth(((0.002, 0.0, 0.0),) * 2)[0]
     # A column further on is scanned 0.8 ms later: 17 mm/s · 0.8 ms
     np.testing.assert_allclose(by_a_taxel[..., :-1], plain[..., 1:], atol=2e-5)
-    deeper = motion.depth(((0.0, 0.0, 1e-4),) * 2)[0]
-    touched = plain > 0
+    deeper, touched = motion.depth(((0.0, 0.0, 1e-4),) * 2)[0], plain > 0
     np.testing.assert_allclose((deeper - plain)[touched], 1e-4, rtol=0.15)  # along the ball's slope at its rim
 
 
@@ -154,8 +152,7 @@ def test_effects_act_as_in_the_simulation_scan_by_scan(motion: TouchMotion, effe
     model = TouchModel(CONFIG)
     plain, seen = model.simulate(motion, K_N, K_D), model.simulate(motion, K_N, K_D, effects)
     clock = np.zeros(1)
-    added = AddedEffects(effects, clock)
-    time_s = motion.time_s.mean(axis=1)
+    added, time_s = AddedEffects(effects, clock), motion.time_s.mean(axis=1)
     for k in range(330):  # over the first presses
         clock[:] = time_s[k] - time_s[0]
         ideal = np.zeros((1, len(ROBOT.pads), *ROBOT.pad.shape), np.float32)

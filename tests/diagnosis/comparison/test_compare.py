@@ -59,8 +59,7 @@ def test_one_joint_s_error_stays_with_it_while_another_moves():
 
 def test_gripper_or_contact_takes_the_whole_twin():
     target = chirp(5, seconds=1.0)
-    free = recorded(TwinConfig(), target, 5)
-    target = target.copy()
+    free, target = recorded(TwinConfig(), target, 5), target.copy()
     target[300:, 6] -= 0.02
     gripping = recorded(TwinConfig(), target, 6)
     assert [r.way for r in replay_all(TwinConfig(), [free, gripping], lambda *_: None)] == ["joint", "twin"]

@@ -127,8 +127,7 @@ def test_the_planned_press_settles_a_tie_of_independent_data():
     from taccorl.surrogate import cells
 
     case = CellsCase(seed=5, hidden="touch_delay", values={"delay_s": 0.06})
-    slow = cells._presses((0.4, 3.0, 2.0), (0.9, 4.0, 2.0))
-    taps = OF_NAME["taps"].knots
+    slow, taps = cells._presses((0.4, 3.0, 2.0), (0.9, 4.0, 2.0)), OF_NAME["taps"].knots
     names = {"slow": ("fit", slow), "slow_again": ("fit", slow), "other": ("validation", slow), "taps": ("fit", taps)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cells, "RECORDINGS", names | {"taps_too": ("validation", taps)})

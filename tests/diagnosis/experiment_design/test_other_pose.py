@@ -102,8 +102,7 @@ def test_a_pose_that_must_not_be_recorded_is_refused(tmp_path, machine, position
 def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_does_not(machine):
     """Within ± 0.5 rad, sin q and q differ by 1 % of the torque; at lift -1 the base loads 0.54 as much, the spring as before."""
     known = Measurements((swung(machine, 1, 0.3), swung(machine, 2, 0.5)))
-    ground = ground_of(machine, "pan", known)
-    apart = []
+    ground, apart = ground_of(machine, "pan", known), []
     for positions in ({}, {"lift": -1.0}):
         pose = stated_pose(machine, "pan", ground.like, ground.span, positions) if positions else None
         part = JointPart(dataclasses.replace(ground, pose=pose), 1e-4, known)
@@ -114,8 +113,7 @@ def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_d
 
 def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machine):
     """At lift 0 the base loads 1 / cos 1 = 1.85 times as much as at -1."""
-    m = swung(machine, 1, 0.3)
-    lowered = np.array([0.0, -1.0])
+    m, lowered = swung(machine, 1, 0.3), np.array([0.0, -1.0])
     m = dataclasses.replace(m, target=m.target + lowered, measured=m.measured + lowered)
     problem: Any = SimpleNamespace(simulate_all=lambda cases, recordings: [[cases[0][1]]])
     changed = in_other_pose(problem, stated_pose(machine, "pan", m, SPAN, {"lift": 0.0}), "new")

@@ -95,8 +95,7 @@ def test_every_press_of_the_library_keeps_the_twin_s_limits_and_rests_at_both_en
 
 def test_commands_lie_below_the_opening_by_what_the_gripper_yields():
     """A pad of 20 kN/m pressed in by 0.8 mm pushes back with 16 N: a gripper of 2 kN/m yields by 8 mm."""
-    hold = OF_NAME["long_hold"]
-    middle = round((presses.REST_S + 4.0) * 200)
+    hold, middle = OF_NAME["long_hold"], round((presses.REST_S + 4.0) * 200)
     force, target = presses.grip(RobotConfig(), hold)
     assert force[middle] == pytest.approx(16.0)
     assert hold.opening_m()[middle] == pytest.approx(2 * (0.012 - 0.0008))

@@ -78,11 +78,11 @@ def recording(
     q = v = goal = given = 0.0
     steps, rows = round(1 / (RATE_HZ * DT_S)), []
     slows = DT_S * friction_nm / INERTIA
-    for following in target.tolist():
+    for row, following in enumerate(target.tolist()):
         rows.append((q, torque(law, following if after else goal, q, v) if held_steps == 1 else given))
         goal = following
         for step in range(steps):
-            given = torque(law, goal, q, v) if step % held_steps == 0 else given
+            given = torque(law, goal, q, v) if (row * steps + step) % held_steps == 0 else given
             free = v + DT_S * (given - WEIGHT_NM * math.sin(q)) / INERTIA
             v = math.copysign(max(abs(free) - slows, 0.0), free)
             q += DT_S * v
@@ -144,6 +144,18 @@ def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(stated: bool
     assert rms(stacked(problem, problem.start, [], problem.validation)) == pytest.approx(after, abs=0.02)
 
 
+@pytest.mark.parametrize("held_steps", [50, 100])
+def test_targets_that_wait_for_a_loop_unlike_the_rows_are_named(held_steps: int, tmp_path: Path) -> None:
+    """Rows of 5 ms. A loop of 1 ms takes each row's target at once; one of 2 ms every other target 1 ms late."""
+    machine = RobotMachine(robot(tmp_path, f"{FILES['impedance']}, loop_hz: {1.0 / (held_steps * DT_S):.0f}"), "robot")
+    one, other = (recording("impedance", *own, 1, 0.0, held_steps=held_steps) for own in (("a", 2.5), ("b", 2.0)))
+    d = machine.diagnose(
+        "swing", Measurements((one,), (other,)), without=[n for n in effects if n != "backlash"]
+    ).diagnosis
+    told = [remark for remark in d.remarks if "waits 0 … 2 ms" in remark and "(500 Hz)" in remark]
+    assert len(told) == (held_steps == 100) and (d.errors["after"]["validation"] > 1.2) == bool(told)
+
+
 def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(tmp_path: Path) -> None:
     made = robot(tmp_path, "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.8, torque_nm_per_a: 1.0")
     _, model, error = fitted(made, swept("pwm"), "coulomb_friction")
@@ -167,7 +179,7 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
     def checks(made: Robot, m: Measurement) -> list[str]:
         whole = made.joint("swing").whole(m)
         found = {m.name: check_robot(made, m, whole, ["swing"])}
-        check_effort_time(made.config.joints["swing"], [whole], found, "swing", made.path.name)
+        check_effort_time(made.config.joints["swing"], [whole], found, "swing", made.path.name, lambda m: INERTIA)
         return [f.text for f in found[m.name] if f.severity == "error"]
 
     assert checks(plain, before) == [] and checks(declared, after[0]) == []

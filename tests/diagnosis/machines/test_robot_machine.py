@@ -73,8 +73,7 @@ def test_a_robot_that_lacks_nothing_is_replayed_to_its_noise_and_a_hidden_spring
 
 def test_known_numbers_of_a_robot_file_are_held_saved_and_checked(tmp_path: Path) -> None:
     plant = Plant(PLAIN)
-    made = Measurements((plant.record("sine", SINE, 1),))
-    machine = scara(tmp_path)
+    made, machine = Measurements((plant.record("sine", SINE, 1),)), scara(tmp_path)
     weighed = make_effect("payload", mass_kg=0.25)
     config = machine.robot.config.joints["scara_2"]
     known = dataclasses.replace(config, effects=[weighed], known=("payload.mass_kg", "torque_ff"))

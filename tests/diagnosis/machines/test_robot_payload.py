@@ -96,8 +96,7 @@ def recorded(
     model, known = (mujoco.MjModel.from_xml_string(xml) for xml in (arm.true, arm.known))
     data, believed, rng = mujoco.MjData(model), mujoco.MjData(known), np.random.default_rng(seed)
     time_s = np.arange(1100) * 0.005
-    moving = np.clip(time_s - 0.5, 0.0, None)
-    target = np.tile(arm.rest, (len(time_s), 1))
+    moving, target = np.clip(time_s - 0.5, 0.0, None), np.tile(arm.rest, (len(time_s), 1))
     target[:, joint] += amplitude * np.sin(2 * np.pi * (0.1 + 0.5 * (fastest_hz - 0.1) * moving / 5.0) * moving)
     for _ in range(20):  # where it rests: the controller carries the weight of the known bodies only
         data.qpos[:] = (
@@ -248,8 +247,7 @@ def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
     torque instead; a drive that has leaves no mass."""
     without = [name for name in effects if name not in ("payload", "torque_scale", "direction_gain", "unbalance")]
     robot = machine(tmp_path, TEACH_MODEL.format(tip=""), TEACH_FILE)
-    one = SearchConfig(max_effects=1)
-    made = teaching(TEACH_MODEL.format(tip=TEACH_TIP))
+    one, made = SearchConfig(max_effects=1), teaching(TEACH_MODEL.format(tip=TEACH_TIP))
     found = diagnose_parts(robot, TEACH_JOINTS, made, search=one, without=without)
     added = {f.part: f.diagnosis.names for f in found if f.diagnosis.effects}
     added = {part: [n for n in names if n != "viscous_friction"] for part, names in added.items()}

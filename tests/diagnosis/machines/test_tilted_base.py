@@ -171,8 +171,7 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
 
 def test_gravity_also_turns_with_other_joints_that_move(tmp_path: Path) -> None:
     """Both joints swing: what the tilt adds about the pan axis changes with lift."""
-    both = turned("both", 0.5, 0.3, 7, swing=0.8)
-    robot = machine(tmp_path)
+    both, robot = turned("both", 0.5, 0.3, 7, swing=0.8), machine(tmp_path)
     config = dataclasses.replace(robot.robot.config, gravity=[math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)])
     leaning = RobotMachine(dataclasses.replace(robot.robot, config=config), "leaning")
     assert replay_error(leaning, both) < 0.3 * replay_error(robot, both)

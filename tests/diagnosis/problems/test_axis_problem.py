@@ -79,8 +79,7 @@ def test_a_log_of_position_and_force_alone_shows_the_friction(slide: Measurement
                                                               for use in ("fit", "validation")}))  # fmt: skip
     assert problem.measured == "efforts" and [f.name for f in problem.base if not f.held] == ["inertia", "torque_ff"]
     assert not {"command_delay", "torque_saturation", "error_deadband", "encoder_scale"} & {*problem.candidates}
-    recording = problem.fit[0]
-    friction = problem.axis.effect_class("coulomb_friction")
+    recording, friction = problem.fit[0], problem.axis.effect_class("coulomb_friction")
     left = {}
     for force in (0.0, FRICTION_N):
         numbers: Any = {"torque_nm": force}

@@ -79,8 +79,7 @@ def test_every_cell_has_the_gain_of_each_place():
 
 
 def test_creep_is_found_in_presses_of_several_places_at_the_noise_floor():
-    machine = CellsMachine(CONFIG, "array")
-    measurements = recorded(SHARE)
+    machine, measurements = CellsMachine(CONFIG, "array"), recorded(SHARE)
     finding = machine.diagnose("array", measurements)
     d = finding.diagnosis
     assert d.names == ("taxel_creep",) and d.status == "at_floor" and not d.rivals.get("taxel_creep")
@@ -141,8 +140,7 @@ def test_in_twenty_arrays_creep_is_found_where_it_is_and_nowhere_else(creep: flo
 def test_presses_that_slide_or_are_elsewhere_are_named_and_not_used():
     elsewhere = PLACES_MM.copy()
     elsewhere[2] = (6.0, 0.0)
-    known = recorded(0.0)
-    other = recording("other", 0, 0.0, elsewhere)
+    known, other = recorded(0.0), recording("other", 0, 0.0, elsewhere)
     slides = recording("slides", 0, 0.0, slide_mm=2.0)
     measurements = with_places(CONFIG, Measurements(known.fit, (other, slides)))
     for m, share, words in zip(

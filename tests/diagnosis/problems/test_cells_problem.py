@@ -87,8 +87,7 @@ def test_gain_and_offset_are_least_squares_and_the_converter_cuts_at_its_ends():
     ],
 )
 def test_effects_of_pads_act_on_a_cell_by_their_equations_after_20_s_under_10_n(name, values, expected):
-    effect = make_cells_effect(name, **values)
-    m = press(np.full(2001, 10.0))
+    effect, m = make_cells_effect(name, **values), press(np.full(2001, 10.0))
     assert responses(config(), m, [effect])[-1, 0] == pytest.approx(expected, rel=2e-3)
     own = responses(config(effects=[effect]), m)
     np.testing.assert_array_equal(own, responses(config(), m, [effect]))  # in the file, or added to it
@@ -241,8 +240,7 @@ def test_rows_at_the_ends_of_the_converter_do_not_bend_the_gain():
 @pytest.mark.parametrize("hidden", ["taxel_creep", pytest.param("taxel_temperature", marks=pytest.mark.slow)])
 def test_a_hidden_effect_is_found_with_its_numbers_and_the_mended_machine_is_at_the_floor(hidden):
     case = draw_cells(hidden, 11)
-    measurements = simulated(case)
-    machine = CellsMachine(case.config(), "taxel")
+    measurements, machine = simulated(case), CellsMachine(case.config(), "taxel")
     finding = machine.diagnose("fingertip", measurements)
     d = finding.diagnosis
     assert d.names == (hidden,) and d.errors["after"]["test"] < 1.3
@@ -301,8 +299,7 @@ GAIN = 200.0  # Count per N that the cell bears
 
 def ramps(seed: int) -> np.ndarray:
     """(T,) load [N]: presses to three peaks at two speeds, 2 s of nothing between them."""
-    rng = np.random.default_rng(seed)
-    pieces = [np.zeros(200)]
+    rng, pieces = np.random.default_rng(seed), [np.zeros(200)]
     for peak_n, speed in ((9.0, 4.0), (3.0, 8.0), (6.0, 2.0)):
         up = np.linspace(0, peak_n, int(peak_n / speed * RATE_HZ))
         pieces += [up, np.full(100, peak_n), up[::-1], np.zeros(200)]

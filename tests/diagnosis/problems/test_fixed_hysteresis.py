@@ -65,8 +65,7 @@ def recorded(
     load_noise_n: float = 0.01,
 ) -> Measurements:
     """Two fit recordings, one for validation, one for the test, with noise of the load cell and of the readings (1 count)."""
-    rng = np.random.default_rng(seed)
-    found = []
+    rng, found = np.random.default_rng(seed), []
     for name in ("one", "two", "three", "four"):
         load = ramps(rng, speeds, 2.0, loops)
         response = {"": lambda f: f, "play": play, "layers": layers, "creep": creep, "lag": lag}[kind](load, *values)

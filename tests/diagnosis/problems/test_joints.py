@@ -262,8 +262,7 @@ def test_an_entry_of_all_joints_gives_up_the_one_that_is_replaced(tmp_path):
 
 def test_other_joints_and_other_effects_stay_as_they_are():
     others = [friction(0.1, "left", "joint4"), make_effect("backlash", play_rad=0.01, arm="left", joints=["joint5"])]
-    twin = TwinConfig(effects=list(others))
-    new = friction(0.7, "left", "joint5")
+    twin, new = TwinConfig(effects=list(others)), friction(0.7, "left", "joint5")
     add_effect(twin, new)
     assert twin.effects == [*others, new]
     assert all(kept is old for kept, old in zip(twin.effects, others, strict=False))

@@ -91,8 +91,7 @@ def found_in(
         ),
         (recorded("validation", validation, 4, acting, friction),),
     )
-    problem = AxisProblem(AXIS, made)
-    config = SearchConfig(max_effects=1)
+    problem, config = AxisProblem(AXIS, made), SearchConfig(max_effects=1)
     return diagnose(problem, problem.fit, problem.validation, start=problem.start, without=without, config=config)
 
 

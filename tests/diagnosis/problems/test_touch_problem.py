@@ -155,8 +155,7 @@ def test_what_the_pads_do_not_repeat_is_in_the_floor() -> None:
     first = press(0)
     again = press(7, motion_seed=0, repeat_of="press_0", name="press_0_again")
     offset = dataclasses.replace(press(7, motion_seed=0), measured=again.measured)
-    deeper = dataclasses.replace(again, touch=offset.touch)
-    ball = ball_at(*PLACES[0])
+    deeper, ball = dataclasses.replace(again, touch=offset.touch), ball_at(*PLACES[0])
     counts = deeper.touch.counts.reshape(-1, 4, 384).copy()
     pressed = touch_motion(first, CONFIG, ball)
     held = np.zeros((len(counts), 2, 384), bool)
@@ -176,8 +175,7 @@ def test_what_the_pads_do_not_repeat_is_in_the_floor() -> None:
 
 
 def test_an_effect_that_the_twin_has_is_refitted_where_it_acts_on_just_these_pads_and_else_stays() -> None:
-    motions = [recorded("none", 0)]
-    pads = ["left_a", "left_b"]
+    motions, pads = [recorded("none", 0)], ["left_a", "left_b"]
     own = TouchProblem(motions, TwinConfig(effects=[make_effect("touch_lag", time_constant_s=0.02, pads=pads)]))
     assert own.present == ("touch_lag",)
     assert own.start["touch_lag.time_constant_s"] == 0.02

@@ -31,8 +31,7 @@ class Offset(MadeProblem):
 def test_what_a_model_leaves_above_the_floor_widens_its_intervals_however_many_rows_there_are():
     """A square wave of 8 floors that no effect explains counts as 4 entries. With JᵀJ = n / 0.1² the offset's variance is that of
     the rest, (e² − 1.5²) 0.1² / 4, with e² = 1 + 8²."""
-    t = np.arange(0.0, 60.0, 0.005)
-    problem = Offset()
+    t, problem = np.arange(0.0, 60.0, 0.005), Offset()
     square = 0.8 * np.sign(np.sin(40.0 * t))
     model = fit(problem, [record(0, gain=0.0, seconds=60.0, extra=square)], (), {})
     assert model.error == pytest.approx(np.sqrt(1.0 + 64.0), rel=0.01)
@@ -139,8 +138,7 @@ def test_a_block_with_little_weight_decides_little():
 
 
 def test_bic_of_a_needless_parameter_falls_below_zero():
-    recordings = [record(0)]
-    problem = MadeProblem(Ripple)
+    recordings, problem = [record(0)], MadeProblem(Ripple)
     parent, child = fit(problem, recordings, (), {}), fit(problem, recordings, ("ripple",), {})
     # one number of ln n less a trifle: on its logarithmic scale it cannot quite reach 0
     assert -np.log(3000) - 2 < bic_gain(parent, child, 1) < -np.log(1000)
@@ -150,8 +148,7 @@ def test_bic_of_a_needless_parameter_falls_below_zero():
 
 
 def test_the_probe_of_the_true_effect_explains_what_it_is_and_says_how_strong():
-    problem = MadeProblem(Ripple, Square)
-    recordings = [record(0, Ripple(strength=0.3))]
+    problem, recordings = MadeProblem(Ripple, Square), [record(0, Ripple(strength=0.3))]
     parent = fit(problem, recordings, (), {})
     found = probe(problem, recordings, parent, list(problem.candidates.values()))
     ripple, other = [p for p in found if p.name == "ripple"][:2]

@@ -5,12 +5,7 @@ import re
 import pytest
 import yaml
 
-from taccorl.episodes.sources.mimicgen.spec import (
-    check_task,
-    load_mimic_spec,
-    mimic_spec_path,
-    with_options,
-)
+from taccorl.episodes.sources.mimicgen.spec import check_task, load_mimic_spec, mimic_spec_path, with_options
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.sim.task import tasks
 
