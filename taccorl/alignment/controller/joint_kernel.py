@@ -264,6 +264,7 @@ def _simulated(
     half_play = 0.5 * p.backlash__play_rad
     ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
     early = 0.5 * h if midpoint and geared else 0.0
+    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # the same of the gear's spring: at 1 it is damped by h too much
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
@@ -462,8 +463,8 @@ def _simulated(
         else:
             stretch = gear - min(max(gear, -half_play), half_play)
             pulled = (spring > 0.0) & ((half_play == 0.0) | (stretch != 0.0))
-            m22 = link + GEAR_KGM2 + where(pulled, h * spring_damping + h * h * spring, 0.0)
-            f2 = where(pulled, -spring * (stretch + h * gear_v) - spring_damping * gear_v, 0.0) - load_nm
+            m22 = link + GEAR_KGM2 + where(pulled, into * h * (spring_damping + into * h * spring), 0.0)
+            f2 = where(pulled, -spring * (stretch + into * h * gear_v) - spring_damping * gear_v, 0.0) - load_nm
             about = m11 / (motor_mobility * inertia)
             a1, a2 = _two_masses(m11, m22, link, f1, f2, about, v, limit, h)
             touches = (spring == 0.0) & (stretch != 0.0)
@@ -475,8 +476,8 @@ def _simulated(
                 pushes = touches & ((back - b2) * stretch <= 0.0)  # it never pulls
                 a1, a2 = where(pushes, b1, a1), where(pushes, b2, a2)
             v_next = v + h * a1
+            gear += h * (gear_v + into * h * a2)
             gear_v += h * a2
-            gear += h * gear_v
         # As the step took it: at the step's end.
         at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
         torque += newest_share * (at_end - torque)
