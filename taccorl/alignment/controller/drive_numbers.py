@@ -34,8 +34,6 @@ class _Own(NamedTuple):
     """1: the reported effort includes the torque of the gravity compensation; 0: it does not."""
     effort_age: float = 0.0
     """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
-    position_age: float = 0.0
-    """Mean age a of the position that K_p multiplies [s]: a damping smaller by K_p a and an inertia larger by ½ K_p a²."""
     speed_age: float = 0.0
     """Mean age of the speed that K_d multiplies [s]: an inertia smaller by K_d · age (at most by ``joint_kernel.MOST_LOST`` of
     it), except while the motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""

@@ -139,7 +139,7 @@ def _asked(
         at = q + p.encoder_bias__bias_rad + p.encoder_eccentricity__phase_rad
         slope *= 1.0 + p.encoder_eccentricity__amplitude_rad * sine_and_cosine(at)[1]
     error = command - angle
-    stiffness = p.kp * p.encoder_scale__factor
+    stiffness, damping = p.kp * p.encoder_scale__factor, p.kd * slope
     if holds(width > 0.0):
         far = (width <= 0.0) | (abs(before - angle) > width)
         error = where(far, error - where(width > 0.0, math.copysign(width, before - angle), 0.0), 0.0)
@@ -147,7 +147,6 @@ def _asked(
     by_error = p.kp * (error + p.integral_action__rate_per_s * integral)
     factor = where((by_error < 0.0) & (p.commands_speed > 0.0), p.direction_gain__factor, 1.0)
     by_error, stiffness = factor * by_error, factor * stiffness
-    damping = p.kd * slope - p.position_age * stiffness  # K_p (q* − q(t − a)) is K_p (q* − q + a q̇ − ½ a² q̈)
     asked = by_error - damping * v + p.torque_ff + added
     full = abs(asked) > p.duty_torque
     asked = where(full, math.copysign(p.duty_torque, asked), asked)
@@ -264,16 +263,15 @@ def _simulated(
     half_play = 0.5 * p.backlash__play_rad
     ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
     early = 0.5 * h if midpoint and geared else 0.0
-    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # the same of the gear's spring: at 1 it is damped by h too much
+    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # of the gear's spring, which 1 damps by h besides
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
-    lost = p.kd * (p.speed_age + min(p.speed_delay__delay_s, 0.0)) - 0.5 * p.kp * p.position_age * p.position_age
-    lost = min(lost, MOST_LOST * whole_inertia)
+    lost = min(p.kd * (p.speed_age + min(p.speed_delay__delay_s, 0.0)), MOST_LOST * whole_inertia)
     fresh_share = where(p.speed_delay__delay_s > 0.0, ahead * h / (ahead * h + p.speed_delay__delay_s), 1.0)
     with_filter = holds(fresh_share < 1.0)
     ruled_inertia = whole_inertia - lost
-    ruled_inertia -= min(early * (p.kd - p.kp * p.position_age + p.back_emf), 0.5 * ruled_inertia)
+    ruled_inertia -= min(early * (p.kd + p.back_emf), 0.5 * ruled_inertia)
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = ruled_inertia * (link + GEAR_KGM2) - link * link
     motor_mobility, gear_mobility = (link + GEAR_KGM2) / free, ruled_inertia / free
@@ -366,9 +364,7 @@ def _simulated(
                 by = load(command, n + hold * min(effort_after - 1, parts - 1))
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(p, kind, by, by, q, v, integral, supply[part], on[part], added[seen])
-            of_change = by_position * (v - 0.5 * p.effort_age * acceleration) + by_speed * acceleration
-            older = where(lag_s > 0.0, 0.0, p.effort_age * of_change)
-            by_speed += p.position_age * by_position
+            older = where(lag_s > 0.0, 0.0, p.effort_age * (by_position * v + by_speed * acceleration))
             shown = where(lag_s > 0.0, torque, shown)
             shown_strength = strength * _of_direction(p, shown + carried)
             given_weight = shown_strength * carried
@@ -393,7 +389,7 @@ def _simulated(
             integral += ahead * h * now  # taken ahead as the position is, which is its other part
         asked, stiffness, damping = _asked(p, kind, now, until_now, q, v, integral, supply[part], on[part], added[part])
         if with_filter:
-            slow = (1.0 - fresh_share) * (damping + p.position_age * stiffness - on[part] * p.back_emf)
+            slow = (1.0 - fresh_share) * (damping - on[part] * p.back_emf)
             asked, damping = asked + slow * (v - late_v), damping - slow
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness

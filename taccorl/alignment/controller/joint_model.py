@@ -242,10 +242,11 @@ def _side_by_side(
         late_s = joint.target_late_s
         when = late_s, parts, hold, step_s
         kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
-        age_s = joint.position_age_s + case.age_s if kp else 0.0
+        # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
+        gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
         body = model._body(motion, bodies)._asdict()
         held_n = body.pop("weight_n")
-        drive = {**_ABSENT, **case.gains._asdict(), "kp": kp, "kd": kd, "position_age": age_s, **body, **numbers}
+        drive = {**_ABSENT, **gains._asdict(), **body, **numbers}
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive["gravity_sin"] += weight * case.lever.sin_m
         drive["gravity_cos"] += weight * case.lever.cos_m

@@ -215,18 +215,6 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     np.testing.assert_allclose(answer.effort[2:], 0.05 * acceleration, rtol=0, atol=1e-9 * np.abs(answer.effort).max())
 
 
-def test_a_late_position_is_less_damping_and_more_inertia() -> None:
-    """K_p (q* − q(t − a)) − K_d q̇(t − s) at 3 Hz, K_p a² = 0.16 J, against its transfer function."""
-    gains, age_s, late_s, time_s = Gains(8250.0, 165.0, 0.0), 8e-3, 2e-3, np.arange(3000) * 1e-3
-    model, rate = JointModel(_Geared("late", 3.3, gains, "rad", 1e-4)), 6.0 * np.pi
-    case = Numbers(gains, age_s=age_s, facts={"speed_age": late_s})
-    ((answer,),) = model.simulate_all([of_joint("sine", 1000.0, np.sin(rate * time_s), np.zeros(3000))], [case])
-    found = 2.0 * np.mean((answer.reported * np.exp(-1j * rate * time_s))[2000:]) * 1j
-    late, damping = np.exp(-1j * rate * age_s), 165.0 * 1j * rate * np.exp(-1j * rate * late_s)
-    expected = 8250.0 * np.exp(-1j * rate * 0.5e-3) / (8250.0 * late + damping - 3.3 * rate**2)
-    assert abs(found - expected) < 1e-3
-
-
 def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_reports_the_limit() -> None:
     """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
     joint = JointModel(AxisJoint("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), step_s=1e-4))
