@@ -211,7 +211,8 @@ class JointProblem(WithoutMaps):
         facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
             newer = 2.0 * bool(self.model.joint.facts["effort_after"])
-            facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": 2.0 * half_s}
+            speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
+            facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
         return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0))
 
     def learn(self, values: Mapping[str, float]) -> None:
