@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_074,
     "taccorl/cli": 5_133,
     "taccorl/data": 8_797,
-    "taccorl/diagnosis": 11_320,
+    "taccorl/diagnosis": 11_316,
     "taccorl/episodes": 4_937,
     "taccorl/evaluation": 1_888,
     "taccorl/lerobot_plugin": 343,

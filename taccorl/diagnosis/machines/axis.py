@@ -191,9 +191,7 @@ class Axis(Machine):
     def with_additions(self, additions: Sequence[Addition]) -> "Axis":
         config = self.config
         for a in additions:
-            timing = (
-                {"loop_s": 0.0} if a.base.get("loop_s", 0.0) < SHORTEST_STEP_S else {}
-            )  # faster than the model's steps
+            timing = {"loop_s": 0.0} if a.base.get("loop_s", 0.0) < SHORTEST_STEP_S else {}  # faster than a step
             config = config.with_numbers({**a.base, **timing}).with_effects(a.effects)
         return dataclasses.replace(self, config=config)
 

@@ -108,9 +108,7 @@ def _of_loop(problem: Problem, found: Diagnosis, recordings: Sequence[Recording]
     model, period_s = found.after, problem.loop_s or found.base.get("loop_s", 0.0)
     if not period_s or found.status not in ("something_else", "too_many"):
         return []
-    squares = np.zeros(
-        3
-    )  # of what is left, of what one wait of a period changes, of what a wait of each half second explains
+    squares = np.zeros(3)  # of what is left, of the change by one wait, of what a wait of each half second explains
     for r in recordings:
         cases = [(model.values | {"loop_waits_s": wait_s}, model.effects) for wait_s in (0.0, period_s)]
         left, late = (np.nan_to_num(residuals(problem, *case, r)) for case in cases)
