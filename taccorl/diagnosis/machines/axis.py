@@ -231,13 +231,13 @@ def _wrong_inertia(axis: AxisConfig, m: Measurement, fit: LawFit | None) -> list
     if (reversed_ := reversed_effort(m, axis.name, against, fit)) or alike < INERTIA_SURE:
         return reversed_
     inertia = float(left[0] @ left[1]) / float(left[0] @ left[0])
-    unit = axis.scale.unit_of("kg·m²")
-    stated = axis.inertia + axis_motion(axis, m).mounted_kgm2
-    if 1 / INERTIA_OFF <= inertia / stated <= INERTIA_OFF:
+    ratio = inertia / (axis.inertia + (mounted := axis_motion(axis, m).mounted_kgm2))
+    if 1 / INERTIA_OFF <= ratio <= INERTIA_OFF:
         return []
+    degrees = in_degrees(ratio, axis.name, axis.unit)
     text = (
-        f"effort and acceleration of {axis.name} say {inertia:.3g} {unit}, its file {stated:.3g}: {inertia / stated:.2g} times."
-        f"{in_degrees(inertia / stated, axis.name, axis.unit)} Else write the right unit or factor of q and tau in a columns "
-        f"file, or `inertia: {max(inertia - stated + axis.inertia, 1e-3 * inertia):.3g}`"
+        f"effort and acceleration of {axis.name} say {inertia:.3g} {axis.scale.unit_of('kg·m²')}, its file "
+        f"{inertia / ratio:.3g}: {ratio:.2g} times.{degrees}{' Else write' if degrees else ' Write'} `inertia: "
+        f"{max(inertia - mounted, 1e-3 * inertia):.3g}`, or the right unit or factor of q and tau in a columns file"
     )
     return [DataFinding("wrong_inertia", "error", axis.name, text)]
