@@ -2,6 +2,7 @@
 # MuJoCo Warp against MuJoCo C: GPU 0 with the first half of the threads is C's, GPU 1 with the others Warp's. Parts, until SECOND of the
 # machine's clock, all if none is given: adapters, of the full size on both GPUs; bench, control steps and pictures; scores, 512 scenes by
 # both of each policy /dev/shm/policies/TASK of $TASKS; ppo of the policy of the first, from it.
+# Results go to $RESULTS, /dev/shm/learn_physics if not given.
 # Before it, with the parts of a policy that next.sh brought in FOLDER: bash .ci/gpu/physics.sh unpack TASK FOLDER.
 if [ "$1" = unpack ]; then
   to=${POLICIES:-/dev/shm/policies}/$2

@@ -180,8 +180,8 @@ RELEASED_S, LONG_S = (0.1, 0.4), 1.0
 RETURNS = 0.3
 """Least share of a fall below rest that is gone at the end of the rest: relaxation returns, a drift does not."""
 LEAST_ROWS, TOP = 20, 0.005
-"""The highest reading of a cell is taken as the reading that this share of its rows exceeds, and at least this number of rows,
-so that single outliers do not count."""
+"""Share of a cell's rows, and least number of rows, whose readings are above what is taken as its highest reading, so that single
+outliers do not count."""
 WIDTH = 4.0
 """Rows within so many standard deviations of the noise of the highest reading may be on a plateau."""
 LONG = 10.0

@@ -48,9 +48,9 @@ STATED_LEFT, SHARES = 2.0, (-0.5, 1.5)
 """Fitted gains are reported if the residual of the stated ones, with the best delay and lag of the targets, is at least so many
 times that of the fitted ones, and r is in this range. Of 378 simulated joints with the stated gains none was reported."""
 ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
-"""Largest residual of the law of one recording alone that is compared with others', least ratio of two neighbouring gains that
-are not of one machine (with one of 7 effects they were within 1.34), and least ratio of K_p to the stated one that is believed of
-accelerations. Choices."""
+"""Gains fitted to one recording are compared with others' if the law leaves at most the first share of its effort; two that
+differ by more than the second factor are not of one machine (with one of 7 effects: at most 1.34). From accelerations in place of
+efforts, K_p is told as another only beyond the third factor. Choices."""
 LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)
 """Lags and delays of targets that are tried."""
 ALIKE = 1e-3
@@ -188,8 +188,8 @@ def _late(m: Measurement, delay_s: float, lag_s: float = 0.0) -> Measurement:
 
 
 def _stated_left(law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool) -> float:
-    """Share of the effort that the stated gains leave beside any b and integral of the position error and any r (½ where it is
-    ``unseen``), with the delay and lag of targets at which they leave least."""
+    """Share of the effort that the stated gains leave beside any b and integral of the position error and any r (0.5 for
+    accelerations, ``unseen``), with the delay and lag of targets at which they leave least."""
     least = math.inf
     for delay_s, lag_s in itertools.product(DELAYS_S, LAGS_S):
         if found := _all_equations(law, [_late(m, delay_s, lag_s) for m in recordings], signal, smooth=True):

@@ -229,7 +229,7 @@ REST_S = 0.25
 HELD_S = 0.04
 """Time for which the target must rest after a step [s]."""
 WINDOW_S = 0.12
-"""Time after a step within which a joint must have moved by ``SHARE`` [s]."""
+"""Time after a step of the target within which the joint must have moved by ``SHARE`` of the step [s]."""
 SHARE = 0.25
 """Share of the step up to which the motion is compared. A choice."""
 SEEN_FLOORS, SEEN_ROWS = 6.0, 3

@@ -263,7 +263,7 @@ def _simulated(
     half_play = 0.5 * p.backlash__play_rad
     ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
     early = 0.5 * h if midpoint and geared else 0.0
-    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # of the gear's spring, which 1 damps by h besides
+    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # the same of the gear; 1 damps it by h · spring
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off

@@ -78,7 +78,7 @@ class Numbers(NamedTuple):
     facts: Mapping[str, float] | None = None
     """Overrides: name of a field of ``drive_numbers.Drive`` → value that is used instead of the joint's own."""
     waits_s: float = 0.0
-    """How long targets wait for the next period of a loop; efforts of rows are as much newer."""
+    """Time for which a row's target waits until the drive's loop reads it [s]; the row's effort is newer by the same time."""
 
 
 class _Prepared(NamedTuple):
@@ -118,8 +118,8 @@ class JointResponse:
 
 
 class JointModel:
-    """Model of a joint, or of joint ``signal`` of a machine, with its own effects. Raises TaccorlError: there is no such joint,
-    or it is a gripper of the PiPER."""
+    """Model of one joint: a given ``RigidJoint``, or joint ``signal`` of a machine with the effects of the machine's file. Raises
+    TaccorlError: there is no such joint, or it is a gripper of the PiPER."""
 
     def __init__(self, of: TwinConfig | HasJoints | RigidJoint, signal: str = "") -> None:
         joint = of if isinstance(of, RigidJoint) else joint_of(of, signal)

@@ -62,9 +62,9 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
         row = int(np.argmax(np.abs(gaps - m.period_s)))
         raise TaccorlError(
             f"{m.name}: rows are not evenly spaced: {gaps[row] * 1e3:.1f} ms at {m.time_s[row]:.3f} s instead of the usual "
-            f"{m.period_s * 1e3:.1f} ms. Tables with jitter below half a row and gaps below 0.25 s are resampled to an even "
-            "rate when they are read; this table exceeds these limits: log the driver's or the bus's own stamps, or cut the "
-            "recording at the gap"
+            f"{m.period_s * 1e3:.1f} ms. Tables with jitter below half a row, gaps below 0.25 s and at most a tenth of the "
+            "rows lost are made even when they are read; this table exceeds these limits: log the driver's or the bus's own "
+            "stamps, or cut the recording at the gap"
         )
     rest = joint.surroundings(m)
     effort = m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan)

@@ -72,7 +72,7 @@ class ArrayColumns(CellColumns):
     """Columns of all cells of an array; their names are patterns."""
 
     first: int
-    """Number of the first cell, row and column, such as 0 or 1."""
+    """Number from which the column names count cells, rows and columns: 0 or 1, say."""
     order: Literal["row by row", "column by column"] | None = None
     """Order in which ``{index}`` numbers the cells of a grid; None for other patterns."""
 
@@ -84,7 +84,7 @@ class CellTableSpec(ColumnsFile):
     cells: dict[str, CellColumns] = field(default_factory=dict)
     """Name of the cell → its columns; empty with ``array``."""
     array: ArrayColumns | None = None
-    """Columns of all cells by a pattern, in place of ``cells``."""
+    """Pattern of the column names of all cells; given instead of ``cells``."""
     load: Column | None = None
     """Column of the load of all cells; None if each cell has its own."""
     temperature: TemperatureColumn | None = None

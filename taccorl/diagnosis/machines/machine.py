@@ -45,7 +45,7 @@ class PartFinding:
     can_tell: Identifiability
     """Effects that the recordings can show and separate, independent of the measured values."""
     noise: str
-    """Text of the noise floors."""
+    """The noise floors of the compared channels with their units, as text for reports."""
     numbers: str
     """Text that states which numbers are always fitted, and from where the other numbers are taken."""
     measured: str
@@ -53,7 +53,7 @@ class PartFinding:
     recordings: dict[str, tuple[str, ...]]
     """fit, validation, test → names."""
     rows_split: bool
-    """True if no recording was marked for validation, so that the last rows of each were used."""
+    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
     known: Known | None = None
     """Numbers that the recordings identify; None for parts for which they are not computed."""
     remark: str = ""

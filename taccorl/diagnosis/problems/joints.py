@@ -61,7 +61,7 @@ class JointFinding:
     recordings: dict[str, tuple[str, ...]]
     """fit, validation, test → names."""
     rows_split: bool
-    """True: no recording was marked for validation, so that the last rows of each were used."""
+    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
     known: Known
     """Numbers that the recordings identify, and the range of those that they do not."""
     held: tuple[str, ...] = ()
@@ -78,7 +78,7 @@ class JointFinding:
 
     @property
     def noise(self) -> str:
-        """Text of the noise floors."""
+        """The noise floors of the compared channels with their units, as text for reports."""
         least = f", at least {EXACT:.1%} of its changes" * (len(self.floors) > 1)
         return "; effort ".join(f.words() for f in self.floors) + least
 

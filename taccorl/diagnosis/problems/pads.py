@@ -49,7 +49,7 @@ class PadFinding:
     recordings: dict[str, tuple[str, ...]]
     """fit, validation, test → names."""
     rows_split: bool
-    """True: no recording was marked for validation, so that the last rows of each were used."""
+    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
     gains: GainStatistics | None = None
     """Statistics of differing taxel gains that could not be validated, because no validation recording presses the fitted
     taxels; None otherwise."""

@@ -16,8 +16,8 @@ from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
 
 WAITS, SHARE = 0.5, 0.15
-"""Least share of the error that waits for the loop can make, and, of a loop that is fitted, share of its square that one wait for
-each half second explains, for which they are named. Choices: of waits 0.25 and more was seen, of an unknown friction 0.05."""
+"""A remark names the wait of targets for the drive's loop if it can make at least the first share of the RMS error that is left,
+and, where the loop's rate was fitted, if one wait fitted to each half second explains the second share of its square. Choices."""
 
 
 class Startable(Problem, Protocol):
@@ -46,7 +46,7 @@ class Solved(NamedTuple):
     validation: Sequence[Recording]
     """Recordings, or their last rows, by whose error effects were chosen."""
     rows_split: bool
-    """True if no recording was marked for validation, so that the last rows of each were used."""
+    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
 
 
 def solve(

@@ -248,7 +248,7 @@ def test_of_an_effect_of_all_joints_the_model_takes_what_acts_on_its_own() -> No
 
 @dataclasses.dataclass(kw_only=True)
 class _Hooks(JointEffect):
-    """An outsider's effect that the one-joint model has never heard of."""
+    """Effect of a plug-in that states no numbers of the one-joint model (``drive``)."""
 
     name = "test_hooks"
     late: float = number("n", "1", 0.0, 1.0, (0.0, 1.0), "a test")

@@ -302,7 +302,7 @@ def test_a_true_effect_of_the_twin_is_not_to_be_removed_where_a_larger_one_is_mi
 Slow = kind("slow", lambda t, seed: np.sin(40.0 * t))
 """Effect that adds a sine of 40 rad/s and amplitude 1 to every recording."""
 Undoing = kind("undoing", lambda t, seed: 0.3 * np.sin(60.0 * t) - 0.9 * (seed > 0) * np.sin(40.0 * t))
-"""Effect that adds a sine of 60 rad/s, and subtracts 0.9 of ``Slow`` in all recordings but the first, which is fitted."""
+"""Effect that adds a sine of 60 rad/s. In all recordings but the first, that of the fit, it also subtracts 0.9 ``Slow``."""
 
 
 def test_two_effects_that_hide_each_other_on_validation_recordings_are_found_together():

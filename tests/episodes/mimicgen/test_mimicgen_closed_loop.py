@@ -368,7 +368,7 @@ def strengths_of(steps) -> np.ndarray:
 
 
 def test_nothing_drifts_from_0_8_s_before_a_gripper_moves_to_0_4_s_after():
-    # The left gripper moves only in row 60: after row 0 that is 59 steps away.
+    # The left gripper moves once, from row 59 to row 60: in row k that is 59 − k steps ahead.
     ahead = [Ahead(59 - k if k < 60 else math.inf, math.inf) for k in range(100)]
     found = strengths_of([(arm_targets(0.05 if k < 60 else 0.01), ahead[k], FREE, (False, False)) for k in range(100)])
     left, right = found.T
