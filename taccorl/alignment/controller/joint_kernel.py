@@ -144,6 +144,7 @@ def _asked(
         far = (width <= 0.0) | (abs(before - angle) > width)
         error = where(far, error - where(width > 0.0, math.copysign(width, before - angle), 0.0), 0.0)
         stiffness = where(far, stiffness, 0.0)
+    stiffness += p.commands_speed * p.encoder_scale__factor * p.kd * p.integral_action__rate_per_s
     by_error = p.kp * (error + p.integral_action__rate_per_s * integral)
     factor = where((by_error < 0.0) & (p.commands_speed > 0.0), p.direction_gain__factor, 1.0)
     by_error, stiffness = factor * by_error, factor * stiffness
@@ -307,13 +308,15 @@ def _simulated(
             soft_end = load_nm * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS  # of the play
             hanging -= where(compliance == 0.0, soft_end, 0.0)
             gear = where(abs(load_nm) > 1e-9, hanging, gear)
-    integral = none
+    integral = came = none
     until_now = none if kind == VELOCITY else load(command, 0)  # who rests was commanded no velocity
     torque = _asked(p, kind, until_now, until_now, q, v, integral, supply[0], on[0], added[0])[0]
     needed = weight + load(coupling, 0) + spring_stiffness * (q - spring_rest) + coulomb * asymmetry
     needed -= cogging_nm * sine_and_cosine(periods * q + phase)[0]
     holding = torque_scale * _of_direction(p, where(integral_rate > 0.0, needed, torque + carried))
     missing = needed - holding * (torque + carried)
+    speeds = none + 1.0 if kind == VELOCITY else p.commands_speed  # 1: the integral is that of a speed's error
+    went = none + 1.0 if kind == VELOCITY else p.encoder_scale__factor * (p.kd / p.kp + 0.5 * h)
     if with_integral:
         of_error = p.kd if kind == VELOCITY else p.kp
         integral = where(integral_rate > 0.0, missing / (holding * of_error * integral_rate), 0.0)
@@ -385,8 +388,9 @@ def _simulated(
 
         # The drive.
         strength *= _of_direction(p, given + carried)
-        if with_integral and kind == VELOCITY:
-            integral += ahead * h * now  # taken ahead as the position is, which is its other part
+        if with_integral:  # that of a speed is taken ahead as the position is, which is its other part
+            came = h * (now if kind == VELOCITY else now - p.encoder_scale__factor * q)
+            integral += ahead * speeds * came
         asked, stiffness, damping = _asked(p, kind, now, until_now, q, v, integral, supply[part], on[part], added[part])
         if with_filter:
             slow = (1.0 - fresh_share) * (damping - on[part] * p.back_emf)
@@ -483,10 +487,7 @@ def _simulated(
             kept = decayed(abs(over) / where(bends, bend_rad, 1.0))[0]
             bent = where(bends, kept * bent + (1.0 - kept) * math.copysign(bend_rad, over), 0.0)
         if with_integral:
-            if kind == VELOCITY:
-                integral += (1.0 - ahead) * h * now - moved
-            else:
-                integral += h * (now - p.encoder_scale__factor * q)
+            integral += (1.0 - ahead * speeds) * came - speeds * went * moved
         acceleration = (v_next - v) / h
         if with_filter:
             late_v = where(fresh_share < 1.0, late_v + fresh_share / ahead * (moved / h - late_v), v_next)

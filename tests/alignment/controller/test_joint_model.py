@@ -184,17 +184,8 @@ def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
     """dz/dx = 1 − z / x_p forwards and 1 + z / x_p backwards: half of the friction bends them by x_p ln 2 from rest, and back to
     no torque they return x_p ln 1.5."""
     bend_rad, friction_nm = 1e-4, 3.0
-    drive = Drive(
-        kp=0.0,
-        kd=0.0,
-        torque_ff=0.0,
-        inertia=0.01,
-        viscous_friction__damping_nms_per_rad=5.0,
-        coulomb_friction__torque_nm=friction_nm,
-        presliding__presliding_rad=bend_rad,
-        command=TORQUE,
-        midpoint=1.0,
-    )
+    rubs = {"coulomb_friction__torque_nm": friction_nm, "presliding__presliding_rad": bend_rad}
+    drive = Drive(0.0, 0.0, 0.0, 0.01, viscous_friction__damping_nms_per_rad=5.0, command=TORQUE, midpoint=1.0, **rubs)
     torque = 0.5 * friction_nm * np.interp(np.arange(8000), [0, 3000, 4000, 7000], [0.0, 1.0, 1.0, 0.0])
     still, ones = np.zeros(8000), np.ones(8000)
     angle, _ = simulate(drive, torque, still, still, ones, ones, still, 0.0, 1, 1, 1e-3, 0.0)
@@ -406,16 +397,8 @@ def test_a_rotor_on_a_stiff_gear_swings_as_its_two_masses_do() -> None:
 def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_constant_load() -> None:
     """J v̇ = K_d (v* − v + r ∫ (v* − v) dt) − d: a step of v* answers as (K_d s + K_d r) / (J s² + K_d s + K_d r), whatever d."""
     inertia, kd, rate, load_nm, step_s = 0.1, 2.0, 10.0, 0.7, 1e-3
-    drive = Drive(
-        kp=0.0,
-        kd=kd,
-        torque_ff=0.0,
-        inertia=inertia,
-        integral_action__rate_per_s=rate,
-        command=VELOCITY,
-        effort_after=1.0,
-        midpoint=1.0,
-    )
+    law = {"integral_action__rate_per_s": rate, "command": VELOCITY, "effort_after": 1.0, "midpoint": 1.0}
+    drive = Drive(0.0, kd, 0.0, inertia, **law)
     goal = np.full(1500, 1.0)
     still = np.zeros_like(goal)
     angle, effort = simulate(

@@ -9,7 +9,7 @@ from made_rows import of_signal
 
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
+from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, EffectEntry
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 
@@ -76,6 +76,22 @@ def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():
     time_s = np.arange(200) / RATE_HZ
     found = answer(axis, recording(np.full(200, 1.5), "velocity"))
     np.testing.assert_allclose(found.reported, 1.5 * (time_s - 0.1 * (1 - np.exp(-time_s / 0.1))), atol=3e-3)
+
+
+def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
+    """τ = kd (u + r ∫ u dt), u = kp (q* − q) − q̇. At rest it balances a spring of 2 N·m/rad at the target."""
+    numbers = {"integral_action": {"rate_per_s": 15.0}, "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0}}
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0)
+    axis.effects = tuple(EffectEntry(*one) for one in numbers.items())
+    target, total = np.where(np.arange(400) < 10, 0.0, 0.3), np.zeros(1)
+
+    def torque(goal: float, q: float, v: float) -> float:
+        total[0] += DT_S * (25.0 * (goal - q) - v)
+        return 4.0 * (25.0 * (goal - q) - v + 15.0 * total[0]) - 2.0 * q
+
+    found = answer(axis, recording(target))
+    assert np.abs(found.reported - integrated(target, torque, 0.08)).max() < 1e-4
+    assert found.reported[-1] == pytest.approx(0.3, abs=1e-3) and found.effort[-1] == pytest.approx(0.6, rel=0.01)
 
 
 def test_a_torque_accelerates_and_none_lets_the_axis_coast():
