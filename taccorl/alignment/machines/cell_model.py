@@ -38,10 +38,8 @@ class Calibration(NamedTuple):
 
 
 def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()) -> np.ndarray:
-    """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``; a load below 0 counts as none. If
-    ``m`` has places, (T, P): a column for each place, with the load while it is pressed.
-
-    A row's load acts at the row's time; between rows it follows a straight line.
+    """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``, which acts at its row's time and
+    follows a straight line between rows. If ``m`` has places, (T, P): a column for each place, with the load while it is pressed.
 
     Args:
         effects: effects besides the config's; one of the same name replaces the config's.
@@ -50,7 +48,7 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
     acting = present([*(e for e in config.effects if e.name not in {effect.name for effect in effects}), *effects])
     if config.reading.below_rest:
         acting = [dataclasses.replace(e, below_rest=True) if isinstance(e, CreepingEffect) else e for e in acting]
-    load, shape = np.maximum(loads(m), 0.0), (1, m.num_places) if m.place.size else config.shape
+    load, shape = loads(m), (1, m.num_places) if m.place.size else config.shape
     reading = (load / config.load_of_reading).astype(np.float32).reshape(-1, 1, *shape)
     dt_s = np.diff(m.time_s, prepend=m.time_s[0])
     for effect in acting:

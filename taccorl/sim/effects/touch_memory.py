@@ -80,7 +80,7 @@ class CreepingEffect(RememberingEffect):
         return {"crept": np.zeros((num_sims, len(self.times_s), len(self.pads), *pad_shape), np.float32)}
 
     def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
-        lowest = -np.inf if self.below_rest else 0.0
+        lowest = -np.inf if self.below_rest or self.share > 0.0 else 0.0
         _approach(own, (1.0, self.share, lowest), self.times_s, dt_s, memory["crept"], seen)
 
 
@@ -105,8 +105,8 @@ class TaxelCreep(CreepingEffect):
 
 @effect("taxel_log_creep", slot="material")
 class TaxelLogCreep(CreepingEffect):
-    """Creep over many time scales: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s. After t seconds of load r is
-    about (1 + a log₁₀(t / 0.06 s)) f. a < 0 is relaxation."""
+    """Creep over many time scales: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s. After t seconds of load, 0.2 s
+    and more, r is (1 + a log₁₀(t / 0.018 s)) f within 0.03 a f. a < 0 is relaxation."""
 
     only: ClassVar = ("cells",)  # presses of pads are too short to tell it from ``taxel_creep``
     below_rest: bool = False
@@ -235,9 +235,9 @@ def _carry_along(
     for s in range(own.shape[0]):
         for n in range(own.shape[1]):
             for k in range(own.shape[2]):
-                total = np.float32(0)
+                total, load = np.float32(0), max(own[s, n, k], np.float32(0))
                 for m in range(widths.size):
-                    least, most = low * own[s, n, k] - widths[m], high * own[s, n, k] + widths[m]
+                    least, most = low * load - widths[m], high * load + widths[m]
                     held[n, m, k] = min(max(held[n, m, k], least), most)
                     total += held[n, m, k]
                 seen[s, n, k] = total / np.float32(widths.size)

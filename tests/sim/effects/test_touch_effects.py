@@ -53,22 +53,14 @@ def bumps() -> np.ndarray:
         ("taxel_saturation", {"limit": 2.0}, [0.0, 0.5, 2.0, 6.0, 1998.0], [0.0, 0.4, 1.0, 1.5, 1.998]),
         ("taxel_threshold", {"threshold": 0.3}, [0.0, 0.2, 0.3, 1.0], [0.0, 0.0, 0.0, 0.7]),
         # Loading 0.9 f; at 1.9 the play of 1.71 … 2.09 holds 1.8; unloading 1.1 f; at 1.05 its 0.945 … 1.155 holds 1.1.
-        (
-            "taxel_hysteresis",
-            {"half_width": 0.1},
-            [0.0, 1.0, 2.0, 1.9, 1.0, 1.05, 0.0, 1.0],
-            [0.0, 0.9, 1.8, 1.8, 1.1, 1.1, 0.0, 0.9],
-        ),
-        ("taxel_play", {"half_width": 0.1}, [0.0, 1.0, 2.0, 1.9, 1.0, 0.0], [0.0, 0.9, 1.9, 1.9, 1.1, 0.1]),
+        ("taxel_hysteresis", {"half_width": 0.1}, [0, 1, 2, 1.9, 1, 1.05, 0, 1], [0, 0.9, 1.8, 1.8, 1.1, 1.1, 0, 0.9]),
+        # Below 0, as by noise of a measured load, nothing pulls.
+        ("taxel_play", {"half_width": 0.1}, [-1.0, 1.0, 2.0, 1.9, 1.0, -1.0], [0.0, 0.9, 1.9, 1.9, 1.1, 0.1]),
         # Mean of the load and of a play of half width 0.2, which reads 0, 0.8, 1.8, 1.8, 1.2, 0.2.
         ("taxel_play", {"half_width": 0.1, "elastic": 0.5}, [0, 1, 2, 1.9, 1, 0], [0, 0.9, 1.9, 1.85, 1.1, 0.1]),
-        # Eight plays, w = 0.3, 0.5 … 1.7. Loaded to 2 each reads 2 − w; at 0.5 the first three read 0.5 + w, the others hold.
-        (
-            "taxel_play",
-            {"half_width": 1.0, "spread": 0.7},
-            [0, 2, 0.5],
-            [0, 1.0, (0.8 + 1.0 + 1.2 + 1.1 + 0.9 + 1.5) / 8],
-        ),
+        # Eight plays, w = 0.3, 0.5 … 1.7. Loaded to 2 each reads 2 − w; at 0.5 the first three read 0.5 + w, the others hold:
+        # 0.8 + 1.0 + 1.2, and 1.1 + 0.9 + 0.7 + 0.5 + 0.3.
+        ("taxel_play", {"half_width": 1.0, "spread": 0.7}, [0, 2, 0.5], [0, 1.0, 6.5 / 8]),
         # Relaxation sinks under a load that stays, and never pulls: −0.5 · 2 (1 − e^(−0.01 / 0.5)) after a scan.
         ("taxel_creep", {"share": -0.5, "time_constant_s": 0.5}, [2.0, 0.0], [2.0 - (1 - np.exp(-0.02)), 0.0]),
     ],
