@@ -128,6 +128,7 @@ class CellsProblem(WithoutMaps):
             floor=self.floor[self.channels],
             channels=tuple(f"{self.config.names[k]} [{unit}]" for k in self.channels),
             data=m,
+            short_noise=True,
         )
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:

@@ -26,6 +26,8 @@ class Rows(NamedTuple):
     """(T, C) bool: entries that were measured."""
     rate_hz: float
     """Row rate [Hz]."""
+    short_noise: bool = False
+    """As in ``Recording``."""
 
 
 def rate_of(time_s: np.ndarray) -> float:
@@ -74,6 +76,18 @@ def block_sums(values: np.ndarray, layout: Sequence[Rows]) -> np.ndarray:
     where = np.concatenate(number)
     starts = np.flatnonzero(np.diff(where, prepend=-1))  # entries of a block stand together: rows are in order of time
     return np.add.reduceat(values, starts, axis=0)
+
+
+def lasting_square(values: np.ndarray, layout: Sequence[Rows]) -> float:
+    """Mean product of the stacked ``values`` (n,) with those of the same channel one to two blocks later, over the recordings of
+    short noise: the part of their mean square that is no noise, but a misfit that lasts. At least 0."""
+    products = np.zeros(2)  # of values, and of ones in their places
+    for part, rows in zip(unstacked(values, layout), layout, strict=True):
+        block = max(1, round(BLOCK_S * rows.rate_hz))
+        for k, own in enumerate((np.nan_to_num(part), rows.measured) if rows.short_noise else ()):
+            sums = np.cumsum(own, axis=0)
+            products[k] += (own[: -2 * block] * (sums[2 * block :] - sums[block:-block])).sum()
+    return max(float(products[0]), 0.0) / max(float(products[1]), 1.0)
 
 
 def independent_rows(parts: Sequence[np.ndarray]) -> float:

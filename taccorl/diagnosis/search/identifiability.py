@@ -65,11 +65,6 @@ def _ridges(model: Fit) -> list[tuple[str, str, float]]:
     size = np.sqrt(np.diag(spread))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = spread / np.outer(size, size)
-    names = [f.name for f in model.frees]
-    pairs = [
-        (names[i], names[j], float(correlation[i, j]))
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-        if abs(correlation[i, j]) > RIDGE
-    ]
+    over = np.argwhere(np.triu(np.abs(correlation) > RIDGE, 1))
+    pairs = [(model.frees[i].name, model.frees[j].name, float(correlation[i, j])) for i, j in over]
     return sorted(pairs, key=lambda p: -abs(p[2]))

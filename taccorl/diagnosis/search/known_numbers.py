@@ -54,20 +54,20 @@ def limits_of_known(
 
 def _freed(problem: Problem, name: str) -> tuple[Problem | None, tuple[str, ...]]:
     """The problem in which ``name`` is fitted, and the effect to add if it was left out; (None, ()) if it changes nothing."""
-    held = [f for f in _every(problem) if f.held and name in (f.name, f.name.split(".")[0])]
-    if not held:
+    names = {f.name for f in _held(problem, name)}
+    if not names:
         return (problem, (name,)) if name in problem.candidates else (None, ())
-    names = {f.name for f in held}
     freed = with_frees(problem, lambda f: dataclasses.replace(f, held=f.held and f.name not in names))
     return freed, ()
 
 
-def _every(problem: Problem) -> tuple[Free, ...]:
-    return (*problem.base, *(f for c in problem.candidates.values() for f in c.frees))
+def _held(problem: Problem, name: str) -> list[Free]:
+    every = (*problem.base, *(f for c in problem.candidates.values() for f in c.frees))
+    return [f for f in every if f.held and name in (f.name, f.name.split(".")[0])]
 
 
 def _words(problem: Problem, name: str) -> str:
-    held = [f for f in _every(problem) if f.held and name in (f.name, f.name.split(".")[0])]
+    held = _held(problem, name)
     values = " and ".join(f"{f.name} {f.start:.4g}{'' if f.unit == '1' else f' {f.unit}'}" for f in held)
     return (
         f"{values} {'is' if len(held) == 1 else 'are'} marked as known"

@@ -143,6 +143,9 @@ class Recording:
     """Data that the problem needs to simulate it."""
     regimes: Mapping[str, tuple[np.ndarray, float]] = field(default_factory=dict, repr=False)
     """Regime of motion → its rows, (T,) bool, and the noise of positions there by repeats [floors], at least 1."""
+    short_noise: bool = False
+    """True: noise does not last, so that what is left for longer than half a second is a misfit. False: as where joints or
+    objects are not placed alike twice."""
 
     def __post_init__(self) -> None:
         if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):

@@ -48,9 +48,7 @@ def settled(
     Args:
         began: values at the start; numbers that are left out begin at their defaults.
         present: effects that the twin has already: their strengths are known at the start.
-        fitted_to: recordings of the fit.
         validation: recordings whose error must not rise either.
-        most: most steps of the solver.
     """
     deviations = np.array([_deviation(problem, f, present) for f in model.frees])
     variances = np.diag(model.covariance())

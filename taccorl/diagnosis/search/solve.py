@@ -62,13 +62,8 @@ def solve(
     """Search for the effect that is missing in one part's problem.
 
     Args:
-        part: name of the part, for messages.
-        fit_to: recordings to which numbers are fitted.
-        validation: recordings by whose error effects are chosen; if there are none, the last rows of those of the fit.
-        test: recordings on which no choice depends.
-        search: criteria of acceptance; the default ones if not given.
-        without: effects that are left out of the search.
-        progress: function that is called with a text about the present step.
+        part: name of the part, for messages; the others are those of ``diagnose``.
+        validation: if there are none, the last rows of ``fit_to`` take their place.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.

@@ -1,11 +1,13 @@
 """Least squares in noise floors, its intervals, and the statistics that judge it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from made_problem import MadeProblem, Ripple, Square, record
 
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
-from taccorl.diagnosis.search.fit import FAR, FINE, fit, out_of_dents, over_own_scale, residuals, rms
+from taccorl.diagnosis.search.fit import FAR, FINE, fit, moved_by, out_of_dents, over_own_scale, residuals, rms
 from taccorl.diagnosis.search.problem import Free, free
 from taccorl.diagnosis.search.screen import alike, probe
 
@@ -40,6 +42,16 @@ def test_what_a_model_leaves_above_the_floor_widens_its_intervals_however_many_r
     assert narrow[0] < 0.1 * wide[0]
     clean = fit(problem, [record(0, gain=0.0, seconds=60.0)], (), {})
     assert np.array_equal(clean.covariance(), clean.covariance(left_over=False))
+
+
+def test_of_what_is_left_within_the_noise_only_what_lasts_widens_intervals():
+    """A square wave of 0.3 floors that lasts 6 s a side: of its 0.09 a share 1 − 2 · 0.75 s / 6 s is left 0.5 to 1 s later."""
+    for period_s, expected in ((12.0, 0.09 * 0.75 * 0.1**2), (0.04, 0.0)):
+        square = 0.03 * np.sign(np.sin(2.0 * np.pi / period_s * np.arange(0.0, 60.0, 0.005)))
+        recording = record(0, gain=0.0, seconds=60.0, extra=square)
+        model = fit(Offset(), [dataclasses.replace(recording, short_noise=True)], (), {})
+        assert model.covariance()[0, 0] == pytest.approx(expected, rel=0.2, abs=0.1**2 / 400)
+        assert fit(Offset(), [recording], (), {}).covariance()[0, 0] < 0.1**2 / 400
 
 
 class Stepped(Offset):
@@ -87,6 +99,10 @@ def test_a_number_at_its_bound_is_said_to_be_there():
     problem.base = (Free(name="gain", unit="1", start=1.0, low=0.1, high=2.0, log=True), problem.base[1])
     assert fit(problem, [record(0)], (), {}).at_bound == ("gain",)
     assert fit(MadeProblem(), [record(0)], (), {}).at_bound == ()
+    alone, recordings = Offset(), [record(0, gain=0.0)]
+    alone.base = (dataclasses.replace(Offset.base[0], low=0.6, high=0.7),)
+    model = fit(alone, recordings, (), {})
+    assert model.at_bound == ("offset",) and moved_by(alone, model, recordings, recordings, np.full(1, FINE)) == [0.0]
 
 
 def test_a_fit_that_runs_out_of_steps_says_so():
