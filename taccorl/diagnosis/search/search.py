@@ -154,12 +154,11 @@ class Beam:
             found = best([answer, *(k for k, m in grown.values() if not fits.why_not(k, m))], c)
             if found is not answer:
                 better_ones = [k for k, m in grown.values() if not fits.why_not(k, m) and not refusal(k, answer, c)]
-                more = self.much(level[0])  # two effects can hide each other on validation recordings
-                answer = fits.polished(found)
+                more, answer = self.much(level[0]), fits.polished(found)  # more may hide on validation recordings
                 if depth > 0:  # what was added first may only have been the nearest to two that are missing
                     answer = self._exchanged(answer, further=False)
                 rest = sorted((k for k in better_ones if k.names != found.names), key=lambda k: above_floor(k.squares))
-                rest += [k for k in more if k.fit.error < answer.fit.error and k not in rest]
+                rest += [k for k in more if k.fit.error < answer.fit.error]
                 level = [answer, *rest[: c.width - 1]]
             elif depth == 0:
                 level = self.much(answer)

@@ -78,8 +78,7 @@ class IntegralAction(JointEffect):
 
     At the start of an episode or a replay, I has the value that holds the joint where it is. A physics step applies I_n and
     computes I_{n+1} = I_n + h (q*_n − q_n). Implemented as MuJoCo's PID actuator. An encoder's bias on the same joint is not
-    integrated. A loop of speed, as of law velocity or cascade of an axis or robot file, integrates the error of the speed: τ = K_d
-    (u + r ∫ u dt) with u = q̇* − q̇, of a cascade K_p / K_d (q* − q) − q̇. r is 1 / T_i of the drive."""
+    integrated. Laws velocity and cascade: τ = K_d (u + r ∫ u dt), u = q̇* − q̇ or K_p / K_d (q* − q) − q̇; r is 1 / T_i."""
 
     rate_per_s: float = number(
         "r", "1/s", 0, 0.5, (0, 500), "a choice: K_i / K_p; position loops have up to 5, loops of speed 10 to 200"
