@@ -15,7 +15,7 @@ MOST_LINES = {
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_207,
     "taccorl/policies": 3_478,
-    "taccorl/report": 2_478,
+    "taccorl/report": 2_475,
     "taccorl/rl": 2_479,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,

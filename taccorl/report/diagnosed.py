@@ -14,7 +14,7 @@ from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
 from taccorl.report.evidence_words import effect_class, evidence_words, last_refit_words, unit_words
 from taccorl.report.section import Cell, Picture, Section, Value, change
-from taccorl.report.verdict import NEAR, Verdict, added, refitted_words
+from taccorl.report.verdict import NEAR, Verdict, added, clean, refitted_words
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
@@ -80,8 +80,10 @@ def _in_twin(d: Diagnosis) -> str:
 
 
 def _values(e: Effect) -> str:
+    width = {name: high - low for name, (low, high) in e.interval.items()}
     return ", ".join(
-        f"{p.name} {p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)} ({_interval(e.interval, p.name)})"
+        f"{p.name} {p.symbol} = {clean(getattr(e, p.name), width.get(p.name, 0.0))}{unit_words(p.unit)} "
+        f"({_interval(e.interval, p.name)})"
         for p in e.parameters()
     )
 
@@ -146,18 +148,13 @@ def _waterfall(part: str, d: Diagnosis, origins: Sequence[Origin]) -> Picture:
 
 def _interval(intervals: Mapping[str, Sequence[float]], name: str, none: str = "not fitted") -> str:
     low, high = intervals.get(name, (math.nan, math.nan))
-    return f"{low + 0.0:.4g} … {high + 0.0:.4g}" if math.isfinite(low) and math.isfinite(high) else none
-
-
-def clean(value: float, width: float) -> str:
-    """A number; 0 if it is nothing beside the ``width`` of its interval."""
-    return f"{0.0 if abs(value) < 1e-6 * width else value:.4g}"
+    return " … ".join(clean(end, high - low) for end in (low, high)) if math.isfinite(high - low) else none
 
 
 def _identified(known: Known) -> Section:
     """The primary numbers, and what pins the others."""
     rows = [
-        [n.name, f"{clean(n.value, n.high - n.low)}{unit_words(n.unit)}", f"{n.low + 0.0:.4g} … {n.high + 0.0:.4g}"]
+        [n.name, f"{clean(n.value, n.high - n.low)}{unit_words(n.unit)}", _interval({n.name: (n.low, n.high)}, n.name)]
         for n in known.identifiable
     ]
     note = f"The scale of the torques is fixed by {' and '.join(known.pinned_by)}."
@@ -182,9 +179,8 @@ def _numbers(d: Diagnosis, known: Known | None) -> Section:
         words = f"{name} (of the recordings, not in the twin)" if name in OF_RECORDINGS else name
         start = f"{d.start[name]:.4g}" if name in d.start else ""
         low, high = d.intervals.get(name, (0.0, 0.0))
-        rows.append(
-            [words, start, f"{clean(value, high - low)}{units.get(name, '')}", _interval(d.intervals, name, "")]
-        )
+        fitted = f"{clean(value, high - low)}{units.get(name, '')}"
+        rows.append([words, start, fitted, _interval(d.intervals, name, "")])
     notes = []
     if known is not None and not known.pinned_by and "kp" in d.base:
         notes = ["Together they reproduce the recordings; intervals include what the loop's timing leaves open."]
@@ -217,7 +213,7 @@ def _regimes(found: RegimeErrors) -> Section:
         n = cells[use, recording, ALL].n if (use, recording, ALL) in cells else 0
         ratios = [Cell(f"{r.error:.3g}", "good" if r.error <= AT_FLOOR else "bad") if r else "" for r in own]
         rows.append([use, recording or Cell("all of them", "bold"), f"{n:,}", *ratios])
-    heads = ("use", "recording", "n", *regimes)
+    heads, title = ("use", "recording", "n", *regimes), "Error after the fit, by recording and regime"
     note = "RMSE over the noise floor; 1 is as good as any twin can be. Regimes with hardly a row are left out."
     ends = [[c.ranges.get(use) for use in USES] for c in found.coverage]
     ranges = [
@@ -227,7 +223,7 @@ def _regimes(found: RegimeErrors) -> Section:
     covered = Section(heads=("range covered", *USES), rows=ranges, right=range(1, 4), notes=found.remarks)
     marks = ["" if row[1] else "tie" for row in dict.fromkeys((r.use, r.recording) for r in found.rows)]
     return Section(
-        title="Error after the fit, by recording and regime",
+        title=title,
         heads=heads,
         rows=rows,
         right=range(2, len(heads)),
@@ -254,16 +250,9 @@ def _evidence_row(e: Evidence, mark: str) -> list[Value]:
     about += [] if cls is None else [f"near-twin {other}: {why}" for other, why in cls.near_twins.items()]
     fitted = ", ".join(f"{k.split('.', 1)[1]} {v:.4g}{unit_words(e.units.get(k, '1'))}" for k, v in e.values.items())
     bounds = f"at bound: {', '.join(e.at_bound)}" if e.at_bound else ""
-    return [
-        mark,
-        Cell(e.name, more=about),
-        fitted,
-        _floors(e.validation_error),
-        f"{round(e.gain, 2) + 0.0:.0%}",
-        f"{e.score:.1f}",
-        Cell(evidence_words(e), hint=f"ΔBIC {e.bic:.0f}"),
-        "; ".join(w for w in (e.verdict, e.trouble, bounds) if w),
-    ]
+    numbers = [fitted, _floors(e.validation_error), f"{round(e.gain, 2) + 0.0:.0%}", f"{e.score:.1f}"]
+    words = "; ".join(w for w in (e.verdict, e.trouble, bounds) if w)
+    return [mark, Cell(e.name, more=about), *numbers, Cell(evidence_words(e), hint=f"ΔBIC {e.bic:.0f}"), words]
 
 
 def _can_tell(f: Finding) -> Section:

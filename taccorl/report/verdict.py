@@ -179,7 +179,15 @@ def _change(c: Changed, d: Diagnosis) -> str:
     edit += f": a constant {'force' if c.unit == 'N' else 'torque'}, which may be a weight" * (c.name == "torque_ff")
     edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (c.name == EFFORT_SCALE)
     edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))
-    return f"{c.name} {c.was} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g}){edit}"
+    ends = f"{clean(low, high - low)} … {clean(high, high - low)}"
+    return f"{c.name} {c.was} → {clean(c.after, high - low)}{unit_words(c.unit)} ({ends}){edit}"
+
+
+def clean(value: float, width: float) -> str:
+    """A number with four digits, or those of which the half ``width`` of its interval has two; 0 if it is nothing beside it."""
+    known = 0.0 < width < math.inf and 0.0 < abs(value) < math.inf
+    digits = 2 + math.ceil(math.log10(2.0 * abs(value) / width)) if known else 4
+    return f"{0.0 if abs(value) < 1e-6 * width else value + 0.0:.{max(4, digits)}g}"
 
 
 def added(d: Diagnosis) -> tuple[str, ...]:

@@ -175,11 +175,11 @@ def facts(finding: JointFinding) -> list[str]:
     found = [SIGNAL, effect.name, d.words, finding.noise, finding.numbers, finding.measured]
     found += [f"{of[use]:.2f}" for of in map(d.errors.get, ("before", "fitted")) for use in of if use != "fit"]
     found += [f"{d.errors['after']['validation'] / d.errors['fitted']['validation'] - 1:+.0%}"]
-    found += [f"{effect.torque_nm:.4g} N·m", f"{low:.4g} … {high:.4g}"]  # pyright: ignore[reportAttributeAccessIssue]
+    found += [clean(x, high - low) for x in (effect.torque_nm, low, high)]  # pyright: ignore[reportAttributeAccessIssue]
     found += [cls.equation, cls.in_words, cls.at_a_policy, cls.to_record]
     found += [text for name, why in cls.near_twins.items() for text in (f"near-twin {name}", why)]
     found += [text for n in known.identifiable for text in (n.name, clean(n.value, n.high - n.low))]
-    found += [f"{n.low + 0.0:.4g} … {n.high + 0.0:.4g}" for n in known.identifiable]
+    found += [" … ".join(clean(end, n.high - n.low) for end in (n.low, n.high)) for n in known.identifiable]
     found += [word for r in d.rounds for e in r.evidence[:6] for word in (e.name, f"{e.score:.1f}")]
     found += [f"taccorl add-effect {effect.name}", *finding.recordings["validation"], *known.pinned_by, *rivals]
     apart = separable(d, effect.name, rivals)
@@ -218,7 +218,7 @@ def test_a_lead_that_only_one_effect_of_several_left_behind_holds_nothing_up(dia
 
 
 def test_a_number_that_is_nothing_beside_its_interval_is_zero_and_no_change_has_no_sign():
-    assert (clean(2.6e-13, 4e-5), clean(-0.0285, 0.001)) == ("0", "-0.0285")
+    assert (clean(2.6e-13, 4e-5), clean(-0.0285, 0.001), clean(0.01200032, 6e-7)) == ("0", "-0.0285", "0.01200032")
     assert (change(100.0, 99.7), change(2.0, 1.0)) == ("+0%", "-50%")
 
 
