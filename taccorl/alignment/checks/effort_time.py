@@ -44,9 +44,9 @@ without a shift, for which the shift is reported. Choices."""
 GAINS_LEFT, GAINS_OFF, ALIKE_GAINS = 0.25, 1.3, 1.1
 """Largest residual of the fitted law as a share of the RMS effort, for which its gains are reported; least ratio of a fitted gain
 to the stated one, or its inverse; and largest ratio of both ratios that a wrong unit of the effort explains, too. Choices."""
-STATED_LEFT, SHARES = 2.0, (-0.5, 1.5)
-"""Fitted gains are reported if the residual of the stated ones, with the best delay and lag of the targets, is at least so many
-times that of the fitted ones, and r is in this range. Of 378 simulated joints with the stated gains none was reported."""
+STATED_LEFT, SHARES = (1.2, 2.0), (-0.5, 1.5)
+"""Fitted gains are reported if the stated ones, with the best delay and lag of the targets, leave so many times as much of
+efforts (the fitted ones leave their noise) or accelerations, and r is in this range. Choices."""
 ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
 """Gains fitted to one recording are compared with others' if the law leaves at most the first share of its effort; two that
 differ by more than the second factor are not of one machine (with one of 7 effects: at most 1.34). From accelerations in place of
@@ -165,7 +165,7 @@ def _other_gains(
     m, (kp, kd) = recordings[0], times(fit)
     if unseen and (max(kp, 1 / kp) < MOVED or max(kp / kd, kd / kp) < GAINS_OFF):
         return None
-    if _stated_left(law, recordings, signal, unseen) < STATED_LEFT * fit.left:
+    if _stated_left(law, recordings, signal, unseen) < STATED_LEFT[unseen] * fit.left:
         return None
     stated = m.kp[signal], m.kd[signal]
     text = (
