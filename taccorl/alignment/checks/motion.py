@@ -338,7 +338,7 @@ def check_effort(t: Trial) -> Iterator[Finding]:
         at = np.flatnonzero(np.abs(effort) == largest)
         value, level, least = largest, f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
         if len(at) < least:
-            at, value, sd = _plateau(m, int(j))
+            at, value, sd = plateau(m, int(j))
             level, least = f"±{value:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
         if len(at) >= least and abs(value - t.limits.get(name, math.inf)) > STATED_LIMIT * value:
             text = (
@@ -378,7 +378,7 @@ def _without_effort(m: Measurement, name: str) -> str:
     return write(m, file, f"write `effort_scale: {{{name}: 0}}` in measurements.yaml")
 
 
-def _plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
+def plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
     """Rows in which a linear law of target, position and speed, fitted to the rows of less effort, asks for more than the largest
     effort, while the effort stays at it but for its noise; that effort [N·m, N], and its standard deviation in these rows. No
     rows if there is no such law."""

@@ -30,7 +30,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, seen_in, unlike_rows
+from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, recording_of, seen_in, unlike_rows
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -179,15 +179,8 @@ class AxisProblem(WithoutMaps):
             found.append(late if axis.loop_hz else LOOP)
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
         found += [
-            Free(
-                name=name,
-                unit=unit(units.get(name, "N·m·s/rad")),
-                start=at,
-                low=at / within,
-                high=at * within,
-                log=True,
-            )
-            for name, at in numbers.items()
+            Free(name=n, unit=unit(units.get(n, "N·m·s/rad")), start=at, low=at / within, high=at * within, log=True)
+            for n, at in numbers.items()
             if at > 0.0
         ]
         return tuple(found)
@@ -200,20 +193,7 @@ class AxisProblem(WithoutMaps):
         return bool(self.axis.weight_sin or self.axis.weight_cos)
 
     def _recording(self, m: Measurement) -> Recording:
-        motion = axis_motion(self.axis, m)
-        columns = {"position": motion.measured, "effort": motion.effort}
-        channels = {
-            "position": f"{self.signal} [{self.axis.unit}]",
-            "effort": f"{self.signal} effort [{self.axis.scale.unit_of('N·m')}]",
-        }
-        return Recording(
-            name=m.name,
-            time_s=motion.time_s,
-            measured=np.column_stack([columns[kind] for kind in self._kinds]),
-            floor=self.floor_values,
-            channels=tuple(channels[kind] for kind in self._kinds),
-            data=motion,
-        )
+        return recording_of(m, self.signal, axis_motion(self.axis, m), self._kinds, self.floor_values)
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         motions: list[JointMotion] = [r.data for r in self.fit]

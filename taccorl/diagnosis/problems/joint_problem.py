@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.checks.motion import plateau
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
@@ -265,17 +266,8 @@ class JointProblem(WithoutMaps):
         return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
 
     def _recording(self, m: Measurement) -> Recording:
-        motion = motion_of(m, self.signal, self.model.joint)
-        columns = [motion.measured, motion.effort] if self.effort else [motion.measured]
-        names = [f"{self.signal} [{self.model.unit}]", f"{self.signal} effort [{UNITS[self.model.unit][1]}]"]
-        return Recording(
-            name=m.name,
-            time_s=motion.time_s,
-            measured=np.column_stack(columns[self._first :]),
-            floor=np.array(self._floor_values(m)),
-            channels=tuple(names[self._first : len(columns)]),
-            data=motion,
-        )
+        kinds, motion = ("position", "effort"), motion_of(m, self.signal, self.model.joint)
+        return recording_of(m, self.signal, motion, kinds[self._first : 1 + self.effort], self._floor_values(m))
 
     def _floor_values(self, m: Measurement) -> list[float]:
         """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains."""
@@ -315,6 +307,28 @@ def seen_in(
         "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
         "duration_s": max(float(m.time_s[-1]) for m in motions),
     }
+
+
+def recording_of(
+    m: Measurement, signal: str, motion: JointMotion, kinds: Sequence[str], floors: Sequence[float] | np.ndarray
+) -> Recording:
+    """Channels ``kinds`` of a joint, with their noise floors (C,). An effort at a limit has none of the noise of positions and
+    speeds that a drive multiplies by its gains, which is most of its floor; a quarter is assumed at least, a choice."""
+    unit, share = m.units[m.column(signal)], np.ones((m.num_rows, len(kinds)))
+    columns = {"position": motion.measured, "effort": motion.effort}
+    names = {"position": f"{signal} [{unit}]", "effort": f"{signal} effort [{UNITS[unit][1]}]"}
+    if kinds[-1] == "effort":
+        rows, _, sd = plateau(m, m.column(signal))
+        share[rows, -1] = min(max(sd / floors[-1], 0.25), 1.0)
+    return Recording(
+        name=m.name,
+        time_s=motion.time_s,
+        measured=np.column_stack([columns[kind] for kind in kinds]),
+        floor=np.array(floors),
+        channels=tuple(names[kind] for kind in kinds),
+        data=motion,
+        share=share,
+    )
 
 
 def unlike_rows(loop_s: float, recordings: Sequence[Measurement]) -> float:

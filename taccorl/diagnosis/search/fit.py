@@ -272,7 +272,7 @@ class _Entries(NamedTuple):
 @lru_cache(maxsize=64)
 def _entries(recording: Recording) -> _Entries:
     measured = np.isfinite(recording.measured)
-    floors = np.broadcast_to(recording.floor, measured.shape)
+    floors = np.broadcast_to(recording.floor * recording.share, measured.shape)
     return _Entries(np.flatnonzero(measured), recording.measured[measured], floors[measured])
 
 

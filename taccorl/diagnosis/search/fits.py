@@ -264,9 +264,7 @@ class Fits:
         model = self.fitted((*parent.names, name), [start], steps)
         more = [start | self.given] * (model.error > STUCK * parent.error)
         if parent.at_an_end and model.error > FAR_OFF:
-            own = self.problem.candidates[name]
-            starts = [{f.name: f.start for f in own.frees} | one | self.given for one in own.starts]
-            more.append(self.fitted((*parent.names, name), [parent.values | one for one in starts], 1).values)
+            more.append(self._afresh(parent, name))
         # At a whole row a delayed target comes before that row's effort is measured, or after it: the error jumps there.
         row_s = min(float(np.median(np.diff(r.time_s))) for r in self.fit_to)
         for delay in [f.name for f in self.problem.candidates[name].frees if f.name.endswith(".delay_s")]:
@@ -282,11 +280,17 @@ class Fits:
         if model.error > STUCK * parent.error:  # stuck: from where the effect is hardly there
             faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
             more.append(parent.values | faint)
+        if parent.error > FAR_OFF:
+            more.append(self._afresh(parent, name))
         if model.error > self.config.floor:  # the numbers may have gone far to make up for it: from where they began
             more.append(starts[0] | self.given)
-        if more:
-            model = min((model, self.fitted((*parent.names, name), more)), key=lambda m: m.error)
-        return model
+        return min((model, *(self.fitted((*parent.names, name), [one]) for one in more)), key=lambda m: m.error)
+
+    def _afresh(self, parent: Fit, name: str) -> Values:
+        """The best start of an effect's own beside the numbers that the file has, after one step."""
+        own = self.problem.candidates[name]
+        starts = [parent.values | {f.name: f.start for f in own.frees} | one | self.given for one in own.starts]
+        return self.fitted((*parent.names, name), starts, 1).values
 
     def grown(self, model: Model) -> Model:
         """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles. Also of a

@@ -136,7 +136,7 @@ class Recording:
     measured: np.ndarray
     """(T, C) measured values; NaN where not measured."""
     floor: np.ndarray
-    """(C,) noise floor of each channel in its unit; residuals are divided by it."""
+    """(C,) noise floor of each channel in its unit; residuals are divided by it, times ``share``."""
     channels: tuple[str, ...]
     """Name and unit of each channel, such as "left_joint5 [rad]"."""
     data: Any = field(repr=False)
@@ -146,6 +146,8 @@ class Recording:
     short_noise: bool = False
     """True: noise does not last, so that what is left for longer than half a second is a misfit. False: as where joints or
     objects are not placed alike twice."""
+    share: np.ndarray | float = 1.0
+    """(T, C) noise of an entry as a share of the floor of its channel."""
 
     def __post_init__(self) -> None:
         if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):
