@@ -77,6 +77,10 @@ def run(config: DiagnoseConfig) -> int:
     if not parts:
         return 1
     found = _diagnosed(config, machine, parts, measurements)
+    left = [part for part in parts if part not in {f.part for f in found}]
+    refused += [f"{part}: stopped before an effect was found" for part in left]
+    if not found:
+        raise KeyboardInterrupt
     mended, disagree = machine.mended(found)
     report = _report(config, machine, found, beside, measurements, mended)
     verdicts = report.verdicts()
@@ -98,7 +102,7 @@ def _diagnosed(
     from taccorl.diagnosis.search.result import SearchConfig
 
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-    with Bars(len(parts), f"diagnosing {len(parts)} parts") as bars:
+    with Bars(len(parts), f"diagnosing {len(parts)} parts") as bars, Steps().until_interrupted() as steps:
         count = itertools.count(1)
         return diagnose_parts(
             machine,
@@ -109,7 +113,7 @@ def _diagnosed(
             without=config.without,
             workers=config.workers,
             done=lambda part: bars.update(part, next(count), len(parts)),
-            progress=Steps(),
+            progress=steps,
         )
 
 

@@ -1,9 +1,15 @@
 """Progress of the verbs: bars in a terminal, lines now and then in a log file."""
 
+import multiprocessing
+import signal
 import sys
+import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -75,9 +81,38 @@ class Steps:
     """Time of the beginning [s], which lines state."""
     line_s: float = field(default_factory=lambda: time.monotonic())
     """Time of the last line [s]."""
+    asked: Path | None = None
+    """File that is there once the user has typed Ctrl-C; all processes see it."""
+
+    @contextmanager
+    def until_interrupted(self) -> Iterator["Steps"]:
+        """The first Ctrl-C makes calls raise ``Stopped`` in every process, the second ends the command."""
+        if threading.current_thread() is not threading.main_thread():  # in which alone signals can be handled
+            yield self
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            asked = self.asked = Path(folder) / "stop"
+
+            def ask(*_: object) -> None:
+                asked.touch()
+                signal.signal(signal.SIGINT, before)
+                print("\nstopping with what was found; Ctrl-C again ends without it", file=sys.stderr, flush=True)
+
+            before = signal.signal(signal.SIGINT, ask)
+            try:
+                yield self
+            finally:
+                signal.signal(signal.SIGINT, before)
 
     def __call__(self, part: str, text: str = "") -> None:
         """Print the present step ``text`` of ``part``, with the time since the beginning."""
+        if self.asked is not None:
+            from taccorl.diagnosis.search.problem import Stopped
+
+            if multiprocessing.parent_process() is not None:  # a worker, which its parent stops
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+            if self.asked.exists():
+                raise Stopped
         now_s = time.monotonic()
         if now_s - self.line_s >= self.every_s:
             self.line_s = now_s

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import os
 import shlex
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from simulated_sweeps import write_folder
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.cli.main import main
+from taccorl.cli.progress import Steps
 from taccorl.data.dataset import read_info
 from taccorl.data.lerobot_format import change_features
 from taccorl.robots import ROBOT
@@ -280,3 +283,26 @@ def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: P
         own, end, shown = shown.partition(f"=== {words} === {status}\n")
         assert end, f"{words} does not end with {status}: {own}"
         assert printed in own, words
+
+
+def test_ctrl_c_ends_with_what_was_found(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd):
+    """The first one once the friction is in the model; where nothing was found yet, as everywhere."""
+    words = ["diagnose", f"--measurements={sweeps}", f"--twin={sweeps.parent / 'twin.yaml'}", f"--joints=[{SIGNAL}]"]
+    words += [few("coulomb_friction", "encoder_offset"), "--until=noise_floor"]
+
+    def typed_at(begins: str, out: str) -> int:
+        def step(self: Steps, part: str, text: str = "") -> None:
+            if text.startswith(begins) and not self.asked.exists():
+                os.kill(os.getpid(), signal.SIGINT)
+            plain(self, part, text)
+
+        monkeypatch.setattr(Steps, "__call__", step)
+        return main([*words, f"--out={tmp_path / out}"])
+
+    plain, before = Steps.__call__, signal.getsignal(signal.SIGINT)
+    assert typed_at("no effect added", "nothing") == 130 and not (tmp_path / "nothing").exists()
+    assert typed_at("coulomb_friction", "found") in (0, 1)
+    assert signal.getsignal(signal.SIGINT) is before
+    told = json.loads((tmp_path / "found" / "report.json").read_text())["diagnoses"][SIGNAL]
+    assert [e["effect"] for e in told["effects"]] == ["coulomb_friction"]
+    assert "stopping with what was found" in capfd.readouterr().err

@@ -24,7 +24,7 @@ from taccorl.diagnosis.problems.joints import JointFinding, each
 from taccorl.diagnosis.problems.pads import PadFinding
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
-from taccorl.diagnosis.search.problem import Progress, Recording, no_progress
+from taccorl.diagnosis.search.problem import Progress, Recording, Stopped, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import Startable, solve
 from taccorl.errors import TaccorlError, nearest
@@ -424,7 +424,7 @@ def diagnose_parts(
         without: effects that are left out of the search.
         done: function that is called with each finished part.
         progress: function that is called with (part, text about the present step), in the process of the part if ``workers`` is
-            above 1.
+            above 1. Parts in which it raises ``Stopped`` before an effect was added are left out.
     """
 
     def diagnosed(
@@ -432,16 +432,28 @@ def diagnose_parts(
         some: Sequence[str],
         leave_out: Sequence[str] = (),
         done: Callable[[str], None] = lambda _: None,
-    ) -> list[Finding]:
+    ) -> list[Finding | None]:
         options = {"gains": gains, "search": search, "without": (*without, *leave_out)}
         items = {part: (part, machine.of_part(part, measurements)) for part in some}
         return each(partial(_diagnosed, machine, progress, options), items, workers, done)
 
-    return machine.reconsidered(diagnosed(machine, parts, done=done), measurements, gains, diagnosed)
+    def again(*asked: Any) -> list[Finding]:
+        if len(found := [f for f in diagnosed(*asked) if f is not None]) < len(asked[1]):
+            raise Stopped
+        return found
+
+    found = [f for f in diagnosed(machine, parts, done=done) if f is not None]
+    try:
+        return machine.reconsidered(found, measurements, gains, again)
+    except Stopped:
+        return found
 
 
 def _diagnosed(
     machine: Machine, progress: Callable[[str, str], None], options: Mapping[str, Any], item: tuple[str, Measurements]
-) -> Finding:
+) -> Finding | None:
     part, measurements = item
-    return machine.diagnose(part, measurements, **options, progress=partial(progress, part))
+    try:
+        return machine.diagnose(part, measurements, **options, progress=partial(progress, part))
+    except Stopped:
+        return None

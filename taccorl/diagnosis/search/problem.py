@@ -275,6 +275,10 @@ Progress = Callable[[str], None]
 """Function that is called with a text about the present step."""
 
 
+class Stopped(Exception):
+    """Raised by a ``Progress``: no further fit is wanted."""
+
+
 def no_progress(*text: str) -> None:
     """Progress that nobody reads; no lambda, since workers are sent it."""
 

@@ -16,9 +16,10 @@ test recordings, which no choice has seen, give the final figures.
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
 """
 
+import dataclasses
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,16 @@ from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_sco
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
 from taccorl.diagnosis.search.identifiable import not_told_from_none
-from taccorl.diagnosis.search.problem import EFFORT_SCALE, Problem, Progress, Recording, Values, no_progress, with_scale
+from taccorl.diagnosis.search.problem import (
+    EFFORT_SCALE,
+    Problem,
+    Progress,
+    Recording,
+    Stopped,
+    Values,
+    no_progress,
+    with_scale,
+)
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
@@ -69,7 +79,11 @@ def diagnose(
         present: effects that the twin has already: they are refitted and never removed.
         without: effects that are left out of the search.
         config: criteria of acceptance; the default ones if not given.
-        progress: function that is called with a text about the present step.
+        progress: function that is called with a text about the present step. Where it raises ``Stopped``, the effects of the
+            rounds so far are the result, with a remark.
+
+    Raises:
+        Stopped: by ``progress``, before an effect was added.
     """
     began = time.process_time()
     how = (fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
@@ -118,10 +132,11 @@ def diagnose(
         steps=(("", fits.base.error), *((r.added, r.validation_error) for r in rounds if r.added)),
         remarks=(
             *remarks,
+            *beam.remarks,
             *_of_refit(fits, answer),
             *_of_pairs(beam, answer),
             *_of_gains(fits, model),
-            *_better_than_present(beam, answer),
+            *(() if beam.remarks else _better_than_present(beam, answer)),
         ),
         at_bound=tuple(f.name for f in model.ended),
         undetermined=_undetermined(model),
@@ -141,9 +156,27 @@ class Beam:
 
     def __init__(self, fits: Fits, names: Sequence[str]) -> None:
         self.fits, self.config, self.names = fits, fits.config, list(names)
+        self.remarks: list[str] = []
 
     def search(self) -> Model:
-        """The best model with at most ``max_effects`` effects more than the twin has."""
+        """The best model with at most ``max_effects`` effects more than the twin has, or of the rounds before ``Stopped``."""
+        fits = self.fits
+        answer = fits.base
+        try:
+            for answer in self._answers():  # noqa: B007
+                pass
+        except Stopped:
+            if not (names := fits.added(answer)):
+                raise
+            fits.report = no_progress
+            self.config = fits.config = dataclasses.replace(self.config, max_effects=len(names))
+            self.remarks.append(
+                f"Stopped after {' and '.join(names)}: what may be beside or in place of it was not tried."
+            )
+        return answer
+
+    def _answers(self) -> Iterator[Model]:
+        """The best model after each round."""
         fits, c = self.fits, self.config
         answer = fits.grown(fits.base)
         level = [answer]
@@ -154,7 +187,8 @@ class Beam:
             found = best([answer, *(k for k, m in grown.values() if not fits.why_not(k, m))], c)
             if found is not answer:
                 better_ones = [k for k, m in grown.values() if not fits.why_not(k, m) and not refusal(k, answer, c)]
-                more, answer = self.much(level[0]), fits.polished(found)  # more may hide on validation recordings
+                more = self.much(level[0])  # which may hide on validation recordings
+                yield (answer := fits.polished(found))
                 if depth > 0:  # what was added first may only have been the nearest to two that are missing
                     answer = self._exchanged(answer, further=False)
                 rest = sorted((k for k in better_ones if k.names != found.names), key=lambda k: above_floor(k.squares))
@@ -166,7 +200,7 @@ class Beam:
                 break
             if not level:
                 break
-        return self._exchanged(self._simpler(answer))
+        yield self._exchanged(self._simpler(answer))
 
     def _simpler(self, answer: Model) -> Model:
         """The best of ``answer``, at the floor, and of the simpler forms of its effects with another effect: two effects often

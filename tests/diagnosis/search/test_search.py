@@ -8,8 +8,8 @@ import pytest
 from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, drive, kind, record
 
 from taccorl.diagnosis.search import fits
-from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free
-from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Stopped
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
 from taccorl.report.verdict import verdict
@@ -276,6 +276,26 @@ def test_an_effect_that_stood_for_two_is_exchanged_once_the_other_one_is_in(most
     assert errors["mix"] == pytest.approx(4.12, abs=0.05) and errors["tone"] < 1.1
     assert found.status == "at_floor"
     assert found.errors["after"]["test"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_stopped_search_keeps_the_effects_of_its_rounds():
+    """Of ripple + 0.5 tones and noise 0.1 the tone is left: √(1 + 0.125 / 0.01) = 3.7 floors."""
+    split = made(Ripple(strength=1.0), Tone(strength=0.5))
+
+    def diagnosed(begins: str) -> Diagnosis:
+        def progress(text: str) -> None:
+            if text.startswith(begins):
+                raise Stopped
+
+        return diagnose(MadeProblem(Ripple, Tone, Square), *split, progress=progress)
+
+    found = diagnosed("ripple, validation error")
+    assert found.names == ("ripple",) and found.status == "too_many"
+    assert found.errors["after"]["test"] == pytest.approx(3.7, abs=0.1)
+    assert found.remarks[0].startswith("Stopped after ripple")
+    assert diagnosed("never").names == ("ripple", "tone")
+    with pytest.raises(Stopped):
+        diagnosed("no effect added")
 
 
 def test_an_effect_of_the_twin_that_another_one_should_replace_is_named_in_a_remark_and_stays():
