@@ -22,7 +22,7 @@ from taccorl.diagnosis.machines.changed_findings import remarked
 from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Finding, GainsAre, Machine, numbers_of
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.diagnosis.problems.joint_problem import JointProblem, selectors
-from taccorl.diagnosis.search.search import REFIT_WORSE
+from taccorl.diagnosis.search.changed_numbers import REFIT_WORSE
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect

@@ -17,7 +17,7 @@ import numpy as np
 
 from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
 from taccorl.diagnosis.search.fit import Fit, best_fit
-from taccorl.diagnosis.search.fits import STEPS, Fits, model_of, refusal
+from taccorl.diagnosis.search.fits import STEPS, Fits, Model, model_of, refusal
 from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Values, with_held, with_scale
 from taccorl.diagnosis.search.result import Changed
 
@@ -34,6 +34,12 @@ STATED = {
 that are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
 NEGLIGIBLE = 0.01
 """If, with the added effects, a number is fitted within this share of the file's value, its change is not reported. A choice."""
+REFIT_WORSE = 1.3
+"""Factor on the validation error from which on a refit of the always fitted numbers is a finding: more than the noise of another
+motion causes."""
+GAINS_MOVED = 2.0
+"""Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
+wrong unit of time, or gains other than the commanded ones."""
 OF_LOOP = ("loop_s", "speed_delay_s")
 """Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 
@@ -126,3 +132,34 @@ def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
     problem = with_held(fits.problem, stated)
     starts = [model.values, model.values | fits.given]
     return best_fit(problem, fits.fit_to, model.names, starts, STEPS)
+
+
+def of_refit(fits: Fits, answer: Model) -> list[str]:
+    """Sentence where no effect was added and the refit of the always fitted numbers is worse than the twin as it was."""
+    before = fits.error(fits.as_it_was)
+    if fits.added(answer) or fits.base.error <= REFIT_WORSE * max(before, 1.0):
+        return []
+    return [
+        f"refitted to the fit recordings, the twin's numbers raise the validation error from {before:.2f} to "
+        f"{fits.base.error:.2f} noise floors: the twin lacks something that both kinds of recordings show differently, such "
+        "as an effect of the speed, the pose or a warm gear."
+    ]
+
+
+def moved_gains(fits: Fits, model: Fit) -> dict[str, tuple[float, float]]:
+    """Gain → (the twin's, fitted) of those that are more than ``GAINS_MOVED`` times off."""
+    pairs = {g: (fits.given[g], model.values[g]) for g in ("kp", "kd") if g in model.values and fits.given.get(g)}
+    return {g: (old, new) for g, (old, new) in pairs.items() if not 1 / GAINS_MOVED <= new / old <= GAINS_MOVED}
+
+
+def of_gains(fits: Fits, model: Fit) -> list[str]:
+    """Sentences on gains that had to move far, as they are in the result, or before any effect where only those moved."""
+    units = {f.name: f.unit for f in model.frees}
+    moved = {g: ("before any effect was considered", *m) for g, m in moved_gains(fits, fits.first).items()}
+    moved |= {g: ("with the effects added", *m) for g, m in moved_gains(fits, model).items()}
+    return [
+        f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) {when}. Check the time "
+        "stamps (positions reported late, wrong unit of time) and which gains were commanded (kp, kd of the recording in "
+        "measurements.yaml)."
+        for gain, (when, old, new) in moved.items()
+    ]

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.diagnosis.search.changed_numbers import changed_numbers
+from taccorl.diagnosis.search.changed_numbers import changed_numbers, moved_gains, of_gains, of_refit
 from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
@@ -43,12 +43,6 @@ from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, Se
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
 
-REFIT_WORSE = 1.3
-"""Factor on the validation error from which on a refit of the always fitted numbers is a finding: more than the noise of another
-motion causes."""
-GAINS_MOVED = 2.0
-"""Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
-wrong unit of time, or gains other than the commanded ones."""
 SCALE_OFF = 1.15
 """Least factor on efforts that is a finding where gains are stated, so that it is fitted in any case. A choice."""
 MOST, HARDLY = 0.5, 0.05
@@ -133,9 +127,9 @@ def diagnose(
         remarks=(
             *remarks,
             *beam.remarks,
-            *_of_refit(fits, answer),
+            *of_refit(fits, answer),
             *_of_pairs(beam, answer),
-            *_of_gains(fits, model),
+            *of_gains(fits, model),
             *(() if beam.remarks else _better_than_present(beam, answer)),
         ),
         at_bound=tuple(f.name for f in model.ended),
@@ -434,7 +428,7 @@ def _status(fits: Fits, answer: Model, changed: Sequence[Changed], standing_out:
     if fits.at_floor(answer) and added:
         return "at_floor"
     if not (added or standing_out) and max(answer.error, answer.fit.error) <= config.little:
-        if _moved_gains(fits, fits.first):
+        if moved_gains(fits, fits.first):
             return "gains_moved"
         return "numbers_off" if changed else "nothing_missing"
     return "too_many" if len(added) >= config.max_effects else "something_else"
@@ -467,24 +461,6 @@ def _undetermined(model: Fit) -> tuple[str, ...]:
     return tuple(f.name for f in model.frees if ends[f.name][0] <= f.low and ends[f.name][1] >= f.high)
 
 
-def _of_refit(fits: Fits, answer: Model) -> list[str]:
-    """Sentence where no effect was added and the refit of the always fitted numbers is worse than the twin as it was."""
-    before = fits.error(fits.as_it_was)
-    if fits.added(answer) or fits.base.error <= REFIT_WORSE * max(before, 1.0):
-        return []
-    return [
-        f"refitted to the fit recordings, the twin's numbers raise the validation error from {before:.2f} to "
-        f"{fits.base.error:.2f} noise floors: the twin lacks something that both kinds of recordings show differently, such "
-        "as an effect of the speed, the pose or a warm gear."
-    ]
-
-
-def _moved_gains(fits: Fits, model: Fit) -> dict[str, tuple[float, float]]:
-    """Gain → (the twin's, fitted) of those that are more than ``GAINS_MOVED`` times off."""
-    pairs = {g: (fits.given[g], model.values[g]) for g in ("kp", "kd") if g in model.values and fits.given.get(g)}
-    return {g: (old, new) for g, (old, new) in pairs.items() if not 1 / GAINS_MOVED <= new / old <= GAINS_MOVED}
-
-
 def _of_pairs(beam: Beam, answer: Model) -> list[str]:
     """Sentence where an effect was refused that may be one of two missing ones, and only one was to be added."""
     fits = beam.fits
@@ -494,19 +470,6 @@ def _of_pairs(beam: Beam, answer: Model) -> list[str]:
         f"{m.names[-1]} alone takes away {1.0 - m.fit.error**2 / fits.base.fit.error**2:.0%} of the squared fit error and fails "
         "on validation recordings, as one of two missing effects may: --until=noise_floor tries pairs."
         for m in beam.much(fits.base)[:1]
-    ]
-
-
-def _of_gains(fits: Fits, model: Fit) -> list[str]:
-    """Sentences on gains that had to move far, as they are in the result, or before any effect where only those moved."""
-    units = {f.name: f.unit for f in model.frees}
-    moved = {g: ("before any effect was considered", *m) for g, m in _moved_gains(fits, fits.first).items()}
-    moved |= {g: ("with the effects added", *m) for g, m in _moved_gains(fits, model).items()}
-    return [
-        f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) {when}. Check the time "
-        "stamps (positions reported late, wrong unit of time) and which gains were commanded (kp, kd of the recording in "
-        "measurements.yaml)."
-        for gain, (when, old, new) in moved.items()
     ]
 
 
