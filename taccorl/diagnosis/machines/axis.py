@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,12 +21,11 @@ from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_di
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
-from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import traces_of
 from taccorl.diagnosis.comparison.replays import Response
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
-from taccorl.diagnosis.machines.machine import Addition, Drive, GainsAre, Machine, machines, numbers_of
+from taccorl.diagnosis.machines.machine import Addition, Counted, Drive, GainsAre, Machine, machines, numbers_of
 from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
@@ -108,16 +107,7 @@ class Axis(Machine):
                 f"{m.name} has no signal {self.config.name!r}, which its file names; {nearest(self.config.name, m.signals)}"
             )
 
-    def compare(
-        self,
-        measurements: Measurements,
-        *,
-        name: str = "",
-        pressed: PressedObject | None = None,
-        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
-    ) -> Comparison:
-        if pressed is not None:
-            raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
+    def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
         uses: list[tuple[Use, Measurement]] = [(use, m) for use in USES for m in getattr(measurements, use)]
         every = [m for _, m in uses]
         floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
@@ -145,7 +135,7 @@ class Axis(Machine):
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
         return Comparison(
-            twin=name or self.name,
+            twin=name,
             effects=self.effects,
             traces=tuple(traces),
             split=measurements.record(),

@@ -1,7 +1,7 @@
 """A sensor of cells as a machine, described by a cells file (``alignment.machines.cells_file``). The sensor is its only part."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -24,10 +24,18 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_co
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs
-from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, CellNumbers, Comparison, TouchTrace
-from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines, numbers_of, solved
+from taccorl.diagnosis.machines.machine import (
+    Addition,
+    Counted,
+    Finding,
+    GainsAre,
+    Machine,
+    machines,
+    numbers_of,
+    solved,
+)
 from taccorl.diagnosis.problems.cells_problem import (
     CellsProblem,
     median_reading,
@@ -36,8 +44,7 @@ from taccorl.diagnosis.problems.cells_problem import (
     without_dead,
 )
 from taccorl.diagnosis.problems.numbers_of_cells import numbers_apart
-from taccorl.diagnosis.search.problem import Progress, no_progress
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -121,14 +128,7 @@ class CellsMachine(Machine):
             raise TaccorlError(f"--{option}: {self.name} is a sensor of cells and has no {option}; remove --{option}")
         return tuple(parts)
 
-    def compare(
-        self,
-        measurements: Measurements,
-        *,
-        name: str = "",
-        pressed: PressedObject | None = None,
-        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
-    ) -> Comparison:
+    def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
         """Compare with gain and offset from the file; if it states none, with those fitted to the fit recordings, and the gain 0
         of dead cells."""
         config = self.config
@@ -181,7 +181,7 @@ class CellsMachine(Machine):
                     )
                 )
         return Comparison(
-            twin=name or self.name,
+            twin=name,
             effects=self.effects,
             traces=(),
             touches=tuple(touches),
@@ -192,19 +192,10 @@ class CellsMachine(Machine):
     def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> CellsProblem:
         return CellsProblem(self.config, measurements)
 
-    def diagnose(
-        self,
-        part: str,
-        measurements: Measurements,
-        *,
-        gains: GainsAre = "auto",
-        search: SearchConfig | None = None,
-        without: Sequence[str] = (),
-        progress: Progress = no_progress,
-    ) -> Finding:
+    def diagnose(self, part: str, measurements: Measurements, *, gains: GainsAre = "auto", **options: Any) -> Finding:
         measurements = with_places(self.config, measurements)
         problem = self.problem(part, measurements, gains)
-        found = solved(part, problem, search, without, progress)
+        found = solved(part, problem, **options)
         unit, load = self.config.load.unit, self.config.load_of_reading
         remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
         d = _with_numbers(problem, found.diagnosis)

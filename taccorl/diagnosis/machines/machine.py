@@ -22,38 +22,32 @@ from taccorl.data.finding import listed
 from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.diagnosis.problems.joints import JointFinding, each
 from taccorl.diagnosis.problems.pads import PadFinding
-from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.problem import Progress, Recording, Stopped, no_progress
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import Startable, solve
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.solve import Found, Startable, solve
 from taccorl.errors import TaccorlError, nearest
 from taccorl.plugins import Registry
 from taccorl.sim.effects.effect import Effect
 
+Counted = Callable[[str, int, int], None]
+"""Function that is called with (recording, number of recordings done, number in all)."""
 GainsAre = Literal["auto", "commanded", "fitted"]
 """Treatment of gains. ``auto``: gains that every recording states stay fixed, others are fitted."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartFinding:
+class PartFinding(Found):
     """Finding about an axis or a sensor of cells: result of the search, and texts about it for reports."""
 
     part: str
     """Name of the part in tables and reports."""
-    diagnosis: Diagnosis
-    can_tell: Identifiability
-    """Effects that the recordings can show and separate, independent of the measured values."""
     noise: str
     """The noise floors of the compared channels with their units, as text for reports."""
     numbers: str
     """Text that states which numbers are always fitted, and from where the other numbers are taken."""
     measured: str
     """Text that names the channels whose errors are minimised and reported, such as positions."""
-    recordings: dict[str, tuple[str, ...]]
-    """fit, validation, test → names."""
-    rows_split: bool
-    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
     known: Known | None = None
     """Numbers that the recordings identify; None for parts for which they are not computed."""
     remark: str = ""
@@ -209,14 +203,13 @@ class Machine(ABC):
                 )
         return tuple(p for p in parts if not joints or p in joints)
 
-    @abstractmethod
     def compare(
         self,
         measurements: Measurements,
         *,
         name: str = "",
         pressed: PressedObject | None = None,
-        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+        progress: Counted = lambda recording, done, total: None,
     ) -> Comparison:
         """Simulate every recording's commands, and compute the residuals.
 
@@ -225,6 +218,13 @@ class Machine(ABC):
             pressed: object between the PiPER's fingers in recordings that do not state one.
             progress: function that is called with (recording, number of recordings done, number in all).
         """
+        if pressed is not None:
+            raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
+        return self._compared(measurements, name or self.name, progress)
+
+    def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
+        """``compare``, for kinds without pads."""
+        raise NotImplementedError
 
     def of_part(self, part: str, measurements: Measurements) -> Measurements:
         """What ``diagnose`` of one part reads of ``measurements``; its worker gets no more."""
@@ -437,8 +437,8 @@ def diagnose_parts(
         items = {part: (part, machine.of_part(part, measurements)) for part in some}
         return each(partial(_diagnosed, machine, progress, options), items, workers, done)
 
-    def again(*asked: Any) -> list[Finding]:
-        if len(found := [f for f in diagnosed(*asked) if f is not None]) < len(asked[1]):
+    def again(machine: Machine, some: Sequence[str], leave_out: Sequence[str] = ()) -> list[Finding]:
+        if len(found := [f for f in diagnosed(machine, some, leave_out) if f is not None]) < len(some):
             raise Stopped
         return found
 

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
@@ -19,7 +19,16 @@ from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.diagnosis.machines.changed_findings import remarked
-from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Finding, GainsAre, Machine, numbers_of
+from taccorl.diagnosis.machines.machine import (
+    Addition,
+    Counted,
+    Diagnosed,
+    Drive,
+    Finding,
+    GainsAre,
+    Machine,
+    numbers_of,
+)
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.diagnosis.problems.joint_problem import JointProblem, selectors
 from taccorl.diagnosis.search.changed_numbers import REFIT_WORSE
@@ -113,7 +122,7 @@ class PiperTwin(Machine):
         *,
         name: str = "",
         pressed: PressedObject | None = None,
-        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
+        progress: Counted = lambda recording, done, total: None,
     ) -> Comparison:
         return compare(self.config, measurements, name=name or self.name, pressed=pressed, progress=progress)
 

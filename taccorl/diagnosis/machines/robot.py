@@ -23,7 +23,6 @@ from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
-from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import moving, traces_of
 from taccorl.diagnosis.comparison.replays import replay_joints
@@ -40,6 +39,7 @@ from taccorl.diagnosis.machines.changed_findings import (
 )
 from taccorl.diagnosis.machines.machine import (
     Addition,
+    Counted,
     Diagnosed,
     Drive,
     Finding,
@@ -131,16 +131,7 @@ class RobotMachine(Machine):
             )
         return found
 
-    def compare(
-        self,
-        measurements: Measurements,
-        *,
-        name: str = "",
-        pressed: PressedObject | None = None,
-        progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
-    ) -> Comparison:
-        if pressed is not None:
-            raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
+    def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
         uses: list[tuple[Use, Measurement]] = [
             (use, self._whole(m)) for use in USES for m in getattr(measurements, use)
         ]
@@ -184,7 +175,7 @@ class RobotMachine(Machine):
             )
         left_out = [f"{s}: {self.robot.path.name} does not name it under joints" for s in sorted(held)]
         return Comparison(
-            twin=name or self.name,
+            twin=name,
             effects=self.effects,
             traces=tuple(traces),
             split=measurements.record(),

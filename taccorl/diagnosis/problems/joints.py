@@ -13,11 +13,10 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor
 from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
-from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import solve
+from taccorl.diagnosis.search.solve import Found, solve
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import Done, Failed, run_in_processes
 from taccorl.robots import ROBOT
@@ -47,21 +46,14 @@ class Leaned:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointFinding:
+class JointFinding(Found):
     """Finding about one joint: result of the search, noise floors, and numbers that the recordings identify."""
 
     signal: str
-    diagnosis: Diagnosis
-    can_tell: Identifiability
-    """Effects that its recordings can show and separate, independent of the measured values."""
     floors: tuple[SignalFloor, ...]
     """Noise floor of the angle, and of the effort if it was used."""
     commanded: bool
     """True: gains are the commanded ones; False: they were fitted."""
-    recordings: dict[str, tuple[str, ...]]
-    """fit, validation, test → names."""
-    rows_split: bool
-    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
     known: Known
     """Numbers that the recordings identify, and the range of those that they do not."""
     held: tuple[str, ...] = ()

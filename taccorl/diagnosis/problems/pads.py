@@ -17,10 +17,9 @@ from taccorl.diagnosis.comparison.replays import matched_contact
 from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem, odd_cells
 from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
-from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.problem import Progress, Recording, no_progress, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import solve
+from taccorl.diagnosis.search.solve import Found, solve
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.pads import TaxelGainMap
@@ -33,23 +32,16 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PadFinding:
+class PadFinding(Found):
     """Finding about the pads of one arm: result of the search, and noise floor."""
 
     arm: str
     pads: tuple[str, ...]
     """Names of the pads that came near the objects."""
-    diagnosis: Diagnosis
-    can_tell: Identifiability
-    """Effects that their recordings can show and separate, independent of the measured values."""
     floor_count: float
     """Noise floor of a row, the mean of ``FRAMES_A_ROW`` frames [counts]: median over the simulated taxels."""
     lower_bound: bool
     """True: no press was recorded twice, so that the floor lacks the variation between repeats."""
-    recordings: dict[str, tuple[str, ...]]
-    """fit, validation, test → names."""
-    rows_split: bool
-    """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
     gains: GainStatistics | None = None
     """Statistics of differing taxel gains that could not be validated, because no validation recording presses the fitted
     taxels; None otherwise."""

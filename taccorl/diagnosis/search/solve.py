@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -34,19 +35,28 @@ class Startable(Problem, Protocol):
         ...
 
 
-class Solved(NamedTuple):
-    """Result of ``solve``: the diagnosis, the effects that the recordings can tell apart, and the recordings, or rows of them,
-    that were fitted and by which effects were chosen."""
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """Result of the search for one part of any kind."""
 
     diagnosis: Diagnosis
     can_tell: Identifiability
     """Effects that the fit recordings can show and separate, independent of the measured values."""
-    fit_to: Sequence[Recording]
-    """Recordings, or their first rows, that were fitted."""
-    validation: Sequence[Recording]
-    """Recordings, or their last rows, by whose error effects were chosen."""
+    recordings: dict[str, tuple[str, ...]]
+    """fit, validation, test → names."""
     rows_split: bool
     """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
+
+
+class Solved(NamedTuple):
+    """Result of ``solve``: fields of ``Found``, and the recordings, or rows of them, that were fitted and by which effects were
+    chosen."""
+
+    diagnosis: Diagnosis
+    can_tell: Identifiability
+    fit_to: Sequence[Recording]
+    validation: Sequence[Recording]
+    rows_split: bool
 
 
 def solve(
