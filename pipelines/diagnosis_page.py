@@ -65,10 +65,7 @@ def write_page(rows: list[dict]) -> None:
     ):
         own = [r for r in joints if r["design"] == design and material(r)]
         lines.append(_share(f"{words}: exact, counted as one", own, exact_but_for_algebra))
-    for words, condition, there in (
-        ("efforts used", "effort", True),
-        ("positions only", "effort", False),
-    ):
+    for words, condition, there in (("efforts used", "effort", True), ("positions only", "effort", False)):
         own = [r for r in joints if material(r) and _has(r, condition) == there]
         lines.append(_share(f"… {words}: exact, counted as one", own, exact_but_for_algebra))
     mended = [r["errors"]["after"] for r in joints if "failed" not in r and material(r) and named(r)]

@@ -114,12 +114,7 @@ class Scenes:
 
 
 def score(
-    scenes: Scenes,
-    actor: Actor,
-    progress: Progress | None = None,
-    *,
-    stream: int = 0,
-    num_threads: int | None = None,
+    scenes: Scenes, actor: Actor, progress: Progress | None = None, *, stream: int = 0, num_threads: int | None = None
 ) -> list[Rollout]:
     """Run all episodes of one policy; returns one ``Rollout`` per episode, task by task, in the order of their seeds.
 

@@ -53,10 +53,7 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "touch_delay": lambda rng: {"delay_s": _between(rng, 0.02, 0.1)},
     "baseline_drift": lambda rng: {"rate_per_min": _either(rng, 0.1, 1.0)},
     "taxel_log_creep": lambda rng: {"share": _either(rng, 0.02, 0.08)},
-    "taxel_temperature": lambda rng: {
-        "gain_per_k": _either(rng, 0.003, 0.02),
-        "zero_per_k": _either(rng, 0.01, 0.1),
-    },
+    "taxel_temperature": lambda rng: {"gain_per_k": _either(rng, 0.003, 0.02), "zero_per_k": _either(rng, 0.01, 0.1)},
     "taxel_crosstalk": lambda rng: {"share": _between(rng, 0.05, 0.4)},
     "taxel_ghosting": lambda rng: {"share": _between(rng, 0.005, 0.05)},
 }

@@ -252,10 +252,7 @@ class Streams:
         """What a real bag holds besides: a status without header, transforms, a service event nobody can decode."""
         status = dict.fromkeys(("ctrl_mode", "arm_status", "mode_feedback", "teach_status", "motion_status"), 1)
         status |= {"trajectory_num": 0, "err_code": 0}
-        origin = {
-            "translation": {"x": 0.0, "y": 0.3, "z": 0.26},
-            "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        }
+        origin = {"translation": {"x": 0.0, "y": 0.3, "z": 0.26}, "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
         for ticks in self._slices(EXTRA_TOPICS_HZ[topic]):
             for time_s in (ticks / EXTRA_TOPICS_HZ[topic]).tolist():
                 if topic == "/arm_status_left":

@@ -32,14 +32,7 @@ from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.seen_scene import DRAWN_TOGETHER
 from taccorl.sim.simulation import Simulation
-from taccorl.training.frame_cache import (
-    FRAMES,
-    FrameIndex,
-    FramesConfig,
-    empty_frames,
-    frames_file,
-    resized,
-)
+from taccorl.training.frame_cache import FRAMES, FrameIndex, FramesConfig, empty_frames, frames_file, resized
 
 
 def render_frames(
@@ -93,12 +86,7 @@ class DrawnFrames:
     """Frames of a dataset that is being collected, drawn as its episodes become known: ``collect.Pictures``."""
 
     def __init__(
-        self,
-        spec: DatasetSpec,
-        rows_per_picture: int,
-        resolution: tuple[int, int] | None,
-        store: Store,
-        folder: Path,
+        self, spec: DatasetSpec, rows_per_picture: int, resolution: tuple[int, int] | None, store: Store, folder: Path
     ) -> None:
         """
         Args:

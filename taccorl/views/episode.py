@@ -64,12 +64,7 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = Fa
 
 
 def save_episode(
-    episode: Episode,
-    rrd: Path,
-    *,
-    at_s: float | None = None,
-    native: bool = False,
-    progress: Progress = no_progress,
+    episode: Episode, rrd: Path, *, at_s: float | None = None, native: bool = False, progress: Progress = no_progress
 ) -> None:
     """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as in
     ``log_episode``. Raises OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full."""

@@ -46,11 +46,7 @@ WIDTHS = (3.0, 2.0)
 PLOTS_IN_A_ROW, PLOTS_IN_A_TAB = 3, 15
 LABEL_TAXELS = 5.0
 """Height of the names above a row of pads [taxels]."""
-TOUCH_KINDS = {
-    "sum": "touch sum of active taxels [counts]",
-    "peak": "touch peak [counts]",
-    "active": "active taxels",
-}
+TOUCH_KINDS = {"sum": "touch sum of active taxels [counts]", "peak": "touch peak [counts]", "active": "active taxels"}
 
 
 def save_shown(

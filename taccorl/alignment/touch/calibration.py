@@ -136,10 +136,7 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
             f"touch: no taxel ever has a reading above λ_noise = {threshold_count:g} counts in {_names(motions)}"
         )
     differences = [(x - y)[:, of] for (x, y), of in zip(both, ever, strict=True)]
-    return TouchMatch(
-        rms_count=_rms(differences),
-        mask_iou=sum(int((a & b).sum()) for a, b in masks) / union,
-    )
+    return TouchMatch(rms_count=_rms(differences), mask_iou=sum(int((a & b).sum()) for a, b in masks) / union)
 
 
 def calibrate_touch(

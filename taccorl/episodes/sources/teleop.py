@@ -23,14 +23,7 @@ import numpy as np
 
 from taccorl.episodes.attempt import Actions, Source, outcome_of
 from taccorl.episodes.sources.teleop_actions import ActionLog, find_finished, give_time, replay, scene_of
-from taccorl.episodes.sources.teleop_jog import (
-    AXES,
-    Command,
-    Jogger,
-    Keyboard,
-    key_map,
-    label,
-)
+from taccorl.episodes.sources.teleop_jog import AXES, Command, Jogger, Keyboard, key_map, label
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation

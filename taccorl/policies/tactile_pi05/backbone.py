@@ -99,13 +99,7 @@ class SmallBackbone(CompiledBackbone):
     small changes of weights are not lost."""
 
     def __init__(
-        self,
-        size: Size,
-        *,
-        image_px: int,
-        num_cameras: int,
-        freeze_vision_encoder: bool,
-        train_expert_only: bool,
+        self, size: Size, *, image_px: int, num_cameras: int, freeze_vision_encoder: bool, train_expert_only: bool
     ) -> None:
         nn.Module.__init__(self)
         self.freeze_vision_encoder = freeze_vision_encoder

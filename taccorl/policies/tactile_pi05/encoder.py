@@ -139,11 +139,7 @@ class Fusion(nn.Module):
         self.width = width
         self.inputs = nn.Linear(num_inputs, width)
         self.layers = nn.Sequential(
-            nn.LayerNorm(width),
-            nn.SiLU(),
-            nn.Linear(width, width),
-            nn.SiLU(),
-            nn.Linear(width, width),
+            nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
         )
         self.condition = nn.Linear(width, condition_width)
 

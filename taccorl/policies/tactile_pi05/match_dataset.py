@@ -69,9 +69,7 @@ def match_cameras(config: Any, meta: Any, renamed: Mapping[str, str]) -> None:
         )
     if known and (unused := sorted(found - set(known))):
         _log.warning(
-            "dataset %s: %s is not used, because the checkpoint was trained without it",
-            meta.repo_id,
-            ", ".join(unused),
+            "dataset %s: %s is not used, because the checkpoint was trained without it", meta.repo_id, ", ".join(unused)
         )
 
 

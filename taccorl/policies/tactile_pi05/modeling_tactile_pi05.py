@@ -24,11 +24,7 @@ from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest, seal_checkp
 from taccorl.policies.tactile_pi05.averaged import Averaged
 from taccorl.policies.tactile_pi05.black_bars import without_bars
 from taccorl.policies.tactile_pi05.chunk_steps import ChunkSteps
-from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
-    RAW_STATE,
-    STATE_SINCE_PLAN,
-    TactilePI05Config,
-)
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import RAW_STATE, STATE_SINCE_PLAN, TactilePI05Config
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES

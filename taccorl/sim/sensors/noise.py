@@ -12,13 +12,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numba.np.random._constants import (
-    fi_float,
-    ki_float,
-    wi_float,
-    ziggurat_nor_inv_r_f,
-    ziggurat_nor_r_f,
-)
+from numba.np.random._constants import fi_float, ki_float, wi_float, ziggurat_nor_inv_r_f, ziggurat_nor_r_f
 
 _TAIL, _TAIL_INVERSE = np.float32(ziggurat_nor_r_f), np.float32(ziggurat_nor_inv_r_f)
 _MULTIPLIER = np.uint64(0x2360ED051FC65DA4), np.uint64(0x4385DF649FCCF645)  # of PCG64: high and low half

@@ -147,10 +147,7 @@ class Puzzle(Task):
             def placed(scene: Scene) -> np.ndarray:
                 return self.placed(scene, shape)
 
-            return (
-                Subtask(name=f"grasp {shape}", done=lifted),
-                Subtask(name=f"place {shape}", done=placed),
-            )
+            return (Subtask(name=f"grasp {shape}", done=lifted), Subtask(name=f"place {shape}", done=placed))
 
         return {"left": pair("circle"), "right": (*pair("triangle"), *pair("heart"))}
 

@@ -132,10 +132,7 @@ class TestTube(Task):
             return self.inside(self.fit(scene)) & released & (_speed(scene) < AT_REST_MPS)
 
         return {
-            "left": (
-                Subtask(name="grasp rack", done=gripped),
-                Subtask(name="hold rack", done=inserted),
-            ),
+            "left": (Subtask(name="grasp rack", done=gripped), Subtask(name="hold rack", done=inserted)),
             "right": (
                 Subtask(name="lift tube", done=lifted),
                 Subtask(name="turn tube upright", done=upright),

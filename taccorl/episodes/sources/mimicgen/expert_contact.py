@@ -38,11 +38,7 @@ class ExpertContact:
         hands = {arm: expert.hands[arm] for arm in expert.running}
         return {
             arm: ArmTarget(
-                goal=hand.goal,
-                opening_m=hand.opening_m,
-                contact=not hand.learns,
-                noisy=False,
-                intended=hand.intended,
+                goal=hand.goal, opening_m=hand.opening_m, contact=not hand.learns, noisy=False, intended=hand.intended
             )
             for arm, hand in hands.items()
         }
