@@ -158,16 +158,11 @@ def test_a_file_is_written_as_it_is_read(tmp_path):
         ("cells: [thumb]\n", "", 1, "give names, `cells: [thumb]`, or a grid"),
         ("highest: 1023}", "highest: 1023}\ngain: [1, 2]\noffset: [1, 2]", 5, "2 numbers for 1 cells"),
         ("highest: 1023}", "highest: 1023}\neffects: [{effect: pad_shift}]", 5, "pad_shift acts on pads, not on cells"),
-        (
-            "highest: 1023}",
-            "highest: 1023}\neffects: [{effect: taxel_ghosting, share: 0.1}]",
-            5,
-            "needs neighbours; give rows",
-        ),
+        ("highest: 1023}", "highest: 1023}\neffects: [{effect: taxel_ghosting, share: 0.1}]", 5, "needs neighbours; give rows"),
         ("kind: cells", "kind: cell", 1, "there is no kind of machine 'cell'; did you mean 'cells'"),
         ("cells: [thumb]", "cellz: [thumb]", 2, "unknown key 'cellz'"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_line_of_the_file_is_said_with_the_way_out(tmp_path, said, old, new, line, words):
     table(tmp_path / "presses")
     (tmp_path / "taxel.yaml").write_text(SENSOR.replace(old, new))
@@ -191,10 +186,7 @@ def held(values: np.ndarray, rows: int) -> np.ndarray:
         ({"force_n": np.full(len(T_S), 8.0)}, "constant_load"),
         ({"force_n": LOAD_N + 3.0}, "no_rest: less than 0.5 s without load (below 0.4 N)"),
         ({"force_n": LOAD_N * 1000}, "load_unit: the load reaches 1.8e+04 N, 900 times the rated 20 N"),
-        (
-            {"thumb__reading": np.where(LOAD_N > 0.5, 1023, 20)},
-            "saturated: thumb: 100% of the loaded rows are at an end",
-        ),
+        ({"thumb__reading": np.where(LOAD_N > 0.5, 1023, 20)}, "saturated: thumb: 100% of the loaded rows are at an end"),
         (
             {"thumb__reading": 200 * LOAD_N + 20},
             "beyond_ends: thumb: readings are 20 … 3620 count, beyond lowest 0 … highest 1023",
@@ -202,7 +194,7 @@ def held(values: np.ndarray, rows: int) -> np.ndarray:
         ({"thumb__reading": np.full(len(T_S), 20.0)}, "no_reading: thumb: the reading never changes under load"),
         ({"force_n": held(LOAD_N + 0.01 * np.sin(17 * T_S), 10)}, "load_held: the load changes every 10 rows only"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_recording_is_said_with_what_to_do_and_nothing_is_compared(tmp_path, said, columns, words):
     table(tmp_path / "presses", **columns)
     (tmp_path / "taxel.yaml").write_text(SENSOR)

@@ -62,26 +62,17 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
         (("--task=puzzle", "--policy.type=expert", "--failures=-1"), "--failures=-1"),
         (("--task=puzzle", "--policy.type=expert", "--workers=0"), "--workers=0: at least 1"),
-        (
-            ("--task=puzzle", "--policy.type=expert", "--physics=wrap", "--failures=2"),
-            "physics=wrap: did you mean 'warp'",
-        ),
+        (("--task=puzzle", "--policy.type=expert", "--physics=wrap", "--failures=2"), "physics=wrap: did you mean 'warp'"),
         (("--task=puzzle", "--policy.type=expert", "--physics=warp", "--failures=2"), "give --failures=0"),
-        (
-            ("--task=puzzle", "--policy.type=expert", "--physics=warp", "--workers=2"),
-            "--workers=2: --physics=warp runs all",
-        ),
-        (
-            ("--task=puzzle", "--policy.path=x", "--robot.type=taccorl_surrogate", "--physics=warp"),
-            "--physics has no effect",
-        ),
+        (("--task=puzzle", "--policy.type=expert", "--physics=warp", "--workers=2"), "--workers=2: --physics=warp runs all"),
+        (("--task=puzzle", "--policy.path=x", "--robot.type=taccorl_surrogate", "--physics=warp"), "--physics has no effect"),
         (("--task=puzzle", "--policy.path=x", "--before_mate=1"), "--before_mate=1: 0, or 2 or more"),
         (("--task=puzzle", "--policy.type=expert", "--before_mate=2"), "--before_mate=2: asks a policy"),
         (("--task=puzzle", "--policy.type=expert", "--pictures=randomized"), "did you mean 'randomised'"),
         (("--task=puzzle", "--policy.type=expert", "--hide=touch,camera"), "--hide=camera: "),
         (("--task=puzzle", "--policy.type=expert", "--hide=touch"), "the expert reads no sensor"),
     ],
-)
+)  # fmt: skip
 def test_wrong_words_end_before_any_rollout(words: tuple[str, ...], message: str, said: Any, tmp_path: Path) -> None:
     code, shown = said("evaluate", *words, "--out=scored")
     assert code == 2 and message in shown and not (tmp_path / "scored").exists()

@@ -59,15 +59,12 @@ YUV = np.zeros((ROWS, COLUMNS, 2), np.uint8)
 @pytest.mark.parametrize(
     ("picture", "reason"),
     [
-        (
-            lambda t: compressed(t, cv2.imencode(".png", np.full((8, 8), 4700, np.uint16))[1].tobytes(), "16UC1; png"),
-            "uint16",
-        ),
+        (lambda t: compressed(t, cv2.imencode(".png", np.full((8, 8), 4700, np.uint16))[1].tobytes(), "16UC1; png"), "uint16"),
         (lambda t: compressed(t, bytes(40), "16UC1; compressedDepth png"), "compressedDepth"),
         (lambda t: raw(t, "16UC1", YUV), "16UC1"),
         (lambda t: raw(t, "yuv411", YUV), "yuv411"),
     ],
-)
+)  # fmt: skip
 def test_pictures_that_are_not_read_are_refused_with_their_reason(tmp_path, picture, reason, capsys):
     path = write_mcap(tmp_path / "rec.mcap", messages(picture=picture))
     spec = write_spec(tmp_path)

@@ -91,17 +91,14 @@ def test_a_complete_file_becomes_the_dataclass(tmp_path):
         (GOOD + "shape: 32\n", "a.yaml:3: shape: expected a list, found '32'"),
         (GOOD + "shape: [32, [12]]\n", "a.yaml:3: shape → 1: expected one int, found a list"),
         (GOOD + "span: [1]\n", "a.yaml:3: span: expected 2 values, found 1"),
-        (
-            GOOD + "span: {x: [0, one]}\n",
-            "a.yaml:3: span → x → 1: expected float, found 'one'; plain decimal digits only",
-        ),
+        (GOOD + "span: {x: [0, one]}\n", "a.yaml:3: span → x → 1: expected float, found 'one'; plain decimal digits only"),
         (GOOD + "name2: {}\n", "a.yaml:3: name2: unknown key 'name2'; did you mean 'name'?"),
         ("name: [pad]\nrate_hz: 1\n", "a.yaml:1: name: expected one str, found a list"),
         (GOOD + "many: {[1, 2]: {count: 1}}\n", "a.yaml:3: many: a key must be a word, found a list"),
         (GOOD + "<<: {note: x}\n", "a.yaml:3: <<: merge keys are not read"),
         (GOOD + "many: {<<: {a: {count: 1}}}\n", "a.yaml:3: many → <<: merge keys are not read"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_file_names_file_line_key_and_value(tmp_path, text, expected):
     assert refusal(tmp_path, text).startswith(expected)
 
@@ -202,17 +199,14 @@ def test_what_is_no_spec_at_all_gets_a_plain_message(tmp_path, text, expected):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            f"{GOOD}inner: {{count: {'1' * 5000}}}",
-            ("a.yaml:3: inner → count", "(5,000 characters)", "at most 100 digits"),
-        ),
+        (f"{GOOD}inner: {{count: {'1' * 5000}}}", ("a.yaml:3: inner → count", "(5,000 characters)", "at most 100 digits")),
         (f"name: pad\nrate_hz: {'1' * 5000}", ("a.yaml:2: rate_hz", "expected float", "(5,000 characters)")),
         (f"{GOOD}{'x' * 900}: 1", ("a.yaml:3: xxx", "unknown key", "(900 characters)")),
         ("name: " + "[" * 20_000, ("a.yaml: is nested too deeply",)),
         (f"name: {'x' * 20_000_000}", ("a.yaml: is larger than 262,144 bytes",)),
         ("name: [" + "1," * 5_000_000 + "]", ("a.yaml: is larger than 262,144 bytes",)),
     ],
-)
+)  # fmt: skip
 def test_absurd_values_are_refused_soon_and_in_short(tmp_path, text, expected):
     begin_s = time.process_time()
     message = refusal(tmp_path, text)

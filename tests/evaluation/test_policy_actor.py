@@ -114,10 +114,7 @@ def test_what_a_checkpoint_does_not_state_is_no_difference():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            {"inputs": {"observation.images.top": (3, 224, 224)}},
-            "cameras: top 224×224 in the checkpoint, front 224×224",
-        ),
+        ({"inputs": {"observation.images.top": (3, 224, 224)}}, "cameras: top 224×224 in the checkpoint, front 224×224"),
         ({"inputs": {"observation.images.front": (3, 96, 96)}}, "cameras: front 96×96"),
         ({"inputs": {"observation.state": (7,)}}, "state: 7 in the checkpoint, 14 in the environment"),
         ({"inputs": {"observation.tactile": (768,)}}, "touch: 768 in the checkpoint, 1536"),
@@ -127,18 +124,12 @@ def test_what_a_checkpoint_does_not_state_is_no_difference():
         ({"robot_type": "aloha"}, "robot: aloha in the checkpoint, bi_piper_flexitac"),
         ({"action_names": tuple("abcdefghijklmn")}, "action names: a, b, c"),
         ({"touch_gain_per_count": 1 / 255}, "touch gain: counts × 0.00392157 in the checkpoint, counts × 0.0133333"),
-        (
-            {"touch_has_unit": False},
-            "unit of touch: statistics of its dataset in the checkpoint, counts above baseline",
-        ),
+        ({"touch_has_unit": False}, "unit of touch: statistics of its dataset in the checkpoint, counts above baseline"),
         ({"touch_layout": (2, 16, 16)}, "touch layout: 2 × 16 × 16 in the checkpoint, 4 × 32 × 12"),
-        (
-            {"ranges": {"action": (np.degrees(ROBOT.action_low), np.degrees(ROBOT.action_high))}},
-            "range of action: -170 … 180 in",
-        ),
+        ({"ranges": {"action": (np.degrees(ROBOT.action_low), np.degrees(ROBOT.action_high))}}, "range of action: -170 … 180 in"),
         ({"unnormalised": ("action",)}, "normalisation: no statistics of action"),
     ],
-)
+)  # fmt: skip
 def test_each_difference_is_named_with_both_sides(changes, words):
     checks = preflight(facts(**changes), TwinConfig())
     with pytest.raises(TaccorlError, match="policy does not fit the environment") as error:

@@ -64,15 +64,12 @@ def test_a_driver_of_ones_own_gives_counts_above_its_baseline_at_the_right_taxel
     ("config", "said"),
     [
         (DriverPads(pads=["one"], open_with=f"{__name__}:Missing"), "give module:function"),
-        (
-            DriverPads(pads=["one"], open_with=f"{__name__}:Crooked"),
-            r"frames of \(4, 4\), but flexitac_v2 sends \(12, 32\)",
-        ),
+        (DriverPads(pads=["one"], open_with=f"{__name__}:Crooked"), r"frames of \(4, 4\), but flexitac_v2 sends \(12, 32\)"),
         (FlexiTacPads(ports={"a": "/dev/x", "b": "/dev/x"}), "a port is given twice"),
         (FlexiTacPads(ports={}), "no pad is named"),
         (FlexiTacPads(ports={"a": "/dev/x"}), "pip install flexitac"),
     ],
-)
+)  # fmt: skip
 def test_pads_that_cannot_be_read_are_said(config: DriverPads, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flexitac", None)  # not installed
     with pytest.raises(TaccorlError, match=said):

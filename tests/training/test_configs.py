@@ -62,12 +62,9 @@ def test_every_file_is_loaded_by_what_reads_it(name: str, monkeypatch: pytest.Mo
     [
         ("assembly_2", 1000),
         ("test_tube", 3000),
-        *(
-            pytest.param(task, steps, marks=pytest.mark.slow)
-            for task, steps in (("assembly_1", 1000), ("puzzle", 3000))
-        ),
+        *(pytest.param(task, steps, marks=pytest.mark.slow) for task, steps in (("assembly_1", 1000), ("puzzle", 3000))),
     ],
-)
+)  # fmt: skip
 def test_the_papers_co_training_is_the_papers_table(task: str, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     config = lerobot_train(CONFIGS / "cotrain" / f"{task}.yaml", monkeypatch)
     policy = config.policy

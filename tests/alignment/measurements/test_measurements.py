@@ -111,13 +111,9 @@ def test_an_index_says_what_files_cannot(folder):
         (pressed(f"{BALL}, length_m: 0.1"), SpecError, "a sphere has no length_m"),
         (pressed(f"{BALL}, position_m: [0, 0]"), SpecError, "expected 3 values, found 2"),
         (pressed(f"{BALL}, frame: hand"), SpecError, "'hand' is not one of 'tcp', 'world'"),
-        (
-            pressed(BALL),
-            TaccorlError,
-            "yaml: recordings → sweep_1.csv → pressed:.*recording holds.*frames.*pads; record",
-        ),
+        (pressed(BALL), TaccorlError, "yaml: recordings → sweep_1.csv → pressed:.*recording holds.*frames.*pads; record"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_index_is_named(folder, text, error, message):
     (folder / "measurements.yaml").write_text(text + "\n")
     with pytest.raises(error, match=message):

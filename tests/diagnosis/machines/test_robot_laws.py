@@ -204,18 +204,12 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
         ("law: torque, kd: 1.0", "kd: law torque does not use this"),
         ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", "resistance_ohm: law pwm requires this"),
         ("kp: 20.0, kd: 1.0, supply_v: 12.0", "supply_v: law impedance does not use this"),
-        (
-            "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 1.0, gains: fitted",
-            "`gains: commanded`",
-        ),
-        (
-            "law: velocity, kd: 1.0, effects: [{effect: error_deadband, width_rad: 0.01}]",
-            "loop that law velocity does not",
-        ),
+        ("law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 1.0, gains: fitted", "`gains: commanded`"),
+        ("law: velocity, kd: 1.0, effects: [{effect: error_deadband, width_rad: 0.01}]", "loop that law velocity does not"),
         ("law: torque, effects: [{effect: integral_action, rate_per_s: 1.0}]", "loop that law torque does not have"),
         ("law: pd, kp: 1.0, kd: 1.0", "'pd' is not one of 'impedance'"),
     ],
-)
+)  # fmt: skip
 def test_numbers_that_a_law_lacks_or_has_none_of_are_refused_with_their_line(
     drive: str, words: str, tmp_path: Path
 ) -> None:

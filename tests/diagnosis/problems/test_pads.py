@@ -173,13 +173,10 @@ def test_recordings_of_different_pads_are_named():
 @pytest.mark.parametrize(
     ("radius_m", "message"),
     [
-        (
-            0.0115,
-            r"press_0: the object comes near the pads of the left arm and never touches .*up to \d+ counts.*radius_m",
-        ),
+        (0.0115, r"press_0: the object comes near the pads of the left arm and never touches .*up to \d+ counts.*radius_m"),
         (0.004, r"press_0:.*object never comes within 1 mm.*check.*size"),
     ],
-)
+)  # fmt: skip
 def test_an_object_that_is_not_touched_is_named_with_the_way_out(radius_m: float, message: str):
     m = made(0, pressed=indenter("sphere", radius_m, "left", position_m=(0.001, 0.0, 0.003)))
     if radius_m > 0.01:  # 12 mm were 1 mm deep; 11.5 mm are 0.5, and with each finger 0.8 mm further off 0.3 mm away

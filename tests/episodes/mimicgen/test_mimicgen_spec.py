@@ -25,24 +25,12 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
     ("old", "new", "said"),
     [
         ("object_ref: plug", "object_rev: plug", r"unknown key 'object_rev'; did you mean 'object_ref'"),
-        (
-            "coordination_scheme: replay",
-            "coordination_scheme: replai",
-            r"'replai' is not one of .*did you mean 'replay'",
-        ),
+        ("coordination_scheme: replay", "coordination_scheme: replai", r"'replai' is not one of .*did you mean 'replay'"),
         ("nearest_neighbor_object", "nearest_neighbour_object", r"did you mean 'nearest_neighbor_object'"),
-        (
-            "[[left, 1], [right, 1]]",
-            "[[left, 1], [right, 2]]",
-            r"no subtask 2 of 'right'; left has 0 … 1, right has 0 … 1",
-        ),
+        ("[[left, 1], [right, 1]]", "[[left, 1], [right, 2]]", r"no subtask 2 of 'right'; left has 0 … 1, right has 0 … 1"),
         ("[[left, 1], [right, 1]]", "[[left, 0], [left, 1]]", r"both are of the left arm"),
         ("[2, 6]", "[6, 2]", r"\[6, 2\]: the lower bound comes first"),
-        (
-            "held_object: cradle",
-            "held_object: cradle, subtask_term_offset_range: [0, 4]",
-            r"an arm's last subtask ends where",
-        ),
+        ("held_object: cradle", "held_object: cradle, subtask_term_offset_range: [0, 4]", r"an arm's last subtask ends where"),
         ("subtask_term_signal: grasp cradle", "subtask_term_signal: null", r"null: only an arm's last subtask"),
         ("spec_version: 1", "spec_version: 2", r"this taccorl reads version 1"),
         (
@@ -54,11 +42,7 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {time_s: 1}}", r"without joint_rad"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {joint_rad: .nan}}", r"found '\.nan'"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {joint_rad: .inf}}", r"found '\.inf'"),
-        (
-            "task: assembly_2",
-            "task: assembly_2\ngates: {max_force_n: -5}",
-            r"-5: nothing would pass; give a number > 0",
-        ),
+        ("task: assembly_2", "task: assembly_2\ngates: {max_force_n: -5}", r"-5: nothing would pass; give a number > 0"),
         (
             "[[left, 1], [right, 1]], constraint_type: coordination, coordination_scheme: replay}",
             "[[left, 1], [right, 0]], constraint_type: sequential}\n"
@@ -66,7 +50,7 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
             r"deadlock: left waits to begin 'grasp cradle' until right has ended 'insert plug'; right waits",
         ),
     ],
-)
+)  # fmt: skip
 def test_a_slip_in_a_spec_is_named_with_its_place(old, new, said, tmp_path):
     text = mimic_spec_path("assembly_2").read_text()
     assert old in text
