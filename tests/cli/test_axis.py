@@ -148,7 +148,7 @@ def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench, said, 
     low, high = d["intervals"][c["name"]]
     assert low < c["after"] < high and c["after"] == pytest.approx(FRICTION_N, rel=0.15)
     assert c["without"] > 3.0 * d["errors"]["after"]["validation"]
-    said_so = f"coulomb_friction.torque_nm 3 → {c['after']:.4g} N ({low:.4g} … {high:.4g})"
+    said_so = f"coulomb_friction.torque_nm 3 → {c['after']:.5g} N ({low:.5g} … {high:.5g})"
     assert code == 0 and said_so in report["verdicts"]["slide"]["finding"] and said_so in text
     assert (
         f"coulomb_friction.torque_nm of slide 3 → {c['after']:.4g} N" in text.split(f"wrote {found / 'drive.yaml'}")[1]
