@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_070,
+    "taccorl/alignment": 15_078,
     "taccorl/cli": 5_172,
     "taccorl/data": 8_797,
     "taccorl/diagnosis": 11_339,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_558,
     "taccorl/views": 2_629,
-    "tests": 56_450,
+    "tests": 56_462,
     "pipelines": 6_242,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -134,6 +134,18 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench, said,
     assert drive.read_text() == FILE
 
 
+def test_a_log_of_positions_and_efforts_alone_is_diagnosed(bench, said, tmp_path):
+    drive, found = tmp_path / "drive.yaml", tmp_path / "found"
+    drive.write_text(re.sub("kp: .*\nkd: .*\n", "law: effort\n", FILE))
+    shutil.copytree(bench / "bench", rows := tmp_path / "rows")
+    for path in rows.glob("*.csv"):
+        path.write_text(re.sub(r"^([^,]+,[^,]+),[^,]+", r"\1", path.read_text(), flags=re.MULTILINE))
+    code, text = said("diagnose", rows, f"--twin={drive}", f"--out={found}", FEW)
+    assert code in (0, 1) and "error" not in text.split("slide:")[0], text
+    d = json.loads((found / "report.json").read_text())["diagnoses"]["slide"]
+    assert d["errors"]["before"]["validation"] > 5.0 and "kp" not in d["base"]
+
+
 @pytest.mark.slow
 def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench, said, tmp_path):
     """The file has 3 of 12 N. Held there, the rest of 9 N is missing."""

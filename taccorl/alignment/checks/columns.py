@@ -16,6 +16,7 @@ from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.effort_time import law_left
 from taccorl.alignment.checks.registry import find
+from taccorl.alignment.checks.robot import beyond_limits
 from taccorl.alignment.checks.trial import noise_of_rows, write
 from taccorl.alignment.checks.wiring import velocity_gain
 from taccorl.alignment.controller.joint_model import JointModel
@@ -70,8 +71,11 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
             laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
             if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
                 return
-            exchanged = _replay_error(robot, _swapped(m, *pair), other[name])
-            rows.append((name, m.name, _noise(m, name), _replay_error(robot, m, name), exchanged))
+            swapped = _swapped(m, *pair)
+            if any(beyond_limits(robot, swapped, n) for n in pair):  # it is their unit that is wrong
+                return
+            old, new = _replay_error(robot, m, name), _replay_error(robot, swapped, other[name])
+            rows.append((name, m.name, _noise(m, name), old, new))
     deciding = [row for row in rows if row[3] >= FAR * row[2]]  # a slow motion may not: any joint follows its target
     right = all(
         new <= (NEAR * noise if old >= FAR * noise else max(old, NEAR * noise)) for _, _, noise, old, new in rows

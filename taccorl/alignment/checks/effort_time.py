@@ -75,6 +75,8 @@ def check_effort_time(
     follow other gains than stated, or not all the same, a warning alone (``other_scale``: both are off by one factor).
     ``recordings``: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used. ``file``:
     that states the law. ``inertia``: that of the joint in a recording [kg·m²]; its accelerations stand for efforts."""
+    if law.law == "effort":  # there is no drive
+        return
     of_it = ("effort_unit", signal, "")
     wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     every = [m for m in recordings if m.name not in wrong]
@@ -95,6 +97,8 @@ def check_effort_time(
         return
     if early := _early(law, used, signal):
         tell("effort_time", early)
+        return
+    if used and (getattr(law, "command_hz", None) or 0.0) > used[0].rate_hz:  # its target moves within the row, too
         return
     share, sd = target_share(law, used, signal) or (0.0, math.inf)
     after = abs(share - 1.0) < NEAR

@@ -57,7 +57,7 @@ def check_robot(
     of_efforts: list[Finding] = []
     for name in robot.config.joints:
         if name in m.signals:
-            wrong = _beyond_limits(robot, m, name)
+            wrong = beyond_limits(robot, m, name)
             fit = fits[name] if name in moved else None
             known = _factor(robot.config.joints[name], whole, name, fit)
             if known is not None and not wrong and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
@@ -117,7 +117,7 @@ def _missing(robot: Robot, m: Measurement) -> list[Finding]:
 
 
 @check("beyond_limits", "error")
-def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
+def beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     facts, j = robot.rigid.joints[name], m.column(name)
     if facts.limits is None:
         return []

@@ -172,9 +172,8 @@ def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(
 def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str, tmp_path: Path) -> None:
     after = tuple(recording(law, name, hz, 1, after=True) for name, hz in (("sweep", 1.5), ("other", 1.0)))
     before = recording(law, "sweep", 1.5, 1)
-    plain, declared = (
-        robot(tmp_path, f"law: {law}, {FILES[law]}{more}") for more in ("", ", effort_after_target: true")
-    )
+    fields = ("", ", effort_after_target: true", ", command_hz: 1000.0")
+    plain, declared, faster = (robot(tmp_path, f"law: {law}, {FILES[law]}{more}") for more in fields)
 
     def checks(made: Robot, m: Measurement) -> list[str]:
         whole = made.joint("swing").whole(m)
@@ -183,6 +182,7 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
         return [f.text for f in found[m.name] if f.severity == "error"]
 
     assert checks(plain, before) == [] and checks(declared, after[0]) == []
+    assert checks(faster, after[0]) == [], "within a row the target moves on"
     (line,) = checks(plain, after[0])
     assert "Write `effort_after_target: true` for swing" in line
     assert "Remove effort_after_target of swing" in checks(declared, before)[0]
