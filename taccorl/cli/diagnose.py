@@ -170,7 +170,7 @@ def _next(
     found = sorted(found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"])  # the largest first
     names = list(dict.fromkeys(name for f in found for name in added(f.diagnosis)))
     off = [(f.part, c) for f in found for c in f.diagnosis.changed if c.name != EFFORT_SCALE]  # which no file has
-    of_file = [c.effect for f in found if not added(f.diagnosis) for c in f.diagnosis.changed if c.effect]
+    of_file = [c.effect for f in found if f.diagnosis.status == "numbers_off" for c in f.diagnosis.changed if c.effect]
     whole = machine.changes_as_a_whole(found)
     further = shlex.join(command("diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"))
     if config.until == "noise_floor":
