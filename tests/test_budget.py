@@ -19,7 +19,7 @@ MOST_LINES = {
     "taccorl/rl": 2_479,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
-    "taccorl/sim": 9_221,
+    "taccorl/sim": 9_225,
     "taccorl/surrogate": 3_537,
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_558,

@@ -151,6 +151,8 @@ class Effect:
     """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
     tell them apart, and which recording can."""
 
+    range_by: ClassVar[str] = ""
+    """Text that says what else sets the bounds of parameters."""
     reduces_to: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect, without unit; at its lower bound both effects are equal. A fitted
     value less than 0.1 above that bound is rejected in favour of the simpler effect."""
@@ -191,7 +193,8 @@ class Effect:
         low, high = self.accepted(p)
         if value != p.absent and not low <= value <= high:
             unit = "" if p.unit == "1" else f" {p.unit}"
-            raise TaccorlError(f"effect {self.name}: {p.name} is {value:g}{unit}, outside of {low:g} … {high:g}{unit}")
+            range_ = f"{low:g} … {high:g}{unit}{self.range_by}"
+            raise TaccorlError(f"effect {self.name}: {p.name} is {value:g}{unit}, outside of {range_}")
         return float(value)
 
     @classmethod
