@@ -314,7 +314,7 @@ def _from_turning_points(pressed: np.ndarray, half_width: float) -> np.ndarray:
 
 
 def _boltzmann(pressed: np.ndarray, share: float) -> np.ndarray:
-    """Every step of the load adds 1 + a log₁₀(1 + t / 0.018 s) times itself (Boltzmann's superposition)."""
+    """Reading under ``pressed``: the sum of its steps, each times 1 + a log₁₀(1 + t / 0.018 s) after t seconds."""
     kernel = 1.0 + share * np.log10(1.0 + np.arange(len(pressed)) * MILLISECOND / 0.018)
     steps = np.diff(pressed, axis=0, prepend=0.0)
     return np.maximum(fftconvolve(steps, kernel[:, None], axes=0)[: len(pressed)], 0.0)

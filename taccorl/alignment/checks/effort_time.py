@@ -45,12 +45,12 @@ GAINS_LEFT, GAINS_OFF, ALIKE_GAINS = 0.25, 1.3, 1.1
 """Largest residual of the fitted law as a share of the RMS effort, for which its gains are reported; least ratio of a fitted gain
 to the stated one, or its inverse; and largest ratio of both ratios that a wrong unit of the effort explains, too. Choices."""
 STATED_LEFT, SHARES = (1.2, 2.0), (-0.5, 1.5)
-"""Fitted gains are reported if the stated ones, with the best delay and lag of the targets, leave so many times as much of
-efforts (the fitted ones leave their noise) or accelerations, and r is in this range. Choices."""
+"""Fitted gains are reported if the stated gains, with the best delay and lag of the targets, leave a residual of at least 1.2
+times theirs in efforts, or 2 times in accelerations where no effort was recorded, and the share r is in this range. Choices."""
 ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
-"""Gains fitted to one recording are compared with others' if the law leaves at most the first share of its effort; two that
-differ by more than the second factor are not of one machine (with one of 7 effects: at most 1.34). From accelerations in place of
-efforts, K_p is told as another only beyond the third factor. Choices."""
+"""Largest residual, as a share of the RMS effort, of gains that are fitted to one recording and compared with those of others;
+ratio of two of them from which they are not of one machine (with one of 7 effects: at most 1.34); and least ratio of K_p to the
+stated one that is reported where accelerations stand for efforts. Choices."""
 LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)
 """Lags and delays of targets that are tried."""
 ALIKE = 1e-3

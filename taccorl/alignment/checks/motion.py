@@ -65,7 +65,7 @@ rows: beyond it the friction would have given way. A choice."""
 @check("not_finite", "error")
 @check("lost_samples", "error", needs="rows")
 def check_values(t: Trial) -> Iterator[Finding]:
-    """Targets that are not finite, angles that jump by a full turn, and gaps of the measurement."""
+    """Find targets that are no numbers, angles that jump by a full turn, and rows without a measurement."""
     m = t.m
     for name, values in zip(m.signals, m.target.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))

@@ -20,8 +20,8 @@ from taccorl.data.finding import Finding, listed
 BEYOND = 0.02
 """Share of a joint's range by which a measured position may exceed its limits."""
 DEGREES, NEAR_DEGREES = math.pi / 180, 0.3
-"""Velocity in rad/s over the slope of a position in degrees; largest difference of the logarithms of this and of a ratio of
-inertias that positions in degrees explain (a choice)."""
+"""Radians in a degree; and how far the natural logarithm of (fitted inertia / stated inertia) may be from that of this number for
+degrees to be named as the cause, a choice."""
 EFFORT_BEYOND = 1.5
 """Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0
@@ -184,7 +184,7 @@ def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) 
 
 
 def in_degrees(ratio: float, signal: str, unit: str) -> str:
-    """Text: the line to write if an inertia that is ``ratio`` times the stated one may come of positions in degrees."""
+    """Text: the line to write if positions in degrees explain an inertia of ``ratio`` times the stated one; else empty."""
     if unit != "rad" or abs(math.log(ratio / DEGREES)) > NEAR_DEGREES:
         return ""
     line = f"`unit: deg` for {signal}.q and {signal}.q_target in a columns file"

@@ -135,7 +135,7 @@ def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
 
 
 def of_refit(fits: Fits, answer: Model) -> list[str]:
-    """Sentence where no effect was added and the refit of the always fitted numbers is worse than the twin as it was."""
+    """Remark if no effect was added and refitting the always fitted numbers raised the validation error; else none."""
     before = fits.error(fits.as_it_was)
     if fits.added(answer) or fits.base.error <= REFIT_WORSE * max(before, 1.0):
         return []

@@ -79,8 +79,8 @@ def block_sums(values: np.ndarray, layout: Sequence[Rows]) -> np.ndarray:
 
 
 def lasting_square(values: np.ndarray, layout: Sequence[Rows]) -> float:
-    """Mean product of the stacked ``values`` (n,) with those of the same channel one to two blocks later, over the recordings of
-    short noise: the part of their mean square that is no noise, but a misfit that lasts. At least 0."""
+    """Part of the mean square of the stacked residuals ``values`` (n,) that outlasts noise: mean product of two residuals
+    of one channel, one to two blocks of ``BLOCK_S`` apart, in recordings with ``short_noise``. At least 0."""
     products = np.zeros(2)  # of values, and of ones in their places
     for part, rows in zip(unstacked(values, layout), layout, strict=True):
         block = max(1, round(BLOCK_S * rows.rate_hz))

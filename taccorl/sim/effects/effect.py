@@ -152,7 +152,7 @@ class Effect:
     tell them apart, and which recording can."""
 
     range_by: ClassVar[str] = ""
-    """Text that says what else sets the bounds of parameters."""
+    """Ending of the message on a value out of bounds: keys of a file that change the bounds."""
     reduces_to: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect, without unit; at its lower bound both effects are equal. A fitted
     value less than 0.1 above that bound is rejected in favour of the simpler effect."""

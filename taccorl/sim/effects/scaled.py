@@ -91,7 +91,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
         }
         return [{key: value * factors[key] for key, value in start.items()} for start in base.starts(own)]
 
-    by = "; `force_unit_n` and `length_unit_m` of the axis file set the size of these bounds"
+    by = "; in the file of an axis `force_unit_n` and `length_unit_m` set such bounds"
     return _changed(base, changed, (scaled, name, scale), starts=classmethod(starts), range_by=by)
 
 
