@@ -124,19 +124,14 @@ class LocalEngine(Engine):
             take(index, attempt(fn, items[index]))
 
 
-@Engine.register_subclass("slurm")
 @dataclass(frozen=True, kw_only=True)
-class SlurmEngine(Engine):
-    """A Slurm cluster, through datatrove (extra ``cluster``). Waits until the job has ended."""
+class _ClusterEngine(Engine):
+    """One job on a cluster, through datatrove (extra ``cluster``); ``on_done`` is called at its end."""
 
-    partition: str
-    """Name of the Slurm partition."""
-    work_dir: Path = Path("outputs/slurm")
+    work_dir: Path = Path("outputs/cluster")
     """Folder for items, results and logs that all nodes can access. The store must also be in such a folder."""
     tasks: int = 100
-    """Most elements of the job array; each runs every tasks-th item. It must be below the cluster's MaxArraySize."""
-    time: str = "24:00:00"
-    """Time limit of one task, in Slurm's format."""
+    """Most tasks of a job (elements of Slurm's job array, below the cluster's MaxArraySize); each runs every tasks-th item."""
     cpus_per_task: int = 1
     """Number of CPU cores of one task."""
     mem_per_cpu_gb: int = 4
@@ -146,43 +141,39 @@ class SlurmEngine(Engine):
     def at_once(self) -> int:
         return self.tasks
 
+    def _submit(self, run, fn, items, first, name, take, care) -> None:
+        """``Engine._run`` by ``run``, a function of ``cluster``, as one job of the items from ``first`` on."""
+        run(
+            cluster.Job.create(self.work_dir, fn, items[first:], name, care),
+            lambda index, outcome: take(first + index, outcome),
+            tasks=min(self.tasks, len(items) - first),
+            cpus_per_task=self.cpus_per_task,
+            mem_per_cpu_gb=self.mem_per_cpu_gb,
+        )
+
+
+@Engine.register_subclass("slurm")
+@dataclass(frozen=True, kw_only=True)
+class SlurmEngine(_ClusterEngine):
+    """A Slurm cluster. Waits until the job has ended."""
+
+    partition: str
+    """Name of the Slurm partition."""
+    time: str = "24:00:00"
+    """Time limit of one task, in Slurm's format."""
+
     def _run(self, fn, items, first, name, take, care) -> None:
         run = functools.partial(cluster.run_on_slurm, partition=self.partition, time=self.time)
-        _run_on_cluster(self, run, fn, items, first, name, take, care)
+        self._submit(run, fn, items, first, name, take, care)
 
 
 @Engine.register_subclass("ray")
 @dataclass(frozen=True, kw_only=True)
-class RayEngine(Engine):
-    """A running Ray cluster, through datatrove (extra ``cluster``). ``on_done`` is called at the end."""
-
-    work_dir: Path = Path("outputs/ray")
-    """Folder for items, results and logs that all nodes can access. The store must also be in such a folder."""
-    tasks: int = 100
-    """Most Ray tasks; each runs every tasks-th item."""
-    cpus_per_task: int = 1
-    """Number of CPU cores of one task."""
-    mem_per_cpu_gb: int = 4
-    """Memory for each of these cores [GB]."""
-
-    @property
-    def at_once(self) -> int:
-        return self.tasks
+class RayEngine(_ClusterEngine):
+    """A running Ray cluster."""
 
     def _run(self, fn, items, first, name, take, care) -> None:
-        _run_on_cluster(self, cluster.run_on_ray, fn, items, first, name, take, care)
-
-
-def _run_on_cluster(engine: SlurmEngine | RayEngine, run, fn, items, first, name, take, care) -> None:
-    """``Engine._run`` by ``run``, a function of ``cluster``, as one job of the items from ``first`` on."""
-    todo = items[first:]
-    run(
-        cluster.Job.create(engine.work_dir, fn, todo, name, care),
-        lambda index, outcome: take(first + index, outcome),
-        tasks=min(engine.tasks, len(todo)),
-        cpus_per_task=engine.cpus_per_task,
-        mem_per_cpu_gb=engine.mem_per_cpu_gb,
-    )
+        self._submit(cluster.run_on_ray, fn, items, first, name, take, care)
 
 
 def _failure_text(failures: list[tuple[str, Failed]], num_items: int) -> str:

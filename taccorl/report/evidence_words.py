@@ -169,8 +169,8 @@ def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:
     nested = [words for other in same if (words := nested_words(d, name, other))]
     same = [other for other in same if not nested_words(d, name, other)]
     alike = (
-        f"No motion separates {name} from {', '.join(same)}: with the fitted torque_ff they give the same positions. Only the "
-        "motor's effort may; if these recordings have it, it does not. Take either."
+        f"No motion separates {name} from {', '.join(same)}: with the fitted torque_ff they give the same positions. Only "
+        "recorded efforts may, unless these recordings have them. Take either."
     )
     return " ".join([*[alike] * bool(same), *nested])
 

@@ -69,8 +69,8 @@ UNCERTAIN: Mapping[Kind, str] = {
 SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
-    "gains_moved": "Nothing yet: state the commanded gains (kp, kd in measurements.yaml) and check the time stamps.",
-    "too_many": "Nothing yet: let the search add effects until the noise floor is reached (--until=noise_floor).",
+    "gains_moved": "First state the commanded gains (kp, kd) and check the time stamps.",
+    "too_many": "First let the search add effects until the noise floor is reached (--until=noise_floor).",
 }
 """Kind or status → what to record next, where nothing else decides."""
 Level = Literal["high", "moderate", "low"]

@@ -91,7 +91,7 @@ USUAL_TAU_S = 0.12
 least step · period / τ."""
 
 
-@check("measured_before_command", "error")
+@check("measured_before_command", "error", explains=("effort_time",))
 @check(EXCHANGED_COLUMNS, "error", explains=FOLLOWS_FROM)
 @check("late_answer", "note", needs="clock")
 def check_clock(t: Trial) -> Iterator[Finding]:

@@ -211,9 +211,12 @@ def one_cause(
     late in another.
 
     If a signal is reversed, or exchanged with its target, in most of the recordings that have an error of it, the others are
-    checked again with that corrected. Those that pass have the same cause; findings that it explains are removed.
+    checked again with that corrected. Those that pass have the same cause; findings that it explains are removed, as are those
+    that any other error of the signal explains.
     ``found``: name of a recording → its findings. ``rates``: as in ``Trial``."""
-    result = {name: list(findings) for name, findings in found.items()}
+    every = [f for own in found.values() for f in own if f.severity == "error"]
+    explained = {(e, f.feature) for f in every if f.check not in CORRECTED for e in CHECKS[f.check].explains}
+    result = {name: [f for f in own if (f.check, f.feature) not in explained] for name, own in found.items()}
     wrong = {f.feature for own in result.values() for f in own if f.check in CORRECTED and f.severity == "error"}
     for signal in sorted(wrong):
         errors = {

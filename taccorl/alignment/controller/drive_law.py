@@ -103,15 +103,6 @@ class DriveLaw:
         for the law, or is not used by it."""
         check_numbers(owner, self, positive=("kp_factor", "kd_factor"), finite=("torque_ff",))
         stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
-        check_numbers(owner, self, not_negative=[name for name in stated if name == "kd"])
-        check_numbers(owner, self, positive=[name for name in stated if name != "kd"])
-        for name in NEEDED[self.law]:
-            if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
-                raise TaccorlError(f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`")
-        if self.law == "effort":
-            for name in ("loop_hz", "command_hz", "target_late_s", "effort_after_target"):
-                if getattr(self, name, None):
-                    raise TaccorlError(f"{owner}.{name}: law effort has no drive; remove it")
         foreign = () if self.law == "pwm" else WINDING
         foreign += {"velocity": ("kp",), "torque": ("kp", "kd"), "effort": ("kp", "kd", "effort_limit")}.get(
             self.law, ()
@@ -121,6 +112,15 @@ class DriveLaw:
                 raise TaccorlError(
                     f"{owner}.{name}: law {self.law} does not use this number; remove it, or correct the law"
                 )
+        check_numbers(owner, self, not_negative=[name for name in stated if name == "kd"])
+        check_numbers(owner, self, positive=[name for name in stated if name != "kd"])
+        for name in NEEDED[self.law]:
+            if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
+                raise TaccorlError(f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`")
+        if self.law == "effort":
+            for name in ("loop_hz", "command_hz", "target_late_s", "effort_after_target"):
+                if getattr(self, name, None):
+                    raise TaccorlError(f"{owner}.{name}: law effort has no drive; remove it")
 
     def check_known(self, owner: str, effects: Mapping[str, Sequence[str]]) -> None:
         """Check the names in ``known``; ``effects``: effect of the file → its parameters. Raises TaccorlError, which begins with

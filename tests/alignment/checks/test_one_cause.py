@@ -55,6 +55,15 @@ def test_efforts_that_oppose_the_acceleration_as_well_say_which_column_is_turned
     assert errors(said)["slow.csv"] == {"reversed"} and any(f.text.endswith("table.q") for f in said["slow.csv"])
 
 
+def test_late_targets_of_one_recording_explain_efforts_that_seem_to_answer_them_in_all():
+    early = dataclasses.replace(CLEAN[2], measured=np.roll(CLEAN[2].measured, -50, axis=0))
+    found = check_measurements([*CLEAN[:2], early])
+    for name, signal in (("slow.csv", "table"), ("fast_one.csv", "table"), ("wide.csv", "other")):
+        found[name].append(Finding("effort_time", "error", signal, "effort"))
+    said = errors(one_cause(found, [*CLEAN[:2], early]))
+    assert said == {"slow.csv": set(), "wide.csv": {"effort_time"}, "fast_one.csv": {"measured_before_command"}}
+
+
 def test_exchanged_columns_are_one_cause():
     wrong = [dataclasses.replace(m, measured=m.target, target=m.measured) for m in CLEAN]
     alone = check_measurements(wrong)

@@ -200,7 +200,7 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
     [
         ("kp: 20.0", "kd: law impedance requires this number; write `kd: …`"),
         ("law: cascade, kp: 12.0", "kd: law cascade requires this"),
-        ("law: velocity, kp: 12.0, kd: 1.0", "kp: law velocity does not use this number; remove it"),
+        ("law: velocity, kp: 0.0, kd: 1.0", "kp: law velocity does not use this number; remove it"),
         ("law: torque, kd: 1.0", "kd: law torque does not use this"),
         ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", "resistance_ohm: law pwm requires this"),
         ("kp: 20.0, kd: 1.0, supply_v: 12.0", "supply_v: law impedance does not use this"),

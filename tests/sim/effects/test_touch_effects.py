@@ -165,15 +165,17 @@ def test_a_shifted_pad_feels_with_each_taxel_what_the_next_one_would() -> None:
     np.testing.assert_allclose(shifted[1, 2:, 1:], plain[1, :-2, :-1], atol=1e-7)
 
 
+def squeezed(effect: str, factor: float, steps: int):
+    sim = start(make_effect(effect, stiffness_factor=factor))
+    targets = sim.targets.copy()
+    targets[0, 6] = BLOCK_M - 0.008
+    for _ in range(steps):
+        sim.step(targets)
+    return sim
+
+
 def test_a_softer_part_is_pressed_in_further_by_the_same_command() -> None:
-    opening = {}
-    for factor in (1.0, 0.02):
-        sim = start(make_effect("contact_compliance", stiffness_factor=factor))
-        targets = sim.targets.copy()
-        targets[0, 6] = BLOCK_M - 0.008
-        for _ in range(10):
-            sim.step(targets)
-        opening[factor] = sim.proprioception()[0, 6]
+    opening = {f: squeezed("contact_compliance", f, 10).proprioception()[0, 6] for f in (1.0, 0.02)}
     assert opening[0.02] < opening[1.0] - 1e-4
 
 
@@ -252,11 +254,7 @@ def test_only_the_chosen_pads_change_and_do_so_as_they_would_among_all(name: str
 def test_a_softer_pad_gives_way_by_the_inverse_of_its_stiffness_under_the_same_force() -> None:
     pressed = {}
     for factor in (1.0, 0.5):
-        sim = start(make_effect("pad_compliance", stiffness_factor=factor))
-        targets = sim.targets.copy()
-        targets[0, 6] = BLOCK_M - 0.008
-        for _ in range(15):
-            sim.step(targets)
+        sim = squeezed("pad_compliance", factor, 15)
         compression = [sim.batch.joint(f"left_{f}_spring").qpos[0, 0] for f in "ab"]
         pressed[factor] = np.mean(compression) / sim.effort()[0, 6]
     assert pressed[0.5] / pressed[1.0] == pytest.approx(2.0, rel=0.03)
