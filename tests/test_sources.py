@@ -13,7 +13,6 @@ from hatchling.build import build_wheel
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("taccorl", "pipelines", "tests", "data_specs", "configs", "docs")
-OPTIONAL = {"playwright"}  # of the developers' group; looked for before it is imported
 UNLISTED = {"rerun": "rerun-sdk", "rerun_cli": "rerun-sdk"}  # a .pth file puts them on the path
 
 
@@ -63,7 +62,7 @@ def test_every_package_that_is_imported_is_declared() -> None:
         distributions = {
             UNLISTED.get(package, name).lower().replace("_", "-") for name in known.get(package, [package])
         }
-        if not distributions & declared and package not in OPTIONAL:
+        if not distributions & declared:
             undeclared.add(package)
     assert undeclared == set()
 

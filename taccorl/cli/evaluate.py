@@ -21,7 +21,7 @@ from taccorl.cli.parse import given_names, joined, parse, shared_fields
 from taccorl.cli.progress import Steps
 from taccorl.errors import TaccorlError, nearest
 from taccorl.extras import require
-from taccorl.lineage.destinations import is_free
+from taccorl.lineage.destinations import check_writable, is_free
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.processes import worker_number
 from taccorl.report.page import write
@@ -193,6 +193,10 @@ def run(config: EvaluateConfig) -> int:
     names = [one.name for one in opened] + ([stored.policy] if stored else [])
     if len(set(names)) < len(names):
         raise TaccorlError(f"--against={config.against}: is the evaluated policy itself; give another policy")
+    if not is_free(config.out) and not config.robot:
+        text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
+        raise TaccorlError(text)
+    check_writable(config.out)
     config.out.mkdir(parents=True, exist_ok=True)
     begun_s = time.monotonic()
     executed = {one.name: text for one in opened if (text := one.executed)}
@@ -343,12 +347,9 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
 
 
 def _check_places(config: EvaluateConfig) -> None:
-    """Raises TaccorlError: something lies at ``out``, a number is below its range, or --physics cannot be used here."""
+    """Raises TaccorlError: a number is below its range, or --physics cannot be used here."""
     from taccorl.sim.warp_batch import WarpSettings, open_device
 
-    if not is_free(config.out) and not config.robot:
-        text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
-        raise TaccorlError(text)
     if config.workers < 1:
         raise TaccorlError(f"--workers={config.workers}: at least 1")
     if config.failures < 0:

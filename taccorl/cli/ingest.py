@@ -318,10 +318,13 @@ def inspect(config: InspectConfig) -> int:
         if draft is not None:
             _write_drafts(inventory, draft)
             draft = None
-        elif config.draft is None and not inventory.fits and is_damaged:
-            print("no shipped spec fits, and it is damaged (above): --draft=draft.yaml drafts one from what is left\n")
-        elif config.draft is None and not inventory.fits:
-            _print_drafts(inventory, printed)
+        elif config.draft is None and not inventory.fits and inventory.topics:
+            if is_damaged:
+                print(
+                    "no shipped spec fits, and it is damaged (above): --draft=draft.yaml drafts one from what is left\n"
+                )
+            else:
+                _print_drafts(inventory, printed)
     return 1 if failed else 0
 
 

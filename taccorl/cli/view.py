@@ -245,8 +245,8 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
     if config.screenshot is not None:  # last: it alone needs what a machine may lack
         from taccorl.views.screenshot import screenshot
 
-        who = screenshot(shown, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
-        print(f"wrote {config.screenshot}, drawn by {who}")
+        screenshot(shown, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
+        print(f"wrote {config.screenshot}")
     return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 
 

@@ -51,12 +51,14 @@ def finding(
 def leave_out(root: Path, number: int) -> str:
     """The two commands that write a copy of the dataset at ``root`` (absolute) without episode ``number``."""
     new = root.with_name(f"{root.name}_without_{number}")
-    paths = (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")
-    old_root, new_root, spec, beside = (shlex.quote(str(path)) for path in paths)
+    old_root, new_root, spec, beside = (
+        shlex.quote(str(path)) for path in (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")
+    )
+    own = f"; `install -D {spec} -t {beside}` keeps its units and pads, which LeRobot leaves behind"
     return (
         f"leave the episode out (`lerobot-edit-dataset --repo_id=local/old --root={old_root} --new_repo_id=local/new "
         f"--new_root={new_root} --operation.type=delete_episodes --operation.episode_indices=[{number}]` writes a dataset "
-        f"without it; `install -D {spec} -t {beside}` keeps its units and pads, which LeRobot leaves behind)"
+        f"without it{own * (root / 'meta/taccorl/dataset_spec.json').is_file()})"
     )
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-from taccorl.data.episode import Arm, Episode
+from taccorl.data.episode import EXECUTED, Arm, Episode
 from taccorl.data.finding import LEAVE_OUT, Finding, finding, listed, not_judged, place
 from taccorl.data.spec import ACTION, STATE
 from taccorl.data.timing import longest, repeated, runs, stretches
@@ -31,7 +31,8 @@ class Motion:
         self.keys = [key for key in (STATE, ACTION) if key in arrays]
         self.seconds, self.arms = episode.num_rows / self.fps, episode.arms()
         self.finite = all(np.isfinite(arrays[key]).all() for key in self.keys)
-        self.state, self.action = (arrays.get(key, np.empty((0, 0))).astype(float) for key in (STATE, ACTION))
+        sent = EXECUTED if EXECUTED in arrays else ACTION  # demonstrations of the twin: ACTION is what was intended
+        self.state, self.action = (arrays.get(key, np.empty((0, 0))).astype(float) for key in (STATE, sent))
         self.names: tuple[str, ...] = episode.element_names(STATE) if STATE in arrays else ()
 
     @functools.cached_property

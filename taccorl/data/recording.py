@@ -249,6 +249,8 @@ def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str])
         opens = kind.reader if (kind := sniff(path)) else None
         fitting = [name for name, spec in shipped_recording_specs().items() if spec.reader == opens]
         return other + (f" ({', '.join(fitting)} reads {opens})" if fitting and len(names) == 1 else "")
+    if (path / "data").is_dir() and (path / "meta").is_dir() and "lerobot" in names:
+        return "a LeRobot dataset without meta/info.json: copy it again"
     if path.is_dir() and (deeper := _nearest_folder(path, names, split_bag)) is not None:
         return f"no recording here, but there are some in {deeper}: give that folder"
     opened = [", ".join(sorted({s for name in names for s in readers.get(name).suffixes}))]

@@ -11,7 +11,7 @@ from taccorl.errors import nearest
 
 UNITS = (
     *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz", "N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
-    *("adc_count", "rgb8", "unknown"),
+    *("T", "adc_count", "rgb8", "unknown"),
 )
 """Units of features and sensors: SI; wxyz: a unit quaternion; 1: a number without unit; unknown: of others' datasets."""
 OTHER_UNITS = {
@@ -19,7 +19,7 @@ OTHER_UNITS = {
     **dict.fromkeys(("deg/s", "degrees/s", "°/s", "dps"), ("rad/s", "0.0174533")),
     **dict.fromkeys(("mm", "millimetre", "millimeter"), ("m", "0.001")),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), ("m", "0.01")),
-    **{u: (si, "0.001") for u, si in {"mm/s": "m/s", "mA": "A", "mV": "V", "ms": "s"}.items()},
+    **{u: (si, "0.001") for u, si in {"mm/s": "m/s", "mA": "A", "mV": "V", "mT": "T", "ms": "s"}.items()},
     "rpm": ("rad/s", "0.104720"),
     "Ncm": ("Nm", "0.01"),
     "kPa": ("Pa", "1000"),

@@ -108,7 +108,9 @@ def check_other_touch(episode: Episode, key: str) -> Iterator[Finding]:
         yield not_judged(key, "touch", f"{len(known) / fps:.1f} s of values, it takes {JUDGE_S:g} s")
         return
     span = f"{known.min():.4g} … {known.max():.4g}"
-    yield finding("touch_range", key, f"{key}: {layout} values of {span}, in a unit that nobody stated")
+    stated = [u for u in dict.fromkeys(episode.spec.features[key].units) if u not in ("", "unknown")]
+    unit = f"the unit {listed(stated)}" if stated else "a unit that nobody stated"
+    yield finding("touch_range", key, f"{key}: {layout} values of {span}, in {unit}")
     constant = np.ptp(known, axis=0) == 0
     if constant.all():
         text = f"{key}: none of its {layout} values ever changes: a sensor that is not connected, or its driver hung"

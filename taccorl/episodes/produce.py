@@ -20,7 +20,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import read_json, write_json
 from taccorl.episodes.plan import REPORT, Drawing, Made, Plan
 from taccorl.errors import InTheWayError
-from taccorl.lineage.destinations import is_free
+from taccorl.lineage.destinations import check_writable, is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.processes import Care
@@ -171,6 +171,7 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
     """Fail early if ``out`` is occupied: otherwise the store would refuse only after hours of attempts. Raises InTheWayError:
     something other than the result of this plan is at ``out``; the message states what."""
     if is_free(out):
+        check_writable(out)
         return
     if manifest := read_manifest(out) if out.is_dir() else {}:
         config = plan.dataset_config(None)

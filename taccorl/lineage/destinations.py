@@ -3,6 +3,7 @@ small file each, so that `prune` knows which datasets exist."""
 
 import json
 import os
+import tempfile
 from pathlib import Path
 
 from taccorl.errors import TaccorlError
@@ -20,9 +21,12 @@ def check_writable(folder: Path, option: str = "--out") -> None:
     """Check, before long work, that the folder of an ``option`` can be made or written. Raises TaccorlError: the folder, or the
     nearest one above it that exists, cannot be written to."""
     above = next(p for p in (folder, *folder.absolute().parents) if os.path.lexists(p))
-    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        why = "cannot be written to" if above.is_dir() else "is not a folder"
-        raise TaccorlError(f"{option}={folder}: {above} {why}: give another folder")
+    if not above.is_dir():
+        raise TaccorlError(f"{option}={folder}: {above} is not a folder: give another folder")
+    try:
+        tempfile.TemporaryFile(dir=above).close()
+    except OSError as error:
+        raise TaccorlError(f"{option}={folder}: {above} cannot be written to: give another folder") from error
 
 
 def write_new(path: Path, text: str) -> None:

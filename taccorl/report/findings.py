@@ -13,7 +13,7 @@ def found_in(name: str, findings: Sequence[Finding]) -> Section:
     """The worst severity, and each finding, of one episode, recording or dataset."""
     worst = next((s for s in ("error", "warning") if any(f.severity == s for f in findings)), "ok")
     unjudged = sum(f.check == "not_judged" for f in findings) if worst == "ok" else 0
-    head = f"{worst:9s}{name}" + f" ({unjudged} checks not judged)" * bool(unjudged)
+    head = f"{worst:9s}{name}" + f" ({unjudged} check{'s' * (unjudged > 1)} not judged)" * bool(unjudged)
     lines = [Cell(f"  {f.severity:8s}{f.check}: {f.text}", f.severity) for f in findings]
     return Section(text=[Cell(head, "good" if worst == "ok" else worst), *lines])
 

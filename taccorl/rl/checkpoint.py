@@ -57,7 +57,7 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     # torch and safetensors have errors of their own for a full disk
     except (OSError, RuntimeError, SafetensorError) as error:
         shutil.rmtree(unfinished, ignore_errors=True)
-        why = f"cannot be written ({str(error).splitlines()[0]}): is the disk full? The last checkpoint is complete"
+        why = f"cannot be written ({str(error).splitlines()[0]}): is the disk full? Earlier checkpoints are complete"
         raise TaccorlError(f"{folder}: {why}; free space and continue: --resume=true") from error
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)

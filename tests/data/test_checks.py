@@ -24,7 +24,7 @@ from synthetic_episode import (
 
 from taccorl.data import joint_checks, picture_checks
 from taccorl.data.checks import check_episode, check_recording_episodes, check_timing
-from taccorl.data.episode import Episode
+from taccorl.data.episode import EXECUTED, Episode
 from taccorl.data.finding import Finding
 
 FPS = SPEC.fps
@@ -532,6 +532,14 @@ def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name, num_epi
     check, fault = FAULTS[name]
     hits = sum(bool(found(fault(seed), check, pictures=check == "frozen_picture")) for seed in range(num_episodes))
     assert hits >= 0.95 * num_episodes, f"{hits} of {num_episodes}"
+
+
+def test_commands_that_were_sent_are_judged_and_not_those_that_were_intended():
+    episode = FAULTS["command too small"][1](0)
+    assert found(episode, "command_scale")
+    spec = dataclasses.replace(episode.spec, features=episode.spec.features | {EXECUTED: episode.spec.features[ACTION]})
+    sent = episode.arrays | {EXECUTED: base(0).arrays[ACTION]}
+    assert not found(dataclasses.replace(episode, spec=spec, arrays=sent), "command_scale")
 
 
 def test_motion_that_no_command_explains_is_a_warning():

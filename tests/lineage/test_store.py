@@ -73,6 +73,8 @@ def test_a_place_that_cannot_be_written_is_named_before_any_work(tmp_path):
     assert not (tmp_path / "new").exists()
     with pytest.raises(TaccorlError, match=f"--out={tmp_path}/file/x: {tmp_path}/file is not a folder"):
         check_writable(tmp_path / "file" / "x")
+    with pytest.raises(TaccorlError, match="--out=/proc/x/y: /proc cannot be written to"):
+        check_writable(Path("/proc/x/y"))
 
 
 def test_key_is_the_first_16_hex_of_the_sha256_of_stage_version_config_and_inputs(store, raw):

@@ -178,10 +178,13 @@ class CorrectionPlan(Plan):
         }
 
     def nothing(self, report: dict[str, Any], out: Path) -> TaccorlError:
+        own, over = (
+            ", ".join(f"{n} {kind}" for kind, n in report[key].items()) or "none"
+            for key in ("policy_outcomes", "outcomes")
+        )
         return TaccorlError(
-            f"{self.task}: no episode was corrected, nothing was written to {out}: the policy's episodes: "
-            f"{report['policy_outcomes']}, takeovers: {report['outcomes']}. Give more --episodes, or --takeover=all if the "
-            "policy succeeds by itself"
+            f"{self.task}: no episode was corrected, nothing was written to {out}: the policy's episodes: {own}; takeovers: "
+            f"{over}. Give more --episodes, or --takeover=all if the policy succeeds by itself"
         )
 
 
