@@ -36,8 +36,7 @@ Kind = Literal[
     "not_converged",
     "data_first",
 ]
-"""What a verdict says: nothing is missing, numbers of the file are off, effects are missing, effects that tie, more than was
-found, …"""
+"""What a verdict says: nothing is missing, numbers of the file are off, effects are missing or tie, more is than was found, …"""
 KINDS: Mapping[Status, Kind] = {
     "not_converged": "not_converged",
     "gains_moved": "gains_moved",
@@ -134,7 +133,8 @@ def verdict(
         reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
     # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
     unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (floor and kind == "nothing_missing")
-    level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
+    tied = kind == "ties" or (kind == "numbers_off" and w.instead)
+    level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or tied else "high"
     first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
     why = [reason.rstrip(".") for reason in (*first, *reasons)]
     more = f"; and {len(why) - _MOST} more" if len(why) > _MOST else ""
@@ -153,8 +153,7 @@ def verdict(
 
 
 def refitted_words(d: Diagnosis) -> str:
-    """Text that names the fit of all always fitted numbers without an added effect: for a joint these are the gains, for pads and
-    axes others."""
+    """Text that names the fit of all always fitted numbers without an added effect; for a joint these are the gains."""
     return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
 
 
@@ -263,7 +262,8 @@ class _Words:
     @property
     def names(self) -> str:
         """Added effects, each with all others that may be missing in its place."""
-        each = [" or ".join((name, *self.d.rivals.get(name, ()))) for name in added(self.d)]
+        links = {e.name: f"{e.name} in {link}" for e in self.d.effects if (link := getattr(e, "link", ""))}
+        each = [" or ".join((links.get(name, name), *self.d.rivals.get(name, ()))) for name in added(self.d)]
         return ("; " if any(self.d.rivals.values()) else " and ").join(each)
 
     @property

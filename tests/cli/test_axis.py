@@ -5,6 +5,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,39 +21,46 @@ FEW = f"--without=[{','.join(name for name in effects if name not in CONSIDERED)
 FILE = f"kind: axis\nname: slide\nunit: m\ninertia: {MASS_KG}\nkp: {KP}\nkd: {KD}\nlimits: [-0.15, 0.15]\nforce_unit_n: 10.0\n"
 
 
-def write(path: Path, amplitude_m: float, hz: float, seed: int, effort: float = 1.0, damping: float = 0.0) -> None:
-    """A mass with dry friction, and ``damping`` [N·s/m], under PD control, at 0.1 ms: equations of this test."""
+def write(
+    path: Path, amplitude_m: float, hz: float, seed: int, effort: float = 1.0, damping: float = 0.0,
+    friction_n: float = FRICTION_N, log: bool = False,
+) -> None:  # fmt: skip
+    """A mass with dry friction, and ``damping`` [N·s/m], under PD control, at 0.1 ms: equations of this test. ``log``: the target
+    moves on evenly from row to row and is not logged."""
     time_s = np.arange(4 * RATE_HZ) / RATE_HZ
     fade = np.clip(np.minimum(time_s - 0.3, 3.7 - time_s) / 0.4, 0, 1)
     target = amplitude_m * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * hz * (time_s - 0.3))
     dt_s, at, speed, goal, rows = 1.0 / (RATE_HZ * PARTS), 0.0, 0.0, 0.0, []
-    stops = dt_s * FRICTION_N / MASS_KG
+    stops = dt_s * friction_n / MASS_KG
     for following in target.tolist():
         rows.append((at, KP * (goal - at) - KD * speed))
-        goal = following
-        for _ in range(PARTS):
-            free = speed + dt_s * (KP * (goal - at) - (KD + damping) * speed) / MASS_KG
+        for asked in np.linspace(goal, following, PARTS + 1)[:-1].tolist() if log else [following] * PARTS:
+            free = speed + dt_s * (KP * (asked - at) - (KD + damping) * speed) / MASS_KG
             speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
             at += dt_s * speed
+        goal = following
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((2, len(rows))) * [[2e-5], [1.0]]
-    lines = ["t,slide.q,slide.q_target,slide.tau"]
+    lines = ["t,slide.q,slide.tau" if log else "t,slide.q,slide.q_target,slide.tau"]
     for t, goal, (q, tau), (dq, dtau) in zip(time_s, target, rows, noise.T, strict=True):
-        lines.append(f"{t:.4f},{q + dq:.7f},{goal:.7f},{effort * (tau + dtau):.4f}")
+        lines.append(f"{t:.4f},{q + dq:.7f},{'' if log else f'{goal:.7f},'}{effort * (tau + dtau):.4f}")
     path.write_text("\n".join(lines) + "\n")
+
+
+def made(folder: Path, file: str = FILE, **how: Any) -> Path:
+    (folder / "bench").mkdir()
+    for name, amplitude_m, hz, seed in (("one", 0.1, 0.6, 1), ("again", 0.1, 0.6, 2), ("held", 0.08, 0.8, 3)):
+        write(folder / "bench" / f"{name}.csv", amplitude_m, hz, seed, **how)
+    (folder / "bench" / "measurements.yaml").write_text(
+        "recordings:\n  again.csv: {repeat_of: one.csv}\n  held.csv: {use: validation}\n"
+    )
+    (folder / "drive.yaml").write_text(file)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("axis")
-    (folder / "bench").mkdir()
-    for name, amplitude_m, hz, seed in (("one", 0.1, 0.6, 1), ("again", 0.1, 0.6, 2), ("held", 0.08, 0.8, 3)):
-        write(folder / "bench" / f"{name}.csv", amplitude_m, hz, seed)
-    (folder / "bench" / "measurements.yaml").write_text(
-        "recordings:\n  again.csv: {repeat_of: one.csv}\n  held.csv: {use: validation}\n"
-    )
-    (folder / "drive.yaml").write_text(FILE)
-    return folder
+    return made(tmp_path_factory.mktemp("axis"))
 
 
 def error(report: Path, use: str, kind: str) -> float:
@@ -134,16 +142,18 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench, said,
     assert drive.read_text() == FILE
 
 
-def test_a_log_of_positions_and_efforts_alone_is_diagnosed(bench, said, tmp_path):
+@pytest.mark.parametrize("friction_n", [FRICTION_N, 0.0])
+def test_a_log_of_positions_and_efforts_alone_shows_the_friction(said, tmp_path, friction_n: float):
+    """Its size within 2 %, and no constant force besides; of a mass without friction nothing."""
+    made(tmp_path, re.sub("kp: .*\nkd: .*\n", "law: effort\n", FILE), friction_n=friction_n, log=True)
     drive, found = tmp_path / "drive.yaml", tmp_path / "found"
-    drive.write_text(re.sub("kp: .*\nkd: .*\n", "law: effort\n", FILE))
-    shutil.copytree(bench / "bench", rows := tmp_path / "rows")
-    for path in rows.glob("*.csv"):
-        path.write_text(re.sub(r"^([^,]+,[^,]+),[^,]+", r"\1", path.read_text(), flags=re.MULTILINE))
-    code, text = said("diagnose", rows, f"--twin={drive}", f"--out={found}", FEW)
-    assert code in (0, 1) and "error" not in text.split("slide:")[0], text
+    code, text = said("diagnose", tmp_path / "bench", f"--twin={drive}", f"--out={found}", FEW)
     d = json.loads((found / "report.json").read_text())["diagnoses"]["slide"]
-    assert d["errors"]["before"]["validation"] > 5.0 and "kp" not in d["base"]
+    assert [e["effect"] for e in d["effects"]] == ["coulomb_friction"] * (friction_n > 0.0), text
+    assert code == 0 and not d["changed"] and d["errors"]["after"]["validation"] < 1.1, text
+    assert d["intervals"]["torque_ff"] == pytest.approx([0.0, 0.0], abs=0.2)
+    low, high = d["intervals"].get("coulomb_friction.torque_nm", (0.0, 0.0))
+    assert low <= friction_n <= high and high - low < 0.02 * FRICTION_N
 
 
 @pytest.mark.slow

@@ -28,15 +28,15 @@ from taccorl.sim.twin import TwinConfig
 
 GRAVITY_M_PER_S2 = 9.81
 SAME_RATE = 0.02
-"""Largest difference of the rates at which targets are received and logged, as a share, for which targets count as received once
-per row; stamps are rounded."""
+"""Largest share by which the rates of received and logged targets may differ to count as equal: stamps are rounded."""
 KEPT, KEPT_ROWS = 12, 200_000
-"""Largest number of newest responses, and of their rows, that a model keeps for each recording. A fit varies one number after the
-other, of which some do not act on the motion, as a factor on reported efforts; and a search asks for the same response again."""
+"""Largest number of newest responses, and of their rows, that a model keeps for each recording, as fits ask for some again."""
 GEAR_STEP_S = 2.5e-4
-"""Longest physics step [s] of a joint with play or a spring in its gear (``Drive.midpoint``). The motor alone reacts faster than
-motor and link together, and an implicit step h damps a gear that swings with ω by h ω / 2: a rotor of 0.6 kg·m² on a gear of
-1e5 N·m/rad (71 Hz) has a damping ratio 0.22 too large with steps of 1 ms, 0.06 with these."""
+"""Longest physics step [s] of a joint with play or a spring in its gear (``Drive.midpoint``): an implicit step h damps a swing
+with ω by h ω / 2. At 71 Hz the damping ratio is 0.22 too large with steps of 1 ms, 0.06 with these."""
+ENDS_S = 0.1
+"""Time from either end of a recording in which a model of law effort is not judged [s]: the position is smoothed there from one
+side, and the model settles in 1 / ``drive_law.FOLLOW_HZ``."""
 _ADDITIVE = {
     "armature__added_kgm2",
     "viscous_friction__damping_nms_per_rad",
@@ -280,12 +280,16 @@ def _side_by_side(
 def _holding(
     of: tuple[_Sent, int, int, float], motion: JointMotion, case: Numbers, answer: JointResponse
 ) -> JointResponse:
-    """With the effort of a law effort: what holds the model at the measured position is beyond the effort that drives it."""
+    """With the effort of a law effort: what holds the model at the measured position is beyond the effort that drives it, and
+    ``torque_ff``, which the recorded effort lacks, is in neither. Within ``ENDS_S`` of either end it is the recorded one."""
     sent, parts, _, _ = of
     before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])
     # What a row shows is of the part before it, whose target is half a part old.
     slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
-    return JointResponse(answer.reported, answer.effort - before + case.gains.kp * slope + motion.effort)
+    held = answer.effort - before - case.gains.torque_ff + case.gains.kp * slope
+    since = motion.time_s - motion.time_s[0]
+    is_judged = np.minimum(since, since[-1] - since) >= ENDS_S
+    return JointResponse(answer.reported, held * is_judged + motion.effort)
 
 
 @lru_cache(maxsize=32)

@@ -27,11 +27,9 @@ _TARGET_COLUMNS = {
 START_ROWS = 8
 """Rows from which the speed at the start is computed. A choice."""
 SMOOTH_S = 0.05
-"""Window of the quadratic that is the measured position and speed at which a model of law effort is held [s]. A choice: half a
-period of the fastest motion that the model is made to follow (``drive_law.FOLLOW_HZ``)."""
+"""Window of the quadratic that is the measured position at which a model of law effort is held [s]: half of 1 / ``FOLLOW_HZ``."""
 MOST_YIELD = 0.05
-"""Largest share of a recording's span by which an effort as large as the recorded one's standard deviation may move what holds
-a model of law effort. A choice."""
+"""Largest share of a recording's span by which the standard deviation of its effort may move a model of law effort (a choice)."""
 
 
 def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints, signal: str) -> JointMotion:
@@ -125,12 +123,14 @@ def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray
             raise TaccorlError(
                 f"{m.name}: {signal} has no {what} at {m.time_s[row]:.3f} s, and law effort needs it; cut the recording there"
             )
-    at, speed = _smooth(m, signal, 0), _smooth(m, signal, 1)
-    return at + joint.gains.kd / joint.gains.kp * speed, 0.5 * (effort + np.append(effort[1:], effort[-1]))
+    at = _smooth(m, signal)
+    target = at + joint.gains.kd / joint.gains.kp * np.gradient(at, m.period_s)
+    return target, 0.5 * (effort + np.append(effort[1:], effort[-1]))
 
 
-def _smooth(m: Measurement, signal: str, deriv: int) -> np.ndarray:
-    """(T,) measured position, or a time derivative of it, of the quadratic over ``SMOOTH_S``."""
+def _smooth(m: Measurement, signal: str, deriv: int = 0) -> np.ndarray:
+    """(T,) measured position, or a time derivative of it, of the quadratic over ``SMOOTH_S``; its first derivative would lack a
+    share of the speed, ω² ``SMOOTH_S``² / 40 of a sine."""
     return savgol_filter(m.measured[:, m.column(signal)].astype(float), _window(m), 2, deriv=deriv, delta=m.period_s)
 
 
@@ -155,6 +155,7 @@ def holding_stiffness(m: Measurement, signal: str) -> float:
     found = omega**2 * size / max(float(np.sqrt(np.mean(_smooth(m, signal, 2) ** 2))), NUMBER)
     noise = [noise_floor([one], kind)[signal] for kind in ("effort", "position")]
     if all(f.used.method != "number" for f in noise):
-        weights = savgol_coeffs(window, 2) + 2.0 / omega * savgol_coeffs(window, 2, deriv=1, delta=m.period_s)
+        weights = np.pad(savgol_coeffs(window, 2), 1)
+        weights = weights + 2.0 / omega * np.gradient(weights, m.period_s)
         found = min(found, noise[0].value / (noise[1].value * float(np.linalg.norm(weights))))
     return max(found, size / (MOST_YIELD * span))

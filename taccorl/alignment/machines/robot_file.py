@@ -50,11 +50,9 @@ class JointConfig(DriveLaw):
     loop_hz: float | None = None
     """Rate of the drive's control loop [Hz]."""
     command_hz: float | None = None
-    """Rate at which the drive receives targets [Hz], if they are logged at a lower rate: a replay then interpolates the rows
-    linearly at this rate. If not given, a target is held until the next row."""
+    """Rate at which the drive receives targets [Hz], if they are logged more slowly: a replay then interpolates them linearly."""
     position_age_s: float = 0.0
-    """Age of the measured position when the torque acts, beyond the age that follows from the loop's timing [s]; ``diagnose``
-    fits it."""
+    """Age of the measured position when the torque acts, beyond that of the loop's timing [s]; ``diagnose`` fits it."""
     effects: list[Effect] = field(default_factory=list)
     """Effects beyond rigid bodies and control law; empty if there are none."""
     FITTED: ClassVar[tuple[str, ...]] = (*DriveLaw.FITTED, "effort_scale", "speed_delay_s", "position_age_s")
@@ -92,8 +90,8 @@ class RobotConfig:
     gravity_compensation: float = 0.0
     """Share of the weight that the controller compensates, 0 … 1."""
     gravity: list[float] = field(default_factory=list)
-    """Direction of gravity (x, y, z) in the model's frame, of any length, where the base is not mounted as the model has it. The
-    controller compensates the weight as the model has it. Empty: as the model has it."""
+    """Direction of gravity (x, y, z) in the model's frame, of any length, where the base is not mounted as in the model, which
+    the controller does not know. Empty: as the model has it."""
     joints: dict[str, JointConfig]
     """Name of the joint in the model → its drive."""
 
@@ -118,8 +116,7 @@ class Robot:
 
     @property
     def units(self) -> dict[str, str]:
-        """Joint of the model → unit of its position, rad or m. Joints that the file does not name may also be recorded; their
-        motion is then known."""
+        """Joint of the model → unit of its position, rad or m. Joints that the file does not name may also be recorded."""
         return {name: facts.unit for name, facts in self.rigid.joints.items()}
 
     def joint(self, signal: str) -> RobotJoint:
@@ -129,12 +126,31 @@ class Robot:
         return RobotJoint(self, signal)
 
     def last_body(self, signal: str) -> int:
-        """Id of the body in which the joint's ``payload`` is."""
-        return _last_body(self.rigid.model, signal)
+        """Id of the body in which the joint's ``payload`` is that states no ``link``: the one with the most bodies between it and
+        the joint; of several the one with the lowest id."""
+        model = self.rigid.model
+        far = model.joint(signal).bodyid[0]
+        depth = {int(far): 0}
+        for body in range(int(far) + 1, model.nbody):
+            parent = int(model.body_parentid[body])
+            if parent in depth:
+                depth[body] = depth[parent] + 1
+        return max(depth, key=lambda body: (depth[body], -body))
+
+    def body_of(self, signal: str, payload: Payload) -> int:
+        """Id of the body in which a payload of the joint is."""
+        return self.rigid.model.body(payload.link).id if payload.link else self.last_body(signal)
 
     def body_name(self, body: int) -> str:
         """Name of a body in the model; ``body 3`` of one without a name."""
         return self.rigid.model.body(body).name or f"body {body}"
+
+    def links_before(self, body: int) -> dict[str, int]:
+        """Name → id of the bodies with joints between the base and a body."""
+        model, found = self.rigid.model, dict[str, int]()
+        while (body := int(model.body_parentid[body])) != 0:
+            found |= {model.body(body).name: body} if model.body(body).name and model.body_jntnum[body] else {}
+        return found
 
     def moves_body(self, signal: str, body: int) -> bool:
         """True if the joint moves the body with this id."""
@@ -145,8 +161,7 @@ class Robot:
         return body == own
 
     def along_chain(self, signal: str) -> tuple[str, ...]:
-        """Joints whose positions change which weight the joint carries: those behind it, from it to the tip, then those before
-        it, from it to the base."""
+        """Joints whose positions change what weight the joint carries: those behind it, to the tip, then those before it."""
         bodies = {name: int(self.rigid.model.joint(name).bodyid[0]) for name in self.rigid.joints if name != signal}
         behind = [name for name, body in bodies.items() if self.moves_body(signal, body)]
         own = int(self.rigid.model.joint(signal).bodyid[0])
@@ -172,9 +187,8 @@ class Robot:
         }
 
     def mass(self, signal: str, payload: Payload) -> PointMass:
-        """The mass of a ``payload`` at one joint: its place is in a frame with the axes of the joint's last body, in that body's
-        centre of mass."""
-        body = self.last_body(signal)
+        """The mass of a ``payload`` at one joint: its place is along the axes of its body, from that body's centre of mass."""
+        body = self.body_of(signal, payload)
         offset = [getattr(payload, name) for name in PAYLOAD_AT]
         x, y, z = (float(a + b) for a, b in zip(self.rigid.model.body_ipos[body], offset, strict=True))
         return PointMass(payload.mass_kg, body, (x, y, z))
@@ -193,8 +207,8 @@ class Robot:
         return "", ""
 
     def reach_m(self, signal: str) -> float:
-        """Largest distance of a payload from the centre of mass of its body along each axis, for a search [m]: half the length of
-        the chain of links from the base, or twice the distance of that centre from its joint, if this is more. A choice."""
+        """Largest distance of a payload from its body's centre of mass along each axis, for a search [m]: half the length of the
+        chain from the base, or twice the distance of that centre from its joint. A choice."""
         model, body = self.rigid.model, self.last_body(signal)
         from_joint = np.linalg.norm(model.body_ipos[body] - model.jnt_pos[model.body_jntadr[body]])
         chain = float(np.linalg.norm(model.body_ipos[body]))
@@ -203,10 +217,11 @@ class Robot:
             body = int(model.body_parentid[body])
         return max(0.5 * chain, 2.0 * float(from_joint), _LEAST_REACH_M)
 
-    def idle_axes(self, signal: str) -> tuple[int, ...]:
-        """Axes 0, 1, 2 of the joint's last body along which the joint does not feel the payload's place: all for a slide; for a
-        hinge the one that is parallel to its own, if joints between it and the body are slides or turn about the same axis."""
-        model, last, own = self.rigid.model, self.last_body(signal), self.rigid.model.joint(signal).id
+    def idle_axes(self, signal: str, last: int | None = None) -> tuple[int, ...]:
+        """Axes 0, 1, 2 of the body ``last`` (default: the joint's last body) along which the joint does not feel the payload's
+        place: all for a slide; for a hinge the one parallel to its own, if all joints in between are slides or turn about it."""
+        model, own = self.rigid.model, self.rigid.model.joint(signal).id
+        last = self.last_body(signal) if last is None else last
         if model.jnt_type[own] == mujoco.mjtJoint.mjJNT_SLIDE:
             return (0, 1, 2)
         data = mujoco.MjData(model)
@@ -227,8 +242,7 @@ class Robot:
         return dataclasses.replace(self, config=dataclasses.replace(self.config, joints=joints))
 
     def text(self, path: Path) -> str:
-        """YAML text of the robot file for ``path``, to which the model's path is relative; keys with default values are left
-        out."""
+        """YAML text of the robot file for ``path``, to which the model's path is relative, without default values."""
         model = self.rigid.path.resolve()
         folder = Path(path).resolve().parent
         content: dict[str, Any] = {"kind": "robot", "model": Path(os.path.relpath(model, folder)).as_posix()}
@@ -250,18 +264,6 @@ class Robot:
         """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""
         model = self.rigid.path.read_bytes()
         return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
-
-
-def _last_body(model: mujoco.MjModel, joint: str) -> int:
-    """Id of the most distal body that ``joint`` moves: the one with the most bodies between it and the joint; of several the one
-    with the lowest id."""
-    far = model.joint(joint).bodyid[0]
-    depth = {int(far): 0}
-    for body in range(int(far) + 1, model.nbody):
-        parent = int(model.body_parentid[body])
-        if parent in depth:
-            depth[body] = depth[parent] + 1
-    return max(depth, key=lambda body: (depth[body], -body))
 
 
 def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -287,6 +289,7 @@ def load_robot(path: Path) -> Robot:
     rigid = load_robot_model(model, config.gravity_compensation)
     if not config.joints:
         raise document.error("joints", f"the file names no joint; the model has {', '.join(rigid.joints)}")
+    bodies = {rigid.model.body(k).name: k for k in range(1, rigid.model.nbody)}
     for name, joint in config.joints.items():
         if name not in rigid.joints:
             raise document.error(
@@ -308,6 +311,9 @@ def load_robot(path: Path) -> Robot:
                     f"{effect.name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of "
                     f"{name}",
                 )
+            link = getattr(effect, "link", "")
+            if link and not (link in bodies and Robot(config, rigid, path).moves_body(name, bodies[link])):
+                raise document.error(key, f"link: {name} moves no body {link!r}; {nearest(link, bodies)}")
     robot = Robot(config, rigid, path)
     name, why = robot.mass_twice()
     if name:
@@ -316,10 +322,7 @@ def load_robot(path: Path) -> Robot:
 
 
 def _refuse_todo(path: Path) -> None:
-    """
-    Raises:
-        SpecError: names each line that still says ``TODO``, with its comment, which says what to write.
-    """
+    """Raises SpecError, which names each line that still says ``TODO``, with its comment, which says what to write."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

@@ -67,13 +67,8 @@ def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> Iterator[m
 
 @cache
 def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
-    """True if an effect can act on one joint of a robot file, so that the one-joint model can compute it.
-
-    Args:
-        weight: the controller compensates gravity.
-        rotor: the rotor's inertia is known.
-        payload: no other joint's payload is in the body.
-    """
+    """True if an effect can act on one joint of a robot file, whose ``weight`` is compensated, of whose ``rotor`` the inertia is
+    known, and in whose body no other joint's ``payload`` is, so that the one-joint model can compute it."""
     if cls is Payload:
         return payload
     if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
@@ -102,8 +97,11 @@ class RobotJoint(DriveJoint):
         super().__init__(law, signal, robot.rigid.joints[signal].unit, law.loop_hz, law.command_hz)
         self._stated, self._along = robot if stated is None else stated, along
         self._masses = robot.masses() if masses is None else masses
+        own = [self._masses[signal].body] if signal in self._masses else []
+        own += [body for body in robot.assumed if robot.moves_body(signal, body)]
+        self._payload_in = [*own, robot.last_body(signal)][0]
         # At a slide the weight of an unknown mass is a constant force, too.
-        self.holds_torque_ff = self.unit == "m" and robot.last_body(signal) in robot.assumed
+        self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
         self.position_age_s += law.position_age_s
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
 
@@ -150,8 +148,7 @@ class RobotJoint(DriveJoint):
         return terms._replace(**{name: getattr(terms, name) + getattr(extra, name) for name in names})
 
     def _every_mass(self, bodies: Sequence[Effect]) -> list[PointMass]:
-        """Point masses that the model file lacks: payloads that the robot file states at other joints, and the payloads among
-        ``bodies``."""
+        """Point masses that the model file lacks: payloads of the robot file at other joints, and those of ``bodies``."""
         masses = [mass for name, mass in self._masses.items() if name != self.signal]
         return masses + [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
 
@@ -182,8 +179,7 @@ class RobotJoint(DriveJoint):
         return own
 
     def pose(self, m: Measurement) -> np.ndarray:
-        """(nq,) positions of all joints of the model at the beginning of a recording [rad, m]; as the model has them where the
-        recording does not."""
+        """(nq,) positions of all joints at the beginning of a recording [rad, m]; where it has none, those of the model."""
         model = self._robot.rigid.model
         pose = model.qpos0.copy()
         for name in self._robot.rigid.joints:
@@ -246,38 +242,34 @@ class RobotJoint(DriveJoint):
         return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal, self._masses, self._stated)
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:
-        if cls is Payload:
-            return self._payload()
+        if cls is Payload:  # bounds for this robot's size
+            far = self._robot.reach_m(self.signal)
+            return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
         if self.unit == "rad":
             return cls
         return scaled(cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m"))
 
-    def _payload(self) -> type[Effect]:
-        """``payload`` with bounds for this robot's size."""
-        far = self._robot.reach_m(self.signal)
-        return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
-
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         if self.unit == "m" and cls.name in OF_A_TURN:
             return None
-        last = self._robot.last_body(self.signal)
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,
             "rotor": self._config.armature > 0,
-            "payload": last not in [mass.body for name, mass in self._masses.items() if name != self.signal],
+            "payload": self._payload_in not in [m.body for name, m in self._masses.items() if name != self.signal],
         }
         if not (acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name)):
             return None
         return self._idle_place() if cls is Payload else {}
 
-    def _idle_place(self) -> dict[str, float]:
-        """Payload's place along the axes along which the joint does not feel it, or at all where it is assumed: as the file
-        has it, else in the centre of mass of its body."""
-        robot, last = self._robot, self._robot.last_body(self.signal)
+    def _idle_place(self) -> dict[str, Any]:
+        """Payload's link, and its place along the axes along which the joint does not feel it, or at all where it is assumed: as
+        the file has it, else in the centre of mass of its body."""
+        robot, last = self._robot, self._payload_in
         known = robot.assumed.get(last, self._masses.get(self.signal))
         at = np.zeros(3) if known is None else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
-        axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal)
-        return {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
+        axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal, last)
+        link = {"link": robot.body_name(last)} if last != robot.last_body(self.signal) else {}
+        return link | {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
 
     def _coupling(self, m: Measurement, pose: np.ndarray, along: "Along | None") -> tuple[np.ndarray, np.ndarray]:
         """(T · F,) torque because other joints move, without payloads (``moving_masses_nm``); of a sliding joint the model's

@@ -8,6 +8,7 @@ from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
 from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF
 from taccorl.diagnosis.problems.joints import JointFinding
+from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects.load import Payload
 
@@ -27,8 +28,10 @@ def payloads(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
-    """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added."""
-    return tuple(n for n in d.names if n not in d.present and effect in (n, *d.rivals.get(n, ())))
+    """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added. And the scale of
+    its efforts where that is off instead."""
+    off = tuple(c.name for c in d.changed if c.name == EFFORT_SCALE and effect in c.instead)
+    return (*off, *(n for n in d.names if n not in d.present and effect in (n, *d.rivals.get(n, ()))))
 
 
 def without_tilt(f: Finding) -> Finding:
@@ -40,7 +43,7 @@ def without_tilt(f: Finding) -> Finding:
 def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     """The finding without a payload among the rivals of what was added, and among what ``add-effect`` may write."""
     d = f.diagnosis
-    text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
+    text = f"no payload: one mass, in whichever link, does not explain what {', '.join(joints)} do"
 
     def without(names: Sequence[str]) -> tuple[str, ...]:
         return tuple(name for name in names if name != "payload")
@@ -51,17 +54,14 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
         dataclasses.replace(r, ties=without(r.ties), evidence=tuple(e)) for r, e in zip(d.rounds, told, strict=True)
     ]
     offers = tuple(o for o in d.offers if "payload" not in o.added)
-    d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers)
+    changed = tuple(dataclasses.replace(c, instead=without(c.instead)) for c in d.changed)
+    d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers, changed=changed)
     return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
 def placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
-    """The finding with the intervals of a payload that was fitted to several joints, and a remark that names what it explains.
-
-    Args:
-        ends: ``payload.mass_kg``, … → 95 % interval.
-        stands_for: joint → effects that alone explain as much there.
-    """
+    """The finding with the intervals of a payload that was fitted to several joints, ``ends``, and a remark that names what it
+    explains: ``stands_for``, joint → effects that alone explain as much there."""
     d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
     effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
     others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
@@ -74,8 +74,14 @@ def placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapp
     if TORQUE_FF.name not in d.base:
         text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
-    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends})
+    or_scale = d.or_scale and not any(EFFORT_SCALE in names for names in stands_for.values())
+    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_scale=or_scale)
     return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
+
+
+def left_of(finding: Finding) -> float:
+    """Mean squared validation error that a finding leaves [noise floors²], 1 at least."""
+    return max(finding.diagnosis.errors["after"]["validation"], 1.0) ** 2
 
 
 def payload_of(finding: Finding) -> Payload:

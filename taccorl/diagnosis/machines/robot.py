@@ -29,6 +29,7 @@ from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
 from taccorl.diagnosis.machines.changed_findings import (
     TILT,
+    left_of,
     payload_of,
     payloads,
     placed,
@@ -50,10 +51,10 @@ from taccorl.diagnosis.machines.machine import (
 )
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
-from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
+from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
-from taccorl.diagnosis.search.problem import Candidate, candidate
+from taccorl.diagnosis.search.problem import candidate
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
@@ -61,6 +62,8 @@ from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.twin_file import write_whole
 
+How = tuple[Measurements, GainsAre, Diagnosed]
+"""What ``RobotMachine.reconsidered`` is given besides the findings."""
 OF_POSITION = ("cable_spring", "cogging", "gravity_mismatch", "position_dependent_friction", "unbalance")
 """Effects with a torque that depends on the position of the joint, as that of a weight does."""
 CLEAR_FLOORS = 3.0
@@ -108,8 +111,7 @@ class RobotMachine(Machine):
     # measurements ----------------------------------------------------------------------------------------------------
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Check recordings: positions or efforts beyond their limits, an impossible inertia, missing columns. Returns recording
-        → findings."""
+        """Recording → findings: positions or efforts beyond their limits, an impossible inertia, missing columns."""
         found: dict[str, list[DataFinding]] = {}
         own = {j: [self._whole(m) for m in measurements.all if moves(m, j)] for j in self.robot.config.joints}
         fits = {name: law_fit(law, own[name], name) for name, law in self.robot.config.joints.items()}
@@ -186,13 +188,12 @@ class RobotMachine(Machine):
     def diagnose(self, part: str, measurements: Measurements, **options: Any) -> Finding:
         found = diagnose_joint(self.robot, part, measurements, **options)
         if any("payload" in own for own in (found.diagnosis.names, *found.diagnosis.rivals.values())):
-            body = self.robot.body_name(self.robot.last_body(part))
+            body = self._payload_body(found)
             text = (
-                f"payload: x_m, y_m and z_m are along the axes of {body} in {self.robot.rigid.path.name}, from "
-                f"its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
+                f"payload: x_m, y_m and z_m are along the axes of {self.robot.body_name(body)} in "
+                f"{self.robot.rigid.path.name}, from its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
             )
-            idle = self.robot.idle_axes(part)
-            if idle:
+            if idle := self.robot.idle_axes(part, body):
                 text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
             found = dataclasses.replace(found, remark=text)
         if found.diagnosis.status == "something_else" and not self.robot.config.joints[part].rotor_inertia:
@@ -256,7 +257,7 @@ class RobotMachine(Machine):
         """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again.
         Where no joint alone determines its mass and place, or several found one, one mass is fitted to all joints
         (``one_mass``). One tilt of the base is fitted to all joints where several lack what it would explain (``one_tilt``)."""
-        return self._with_one_tilt(self._with_payloads(findings, measurements, gains, diagnosed), measurements, gains)
+        return self._with_one_tilt(self._with_payloads(findings, (measurements, gains, diagnosed)), measurements, gains)
 
     def _with_one_tilt(self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre) -> list[Finding]:
         """``findings`` with a remark on one tilt of the base in place of those on single joints, where it explains what several
@@ -299,73 +300,81 @@ class RobotMachine(Machine):
             findings = [leaned.get(f.part, f) for f in findings]
         return [remarked(without_tilt(f), text) if f.part in stands_for else f for f in findings]
 
-    def _with_payloads(
-        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
-    ) -> list[Finding]:
-        for body in dict.fromkeys(self.robot.last_body(f.part) for f in findings):
-            findings = self._with_one_mass(body, findings, measurements, gains, diagnosed)
+    def _with_payloads(self, given: Sequence[Finding], how: How, sure: bool = True) -> list[Finding]:
+        """``sure``: a payload that one joint alone determines stays, unless joints that move it end with a larger error."""
+        findings = given
+        for body in dict.fromkeys(self.robot.last_body(f.part) for f in given):
+            findings = self._with_one_mass(body, findings, how, sure)
         owners = [f for f in payloads(findings) if not f.diagnosis.rivals.get("payload")]
+        shared = {f.part: self._payload_body(f) for f in owners if payload_of(f).link}
+        owners = [f for f in owners if not any(self.robot.moves_body(f.part, shared[p]) for p in {*shared} - {f.part})]
         owners = [f for f in owners if f.part in self._owners(owners)]
         found = [Addition(f.part, [payload_of(f)], {}, {}) for f in owners]
         felt = {
             f.part: owner
             for owner in owners
             for f in findings
-            if f.part not in {o.part for o in owners}
-            and self.robot.moves_body(f.part, self.robot.last_body(owner.part))
+            if f.part not in {o.part for o in owners} and self.robot.moves_body(f.part, self._payload_body(owner))
         }
         if not felt:
             return list(findings)
         again: dict[str, Finding] = {}
-        for f in diagnosed(self.with_additions(found), list(felt)):
-            owner = felt[f.part]
-            body = self.robot.body_name(self.robot.last_body(owner.part))
+        for f in how[2](self.with_additions(found), list(felt)):
+            mass, body = payload_of(felt[f.part]), self.robot.body_name(self._payload_body(felt[f.part]))
             text = (
-                f"judged with the payload of {payload_of(owner).mass_kg:.3g} kg in {body} that this diagnosis found at "
-                f"{owner.part}: add both, or the payload first and diagnose {f.part} again"
+                f"judged with the payload of {mass.mass_kg:.3g} kg in {body} that this diagnosis found at "
+                f"{felt[f.part].part}: add both, or the payload first and diagnose {f.part} again"
             )
             again[f.part] = remarked(f, text)
+        if sure and any(left_of(again[f.part]) > ALIKE * left_of(f) for f in given if f.part in again):
+            return self._with_payloads(given, how, sure=False)
         return [again.get(f.part, f) for f in findings]
 
-    def _with_one_mass(
-        self, body: int, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
-    ) -> list[Finding]:
-        """``findings`` with one payload in ``body`` in place of what several joints lack, if it holds at all of them with fewer
-        numbers; without it among the rivals where it does not hold."""
-        robot = self.robot
+    def _with_one_mass(self, body: int, findings: Sequence[Finding], how: How, sure: bool) -> list[Finding]:
+        """``findings`` with one payload in place of what several joints lack, if it holds with fewer numbers at all that move
+        it: in ``body`` or else in a link before it. Without a payload if it holds in none of them."""
+        robot, (measurements, gains, diagnosed) = self.robot, how
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
         stands_for = {part: found for part, f in group.items() if (found := standing_in(f.diagnosis, "payload"))}
         alone = [part for part, names in stands_for.items() if "payload" in names]
         alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
         loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
-        if not stands_for or (loaded and len(alone) == 1):
+        if not stands_for or (sure and loaded and len(alone) == 1):
             return list(findings)  # weight that turns with a joint shows where the mass is
         if len(group) == 1 and not alone and self.units[next(iter(group))] == "rad":
             return list(findings)  # one vertical hinge tells a mass from a rotor in no way
         (owner,) = self._owners([group[part] for part in alone or stands_for])
+        links = robot.links_before(body)
 
-        def fitted(parts: Sequence[str]) -> OneMass:
-            machine = self._assuming(owner, Payload(mass_kg=0.0, **dict.fromkeys(PAYLOAD_AT, 0.0)))
+        def fitted(parts: Sequence[str], link: str = "") -> OneMass:
+            place = links.get(link, body)
+            parts = [part for part in parts if robot.moves_body(part, place)]
+            machine = self._assuming(owner, Payload(mass_kg=0.0, link=link, **dict.fromkeys(PAYLOAD_AT, 0.0)))
             problems = {part: machine.motion_problem(part, measurements, gains) for part in parts}
-            found = {part: group[part].diagnosis for part in parts}
-            return one_mass(problems, found, stands_for, self._unknown_mass(owner, parts))
+            idle = set.intersection(*({*robot.idle_axes(part, place)} for part in parts))
+            centred = {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
+            mass = candidate(robot.joint(owner).in_units(Payload), {}, link=link, **centred)
+            return one_mass(problems, {part: group[part].diagnosis for part in parts}, stands_for, mass)
 
-        found = fitted([*group])
+        link, found = "", fitted([*group])
+        for name, place in links.items():
+            if not found.holds and all(robot.moves_body(part, place) for part in alone or stands_for):
+                link, found = name, fitted([*group], name)
         if not found.holds:
-            tied = [part for part in stands_for if part not in alone]
-            added = [part for part in tied if "payload" in stands_for[part]]
+            added = [part for part, names in stands_for.items() if "payload" in names]
             again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
-            return [without_payload(again.get(f.part, f), list(group)) if f.part in tied else f for f in findings]
+            findings = [again.get(f.part, f) for f in findings]
+            return [without_payload(f, list(group)) if f.part in stands_for else f for f in findings]
         if not (found.is_simpler or alone):
             text = (
-                f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(body)} explains as much at "
+                f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(links.get(link, body))} explains as much at "
                 f"{' and '.join(stands_for)}, with as many numbers: record a joint that weight loads, or one more that moves it"
             )
             several = len(stands_for) > 1
             return [remarked(f, text) if several and f.part in stands_for else f for f in findings]
-        clear = [part for part in group if found.errors[part] <= CLEAR_FLOORS]
-        if len(clear) < len(group):  # what other joints lack besides must not say where the mass is
-            found = fitted(clear or [owner])
+        clear = [part for part in found.errors if found.errors[part] <= CLEAR_FLOORS]
+        if len(clear) < len(found.errors):  # what other joints lack besides must not say where the mass is
+            found = fitted(clear or [owner], link)
         left_out = [name for name in stands_for[owner] if name != "payload"]
         (again,) = diagnosed(self._assuming(owner, found.payload), [owner], left_out)
         if "payload" not in again.diagnosis.names:
@@ -373,17 +382,14 @@ class RobotMachine(Machine):
         ends = {k: v for k, v in found.model.intervals().items() if k.startswith("payload.")}
         return [placed(again, ends, stands_for) if f.part == owner else f for f in findings]
 
-    def _unknown_mass(self, owner: str, parts: Sequence[str]) -> Candidate:
-        """Payload in the last body of ``owner``, of which mass and place are fitted to ``parts``; along axes along which none of
-        them feels its place, it is in the centre of mass of the body."""
-        idle = set.intersection(*({*self.robot.idle_axes(part)} for part in parts))
-        cls = self.robot.joint(owner).in_units(Payload)
-        return candidate(cls, {}, **{PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)})
+    def _payload_body(self, found: Finding) -> int:
+        """Id of the body of the payload that a finding adds, or would add."""
+        own = [self.robot.body_of(found.part, payload_of(f)) for f in payloads([found])]
+        return own[0] if own else self.robot.last_body(found.part)
 
     def _assuming(self, part: str, payload: Payload) -> "RobotMachine":
-        """The machine in which a search assumes the place of the payload in the last body of ``part``, and for other joints'
-        motion its mass."""
-        assumed = {self.robot.last_body(part): self.robot.mass(part, payload)}
+        """The machine in which a search assumes the place of the payload of ``part``, and for other joints' motion its mass."""
+        assumed = {self.robot.body_of(part, payload): self.robot.mass(part, payload)}
         return dataclasses.replace(self, robot=dataclasses.replace(self.robot, assumed=assumed))
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
@@ -423,7 +429,7 @@ class RobotMachine(Machine):
 
         owners: dict[int, Finding] = {}
         for f in sorted(findings, key=unsure):
-            owners.setdefault(self.robot.last_body(f.part), f)
+            owners.setdefault(self._payload_body(f), f)
         return {f.part for f in owners.values()}
 
     @property

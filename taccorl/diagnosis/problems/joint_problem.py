@@ -41,11 +41,9 @@ KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
 KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
 """K_d, if it is fitted, with the paper's bounds."""
 TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0)
-"""Bounds of the fitted T_ref [N·m], wider than the paper's ± 8, at which an effect would have to compensate (a stiff joint with
-an error of 10 mrad has 18)."""
+"""Bounds of the fitted T_ref [N·m], wider than the paper's ± 8: a stiff joint with an error of 10 mrad has 18."""
 WIDER = 100.0
-"""Factor by which the bounds of K_p and K_d extend below the paper's, which are for stiff position drives; softly driven joints
-have far lower gains."""
+"""Factor by which the bounds of K_p and K_d extend below the paper's, which are for stiff position drives."""
 _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
@@ -53,17 +51,15 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 _NOT_ON_PIPER = ("presliding", "unbalance")
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
 WEIGHS = 3.0
-"""Least motion of the joint due to weight, in noise floors of the angle (standard deviation), at which the weight determines the
-scale of the torques. A choice."""
+"""Least motion due to weight [noise floors of the angle, rms] at which it determines the scale of the torques. A choice."""
 EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
 """Ratio of reported effort to torque, which differs between versions of PiPER firmware."""
 SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
 """τ of the effect speed_delay: how late a sampled loop damps the speed. It is fitted if something besides the inertia
 determines the scale of the torques; otherwise a change of K_p is equivalent (``taccorl.diagnosis.search.identifiable``)."""
 POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4)
-"""Age of the measured position when the drive's torque acts, beyond the age that follows from the loop. It is fitted together
-with commanded gains if the machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is
-equivalent."""
+"""Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
+machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
 LOOP = Free(name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4)
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
@@ -75,8 +71,7 @@ PAYLOAD_PLACE = tuple(
     Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
     for name in ("payload_sin_m", "payload_cos_m")
 )
-"""Bounds of s and c of ``PayloadLever`` [m]. They are fitted if a fit recording holds a payload whose position is not stated; 50
-mm are a choice."""
+"""Bounds of s and c of ``PayloadLever`` [m], fitted if a fit recording holds a payload at an unstated place. A choice."""
 OF_RECORDINGS = (EFFORT_SCALE.name, EFFORT_AGE.name, *(f.name for f in PAYLOAD_PLACE))
 """Always fitted numbers that describe recordings and are not stored in the twin."""
 

@@ -1,6 +1,5 @@
 """One unknown mass in a body as the explanation of what several joints lack. It adds to the inertia of every joint that moves the
-body, and to the load of those that weight loads; so it is fitted to all of them at once, and must hold at all of them.
-"""
+body, and to the load of those that weight loads; so it is fitted to all of them at once, and must hold at all of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,8 +29,7 @@ class OneMassProblem(WithoutMaps):
 
     Args:
         problems: joint → its own problem.
-        names: joint → effects of the joint that are fitted besides the payload.
-        payload: the payload, with the bounds of its place.
+        names: joint → effects of the joint that are fitted besides the ``payload``, whose place has bounds.
     """
 
     def __init__(
@@ -60,13 +58,8 @@ class OneMassProblem(WithoutMaps):
         return [replace(r, name=f"{joint}/{r.name}", data=(joint, r)) for r in own]
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """Simulate one recording of one joint. Returns (T, C), T rows and C measured channels (position, effort), in the units of
-        ``recording.measured``.
-
-        Args:
-            base: numbers of all joints: ``j/name`` → value.
-            effects: the payload.
-        """
+        """(T, C) simulated channels of one recording of one joint, in the units of ``recording.measured``; ``base`` has the
+        numbers of all joints, ``j/name`` → value, and ``effects`` the payload."""
         joint, own = recording.data
         values = {name.split("/", 1)[1]: value for name, value in base.items() if name.startswith(f"{joint}/")}
         key = (own, *values.items(), *map(repr, effects))
@@ -114,8 +107,7 @@ def one_mass(
     Args:
         problems: joint → its problem. A slide's may hold ``torque_ff``, which is the same as a weight there.
         alone: joint → what was found at it alone.
-        stands_for: joint → added effects in whose place the payload does as well.
-        payload: the payload, with the bounds of its place.
+        stands_for: joint → added effects, or the scale of its efforts, in whose place the ``payload`` does as well.
     """
     names = {j: [n for n in d.names if n not in stands_for.get(j, ())] for j, d in alone.items()}
     whole = OneMassProblem(problems, names, payload)
@@ -145,8 +137,8 @@ def holds_at(
     joint: str,
     recordings: Sequence[Recording],
 ) -> tuple[tuple[float, float], bool]:
-    """Validation errors at one joint [noise floors, 1 at least] of what was found there alone and of ``model``, a fit to several
-    joints; and whether the second is about as low."""
+    """Validation errors at one joint [noise floors, 1 at least] of what was found there alone and of ``model``, a fit to several,
+    and whether the second is about as low."""
     squares = [
         above_floor(block_squares(problem, alone.after, recordings)),
         above_floor(block_squares(whole, model, whole.recordings(joint, recordings))),
@@ -161,17 +153,14 @@ def fitted_numbers(d: Diagnosis) -> Values:
 
 
 def _least_numbers(name: str, d: Diagnosis, problem: JointProblem) -> int:
-    """Count of fitted numbers of an added effect, or of the rival with the fewest."""
+    """Count of fitted numbers of an added effect, or of the rival with the fewest; of a number, 1."""
     own = sum(f.name.split(".")[0] == name for f in d.after.frees)
     return min([own, *(len(problem.candidates[n].frees) for n in d.rivals.get(name, ()) if n in problem.candidates)])
 
 
 def is_explained(d: Diagnosis, after: float | None) -> bool:
-    """Whether a joint alone needs a constant torque that it does not need with a shared number.
-
-    Args:
-        after: ``torque_ff`` with that number [N·m]; None: it is held as stated.
-    """
+    """Whether a joint alone needs a constant torque that it does not need with a shared number: ``torque_ff`` is ``after`` with
+    it [N·m]; None: held as stated."""
     if TORQUE_FF.name not in d.base:
         return False
     stated, fitted = d.start[TORQUE_FF.name], d.base[TORQUE_FF.name]

@@ -34,6 +34,8 @@ STATED = {
 that are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
 NEGLIGIBLE = 0.01
 """If, with the added effects, a number is fitted within this share of the file's value, its change is not reported. A choice."""
+BACK = 0.1
+"""Likewise this share of the change that it needs without the added effects. A choice."""
 REFIT_WORSE = 1.3
 """Factor on the validation error from which on a refit of the always fitted numbers is a finding: more than the noise of another
 motion causes."""
@@ -54,7 +56,9 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
             change = {f.name: abs(model.values[f.name] - fits.given[f.name]) for f in moved}
-            moved = [f for f in moved if fit is model or change[f.name] > NEGLIGIBLE * abs(fits.given[f.name])]
+            first = {f.name: abs(fit.values[f.name] - fits.given[f.name]) for f in moved}
+            least = {name: max(NEGLIGIBLE * abs(fits.given[name]), BACK * more) for name, more in first.items()}
+            moved = [f for f in moved if fit is model or change[f.name] > least[f.name]]
             of_drive = frees[0].name in (*STATED, *OF_LOOP)
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):

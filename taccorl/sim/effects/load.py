@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 import numpy as np
 
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import ArmEffect, JointEffect, Memory, Parameter, effect, number
 from taccorl.sim.effects.friction import add_passive_torque
@@ -18,8 +19,7 @@ if TYPE_CHECKING:
 STOP_DAMPING_S = 0.005
 """Damping of ``end_stop`` over its stiffness [s]: a choice. The drive's own K_d damps motion against the stop far more."""
 FARTHEST_M = 2.0
-"""Largest distance of a ``payload`` that a file may state [m]: bounds of the place are those of a search on the PiPER, and robot
-files describe larger machines."""
+"""Largest distance of a ``payload`` that a file may state [m]: bounds of its place are those of a search on the PiPER."""
 _RADIUS_M = 0.02  # of the payload's ball, for its inertia
 _MOST_PERIODS, _MOST_STARTS = 60.0, 32  # where a search for cogging ends; enough for a span of π
 _QUARTERS = (0.0, math.pi / 2, math.pi, -math.pi / 2)  # sine and cosine of both signs
@@ -50,8 +50,7 @@ class CableSpring(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search, parameter → value each: a weak and a strong spring, each relaxed at either end of the
-        range. Recordings determine k and k q₀."""
+        """Start values of a search: a weak and a strong spring, each relaxed at either end. Recordings determine k and k q₀."""
         pairs = ((1 / 3, 0.0), (3.0, 0.0), (1.0, -1.0), (1.0, 1.0))
         return [{"stiffness_nm_per_rad": k, "rest_rad": rest} for k, rest in pairs]
 
@@ -75,10 +74,9 @@ class Cogging(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search, parameter → value each: sine and cosine of both signs; numbers of periods in steps of half
-        the resolution of a recording over ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque
-        that the controller commands. Where the recordings span many turns, the numbers of periods are ``wave_periods_1`` …
-        instead, the phases ``wave_phase_1`` … and π/4 to both sides."""
+        """Start values of a search: sine and cosine of both signs; numbers of periods in steps of half the resolution of a
+        recording over ``span_rad``, from half a period in it on; a twentieth of the torque that the controller commands. Of
+        recordings of many turns periods ``wave_periods_1`` …, phases ``wave_phase_1`` … and π/4 to both sides."""
         apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
         periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
         waves = [(seen[f"wave_periods_{k}"], seen[f"wave_phase_{k}"]) for k in (1, 2, 3) if f"wave_periods_{k}" in seen]
@@ -112,8 +110,7 @@ class EndStop(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search, parameter → value each: stops at and within either end of the recorded range; stiff ones
-        yield by 2 %, soft ones by 20 % of the range under the greatest torque."""
+        """Start values of a search: stops at and within either recorded end, which yield by 2 or 20 % of the range at most."""
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)
         high = seen.get("highest_rad", low + span)
@@ -162,12 +159,16 @@ class Payload(ArmEffect):
     x_m: float = number("c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
     y_m: float = number("c_y", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
     z_m: float = number("c_z", "m", None, 0.1, (-0.05, 0.25), "a choice: between flange and pads (TCP at 0.168)")
+    link: str = ""
+    """Body of a robot file's model to which it is fixed; empty: the last one that the joint moves, of the PiPER the hand."""
 
     @classmethod
     def accepted(cls, p: Parameter) -> tuple[float, float]:
         return (-FARTHEST_M, FARTHEST_M) if p.unit == "m" else super().accepted(p)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        if self.link:
+            raise TaccorlError(f"effect payload: link is {self.link!r}, which only robot files can state; remove it")
         inertia = 0.4 * self.mass_kg * _RADIUS_M**2
         for arm in self.arms():
             ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")
@@ -192,8 +193,7 @@ class Unbalance(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search, parameter → value each: sine and cosine of both signs, with a tenth of the largest commanded
-        torque."""
+        """Start values of a search: sine and cosine of both signs, with a tenth of the largest commanded torque."""
         torque_nm = min(max(0.1 * seen.get("peak_torque_nm", 0.0), 1e-3), 10.0)
         return [{"torque_nm": torque_nm, "hangs_at_rad": angle} for angle in _QUARTERS]
 

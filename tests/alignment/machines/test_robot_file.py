@@ -134,43 +134,40 @@ def test_a_payload_on_a_vertical_slide_weighs_and_has_inertia(tmp_path: Path) ->
     np.testing.assert_allclose(searched.reported, answer.reported, atol=1e-12)
 
 
-@pytest.mark.parametrize("gravity", ["", "gravity: [0.2, -0.1, -1]\n"])
-def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity: str) -> None:
+@pytest.mark.parametrize(("link", "gravity"), [("", ""), ("", "gravity: [0.2, -0.1, -1]\n"), ("upper", "")])
+def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, link: str, gravity: str) -> None:
     """Both joints move: the torque that one costs the other, from MuJoCo's own inverse dynamics of a model with that mass."""
     time_s = np.arange(600) / 200
     both = swept(shoulder=0.4 * np.sin(3.0 * time_s), elbow=1.0 + 0.5 * np.sin(4.0 * time_s))
-    held = "effects: [{effect: payload, mass_kg: 0.5, x_m: 0.1, y_m: 0.02, z_m: -0.05}]"
-    ball = '<body pos="0.3 0.02 -0.05"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    held = f"effects: [{{effect: payload, mass_kg: 0.5, x_m: 0.1, y_m: 0.02, z_m: -0.05, link: '{link}'}}]"
+    at, joint, end = ("0.4", "shoulder", "kd: 5.0}") if link else ("0.3", "elbow", "effort_limit: 100.0}")
+    ball = f'<body pos="{at} 0.02 -0.05"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-9 1e-9 1e-9"/></body>'
     (tmp_path / "true").mkdir()
-    file = gravity + ROBOT_YAML
-    true = robot(
-        tmp_path / "true",
-        file,
-        model=TWO_LINKS.replace('1e-9 1e-9 1e-9"/></body></body>', f'1e-9 1e-9 1e-9"/>{ball}</body></body>'),
-    )
-    plain = robot(tmp_path, file)
-    made = robot(tmp_path, file.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
+    file, after = gravity + ROBOT_YAML, '<body name="lower"' if link else "</body></body></body></worldbody>"
+    true = robot(tmp_path / "true", file, TWO_LINKS.replace(after, ball + after))
+    plain, made = (robot(tmp_path, file.replace(end, text)) for text in (end, f"{end[:-1]}, {held}}}"))
+    if link:
+        with pytest.raises(SpecError, match=r"elbow.*link: elbow moves no body 'upper'"):
+            robot(tmp_path, file.replace("100.0}", f"100.0, {held}}}"))
     moved = moved_together(true, both)
     period_s = both.period_s * both.num_rows / len(moved.positions)
 
     def along(r: Robot, name: str) -> RobotJoint:
-        return RobotJoint(
-            r, name, along=Along(moved.moving, moved.positions, *needed_along(r, moved.positions, period_s)[:2])
-        )
+        needed = needed_along(r, moved.positions, period_s)[:2]
+        return RobotJoint(r, name, along=Along(moved.moving, moved.positions, *needed))
 
     for name in ("shoulder", "elbow"):
         seen = [motion_of(both, name, along(r, name)) for r in (made, true, plain)]
-        terms = [
-            r.joint(name).rigid(m, r.joint(name).effects([])) for r, m in zip((made, true, plain), seen, strict=True)
-        ]
+        terms = [r.joint(name).rigid(m, r.joint(name).effects([])) for r, m in zip((made, true), seen[:2], strict=True)]
         np.testing.assert_allclose(terms[0], terms[1], atol=1e-7)
-        (stated,) = made.joint("elbow").effects([])
-        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_m", "y_m", "z_m")})
-        # At the elbow the file has it; at the shoulder of a robot without it a search tries it.
+        (stated,) = made.joint(joint).effects([])
+        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_m", "y_m", "z_m", "link")})
+        # At one joint the file has it; at the other one, of a robot without it, a search tries it.
         for r, m, own in ((made, seen[0], made.joint(name).effects([])), (plain, seen[2], [one])):
             loads = m.coupling_nm + r.joint(name).moving_masses_nm(m, own)
             np.testing.assert_allclose(loads, seen[1].coupling_nm, atol=1e-6)
-        assert np.abs(seen[2].coupling_nm - seen[1].coupling_nm).max() > 0.3  # N·m, without the payload
+        felt = np.abs(seen[2].coupling_nm - seen[1].coupling_nm).max() > 0.3  # N·m, without the payload
+        assert felt == (not link), "the elbow does not move the upper link"
 
 
 def test_coupling_is_the_torque_that_the_other_joints_motion_costs(tmp_path: Path) -> None:
@@ -245,10 +242,8 @@ def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_writt
         assert line in text, line  # a gear of 2 turns 80 N·m/rad into 320, and 10 N·m into 20
     with pytest.raises(SpecError, match=r"arm_robot\.yaml:\d+: TODO.*\(1\.0 if.*shoulder/kp \(N·m/rad"):
         load_robot(out)
-    written = text.replace("gravity_compensation: TODO", "gravity_compensation: 0.0").replace(
-        "gains: TODO", "gains: commanded"
-    )
-    out.write_text(written.replace(": TODO", ": 10.0"))
+    written = text.replace("gravity_compensation: TODO", "gravity_compensation: 0.0")
+    out.write_text(written.replace("gains: TODO", "gains: commanded").replace(": TODO", ": 10.0"))
     made = load_robot(out)
     assert made.config.joints["elbow"].kp == 320.0
     again = tmp_path / "again.yaml"
@@ -290,9 +285,7 @@ def drafted(folder: Path, kp_b: float, others: str = "") -> tuple[str, list[str]
     return text, [remark for remark in model.remarks if "held fixed" not in remark or "actuator" in remark]
 
 
-def test_motors_on_belts_are_named_with_the_joints_that_they_move_and_the_gains_that_joints_feel(
-    tmp_path: Path,
-) -> None:
+def test_motors_on_belts_are_named_with_the_joints_that_they_move_and_their_gains(tmp_path: Path) -> None:
     # K = 20000 [1 1; 1 1] + 4 · 5000 [1 −1; −1 1]: 40000 N/m at x and y, nothing between; kd 150 + 4 · 150.
     text, (of_a, of_b, whole, shared) = drafted(tmp_path, 5000.0)
     assert all(word in of_a for word in ("actuator a ", "tendon belt_a", "x (1), y (1)"))
@@ -313,14 +306,8 @@ def test_actuators_on_anything_but_a_joint_are_named(tmp_path: Path) -> None:
     text, remarks = drafted(tmp_path, 5000.0, others)
     said = {remark.split()[1]: remark for remark in remarks if remark.startswith("actuator ")}
     assert list(said) == ["a", "b", "pull", "jet", "rod", "crank", "glue", "wrist"]
-    where = {
-        "pull": "tendon rope",
-        "jet": "site on_carriage",
-        "crank": "slider-crank",
-        "glue": "body",
-        "wrist": "joint ball",
-    }
-    assert all(word in said[name] for name, word in where.items())
+    where = ("pull", "tendon rope"), ("jet", "site on_carriage"), ("crank", "slider-crank"), ("glue", "body")
+    assert all(word in said[name] for name, word in (*where, ("wrist", "joint ball")))
     assert all(said[name].endswith("moves x") for name in ("pull", "rod", "crank"))  # the carriage against the beam
     assert said["jet"].endswith("moves y, x")
     assert "kp: 70 " in text and "of actuator own" in text  # on a slide jointinparent is joint
@@ -384,9 +371,8 @@ def test_a_joint_that_an_equality_ties_to_another_is_told_of(tmp_path: Path) -> 
     # x follows y times −2: the motor of y also moves the carriage, 2² times as heavy.
     tied = '</tendon><equality><joint joint1="x" joint2="y" polycoef="0 -2 0 0 0"/></equality>'
     (tmp_path / "gantry.xml").write_text(GANTRY.replace("KP_B", "1").replace("OTHERS", "").replace("</tendon>", tied))
-    (remark,) = [
-        text for text in load_robot_model(tmp_path / "gantry.xml").remarks if text.startswith("joint x follows y")
-    ]
+    remarks = load_robot_model(tmp_path / "gantry.xml").remarks
+    (remark,) = [text for text in remarks if text.startswith("joint x follows y")]
     assert "2² × 2 = 8 kg" in remark  # the carriage and what hangs at it by the ball joint, 1 kg each
 
 
@@ -419,9 +405,7 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
     ],
 )  # fmt: skip
-def test_wrong_models_and_robot_files_are_refused_with_what_to_write(
-    change: tuple[str, str], says: str, tmp_path: Path
-) -> None:
+def test_wrong_models_and_robot_files_are_refused(change: tuple[str, str], says: str, tmp_path: Path) -> None:
     with pytest.raises(TaccorlError, match=says):
         robot(tmp_path, *(text.replace(*change) for text in (ROBOT_YAML, TWO_LINKS)))
 
@@ -488,12 +472,8 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     late = 0.4 * np.sin(2 * np.pi * (0.2 + 0.2 * (time_s - 0.05)) * (time_s - 0.05))
     law, speed = made.config.joints["elbow"], np.gradient(late, 1 / 200)
     asked = law.loop_gains.kp * (np.append(angle[:1], angle[:-1]) - late) - law.loop_gains.kd * speed
-    whole = swept(shoulder=np.zeros(1200), elbow=angle)
-    current = dataclasses.replace(
-        whole,
-        measured=np.column_stack([np.zeros(1200), late]),
-        effort=np.column_stack([np.zeros(1200), 2000.0 * asked]),
-    )
+    columns = {"measured": late, "effort": 2000.0 * asked}
+    current = dataclasses.replace(plain, **{k: np.column_stack([np.zeros(1200), v]) for k, v in columns.items()})
     said = checks(current)
     assert set(said) == {"effort_unit"} and "2e+03 times" in said["effort_unit"]
     assert "{elbow: 0.0005}" in said["effort_unit"] and "measurements.yaml" in said["effort_unit"]

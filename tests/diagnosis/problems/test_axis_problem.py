@@ -50,11 +50,8 @@ def test_cases_side_by_side_are_those_one_by_one(slide: Measurements):
     assert friction is not None
     cases: list[Any] = []
     for k in range(11):
-        base = made.start | {
-            "inertia": MASS_KG * (1 + 0.02 * (k % 7)),
-            "kp": KP * (1 - 0.01 * k),
-            "target_late_s": 2e-4 * (k % 3),
-        }
+        numbers = MASS_KG * (1 + 0.02 * (k % 7)), KP * (1 - 0.01 * k), 2e-4 * (k % 3)
+        base = made.start | dict(zip(("inertia", "kp", "target_late_s"), numbers, strict=True))
         cases.append((base, [friction(torque_nm=3.0 * k)] if k % 2 else []))  # pyright: ignore[reportCallIssue]
     cases += [cases[4], cases[9]]
     recordings = [*made.fit, *made.validation]
@@ -66,9 +63,9 @@ def test_cases_side_by_side_are_those_one_by_one(slide: Measurements):
 
 
 def without_target(m: Measurement) -> Measurement:
-    """As a table with position and force alone is read; the force is the mean about the row's time, of which half a step of the
-    target is missing before it acts."""
-    mean = m.effort + 0.5 * KP * np.diff(m.target, axis=0, append=m.target[-1:])
+    """As a table with position and force alone is read; the force is the mean of the ten steps of a row, of which 0.55 steps of
+    the target are missing before it acts."""
+    mean = m.effort + 0.55 * KP * np.diff(m.target, axis=0, append=m.target[-1:])
     return dataclasses.replace(m, target=m.measured.copy(), effort=mean, target_kinds=("effort",))
 
 
@@ -88,11 +85,10 @@ def test_a_log_of_position_and_force_alone_shows_the_friction(slide: Measurement
     moving = np.abs(np.gradient(recording.data.measured, 1e-3)) > 0.1
     assert np.median(np.abs(left[0.0][moving])) == pytest.approx(FRICTION_N, rel=0.05)
     assert np.sqrt(np.mean(left[FRICTION_N] ** 2)) < 2.0 * NOISE_N
-    found = best_fit(
-        problem, problem.fit, ("coulomb_friction",), [problem.start | {"coulomb_friction.torque_nm": 5.0}], 20
-    )
-    assert found.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.03)
-    assert found.values["inertia"] == pytest.approx(MASS_KG, rel=0.02)
+    start = problem.start | {"coulomb_friction.torque_nm": 5.0}
+    found = best_fit(problem, problem.fit, ("coulomb_friction",), [start], 20)
+    assert found.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.01)
+    assert found.values["inertia"] == pytest.approx(MASS_KG, rel=0.01)
 
 
 def piston(unit: Any = "m", **changed: Any) -> tuple[AxisConfig, Measurement]:
@@ -152,9 +148,8 @@ def test_of_a_mass_that_takes_no_force_nothing_is_claimed_and_the_friction_is_fo
     found = solve("piston", problem, problem.fit, [], [], SearchConfig(max_effects=1), others).diagnosis
     assert found.names == ("coulomb_friction",)
     assert vars(found.effects[0])["torque_nm"] == pytest.approx(5.0, rel=0.05)
-    assert found.intervals["inertia"][0] < 0.1 < 10.0 < found.intervals["inertia"][1]
-    if found.after.values["inertia"] != pytest.approx(0.3, rel=0.5):
-        pytest.xfail("not reached: the mass stays within a half of the file's 0.3 kg")
+    low, high = found.intervals.get("inertia", (0.0, np.inf))
+    assert low < 0.1 < 10.0 < high and found.after.values["inertia"] == pytest.approx(0.3, rel=0.5)
 
 
 @pytest.mark.parametrize(
