@@ -57,8 +57,9 @@ _FRICTION_SOFTNESS = (1.0 - DRY_SHARE) / DRY_SHARE
 _LIMIT_RATE = 2.0 / (LIMIT_SHARE * LIMIT_TIME_S)
 _LIMIT_STIFFNESS = 1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE  # 1/s², times the impedance
 _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
-MOST_LOST = 0.9
-"""Largest share of the inertia that a delay of the speed may subtract; a loop that loses all of it is unstable."""
+_SAMPLED = 7.0 / 12.0
+"""Second moment, halved, of the age of a sampled loop's damping in squared periods: the mean of its speed over one period and
+that of its output over one have 1/6 each, and 1/4 together."""
 
 
 _PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
@@ -264,14 +265,19 @@ def _simulated(
     half_play = 0.5 * p.backlash__play_rad
     ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
     early = 0.5 * h if midpoint and geared else 0.0
-    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # the same of the gear; 1 damps it by h · spring
+    into = where((half_play > 0.0) & (compliance == 0.0), 1.0, 0.5 if midpoint else 1.0)  # of the gear; 1 damps it
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
-    lost = min(p.kd * (p.speed_age + min(p.speed_delay__delay_s, 0.0)), MOST_LOST * whole_inertia)
-    fresh_share = where(p.speed_delay__delay_s > 0.0, ahead * h / (ahead * h + p.speed_delay__delay_s), 1.0)
+    # Of late seconds of the speed, those that a filter smooths and those of a sampled loop, which means over two periods:
+    # 1 − D s + (τ² + τ T + 7/12 T²) s² is (1 − lead s) / (1 + slow s) to the second order; below 0 it is a lead alone.
+    smoothed, sampled = max(p.speed_delay__delay_s, 0.0), p.speed_age + min(p.speed_delay__delay_s, 0.0)
+    late, sampled, lost = smoothed + max(sampled, 0.0), max(sampled, 0.0), min(sampled, 0.0)
+    slow_s = (smoothed * late + _SAMPLED * sampled * sampled) / where(late > 0.0, late, 1.0)
+    turned = where(slow_s > 0.0, late / where(slow_s > 0.0, slow_s, 1.0), 1.0)  # 1 + lead / slow
+    fresh_share = ahead * h / (ahead * h + slow_s)
     with_filter = holds(fresh_share < 1.0)
-    ruled_inertia = whole_inertia - lost
+    ruled_inertia = whole_inertia - p.kd * lost
     ruled_inertia -= min(early * (p.kd + p.back_emf), 0.5 * ruled_inertia)
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = ruled_inertia * (link + GEAR_KGM2) - link * link
@@ -357,23 +363,24 @@ def _simulated(
         by = until_now  # also of a delayed one that comes now, which MuJoCo's force has already
         if not midpoint:
             until_now = where(p.command_delay__delay_s > 0.0, now, until_now)
-        given = none
+        given, acts = none, now if midpoint else until_now
         if with_given:
-            acts = where(reverse_gain != 1.0, now, until_now) if midpoint else until_now
-            given = _asked(p, kind, acts, until_now, q, v, integral, supply[part], on[part], added[part])[0]
+            given = _asked(p, kind, acts, acts, q, v, integral, supply[part], on[part], added[part])[0]
             given = where(lag_s > 0.0, torque, given)
         if within == 0:
             if effort_after > 0:
                 by = load(command, n + hold * min(effort_after - 1, parts - 1))
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(p, kind, by, by, q, v, integral, supply[part], on[part], added[seen])
+            by_speed -= on[part] * p.back_emf  # which has no age
             older = where(lag_s > 0.0, 0.0, p.effort_age * (by_position * v + by_speed * acceleration))
             shown = where(lag_s > 0.0, torque, shown)
             shown_strength = strength * _of_direction(p, shown + carried)
             given_weight = shown_strength * carried
             if with_filter:
-                shown += where(lag_s > 0.0, 0.0, (by_speed - on[seen] * p.back_emf) * (v - late_v))
-            total = _limited(p, shown_strength * (shown + older) + lost * acceleration + given_weight, v)
+                shown += where(lag_s > 0.0, 0.0, turned * by_speed * (v - late_v))
+            older += lost * by_speed * acceleration
+            total = _limited(p, shown_strength * (shown + older) + given_weight, v)
             store(effort, row, where(p.effort_holds_weight == 0.0, total - given_weight, total))
             store(reported, row, _reading(p, q))
             for lane in range(LANES):
@@ -391,18 +398,22 @@ def _simulated(
         if with_integral:  # that of a speed is taken ahead as the position is, which is its other part
             came = h * (now if kind == VELOCITY else now - p.encoder_scale__factor * q)
             integral += ahead * speeds * came
-        asked, stiffness, damping = _asked(p, kind, now, until_now, q, v, integral, supply[part], on[part], added[part])
+        asked, stiffness, damping = _asked(p, kind, now, acts, q, v, integral, supply[part], on[part], added[part])
+        by_controller = damping - on[part] * p.back_emf  # 0 while the duty is at its end
         if with_filter:
-            slow = (1.0 - fresh_share) * (damping - on[part] * p.back_emf)
+            slow = turned * (1.0 - fresh_share) * by_controller
             asked, damping = asked + slow * (v - late_v), damping - slow
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness
         gain = newest_share * strength
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
-        ruled = drawn + lost * acceleration
+        taken = strength * by_controller * lost
+        ruled = drawn + taken * acceleration
         limited = _limited(p, ruled, v)
         cut = limited != ruled
+        ruled_inertia = whole_inertia - taken
+        ruled_inertia -= min(early * (by_controller + p.back_emf), 0.5 * ruled_inertia)
         drawn, inertia = where(cut, limited, drawn), where(cut, whole_inertia, ruled_inertia)
         stiffness, damping = where(cut, 0.0, gain * stiffness), where(cut, 0.0, gain * damping)
 

@@ -275,7 +275,9 @@ class DrivenAxis(DriveJoint):
     def __init__(self, config: AxisConfig) -> None:
         super().__init__(config, config.name, config.unit, config.loop_hz, config.command_hz)
         self.config, self.target_late_s = config, config.target_late_s
-        self.speed_delay_s = self.speed_delay_s + config.speed_late_s if config.loop_hz and config.kd else 0.0
+        late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
+        self.facts |= {"speed_age": self.speed_delay_s, "speed_delay__delay_s": late_s}
+        self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
 
     def timestep_s(self, motion: JointMotion) -> float:
         return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)
