@@ -31,6 +31,7 @@ from numba.core import types
 from taccorl.alignment.controller import arriving as _arriving
 from taccorl.alignment.controller import drive_numbers as _drive_numbers
 from taccorl.alignment.controller import lanes as _lanes
+from taccorl.alignment.controller import late_speed as _late_speed
 from taccorl.alignment.controller.arriving import arriving
 from taccorl.alignment.controller.drive_numbers import FAMILIES, TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.lanes import (
@@ -47,6 +48,7 @@ from taccorl.alignment.controller.lanes import (
     store,
     where,
 )
+from taccorl.alignment.controller.late_speed import late_speed
 from taccorl.sim.effects.friction import AT_RAD_PER_S, BRISTLE_DAMPING_S, DRY_SHARE, DRY_TIME_S
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
@@ -57,9 +59,6 @@ _FRICTION_SOFTNESS = (1.0 - DRY_SHARE) / DRY_SHARE
 _LIMIT_RATE = 2.0 / (LIMIT_SHARE * LIMIT_TIME_S)
 _LIMIT_STIFFNESS = 1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE  # 1/s², times the impedance
 _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
-_SAMPLED = 7.0 / 12.0
-"""Second moment, halved, of the age of a sampled loop's damping in squared periods: the mean of its speed over one period and
-that of its output over one have 1/6 each, and 1/4 together."""
 
 
 _PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
@@ -171,7 +170,7 @@ def _sources() -> np.ndarray:
     """() array, an argument whose type is named after the sources of the kernel and the fields of ``Drive``. Numba looks for a
     compiled kernel by the types of its arguments and the date of its own file, so that changes of what it imports would not
     reach it."""
-    modules = (_arriving, _drive_numbers, _lanes, *FAMILIES)
+    modules = (_arriving, _drive_numbers, _lanes, _late_speed, *FAMILIES)
     texts = [repr(Drive._fields).encode(), *(Path(str(m.__file__)).read_bytes() for m in modules)]
     return np.zeros((), [("of_" + sha256(b"".join(texts)).hexdigest()[:16], "u1")])
 
@@ -269,12 +268,7 @@ def _simulated(
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
-    # Of late seconds of the speed, those that a filter smooths and those of a sampled loop, which means over two periods:
-    # 1 − D s + (τ² + τ T + 7/12 T²) s² is (1 − lead s) / (1 + slow s) to the second order; below 0 it is a lead alone.
-    smoothed, sampled = max(p.speed_delay__delay_s, 0.0), p.speed_age + min(p.speed_delay__delay_s, 0.0)
-    late, sampled, lost = smoothed + max(sampled, 0.0), max(sampled, 0.0), min(sampled, 0.0)
-    slow_s = (smoothed * late + _SAMPLED * sampled * sampled) / where(late > 0.0, late, 1.0)
-    turned = where(slow_s > 0.0, late / where(slow_s > 0.0, slow_s, 1.0), 1.0)  # 1 + lead / slow
+    slow_s, turned, lost, stiff_lost, shown_slow, shown_lead = late_speed(p)
     fresh_share = ahead * h / (ahead * h + slow_s)
     with_filter = holds(fresh_share < 1.0)
     ruled_inertia = whole_inertia - p.kd * lost
@@ -332,7 +326,6 @@ def _simulated(
     missing += z * bristle
     bent = where(bends, min(max(-missing, -coulomb), coulomb) / bending, 0.0)
     acceleration, loads_per_step = none, len(coupling) / len(command)
-
     row, part, within, since = 0, 0, -1, -1
     for n in range(len(command)):
         within += 1
@@ -373,13 +366,13 @@ def _simulated(
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(p, kind, by, by, q, v, integral, supply[part], on[part], added[seen])
             by_speed -= on[part] * p.back_emf  # which has no age
-            older = where(lag_s > 0.0, 0.0, p.effort_age * (by_position * v + by_speed * acceleration))
+            older = p.effort_age * by_position * v + shown_lead * by_speed * acceleration
+            if with_filter:
+                older += shown_slow * by_speed * (v - late_v)
+            older = where(lag_s > 0.0, lost * by_speed * acceleration, older) + by_position * stiff_lost * acceleration
             shown = where(lag_s > 0.0, torque, shown)
             shown_strength = strength * _of_direction(p, shown + carried)
             given_weight = shown_strength * carried
-            if with_filter:
-                shown += where(lag_s > 0.0, 0.0, turned * by_speed * (v - late_v))
-            older += lost * by_speed * acceleration
             total = _limited(p, shown_strength * (shown + older) + given_weight, v)
             store(effort, row, where(p.effort_holds_weight == 0.0, total - given_weight, total))
             store(reported, row, _reading(p, q))
@@ -408,7 +401,7 @@ def _simulated(
         gain = newest_share * strength
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
-        taken = strength * by_controller * lost
+        taken = strength * (by_controller * lost + stiffness * stiff_lost)
         ruled = drawn + taken * acceleration
         limited = _limited(p, ruled, v)
         cut = limited != ruled
