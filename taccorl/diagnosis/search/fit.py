@@ -377,16 +377,18 @@ def out_of_dents(problem: Problem, model: Fit, recordings: Sequence[Recording], 
     """``model``, or fits (``fit``) from the best of points beside it, as long as they leave less.
 
     Where a link bounces in its play, sticks or is limited, the error has dents in which the solver stops, a fifth of the play off
-    the truth. One coordinate at a time is moved by ``_ASIDE``, the others stay. ``recordings``: those of ``model``."""
-    own = model.frees if any("." in f.name for f in model.frees) else ()
+    the truth. One coordinate at a time is moved by ``_ASIDE``; the others stay, or follow as the derivatives have it, such as a
+    spring beside its play. ``recordings``: those of ``model``."""
+    own = [k for k, f in enumerate(model.frees) if any("." in f.name for f in model.frees)]
     candidates = chosen(problem, model.names)
     for _ in range(_DENTS if own else 0):
-        beside = []
-        for f in own:
-            to = np.clip(
-                f.coordinate(model.values[f.name]) + np.array(_ASIDE), f.coordinate(f.low), f.coordinate(f.high)
-            )
-            beside += [model.values | {f.name: f.value(c)} for c in to]
+        here = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
+        inverse, alone = inverse_of(model.jacobian.T @ model.jacobian), np.eye(len(here))
+        ways = [way for k in own for way in (alone[k], inverse[k] / inverse[k, k])]
+        points = [here + aside * way for way in ways for aside in _ASIDE]
+        beside = [
+            model.values | {f.name: f.value(c) for f, c in zip(model.frees, point, strict=True)} for point in points
+        ]
         cases = [(v, problem.prepare(v, [c.make(v) for c in candidates], recordings)) for v in beside]
         errors = np.mean(np.square(stacked_all(problem, cases, recordings)), axis=1)
         if errors.min() > (_DEEPER * model.error) ** 2:
