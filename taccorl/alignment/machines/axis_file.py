@@ -129,7 +129,8 @@ class AxisConfig(DriveLaw):
         """Size of the axis's forces and motions relative to a joint of a small arm; bounds of effects are multiplied by it."""
         force = self.force_unit_n or (self.effort_limit or 10.0) / 10.0
         stroke = self.limits[1] - self.limits[0] if self.limits and self.unit == "m" else 1.0
-        return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
+        drive = 1.0 / self.loop_gains.kp if self.loop_gains.kp > 0.0 and self.law != "effort" else 0.0
+        return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke, drive=drive)
 
     def effect_class(self, name: str) -> type[Effect] | None:
         """Class of the effect ``name`` with the size and units of this axis; None if an axis cannot have it. Raises TaccorlError:

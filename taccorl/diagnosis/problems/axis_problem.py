@@ -202,7 +202,8 @@ class AxisProblem(WithoutMaps):
         answers = [simulated(bare, m, []) for m in motions]
         position = self.axis.target_kind == "position"
         asked = [m.target if position else a.reported for m, a in zip(motions, answers, strict=True)]
-        return seen_in(motions, answers, asked) | self._waves(motions, inertias)
+        drive = {"drive_rad_per_nm": 1.0 / bare.loop_gains.kp} if bare.loop_gains.kp > 0.0 else {}
+        return seen_in(motions, answers, asked) | drive | self._waves(motions, inertias)
 
     def _waves(self, motions: Sequence[JointMotion], inertias: Sequence[float]) -> dict[str, float]:
         """Periodic forces; of a slide the grid of ``Cogging.starts``, which counts turns, is of no use."""
