@@ -80,7 +80,7 @@ class AxisConfig(DriveLaw):
     fits up to 3 ms of it; a longer delay is an effect."""
     speed_late_s: float = 0.0
     """Delay of the speed in the drive's loop [s] beyond that of a difference of two samples: its filter. ``diagnose`` fits up to
-    two periods of the loop if efforts were recorded."""
+    two periods of the loop; without efforts up to 3 ms, if those are more."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
     force_unit_n: float | None = None

@@ -7,8 +7,8 @@ cent outweighs the friction of a fast drive. They stay, and so do the delays, if
 law, row by row, to the noise floor: a fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted
 within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file states it, because positions determine ratios
 only. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
-delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. If efforts
-were recorded, so is the delay of a speed that the drive filters, or the period of its loop where the file states no
+delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. Unless both gains and
+efforts are unknown, so is the delay of a speed that the drive filters, or the period of its loop where the file states no
 ``loop_hz``. The scale of efforts is fitted in place of the inertia where that decides.
 """
 
@@ -30,7 +30,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, recording_of, seen_in, unlike_rows
+from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, other_gain, recording_of, seen_in, unlike_rows
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -85,6 +85,9 @@ class AxisProblem(WithoutMaps):
         base = (*self._numbers(), *[dataclasses.replace(EFFORT_SCALE, held=True)] * self.effort)
         self.start: Values = {f.name: f.start for f in base} | self._stated
         self.base = holding(base, self.known, self.start)
+        alone = axis.law == "impedance" and axis.gains == "commanded" and not self.effort
+        if alone and axis.kd and "kd" not in axis.known:
+            self.other_gain = other_gain(axis.loop_gains.kd, axis.scale.unit_of("N·m·s/rad"))
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.start)
 

@@ -60,10 +60,7 @@ class JointCompliance(JointEffect):
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: also gears as soft as the drive, and three times as soft."""
         soft = [times * seen["drive_rad_per_nm"] for times in (1.0, 3.0) if "drive_rad_per_nm" in seen]
-        return [
-            *super().starts(seen),
-            *({"compliance_rad_per_nm": cls.clipped("compliance_rad_per_nm", c)} for c in soft),
-        ]
+        return [*super().starts(seen), *({"compliance_rad_per_nm": c} for c in soft)]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for motor in self.chosen(spec):

@@ -90,8 +90,8 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
         changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
-        units = {"rad_per_nm": scale.length / scale.force, "nm": scale.force}
-        units |= {"rad": scale.length, "rad_per_s": scale.length}
+        units = {"rad_per_nm": scale.length / scale.force, "nm": scale.force, "rad": scale.length}
+        units["rad_per_s"] = scale.length
         own = {
             key: value / next((u for end, u in units.items() if key.endswith(f"_{end}")), 1.0)
             for key, value in seen.items()

@@ -108,8 +108,8 @@ ARM = AxisConfig(name="servo", unit="rad", inertia=0.002, kp=3.0, kd=0.08, loop_
     ],
 )
 def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(axis, filter_s, late_s, effect, most):
-    """Steps of up to 0.8 rad and back. While the duty is at its end nothing damps but the back-EMF, which is never late; a gain of
-    one direction acts on the damping as well; a target that leaves a dead band acts at once."""
+    """Steps. At the end of the duty only the back-EMF damps, at once; a gain of one direction is that of the damping, too; a
+    target that leaves a dead band acts at once."""
     target = np.select([np.arange(400) < k for k in (20, 100, 180, 300)], [0.0, 0.8, -0.3, -0.25], 0.5)
     truth = sampled(target, axis, filter_s, **effect)
     own = [("error_deadband", "width_rad", "dead"), ("direction_gain", "factor", "gain")]

@@ -339,8 +339,8 @@ def of_a_sampled_loop(
             free = speed + dt_s * (force - damping * speed) / MASS_KG
             speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
             at += dt_s * speed
-    noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [position_m, 0.1]
     target = target[250:]
+    noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [position_m, 0.1]
     position, force = (np.array(rows[250:]) + noise).T[:, :, None]
     return dataclasses.replace(simulated("log", 0.1, 0.6, 1), target=target[:, None], measured=position, effort=force)
 
