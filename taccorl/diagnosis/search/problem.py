@@ -196,6 +196,10 @@ class Problem(Protocol):
         effects."""
         ...
 
+    def noisier(self, recording: Recording) -> Recording:
+        """``recording`` with the noise of its measured inputs once more; itself if they have none."""
+        ...
+
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
@@ -218,6 +222,10 @@ class WithoutMaps:
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Does nothing."""
+
+    def noisier(self, recording: Recording) -> Recording:
+        """Return ``recording`` unchanged."""
+        return recording
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]

@@ -116,6 +116,30 @@ def test_a_fit_leaves_a_dent_along_a_furrow_of_two_numbers():
     assert found.values["offset"] == pytest.approx(0.4, abs=0.05)
 
 
+class Peaks(MadeProblem):
+    """gain × the largest input so far; ``data`` are the inputs (T,) with noise of 0.02."""
+
+    base = MadeProblem.base[:1]
+
+    def simulate(self, base, effects, recording):
+        return base["gain"] * np.maximum.accumulate(recording.data)[:, None]
+
+    def noisier(self, recording):
+        noise = np.random.default_rng(9).normal(0.0, 0.02, len(recording.data))
+        return dataclasses.replace(recording, data=recording.data + noise)
+
+
+def test_an_interval_holds_a_gain_that_the_peaks_of_an_input_s_noise_make_seem_smaller():
+    """Inputs of 1 … 5, whose peaks are about 3 × 0.02 higher: 2 % of 3, and noise of 0.1 in 2000 rows has 0.02 %."""
+    inputs = np.repeat(np.arange(1.0, 6.0), 400)
+    seen = inputs + np.random.default_rng(8).normal(0.0, 0.02, 2000)
+    recording = [dataclasses.replace(record(0, gain=0.0, offset=0.0, extra=3.0 * inputs), data=seen)]
+    model = fit(Peaks(), recording, (), {}, step=FINE)
+    moved = moved_by(Peaks(), model, recording, recording, np.full(1, FINE))
+    low, high = dataclasses.replace(model, moved=moved).intervals()["gain"]
+    assert model.intervals()["gain"][1] < 2.98 and 2.8 < low < 3.0 < high < 3.1
+
+
 def test_a_number_at_its_bound_is_said_to_be_there():
     problem = MadeProblem()
     problem.base = (Free(name="gain", unit="1", start=1.0, low=0.1, high=2.0, log=True), problem.base[1])
