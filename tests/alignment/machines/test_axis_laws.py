@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +15,8 @@ from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 
 RATE_HZ, DT_S = 200, 1e-5
-SERVO = AxisConfig(
-    name="servo",
-    unit="rad",
-    inertia=0.02,
-    law="pwm",
-    kp=6.0,
-    supply_v=12.0,
-    resistance_ohm=4.0,
-    torque_nm_per_a=1.0,
-    emf_v_s_per_rad=1.1,
-    lever_m=0.15,
-)
+WINDING: dict[str, Any] = {"supply_v": 12.0, "resistance_ohm": 4.0, "torque_nm_per_a": 1.0, "emf_v_s_per_rad": 1.1}
+SERVO = AxisConfig(name="servo", unit="rad", inertia=0.02, law="pwm", kp=6.0, lever_m=0.15, **WINDING)
 
 
 def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0) -> Measurement:
