@@ -277,7 +277,7 @@ class DrivenAxis(DriveJoint):
         super().__init__(config, config.name, config.unit, config.loop_hz, config.command_hz)
         self.config, self.target_late_s = config, config.target_late_s
         late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
-        self.facts |= {"speed_age": self.speed_delay_s, "speed_delay__delay_s": late_s}
+        self.facts = {**self.facts, "speed_age": self.speed_delay_s, "speed_delay__delay_s": late_s}
         self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
 
     def timestep_s(self, motion: JointMotion) -> float:

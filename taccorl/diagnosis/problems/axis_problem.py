@@ -87,7 +87,7 @@ class AxisProblem(WithoutMaps):
         self.base = holding(base, self.known, self.start)
         alone = axis.law == "impedance" and axis.gains == "commanded" and not self.effort
         if alone and axis.kd and "kd" not in axis.known:
-            self.other_gain = other_gain(axis.loop_gains.kd, axis.scale.unit_of("N·m·s/rad"))
+            self.other_gain: Free | None = other_gain(axis.loop_gains.kd, axis.scale.unit_of("N·m·s/rad"))
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.start)
 

@@ -145,7 +145,7 @@ class JointProblem(WithoutMaps):
         self.base, kd = self._base(), self.model.gains.kd
         alone = self.commanded and not (self.effort or joint.winding or joint.facts.get("commands_speed"))
         if alone and joint.target_kind == "position" and kd > 0.0 and "kd" not in self.known:
-            self.other_gain = other_gain(kd, Scale(unit=joint.unit).unit_of(KD.unit))
+            self.other_gain: Free | None = other_gain(kd, Scale(unit=joint.unit).unit_of(KD.unit))
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())
         self.start: Values = self.model.gains._asdict() | dict(joint.winding) | self._stated

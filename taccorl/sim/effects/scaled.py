@@ -86,7 +86,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
         ends = {key: getattr(p, key) for key in ("absent", "low", "high", "typical")}
         number = {k: v if v is None or not math.isfinite(v) else v * factors[p.name] for k, v in ends.items()}
         if p.unit == "rad/(N·m)":
-            number["high"] = max(number["high"], SOFT * scale.drive)
+            number["high"] = max(p.high * factors[p.name], SOFT * scale.drive)
         changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:

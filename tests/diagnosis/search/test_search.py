@@ -484,7 +484,7 @@ def test_one_factor_on_all_efforts_is_told_beside_an_effect_of_one_number_and_in
 class Damped(MadeProblem):
     """measured = gain × drive + offset + effects + (kd − 2) × a ripple, of which the file states kd = 2."""
 
-    other_gain = Free(name="kd", unit="N·m·s/rad", start=2.0, low=0.2, high=20.0, log=True)
+    other_gain: Free | None = Free(name="kd", unit="N·m·s/rad", start=2.0, low=0.2, high=20.0, log=True)
 
     def simulate(self, base, effects, recording):
         more = (base.get("kd", 2.0) - 2.0) * Ripple.signal(recording.time_s, recording.data)
