@@ -277,7 +277,9 @@ class _Words:
             if none is not None and abs(c.after - none) < GONE * abs(c.before - none):
                 found.append(c.effect)
         place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
-        return place + f", or {SCALED}" * self.d.or_scale
+        number, factor = self.d.or_number
+        off = SCALED if number == EFFORT_SCALE else f"{number} of the file is off by a factor of {factor:.4g}"
+        return place + f", or {off}" * bool(number)
 
     @property
     def sizes(self) -> str:
@@ -334,7 +336,10 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
         yield (
             f"validation recordings keep {validation:.2f} of {first:.2f} noise floors, so little that no effect was looked for"
         )
-    yield from filter(None, ("a wrong torque constant does as well" * d.or_scale, unjudged(d, short), may_be_two(d)))
+    also = {"": "", EFFORT_SCALE: "a wrong torque constant does as well"}.get(
+        d.or_number[0], "another gain does as well"
+    )
+    yield from filter(None, (also, unjudged(d, short), may_be_two(d)))
     if d.one_pose:
         yield (
             f"{_some(tuple(d.one_pose))} found in one pose of the other joints, in which the weight of a tilted base or of a "
@@ -357,6 +362,8 @@ def _record_next(
             return f"A {decides}", command
         what = decides.split()[0]
         return f"One {what} twice (repeat_of), for a better noise floor, and a {decides}", command
+    if d.or_number[0] not in ("", EFFORT_SCALE):
+        return "The same motions at twice the gain, stated in measurements.yaml, or with the motor's effort.", ""
     if kind == "ties":
         tied = [name for name in added(d) if d.rivals.get(name)]
         name = next((n for n in tied if separable(d, n, d.rivals[n])), tied[0])
@@ -368,7 +375,7 @@ def _record_next(
         how = ": " + " ".join(cls.to_record for cls in classes) if not command and classes else "."
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how}"
         return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
-    if EFFORT_SCALE in w.instead or d.or_scale:
+    if EFFORT_SCALE in (*w.instead, d.or_number[0]):
         return "The same motions with a known load (`payload_kg`), whose part of the inertia is known.", ""
     if w.instead:
         own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)

@@ -35,8 +35,8 @@ class _Own(NamedTuple):
     effort_age: float = 0.0
     """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
     speed_age: float = 0.0
-    """Mean age of the speed that K_d multiplies [s]: an inertia smaller by K_d · age (at most by ``joint_kernel.MOST_LOST`` of
-    it), except while the motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""
+    """Mean age of the speed that K_d multiplies in a sampled loop [s], its period: to the first order an inertia smaller by K_d ·
+    age, except while the motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""
     midpoint: float = 0.0
     """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
     dropped_commands__seed: float = 0.0

@@ -31,6 +31,7 @@ from numba.core import types
 from taccorl.alignment.controller import arriving as _arriving
 from taccorl.alignment.controller import drive_numbers as _drive_numbers
 from taccorl.alignment.controller import lanes as _lanes
+from taccorl.alignment.controller import late_speed as _late_speed
 from taccorl.alignment.controller.arriving import arriving
 from taccorl.alignment.controller.drive_numbers import FAMILIES, TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.lanes import (
@@ -47,6 +48,7 @@ from taccorl.alignment.controller.lanes import (
     store,
     where,
 )
+from taccorl.alignment.controller.late_speed import late_speed
 from taccorl.sim.effects.friction import AT_RAD_PER_S, BRISTLE_DAMPING_S, DRY_SHARE, DRY_TIME_S
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
@@ -57,8 +59,6 @@ _FRICTION_SOFTNESS = (1.0 - DRY_SHARE) / DRY_SHARE
 _LIMIT_RATE = 2.0 / (LIMIT_SHARE * LIMIT_TIME_S)
 _LIMIT_STIFFNESS = 1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE  # 1/s², times the impedance
 _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
-MOST_LOST = 0.9
-"""Largest share of the inertia that a delay of the speed may subtract; a loop that loses all of it is unstable."""
 
 
 _PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
@@ -170,7 +170,7 @@ def _sources() -> np.ndarray:
     """() array, an argument whose type is named after the sources of the kernel and the fields of ``Drive``. Numba looks for a
     compiled kernel by the types of its arguments and the date of its own file, so that changes of what it imports would not
     reach it."""
-    modules = (_arriving, _drive_numbers, _lanes, *FAMILIES)
+    modules = (_arriving, _drive_numbers, _lanes, _late_speed, *FAMILIES)
     texts = [repr(Drive._fields).encode(), *(Path(str(m.__file__)).read_bytes() for m in modules)]
     return np.zeros((), [("of_" + sha256(b"".join(texts)).hexdigest()[:16], "u1")])
 
@@ -264,14 +264,14 @@ def _simulated(
     half_play = 0.5 * p.backlash__play_rad
     ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
     early = 0.5 * h if midpoint and geared else 0.0
-    into = where(half_play > 0.0, 1.0, 0.5 if midpoint else 1.0)  # the same of the gear; 1 damps it by h · spring
+    into = where((half_play > 0.0) & (compliance == 0.0), 1.0, 0.5 if midpoint else 1.0)  # of the gear; 1 damps it
     spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
-    lost = min(p.kd * (p.speed_age + min(p.speed_delay__delay_s, 0.0)), MOST_LOST * whole_inertia)
-    fresh_share = where(p.speed_delay__delay_s > 0.0, ahead * h / (ahead * h + p.speed_delay__delay_s), 1.0)
+    slow_s, turned, lost, stiff_lost, shown_slow, shown_lead = late_speed(p)
+    fresh_share = ahead * h / (ahead * h + slow_s)
     with_filter = holds(fresh_share < 1.0)
-    ruled_inertia = whole_inertia - lost
+    ruled_inertia = whole_inertia - p.kd * lost
     ruled_inertia -= min(early * (p.kd + p.back_emf), 0.5 * ruled_inertia)
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = ruled_inertia * (link + GEAR_KGM2) - link * link
@@ -326,7 +326,6 @@ def _simulated(
     missing += z * bristle
     bent = where(bends, min(max(-missing, -coulomb), coulomb) / bending, 0.0)
     acceleration, loads_per_step = none, len(coupling) / len(command)
-
     row, part, within, since = 0, 0, -1, -1
     for n in range(len(command)):
         within += 1
@@ -357,23 +356,24 @@ def _simulated(
         by = until_now  # also of a delayed one that comes now, which MuJoCo's force has already
         if not midpoint:
             until_now = where(p.command_delay__delay_s > 0.0, now, until_now)
-        given = none
+        given, acts = none, now if midpoint else until_now
         if with_given:
-            acts = where(reverse_gain != 1.0, now, until_now) if midpoint else until_now
-            given = _asked(p, kind, acts, until_now, q, v, integral, supply[part], on[part], added[part])[0]
+            given = _asked(p, kind, acts, acts, q, v, integral, supply[part], on[part], added[part])[0]
             given = where(lag_s > 0.0, torque, given)
         if within == 0:
             if effort_after > 0:
                 by = load(command, n + hold * min(effort_after - 1, parts - 1))
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(p, kind, by, by, q, v, integral, supply[part], on[part], added[seen])
-            older = where(lag_s > 0.0, 0.0, p.effort_age * (by_position * v + by_speed * acceleration))
+            by_speed -= on[part] * p.back_emf  # which has no age
+            older = p.effort_age * by_position * v + shown_lead * by_speed * acceleration
+            if with_filter:
+                older += shown_slow * by_speed * (v - late_v)
+            older = where(lag_s > 0.0, lost * by_speed * acceleration, older) + by_position * stiff_lost * acceleration
             shown = where(lag_s > 0.0, torque, shown)
             shown_strength = strength * _of_direction(p, shown + carried)
             given_weight = shown_strength * carried
-            if with_filter:
-                shown += where(lag_s > 0.0, 0.0, (by_speed - on[seen] * p.back_emf) * (v - late_v))
-            total = _limited(p, shown_strength * (shown + older) + lost * acceleration + given_weight, v)
+            total = _limited(p, shown_strength * (shown + older) + given_weight, v)
             store(effort, row, where(p.effort_holds_weight == 0.0, total - given_weight, total))
             store(reported, row, _reading(p, q))
             for lane in range(LANES):
@@ -391,18 +391,22 @@ def _simulated(
         if with_integral:  # that of a speed is taken ahead as the position is, which is its other part
             came = h * (now if kind == VELOCITY else now - p.encoder_scale__factor * q)
             integral += ahead * speeds * came
-        asked, stiffness, damping = _asked(p, kind, now, until_now, q, v, integral, supply[part], on[part], added[part])
+        asked, stiffness, damping = _asked(p, kind, now, acts, q, v, integral, supply[part], on[part], added[part])
+        by_controller = damping - on[part] * p.back_emf  # 0 while the duty is at its end
         if with_filter:
-            slow = (1.0 - fresh_share) * (damping - on[part] * p.back_emf)
+            slow = turned * (1.0 - fresh_share) * by_controller
             asked, damping = asked + slow * (v - late_v), damping - slow
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness
         gain = newest_share * strength
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
-        ruled = drawn + lost * acceleration
+        taken = strength * (by_controller * lost + stiffness * stiff_lost)
+        ruled = drawn + taken * acceleration
         limited = _limited(p, ruled, v)
         cut = limited != ruled
+        ruled_inertia = whole_inertia - taken
+        ruled_inertia -= min(early * (by_controller + p.back_emf), 0.5 * ruled_inertia)
         drawn, inertia = where(cut, limited, drawn), where(cut, whole_inertia, ruled_inertia)
         stiffness, damping = where(cut, 0.0, gain * stiffness), where(cut, 0.0, gain * damping)
 

@@ -80,7 +80,7 @@ class AxisConfig(DriveLaw):
     fits up to 3 ms of it; a longer delay is an effect."""
     speed_late_s: float = 0.0
     """Delay of the speed in the drive's loop [s] beyond that of a difference of two samples: its filter. ``diagnose`` fits up to
-    two periods of the loop if efforts were recorded."""
+    two periods of the loop; without efforts up to 3 ms, if those are more."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
     force_unit_n: float | None = None
@@ -129,7 +129,8 @@ class AxisConfig(DriveLaw):
         """Size of the axis's forces and motions relative to a joint of a small arm; bounds of effects are multiplied by it."""
         force = self.force_unit_n or (self.effort_limit or 10.0) / 10.0
         stroke = self.limits[1] - self.limits[0] if self.limits and self.unit == "m" else 1.0
-        return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
+        drive = 1.0 / self.loop_gains.kp if self.loop_gains.kp > 0.0 and self.law != "effort" else 0.0
+        return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke, drive=drive)
 
     def effect_class(self, name: str) -> type[Effect] | None:
         """Class of the effect ``name`` with the size and units of this axis; None if an axis cannot have it. Raises TaccorlError:
@@ -275,7 +276,9 @@ class DrivenAxis(DriveJoint):
     def __init__(self, config: AxisConfig) -> None:
         super().__init__(config, config.name, config.unit, config.loop_hz, config.command_hz)
         self.config, self.target_late_s = config, config.target_late_s
-        self.speed_delay_s = self.speed_delay_s + config.speed_late_s if config.loop_hz and config.kd else 0.0
+        late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
+        self.facts = {**self.facts, "speed_age": self.speed_delay_s, "speed_delay__delay_s": late_s}
+        self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
 
     def timestep_s(self, motion: JointMotion) -> float:
         return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)

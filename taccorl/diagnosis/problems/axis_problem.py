@@ -7,8 +7,8 @@ cent outweighs the friction of a fast drive. They stay, and so do the delays, if
 law, row by row, to the noise floor: a fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted
 within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file states it, because positions determine ratios
 only. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
-delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. If efforts
-were recorded, so is the delay of a speed that the drive filters, or the period of its loop where the file states no
+delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. Unless both gains and
+efforts are unknown, so is the delay of a speed that the drive filters, or the period of its loop where the file states no
 ``loop_hz``. The scale of efforts is fitted in place of the inertia where that decides.
 """
 
@@ -30,7 +30,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, recording_of, seen_in, unlike_rows
+from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, other_gain, recording_of, seen_in, unlike_rows
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -85,6 +85,9 @@ class AxisProblem(WithoutMaps):
         base = (*self._numbers(), *[dataclasses.replace(EFFORT_SCALE, held=True)] * self.effort)
         self.start: Values = {f.name: f.start for f in base} | self._stated
         self.base = holding(base, self.known, self.start)
+        alone = axis.law == "impedance" and axis.gains == "commanded" and not self.effort
+        if alone and axis.kd and "kd" not in axis.known:
+            self.other_gain: Free | None = other_gain(axis.loop_gains.kd, axis.scale.unit_of("N·m·s/rad"))
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.start)
 
@@ -172,9 +175,9 @@ class AxisProblem(WithoutMaps):
             at = axis.target_late_s
             late = Free(name="target_late_s", unit="s", start=at, low=0.0, high=max(TIMING_S, at), scale=1e-4)
             found.append(dataclasses.replace(late, unless="command_delay"))
-        if self.effort and axis.kd and axis.law != "pwm":
+        if axis.kd and axis.law != "effort" and (self.effort or not unknown):
             at = axis.speed_late_s
-            high = max(FILTER_PERIODS / (axis.loop_hz or math.inf), at)
+            high = max(FILTER_PERIODS / (axis.loop_hz or math.inf), at, 0.0 if self.effort else TIMING_S)
             late = Free(name="speed_late_s", unit="s", start=at, low=0.0, high=high, scale=1e-4)
             found.append(late if axis.loop_hz else LOOP)
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
@@ -202,7 +205,8 @@ class AxisProblem(WithoutMaps):
         answers = [simulated(bare, m, []) for m in motions]
         position = self.axis.target_kind == "position"
         asked = [m.target if position else a.reported for m, a in zip(motions, answers, strict=True)]
-        return seen_in(motions, answers, asked) | self._waves(motions, inertias)
+        drive = {"drive_rad_per_nm": 1.0 / bare.loop_gains.kp} if bare.loop_gains.kp > 0.0 else {}
+        return seen_in(motions, answers, asked) | drive | self._waves(motions, inertias)
 
     def _waves(self, motions: Sequence[JointMotion], inertias: Sequence[float]) -> dict[str, float]:
         """Periodic forces; of a slide the grid of ``Cogging.starts``, which counts turns, is of no use."""

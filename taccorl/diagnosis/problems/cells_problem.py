@@ -76,6 +76,7 @@ class CellsProblem(WithoutMaps):
         """(K,) noise floor in the unit of the reading."""
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
         load = np.concatenate([m.target for m in sides[0]])
+        self._load_noise = _own_noise([(m.target, m.rate_hz) for m in sides[0]])
         fit_to = [m for m in measurements.fit if isinstance(m, CellMeasurement)]
         self.dead = CellSet(config, fit_to).dead
         """(K,) bool: cells that are loaded and hardly respond. They are not compared."""
@@ -129,6 +130,14 @@ class CellsProblem(WithoutMaps):
             channels=tuple(f"{self.config.names[k]} [{unit}]" for k in self.channels),
             data=m,
             short_noise=True,
+        )
+
+    def noisier(self, recording: Recording) -> Recording:
+        m = recording.data
+        noise = np.random.default_rng(0).standard_normal(m.target.shape) * self._load_noise
+        noise = noise[:, :1] if self.config.load.shared else noise
+        return dataclasses.replace(
+            recording, name=f"{recording.name}, noisier", data=dataclasses.replace(m, target=m.target + noise)
         )
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:

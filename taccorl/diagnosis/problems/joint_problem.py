@@ -137,7 +137,10 @@ class JointProblem(WithoutMaps):
         sides = (measurements.fit, measurements.validation, measurements.test)
         recordings = [[self._recording(m) for m in side] for side in sides]
         self.fit, self.validation, self.test = with_regimes(recordings, everything, self.floors[0])
-        self.base = self._base()
+        self.base, kd = self._base(), self.model.gains.kd
+        alone = self.commanded and not (self.effort or joint.winding or joint.facts.get("commands_speed"))
+        if alone and joint.target_kind == "position" and kd > 0.0 and "kd" not in self.known:
+            self.other_gain: Free | None = other_gain(kd, Scale(unit=joint.unit).unit_of(KD.unit))
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())
         self.start: Values = self.model.gains._asdict() | dict(joint.winding) | self._stated
@@ -324,6 +327,11 @@ def recording_of(
         data=motion,
         share=share,
     )
+
+
+def other_gain(kd: float, unit: str) -> Free:
+    """A stated K_d [``unit``], as ``Problem.other_gain``: of positions alone viscous friction is more of it."""
+    return dataclasses.replace(KD, unit=unit, start=kd, low=0.1 * kd, high=10.0 * kd)
 
 
 def unlike_rows(loop_s: float, recordings: Sequence[Measurement]) -> float:

@@ -59,7 +59,7 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
             first = {f.name: abs(fit.values[f.name] - fits.given[f.name]) for f in moved}
             least = {name: max(NEGLIGIBLE * abs(fits.given[name]), BACK * more) for name, more in first.items()}
             moved = [f for f in moved if fit is model or change[f.name] > least[f.name]]
-            of_drive = frees[0].name in (*STATED, *OF_LOOP)
+            of_drive = "." not in frees[0].name
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
                 name, before, after, unit = f.name, float(fits.given[f.name]), float(model.values[f.name]), f.unit
@@ -98,6 +98,7 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     least by the covariance of ``model``."""
     names = {f.name for f in model.frees}
     stated = STATED | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
+    stated |= {} if fits.problem.other_gain is None else {fits.problem.other_gain.name: "gain"}
     groups: dict[str, list[Free]] = {}
     for f in model.frees:
         effect, _, _ = f.name.rpartition(".")

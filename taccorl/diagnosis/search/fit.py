@@ -209,15 +209,26 @@ def _secants(
 def moved_by(
     problem: Problem, model: Fit, fitted_to: Sequence[Recording], others: Sequence[Recording], steps: np.ndarray
 ) -> np.ndarray:
-    """(p,) Gauss–Newton step from ``model`` to the fit of all recordings, those of ``fitted_to`` and ``others``; 0 for numbers at
-    their bound. ``steps``: (p,) half widths of the differences."""
+    """(p,) Gauss–Newton step from ``model`` to the fit of all recordings, those of ``fitted_to`` and ``others``, 0 for numbers at
+    their bound, with ``_moved_by_noise`` as the root of the sum of squares. ``steps``: (p,) half widths of the differences."""
     columns = _secants(problem, model, fitted_to, others, steps)
     inside = np.array([f.name not in model.at_bound for f in model.frees])
     together = (model.jacobian.T @ model.jacobian + columns.T @ columns)[np.ix_(inside, inside)]
     here = stacked(problem, model.values, model.effects, others)
     moved = np.zeros(len(inside))
     moved[inside] = -inverse_of(together) @ (columns.T @ here)[inside]
-    return moved
+    return np.hypot(moved, _moved_by_noise(problem, model, fitted_to))
+
+
+def _moved_by_noise(problem: Problem, model: Fit, fitted_to: Sequence[Recording]) -> np.ndarray:
+    """(p,) standard deviation of the coordinates because a response passes on peaks of its inputs' noise, as play does: half of
+    the bias, by how another noise as large moves them (simulation extrapolation, Cook and Stefanski 1994), if it grows as the
+    standard deviation of the noise does."""
+    more = [problem.noisier(r) for r in fitted_to]
+    if all(one is r for one, r in zip(more, fitted_to, strict=True)):
+        return np.zeros(len(model.frees))
+    moved = model.jacobian.T @ (stacked(problem, model.values, model.effects, more) - model.residuals)
+    return 0.5 / (np.sqrt(2.0) - 1.0) * inverse_of(model.jacobian.T @ model.jacobian) @ moved
 
 
 def inverse_of(squares: np.ndarray) -> np.ndarray:
@@ -377,16 +388,18 @@ def out_of_dents(problem: Problem, model: Fit, recordings: Sequence[Recording], 
     """``model``, or fits (``fit``) from the best of points beside it, as long as they leave less.
 
     Where a link bounces in its play, sticks or is limited, the error has dents in which the solver stops, a fifth of the play off
-    the truth. One coordinate at a time is moved by ``_ASIDE``, the others stay. ``recordings``: those of ``model``."""
-    own = model.frees if any("." in f.name for f in model.frees) else ()
+    the truth. One coordinate at a time is moved by ``_ASIDE``; the others stay, or follow as the derivatives have it, such as a
+    spring beside its play. ``recordings``: those of ``model``."""
+    own = [k for k, f in enumerate(model.frees) if any("." in f.name for f in model.frees)]
     candidates = chosen(problem, model.names)
     for _ in range(_DENTS if own else 0):
-        beside = []
-        for f in own:
-            to = np.clip(
-                f.coordinate(model.values[f.name]) + np.array(_ASIDE), f.coordinate(f.low), f.coordinate(f.high)
-            )
-            beside += [model.values | {f.name: f.value(c)} for c in to]
+        here = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
+        inverse, alone = inverse_of(model.jacobian.T @ model.jacobian), np.eye(len(here))
+        ways = [way for k in own for way in (alone[k], inverse[k] / inverse[k, k])]
+        points = [here + aside * way for way in ways for aside in _ASIDE]
+        beside = [
+            model.values | {f.name: f.value(c) for f, c in zip(model.frees, point, strict=True)} for point in points
+        ]
         cases = [(v, problem.prepare(v, [c.make(v) for c in candidates], recordings)) for v in beside]
         errors = np.mean(np.square(stacked_all(problem, cases, recordings)), axis=1)
         if errors.min() > (_DEEPER * model.error) ** 2:

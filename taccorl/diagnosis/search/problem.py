@@ -175,6 +175,8 @@ class Problem(Protocol):
     loop_s: float
     """Period [s] of a drive's loop that the file states and whose rate is no multiple of the rows'; 0: none. ``simulate`` then
     takes ``loop_waits_s``, how long a row's target waits for the next period, beside the numbers of ``base``."""
+    other_gain: Free | None
+    """A stated gain that ``simulate`` takes beside the numbers of ``base``, where effects look like another value of it."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
@@ -194,6 +196,10 @@ class Problem(Protocol):
         effects."""
         ...
 
+    def noisier(self, recording: Recording) -> Recording:
+        """``recording`` with the noise of its measured inputs once more; itself if they have none."""
+        ...
+
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
@@ -208,6 +214,7 @@ class WithoutMaps:
 
     at_once = 1
     loop_s = 0.0
+    other_gain: Free | None = None
 
     def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """Simulate one case after another, (T, C) each."""
@@ -215,6 +222,10 @@ class WithoutMaps:
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Does nothing."""
+
+    def noisier(self, recording: Recording) -> Recording:
+        """Return ``recording`` unchanged."""
+        return recording
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
@@ -269,6 +280,15 @@ def with_scale(problem: Problem) -> Problem | None:
         return None
     held = {"inertia": True, EFFORT_SCALE: False}
     return with_frees(problem, lambda f: dataclasses.replace(f, held=held.get(f.name, f.held)))
+
+
+def with_other_number(problem: Problem) -> dict[str, Problem]:
+    """Number whose value in the file may be off where an effect seems to be missing → ``problem`` in which it is fitted."""
+    found = {} if (scaled := with_scale(problem)) is None else {EFFORT_SCALE: scaled}
+    if (gain := problem.other_gain) is not None:
+        found[gain.name] = copy.copy(problem)
+        found[gain.name].base = (*problem.base, gain)
+    return found
 
 
 Progress = Callable[[str], None]

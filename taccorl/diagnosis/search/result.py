@@ -197,8 +197,9 @@ class Diagnosis:
     rivals: dict[str, tuple[str, ...]]
     """Added effect → other effects that fit these recordings as well in its place, among them more general forms of it, which
     have more parameters."""
-    or_scale: bool = False
-    """Whether all efforts by one factor, a wrong torque constant, explain as much as the added effects."""
+    or_number: tuple[str, float] = ("", 1.0)
+    """Number of the file that explains as much as the added effects, ``effort_scale`` or ``kd``, and the factor by which it is
+    off then; empty if none does."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]

@@ -37,7 +37,7 @@ from taccorl.diagnosis.search.problem import (
     Stopped,
     Values,
     no_progress,
-    with_scale,
+    with_other_number,
 )
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.standing_out import Place, places
@@ -81,16 +81,16 @@ def diagnose(
     """
     began = time.process_time()
     how = (fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
-    fits, by_scale = Fits(problem, *how), None
-    if not fits.at_floor(fits.base) and (scaled := with_scale(problem)) is not None:
-        by_scale = own if (own := Fits(scaled, *how)).at_floor(own.base) else None
-    if by_scale is not None and by_scale.base.numbers <= fits.base.numbers:
-        fits, by_scale = by_scale, None
+    fits = Fits(problem, *how)
+    others = {} if fits.at_floor(fits.base) else {n: Fits(p, *how) for n, p in with_other_number(problem).items()}
+    number, other = next(((n, own) for n, own in others.items() if own.at_floor(own.base)), ("", None))
+    if other is not None and other.base.numbers <= fits.base.numbers:
+        fits, other = other, None
     fits.problem.learn(fits.first.values)
     beam = Beam(fits, [name for name in fits.problem.candidates if name not in without])
     answer, removed, remarks = beam.pruned(beam.search())
-    if by_scale is not None and better(by_scale.base, answer, fits.config):
-        fits, by_scale, beam = by_scale, None, Beam(by_scale, beam.names)
+    if other is not None and better(other.base, answer, fits.config):
+        fits, other, beam = other, None, Beam(other, beam.names)
         answer, removed, remarks = beam.pruned(beam.search())
     steps = beam.steps(answer)
     rivals = beam.rivals(answer, steps)
@@ -104,6 +104,7 @@ def diagnose(
     changed = changed_numbers(fits, model, beam.names)
     if fits.problem is problem:  # the scale was fitted anyway, beside gains that are stated
         changed = tuple(c for c in changed if c.name != EFFORT_SCALE or abs(np.log(c.after)) > np.log(SCALE_OFF))
+    tied = other is not None and fits.added(answer) and refusal(answer, other.base, fits.config)
     standing = fits.standing_out(answer) or fits.standing_out(answer, test)
     return Diagnosis(
         status=_status(fits, answer, changed, bool(standing)),
@@ -112,7 +113,7 @@ def diagnose(
         changed=changed,
         effects=tuple(_described(fits, model, errors, without_it)),
         offers=tuple(_offers(beam, answer, rivals, test)),
-        or_scale=by_scale is not None and bool(fits.added(answer) and refusal(answer, by_scale.base, fits.config)),
+        or_number=(number, other.first.values[number] / other.given[number]) if other and tied else ("", 1.0),
         present=fits.present,
         base=_base(model),
         start=fits.given,

@@ -1,5 +1,6 @@
 """Effects in the gear, between motor and link: play, and a spring. Controller and encoder are on the motor's side."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -54,6 +55,12 @@ class JointCompliance(JointEffect):
 
     compliance_rad_per_nm: float = number("c", "rad/(N·m)", 0, 0.001, (0, 0.05), "a choice: 1e3 N·m/rad")
     damping_s: float = number("κ", "s", None, 0.002, (0, 0.05), "a choice: lightly damped")
+
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Start values of a search, parameter → value each: also gears as soft as the drive, and three times as soft."""
+        soft = [times * seen["drive_rad_per_nm"] for times in (1.0, 3.0) if "drive_rad_per_nm" in seen]
+        return [*super().starts(seen), *({"compliance_rad_per_nm": c} for c in soft)]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for motor in self.chosen(spec):

@@ -28,6 +28,8 @@ _POWERS = {  # of force unit and length unit in each unit of a parameter
 _SLIDE = {"N·m": "N", "rad": "m", "kg·m²": "kg"}
 OF_A_TURN = ("encoder_eccentricity", "unbalance")
 """Effects that repeat with each turn of a joint; a linear axis does not have them."""
+SOFT = 5.0
+"""Compliance that a gear may have in multiples of the drive's; of series elastic actuators it is 0.1 to 3. A choice."""
 WAVE_SHARE = 0.25
 """Share w of a slide's length unit that stands for 1 rad in periodic forces (magnets, a screw): wave numbers 2π / pitch are
 6 / w … 200 / w, pitches 0.8 to 26 % of a stroke. A choice."""
@@ -42,6 +44,8 @@ class Scale:
     """Factor on forces, N·m or N."""
     length: float = 1.0
     """Factor on positions, rad or m."""
+    drive: float = 0.0
+    """Compliance of the drive, 1 / K_p [rad/(N·m) or m/N]; a gear may be ``SOFT`` times as soft whatever its force. 0: none."""
 
     @property
     def wave(self) -> float:
@@ -81,10 +85,13 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     for p in base.parameters():
         ends = {key: getattr(p, key) for key in ("absent", "low", "high", "typical")}
         number = {k: v if v is None or not math.isfinite(v) else v * factors[p.name] for k, v in ends.items()}
+        if p.unit == "rad/(N·m)":
+            number["high"] = max(p.high * factors[p.name], SOFT * scale.drive)
         changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
-        units = {"nm": scale.force, "rad": scale.length, "rad_per_s": scale.length}
+        units = {"rad_per_nm": scale.length / scale.force, "nm": scale.force, "rad": scale.length}
+        units["rad_per_s"] = scale.length
         own = {
             key: value / next((u for end, u in units.items() if key.endswith(f"_{end}")), 1.0)
             for key, value in seen.items()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +15,8 @@ from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 
 RATE_HZ, DT_S = 200, 1e-5
-SERVO = AxisConfig(
-    name="servo",
-    unit="rad",
-    inertia=0.02,
-    law="pwm",
-    kp=6.0,
-    supply_v=12.0,
-    resistance_ohm=4.0,
-    torque_nm_per_a=1.0,
-    emf_v_s_per_rad=1.1,
-    lever_m=0.15,
-)
+WINDING: dict[str, Any] = {"supply_v": 12.0, "resistance_ohm": 4.0, "torque_nm_per_a": 1.0, "emf_v_s_per_rad": 1.1}
+SERVO = AxisConfig(name="servo", unit="rad", inertia=0.02, law="pwm", kp=6.0, lever_m=0.15, **WINDING)
 
 
 def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0) -> Measurement:
@@ -68,6 +59,54 @@ def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
     assert found.effort[-1] == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
     stiff = dataclasses.replace(SERVO, emf_v_s_per_rad=1e-6)
     assert np.abs(answer(stiff, m).reported - truth).max() > 0.05, "without back-EMF it is much faster"
+
+
+def sampled(
+    target: np.ndarray, axis: AxisConfig, filter_s: float = 0.0, dead: float = 0.0, gain: float = 1.0
+) -> np.ndarray:
+    """(T,) position of an axis of law impedance or pwm whose loop of ``loop_hz`` computes its speed from two readings, smooths it
+    over ``filter_s`` and holds its output; ``dead``: half the dead band [rad], ``gain``: factor on negative torques."""
+    every, clips = round(1.0 / (axis.loop_hz or 1.0) / DT_S), axis.law == "pwm"
+    most = axis.stall_nm if clips else math.inf
+    state = {"n": 0, "seen": 0.0, "speed": 0.0, "asked": 0.0}
+
+    def torque(goal: float, q: float, v: float) -> float:
+        if state["n"] % every == 0:
+            fresh = (q - state["seen"]) * (axis.loop_hz or 1.0)
+            share = 1.0 - math.exp(-every * DT_S / filter_s) if filter_s else 1.0
+            state["speed"] += share * (fresh - state["speed"])
+            error = math.copysign(max(abs(goal - q) - dead, 0.0), goal - q)
+            asked = axis.loop_gains.kp * error - axis.loop_gains.kd * state["speed"]
+            state.update(seen=q, asked=min(max(asked, -most), most))
+        state["n"] += 1
+        drawn = state["asked"] - axis.back_emf * v
+        return drawn * (gain if drawn < 0.0 else 1.0)
+
+    return integrated(target, torque, axis.inertia)
+
+
+QUICK = dataclasses.replace(SERVO, kd=0.1, loop_hz=1000.0, lever_m=0.0)
+ARM = AxisConfig(name="servo", unit="rad", inertia=0.002, kp=3.0, kd=0.08, loop_hz=1000.0)
+
+
+@pytest.mark.parametrize(
+    ("axis", "filter_s", "late_s", "effect", "most"),
+    [
+        (QUICK, 0.0, 0.0, {}, 3e-4),
+        (QUICK, 3e-3, 2.53e-3, {}, 8e-4),  # the mean age of the filter's readings is 1 ms · e⁻⅓ / (1 − e⁻⅓)
+        (QUICK, 0.0, 0.0, {"dead": 0.02}, 8e-4),
+        (ARM, 0.0, 0.0, {"gain": 0.7}, 6e-4),
+    ],
+)
+def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(axis, filter_s, late_s, effect, most):
+    """Steps. At the end of the duty only the back-EMF damps, at once; a gain of one direction is that of the damping, too; a
+    target that leaves a dead band acts at once."""
+    target = np.select([np.arange(400) < k for k in (20, 100, 180, 300)], [0.0, 0.8, -0.3, -0.25], 0.5)
+    truth = sampled(target, axis, filter_s, **effect)
+    own = [("error_deadband", "width_rad", "dead"), ("direction_gain", "factor", "gain")]
+    entries = tuple(EffectEntry(name, {p: effect[k]}) for name, p, k in own if k in effect)
+    found = answer(dataclasses.replace(axis, speed_late_s=late_s, effects=entries), recording(target))
+    assert np.abs(found.reported - truth).max() < most, np.abs(found.reported - truth).max()
 
 
 def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():

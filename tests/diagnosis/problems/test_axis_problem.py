@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_rows import of_signal
+from scipy.linalg import expm
 from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N, logged, recorded_slide, simulated
 
 from taccorl.alignment.checks.telemetry import check_names
@@ -318,8 +319,8 @@ def of_a_sampled_loop(
     position_m: float = 1e-7,
 ) -> Measurement:
     """The slide under a loop of 1 kHz: its speed is the mean of ``speed_rows`` differences of positions, its force is held for a
-    row and logged with the row whose target and position it answers. It is in motion when the log begins."""
-    time_s, parts, damping = np.arange(6000) / 1000, 20, 150.0
+    row and logged with the row whose target and position it answers. It is in motion when the log begins, after 0.25 s."""
+    time_s, parts, damping = np.arange(-250, 6000) / 1000, 20, 150.0
     target = 0.1 * np.sin(2 * np.pi * 0.8 * time_s) + 0.004 * np.sin(2 * np.pi * 4 * time_s)
     dt_s, at, speed = 1e-3 / parts, 0.0, 0.1 * 2 * np.pi * 0.8 + 0.004 * 2 * np.pi * 4
     rows = []
@@ -333,8 +334,9 @@ def of_a_sampled_loop(
             free = speed + dt_s * (force - damping * speed) / MASS_KG
             speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
             at += dt_s * speed
+    target = target[250:]
     noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [position_m, 0.1]
-    position, force = (np.array(rows) + noise).T[:, :, None]
+    position, force = (np.array(rows[250:]) + noise).T[:, :, None]
     return dataclasses.replace(simulated("log", 0.1, 0.6, 1), target=target[:, None], measured=position, effort=force)
 
 
@@ -350,7 +352,7 @@ def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows:
     names = ("coulomb_friction", "viscous_friction")
     start = problem.start | {"coulomb_friction.torque_nm": 10.0, "viscous_friction.damping_nms_per_rad": 100.0}
     found = best_fit(problem, problem.fit, names, [start], 30).values
-    assert found["speed_late_s"] == pytest.approx(late_s, abs=1e-4)
+    assert found["speed_late_s"] == pytest.approx(late_s, abs=1.2e-4)
     assert found["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.02)
     assert found["viscous_friction.damping_nms_per_rad"] == pytest.approx(150.0, rel=0.1)
     assert found["inertia"] == pytest.approx(MASS_KG, rel=0.02)  # timing to the first order of a loop's period
@@ -453,7 +455,8 @@ def test_gains_may_move_a_little_where_effort_tells_them_and_not_at_all_without(
     assert list(free) == ["inertia", "torque_ff", "weight_cos", "target_late_s", "loop_s", "kp", "kd"]
     assert free["kp"].high / free["kp"].start == pytest.approx(GAINS_WITHIN)
     silent = tuple(dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit)
-    assert [f.name for f in AxisProblem(AXIS, Measurements(silent)).base] == ["inertia", "torque_ff", "target_late_s"]
+    silent_base = [f.name for f in AxisProblem(AXIS, Measurements(silent)).base]
+    assert silent_base == ["inertia", "torque_ff", "target_late_s", "loop_s"]
     assert problem.effort and problem.fit[0].floor == pytest.approx([NOISE_M, NOISE_N], rel=0.1)
     assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
     peak = np.abs(np.gradient(slide.fit[0].target[:, 0], 1e-3)).max()
@@ -580,3 +583,32 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
     assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"
     if force_n(found.after, problem.test) > 3.6 or abs(found.after.values["inertia"] - 95.1) > 2.0:
         pytest.xfail("not reached with the file's gains: 95.1 ± 2 kg, force errors of 3.6 N (test), 2.2 N (validation)")
+
+
+def of_a_soft_gear(name: str, hz: float, seed: int, repeat_of: str | None = None) -> Measurement:
+    """8 s of a motor of 0.05 kg·m², held by 150 N·m/rad and 5 N·m·s/rad, that moves a link of 0.15 kg·m² through a spring of 50
+    N·m/rad and 0.15 N·m·s/rad, without a sampled loop; noise of 0.02 mrad and 0.05 N·m."""
+    time_s, turn = np.arange(1600) / 200, np.zeros((4, 5))
+    turn[0], turn[2] = [0, 1, 0, 0, 0], [0, 0, 0, 1, 0]
+    turn[1] = np.array([-200.0, -5.15, 50.0, 0.15, 150.0]) / 0.05
+    turn[3] = np.array([50.0, 0.15, -50.0, -0.15, 0.0]) / 0.15
+    step = expm(np.vstack([turn, np.zeros(5)]) / 200)
+    target, state, rows = 0.1 * np.sin(2 * np.pi * hz * time_s**2) * np.clip(2 * time_s - 1, 0, 1), np.zeros(5), []
+    for goal in target:
+        rows.append((state[0], 150.0 * (state[4] - state[0]) - 5.0 * state[1]))
+        state[4] = goal
+        state = step @ state
+    position, torque = (np.array(rows) + np.random.default_rng(seed).standard_normal((1600, 2)) * [2e-5, 0.05]).T
+    return of_signal(name, 200.0, target, position, "hip", effort=torque, repeat_of=repeat_of)
+
+
+def test_a_gear_three_times_as_soft_as_its_drive_is_found():
+    """Whatever the drive's greatest torque: a tenth of 60 N·m alone would end the range at 1 / 120 rad/(N·m)."""
+    axis = AxisConfig(name="hip", unit="rad", inertia=0.2, rotor_inertia=0.05, kp=150.0, kd=5.0, effort_limit=60.0)
+    fit_to = (of_a_soft_gear("one", 0.2, 1), of_a_soft_gear("again", 0.2, 2, "one"))
+    problem = AxisProblem(axis, Measurements(fit_to, (of_a_soft_gear("other", 0.15, 3),)))
+    without = {*problem.candidates} - {"joint_compliance", "coulomb_friction", "torque_lag"}
+    found = diagnose(problem, problem.fit, problem.validation, without=sorted(without))
+    assert found.names == ("joint_compliance",) and found.errors["after"]["validation"] < 1.3
+    low, high = found.intervals["joint_compliance.compliance_rad_per_nm"]
+    assert 0.0198 < low < high < 0.0202

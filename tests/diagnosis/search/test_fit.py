@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_problem import MadeProblem, Ripple, Square, record
+from made_problem import MadeProblem, Ripple, Square, drive, record
 
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
 from taccorl.diagnosis.search.fit import FAR, FINE, fit, moved_by, out_of_dents, over_own_scale, residuals, rms
@@ -92,6 +92,52 @@ def test_a_fit_goes_on_from_a_dent_that_it_stopped_in(start):
     assert found.error < 1.0 and abs(found.values["ripple.strength"] - 2.0) < 0.05
     smooth = fit(MadeProblem(Ripple), recording, ("ripple",), begun)
     assert out_of_dents(MadeProblem(Ripple), smooth, recording, 30) is smooth
+
+
+class Furrowed(MadeProblem):
+    """Rows hold the sum of the strength s and the offset o, 30 (s + o − 2.4): a furrow, with dents along s."""
+
+    def simulate(self, base, effects, recording):
+        strength = vars(effects[0])["strength"]
+        dents = 0.06 * (1.0 - np.cos(40.0 * (strength - 2.0))) + 0.6 * abs(strength - 2.0)
+        wave = Ripple.signal(recording.time_s, recording.data)
+        return (
+            3.0 * drive(recording.time_s, recording.data) + 30.0 * (strength + base["offset"] - 2.4) + dents * wave
+        )[:, None]
+
+
+def test_a_fit_leaves_a_dent_along_a_furrow_of_two_numbers():
+    """The dents are 2π / 40 = 0.157 apart; a strength that moves alone by 0.02 leaves 6 noise floors."""
+    recording = [record(0, offset=0.0)]
+    stopped = fit(Furrowed(Square), recording, ("square",), {"square.strength": 2.3, "offset": 0.1}, step=FINE)
+    found = out_of_dents(Furrowed(Square), stopped, recording, 30, FINE)
+    assert abs(stopped.values["square.strength"] - 2.0) > 0.1
+    assert found.values["square.strength"] == pytest.approx(2.0, abs=0.05)
+    assert found.values["offset"] == pytest.approx(0.4, abs=0.05)
+
+
+class Peaks(MadeProblem):
+    """gain × the largest input so far; ``data`` are the inputs (T,) with noise of 0.02."""
+
+    base = MadeProblem.base[:1]
+
+    def simulate(self, base, effects, recording):
+        return base["gain"] * np.maximum.accumulate(recording.data)[:, None]
+
+    def noisier(self, recording):
+        noise = np.random.default_rng(9).normal(0.0, 0.02, len(recording.data))
+        return dataclasses.replace(recording, data=recording.data + noise)
+
+
+def test_an_interval_holds_a_gain_that_the_peaks_of_an_input_s_noise_make_seem_smaller():
+    """Inputs of 1 … 5, whose peaks are about 3 × 0.02 higher: 2 % of 3, and noise of 0.1 in 2000 rows has 0.02 %."""
+    inputs = np.repeat(np.arange(1.0, 6.0), 400)
+    seen = inputs + np.random.default_rng(8).normal(0.0, 0.02, 2000)
+    recording = [dataclasses.replace(record(0, gain=0.0, offset=0.0, extra=3.0 * inputs), data=seen)]
+    model = fit(Peaks(), recording, (), {}, step=FINE)
+    moved = moved_by(Peaks(), model, recording, recording, np.full(1, FINE))
+    low, high = dataclasses.replace(model, moved=moved).intervals()["gain"]
+    assert model.intervals()["gain"][1] < 2.98 and 2.8 < low < 3.0 < high < 3.1
 
 
 def test_a_number_at_its_bound_is_said_to_be_there():

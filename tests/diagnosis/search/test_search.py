@@ -476,9 +476,36 @@ class Scaled(MadeProblem):
 def test_one_factor_on_all_efforts_is_told_beside_an_effect_of_one_number_and_in_place_of_one_of_two(kind, names):
     fit, validation = ([record(k, gain=4.5)] for k in (0, 1))
     found = diagnose(Scaled(kind), fit, validation)
-    assert found.names == names and found.or_scale == bool(names)
+    assert found.names == names and found.or_number[0] == EFFORT_SCALE * bool(names)
     assert [c.after for c in found.changed] == pytest.approx([1.5] * (not names), rel=0.01)
     assert "one factor" in verdict("it", found).finding
+
+
+class Damped(MadeProblem):
+    """measured = gain × drive + offset + effects + (kd − 2) × a ripple, of which the file states kd = 2."""
+
+    other_gain: Free | None = Free(name="kd", unit="N·m·s/rad", start=2.0, low=0.2, high=20.0, log=True)
+
+    def simulate(self, base, effects, recording):
+        more = (base.get("kd", 2.0) - 2.0) * Ripple.signal(recording.time_s, recording.data)
+        return super().simulate(base, effects, recording) + more[:, None]
+
+
+@pytest.mark.parametrize(("kd", "names"), [(3.2, ("ripple",)), (1.2, ())])
+def test_another_gain_than_the_stated_one_is_told_beside_the_effect_that_it_looks_like_and_alone_where_none_does(
+    kd, names
+):
+    """A ripple has a strength of 0 or more, so that it stands for more of the gain, and not for less."""
+    fit, validation = ([record(k, extra=(kd - 2.0) * Ripple.signal(np.arange(2000) / 200.0, k))] for k in (0, 1))
+    found = diagnose(Damped(Ripple), fit, validation)
+    words = verdict("it", found).finding
+    assert found.names == names
+    if names:
+        assert found.or_number == ("kd", pytest.approx(1.6, rel=0.01))
+        assert f"kd of the file is off by a factor of {found.or_number[1]:.4g}" in words
+    else:
+        assert [(c.name, c.after) for c in found.changed] == [("kd", pytest.approx(1.2, rel=0.01))]
+        assert found.status == "numbers_off" and "kd of the file is off" in words
 
 
 Cube = kind("cube", lambda t, seed: drive(t, seed) ** 3, Square)
