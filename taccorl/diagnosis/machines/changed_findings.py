@@ -74,8 +74,9 @@ def placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapp
     if TORQUE_FF.name not in d.base:
         text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
-    or_scale = d.or_scale and not any(EFFORT_SCALE in names for names in stands_for.values())
-    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_scale=or_scale)
+    of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())
+    number = ("", 1.0) if of_mass else d.or_number
+    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_number=number)
     return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
