@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_119,
     "taccorl/cli": 5_176,
     "taccorl/data": 8_806,
-    "taccorl/diagnosis": 11_396,
+    "taccorl/diagnosis": 11_397,
     "taccorl/episodes": 4_930,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
