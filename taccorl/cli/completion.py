@@ -51,8 +51,11 @@ def _field_names(module: str, name: str) -> list[str]:
     names = [n for base in node.bases if isinstance(base, ast.Name) for n in _field_names(module, base.id)]
     if any(isinstance(base, ast.Attribute) and base.attr == "ChoiceRegistry" for base in node.bases):
         names.append("type")
-        kinds = [n for n in _nodes(module) if isinstance(n, ast.ClassDef) and name in map(ast.unparse, n.bases)]
-        names += [n for kind in kinds for n in _own_names(module, kind)]
+        kinds = {name}  # and, in the order of the file, what is derived from one of them
+        for n in _nodes(module):
+            if isinstance(n, ast.ClassDef) and kinds & {*map(ast.unparse, n.bases)}:
+                kinds.add(n.name)
+                names += _own_names(module, n)
     return list(dict.fromkeys([*names, *_own_names(module, node)]))
 
 

@@ -194,7 +194,7 @@ def check_idle(m: Motion, touch: np.ndarray) -> Iterator[Finding]:
         where, time_s = "start" if first == 0 else "end" if end == len(still) else "middle", (end - first) / m.fps
         if time_s >= IDLE_S[where]:
             text = f"nothing moves for {time_s:.1f} s at the {where} ({place((first, end), m.fps)}; no joint by more "
-            text += f"than {STILL_RAD:g} rad): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
+            text += f"than {STILL_RAD:g} rad in {STILL_WINDOW_S:g} s): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
             yield finding("idle", STATE, text, (first, end))
 
 
