@@ -6,16 +6,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_119,
+    "taccorl/alignment": 15_145,
     "taccorl/cli": 5_179,
-    "taccorl/data": 8_806,
+    "taccorl/data": 8_808,
     "taccorl/diagnosis": 11_397,
     "taccorl/episodes": 4_930,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_202,
     "taccorl/policies": 3_462,
-    "taccorl/report": 2_482,
+    "taccorl/report": 2_489,
     "taccorl/rl": 2_479,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_558,
     "taccorl/views": 2_550,
-    "tests": 56_593,
+    "tests": 56_615,
     "pipelines": 6_242,
 }
 MOST_LINES_OF_A_FILE = 500

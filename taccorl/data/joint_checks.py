@@ -193,9 +193,11 @@ def check_idle(m: Motion, touch: np.ndarray) -> Iterator[Finding]:
     for first, end in runs(still):
         where, time_s = "start" if first == 0 else "end" if end == len(still) else "middle", (end - first) / m.fps
         if time_s >= IDLE_S[where]:
-            text = f"nothing moves for {time_s:.1f} s at the {where} ({place((first, end), m.fps)}; no joint by more "
-            text += f"than {STILL_RAD:g} rad in {STILL_WINDOW_S:g} s): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
-            yield finding("idle", STATE, text, (first, end))
+            text = (
+                f"nothing moves for {time_s:.1f} s at the {where} ({place((first, end), m.fps)}; no joint by more than "
+            )
+            text += f"{STILL_RAD:g} rad in {STILL_WINDOW_S:g} s): a policy learns to wait; record again without the rest, or "
+            yield finding("idle", STATE, f"{text}{LEAVE_OUT}", (first, end))
 
 
 FROZEN_S = 0.5  # Shortest time of bit-identical values that is reported [s]: 15 rows at 30 fps are no coincidence

@@ -76,7 +76,10 @@ def _judged(f: Finding) -> str:
 
 
 def _in_twin(d: Diagnosis) -> str:
-    return f"in the twin, with kp {d.base['kp']:.4g}" if "kp" in d.base else "in the twin"
+    times = (
+        d.base["kp"] / d.start["kp"] if "kp" in d.base else 1.0
+    )  # a law's own kp may be another one, as of a cascade
+    return "in the twin" if times == 1.0 else f"in the twin, with kp {times:.4g} times the stated one"
 
 
 def _values(e: Effect) -> str:

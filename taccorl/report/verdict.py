@@ -76,6 +76,8 @@ Level = Literal["high", "moderate", "low"]
 """Confidence."""
 FLOOR, LITTLE = SearchConfig().floor, SearchConfig().little
 """Largest errors [noise floors] that count as at the floor, and as little above it."""
+BELOW = 0.5
+"""Error [noise floors] below which the floor, of repeats that were not the same motion, is above what the twin leaves. A choice."""
 GONE = 0.2
 """Share of an effect's strength in the file below which an added effect is in place of it. A choice."""
 NEAR = 0.05
@@ -327,6 +329,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
     if kind in ("nothing_missing", "numbers_off") and max(fit, validation) > FLOOR:
         keep = f"fit recordings keep {fit:.2f} and validation recordings {validation:.2f} noise floors"
         yield f"{keep}, and no effect explains that"
+    if validation < BELOW:
+        yield f"at {validation:.2f} noise floors repeats differ by more than the twin is off; an effect below that is not found"
     if named and first <= LITTLE:
         yield (
             f"the whole gain is {first - validation:.2f} noise floors: without what was added the error is {first:.2f}, as "

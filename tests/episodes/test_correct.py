@@ -397,7 +397,9 @@ def test_nothing_is_written_where_nothing_was_corrected(tmp_path: Path) -> None:
     (tmp_path / "acted").mkdir()
     write_policy_episodes([success(its.scene_seeds[0])], tmp_path / "acted")
     store = Store(tmp_path / "store")
-    with pytest.raises(TaccorlError, match=r"no episode was corrected.*'success': 1.*--takeover=all"):
+    with pytest.raises(
+        TaccorlError, match=r"no episode was corrected.*episodes: 1 success; takeovers: none.*--takeover=all"
+    ):
         produce(dataclasses.replace(its, acted=(store.source(tmp_path / "acted"),)), tmp_path / "out", store, quiet)
     assert not (tmp_path / "out").exists()
 

@@ -243,18 +243,26 @@ def test_nothing_is_missing_is_not_sure_where_the_noise_floor_is_not_known(one, 
         assert v.level == level and "2 mrad; not known" in v.confidence and "a third time" in v.record_next
 
 
-@pytest.mark.parametrize("reason", ["test", "no test", "bound", "doubt", "disagree"])
+@pytest.mark.parametrize("reason", ["test", "no test", "bound", "doubt", "disagree", "repeats"])
 def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one, reason):
     after = one.errors["after"]
     errors = {
         "test": after | {"test": 2.34},
         "no test": {k: v for k, v in after.items() if k != "test"},
         "disagree": after | {"fit": 1.47, "validation": 0.92},
+        "repeats": after | {"fit": 0.31, "validation": 0.31},
     }
     d = changed(one, errors=one.errors | {"after": errors.get(reason, after)})
     d = changed(d, at_bound=("ripple.strength",)) if reason == "bound" else d
     v = verdict(PART, d, doubts=["velocity: not validated"] if reason == "doubt" else [])
-    said = {"test": "2.34", "no test": "no test rec", "bound": "strength", "doubt": "velocity", "disagree": "1.47"}
+    said = {
+        "repeats": "at 0.31",
+        "test": "2.34",
+        "no test": "no test rec",
+        "bound": "strength",
+        "doubt": "velocity",
+        "disagree": "1.47",
+    }
     assert v.level == "moderate"
     assert said[reason] in " ".join((v.confidence, *v.remarks))
     assert reason != "doubt" or "1 remark below" in v.confidence

@@ -62,10 +62,30 @@ STICK_ERRORS = 1.5
 rows: beyond it the friction would have given way. A choice."""
 
 
+FILLER, FILLER_LEAST = 5.0, 0.02
+"""A position of one row is no measurement if the way to it is so many times the longest way between other rows, and so long [rad,
+m], while the target stays. Choices: a joint that breaks free does not come back in the next row."""
+
+
+def _filled(values: np.ndarray, target: np.ndarray) -> int | None:
+    """Row of (T,) ``values`` that lies apart from its neighbours, or from its neighbour if it is the first or last one."""
+    way, last = np.abs(np.diff(values)), len(values) - 1
+    if last < 3 or not np.isfinite(way).all():
+        return None
+    k = int(way.argmax())
+    row = 0 if k == 0 else last if k == last - 1 else k + 1
+    around = slice(max(row - 1, 0), row + 1)
+    others = float(np.delete(way, range(*around.indices(last))).max())
+    moved = float(np.ptp(target[max(row - 3, 0) : row + 2]))
+    apart = float(way[around].min())
+    return row if apart > max(FILLER * others, FILLER_LEAST, 2.0 * moved) else None
+
+
 @check("not_finite", "error")
 @check("lost_samples", "error", needs="rows")
 def check_values(t: Trial) -> Iterator[Finding]:
-    """Find targets that are no numbers, angles that jump by a full turn, and rows without a measurement."""
+    """Find targets that are no numbers, angles that jump by a full turn, values that fill a row (a logger's zeros), and rows
+    without a measurement."""
     m = t.m
     for name, values in zip(m.signals, m.target.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
@@ -83,6 +103,12 @@ def check_values(t: Trial) -> Iterator[Finding]:
                 f"angle is wrapped. Unwrap the columns {name}.q and {name}.q_target (numpy.unwrap)"
             )
             yield find("unit", name, text, (int(turns[0]), int(turns[0]) + 2))
+        elif (row := _filled(values, m.target[:, m.column(name)])) is not None:
+            text = (
+                f"{name} is at {values[row]:.4g} {unit} in row {row} ({m.time_s[row]:.3f} s) alone, {FILLER:g} times as far from "
+                f"its neighbours as any other: a value that a logger fills in; {without(m, row)}"
+            )
+            yield find("not_finite", name, text, (row, row + 1))
     known = np.asarray(np.isfinite(m.measured))
     compared = np.asarray(known.any(axis=0))  # a signal that was never measured is not compared
     holes = runs(np.asarray(~known[:, compared].all(axis=1)))

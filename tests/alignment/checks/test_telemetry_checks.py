@@ -765,6 +765,18 @@ def test_a_wrapped_angle_is_named_and_a_fast_joint_is_not(clean):
     assert "unit" not in found(clean)
 
 
+@pytest.mark.parametrize("row", [0, 700, -1])
+def test_a_row_that_a_logger_filled_with_zero_is_named_and_a_joint_that_breaks_free_is_not(clean, row):
+    values = clean.measured[:, 4] - clean.measured[:, 4].mean() + 0.9  # the joint moves by less than that
+    filled = with_column(
+        clean, clean.signals[4], np.where(np.arange(clean.num_rows) == row % clean.num_rows, 0.0, values)
+    )
+    (finding,) = (f for f in check_measurement(filled) if f.severity == "error")
+    assert (finding.check, finding.rows) == ("not_finite", (row % clean.num_rows, row % clean.num_rows + 1))
+    free = with_column(clean, clean.signals[4], values + 0.5 * (np.arange(clean.num_rows) > 700))
+    assert "not_finite" not in found(free)
+
+
 def test_dropped_rows_are_counted_and_placed(clean):
     keep = np.delete(np.arange(clean.num_rows), [*range(700, 712), 900])
     text = text_of(some(clean, keep), "dropped_rows")
