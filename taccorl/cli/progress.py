@@ -86,7 +86,8 @@ class Steps:
 
     @contextmanager
     def until_interrupted(self) -> Iterator["Steps"]:
-        """The first Ctrl-C makes calls raise ``Stopped`` in every process, the second ends the command."""
+        """Context manager. After the first Ctrl-C, calls of this object raise ``Stopped``, in worker processes, too; a second one
+        ends the command."""
         if threading.current_thread() is not threading.main_thread():  # in which alone signals can be handled
             yield self
             return

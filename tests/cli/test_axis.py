@@ -144,7 +144,7 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench, said,
 
 @pytest.mark.parametrize("friction_n", [FRICTION_N, 0.0])
 def test_a_log_of_positions_and_efforts_alone_shows_the_friction(said, tmp_path, friction_n: float):
-    """Its size within 2 %, and no constant force besides; of a mass without friction nothing."""
+    """A friction of 12 N is found, within 2 % and without a constant force beside it; where there is none, nothing is found."""
     made(tmp_path, re.sub("kp: .*\nkd: .*\n", "law: effort\n", FILE), friction_n=friction_n, log=True)
     drive, found = tmp_path / "drive.yaml", tmp_path / "found"
     code, text = said("diagnose", tmp_path / "bench", f"--twin={drive}", f"--out={found}", FEW)

@@ -286,7 +286,7 @@ def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: P
 
 
 def test_ctrl_c_ends_with_what_was_found(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd):
-    """The first one once the friction is in the model; where nothing was found yet, as everywhere."""
+    """After the first round has added the friction, Ctrl-C keeps it; before that nothing is written."""
     words = ["diagnose", f"--measurements={sweeps}", f"--twin={sweeps.parent / 'twin.yaml'}", f"--joints=[{SIGNAL}]"]
     words += [few("coulomb_friction", "encoder_offset"), "--until=noise_floor"]
 

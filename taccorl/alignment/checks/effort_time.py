@@ -48,9 +48,9 @@ STATED_LEFT, SHARES = (1.2, 2.0), (-0.5, 1.5)
 """Fitted gains are reported if the stated gains, with the best delay and lag of the targets, leave a residual of at least 1.2
 times theirs in efforts, or 2 times in accelerations where no effort was recorded, and the share r is in this range. Choices."""
 ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
-"""Largest residual, as a share of the RMS effort, of gains that are fitted to one recording and compared with those of others;
-ratio of two of them from which they are not of one machine (with one of 7 effects: at most 1.34); and least ratio of K_p to the
-stated one that is reported where accelerations stand for efforts. Choices."""
+"""Choices for gains that are fitted to each recording alone: largest residual of such a fit, as a share of the RMS effort; ratio
+of the gains of two recordings from which on they are of two machines (one of 7 effects made at most 1.34); and, where efforts are
+computed from accelerations, least ratio of the fitted K_p to the stated one that is reported."""
 LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)
 """Lags and delays of targets that are tried."""
 ALIKE = 1e-3

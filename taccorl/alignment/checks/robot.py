@@ -20,8 +20,8 @@ from taccorl.data.finding import Finding, listed
 BEYOND = 0.02
 """Share of a joint's range by which a measured position may exceed its limits."""
 DEGREES, NEAR_DEGREES = math.pi / 180, 0.3
-"""Radians in a degree; and how far the natural logarithm of (fitted inertia / stated inertia) may be from that of this number for
-degrees to be named as the cause, a choice."""
+"""Radians in a degree. Where the fitted inertia over the stated one is this number, within a factor of exp(0.3) (a choice), the
+positions are in degrees."""
 EFFORT_BEYOND = 1.5
 """Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0

@@ -30,7 +30,7 @@ GRAVITY_M_PER_S2 = 9.81
 SAME_RATE = 0.02
 """Largest share by which the rates of received and logged targets may differ to count as equal: stamps are rounded."""
 KEPT, KEPT_ROWS = 12, 200_000
-"""Largest number of newest responses, and of their rows, that a model keeps for each recording, as fits ask for some again."""
+"""Simulated responses to each recording that a model keeps, as fits ask for some again; and most rows of them in all."""
 GEAR_STEP_S = 2.5e-4
 """Longest physics step [s] of a joint with play or a spring in its gear (``Drive.midpoint``): an implicit step h damps a swing
 with ω by h ω / 2. At 71 Hz the damping ratio is 0.22 too large with steps of 1 ms, 0.06 with these."""

@@ -1,4 +1,4 @@
-"""Speed and position as the controller of a sampled loop knows them, to the second order of their age, for ``joint_kernel``.
+"""How late a sampled loop knows speed and position: its transfer function to the second order in s, for ``joint_kernel``.
 
 A loop of period T takes its speed from two readings and holds its output; a filter of time constant τ may smooth the speed. Its
 transfer function, 1 − D s + (τ² + τ T + 7/12 T²) s² with D = τ + T, is that of (1 − l s) / (1 + b s), which needs one state: a

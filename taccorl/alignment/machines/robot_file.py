@@ -50,7 +50,8 @@ class JointConfig(DriveLaw):
     loop_hz: float | None = None
     """Rate of the drive's control loop [Hz]."""
     command_hz: float | None = None
-    """Rate at which the drive receives targets [Hz], if they are logged more slowly: a replay then interpolates them linearly."""
+    """Rate at which the drive receives targets [Hz], if only some of them are logged: a replay interpolates rows linearly at this
+    rate. Without it, a target holds until the next row."""
     position_age_s: float = 0.0
     """Age of the measured position when the torque acts, beyond that of the loop's timing [s]; ``diagnose`` fits it."""
     effects: list[Effect] = field(default_factory=list)
@@ -322,7 +323,7 @@ def load_robot(path: Path) -> Robot:
 
 
 def _refuse_todo(path: Path) -> None:
-    """Raises SpecError, which names each line that still says ``TODO``, with its comment, which says what to write."""
+    """Raises SpecError: lines of the file still say ``TODO``. It quotes each with its comment, which says what to write."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

@@ -176,7 +176,7 @@ class Problem(Protocol):
     """Period [s] of a drive's loop that the file states and whose rate is no multiple of the rows'; 0: none. ``simulate`` then
     takes ``loop_waits_s``, how long a row's target waits for the next period, beside the numbers of ``base``."""
     other_gain: Free | None
-    """A stated gain that ``simulate`` takes beside the numbers of ``base``, where effects look like another value of it."""
+    """Gain of the file that is not fitted, but whose wrong value would look like an effect: the search tries it, too."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
@@ -224,7 +224,7 @@ class WithoutMaps:
         """Does nothing."""
 
     def noisier(self, recording: Recording) -> Recording:
-        """Return ``recording`` unchanged."""
+        """``recording`` itself: its inputs have no noise."""
         return recording
 
     def prepare(

@@ -152,7 +152,7 @@ class Effect:
     tell them apart, and which recording can."""
 
     range_by: ClassVar[str] = ""
-    """Ending of the message on a value out of bounds: keys of a file that change the bounds."""
+    """Words that end the error on a parameter out of its bounds: which keys of the axis file set them; empty if none does."""
     reduces_to: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect, without unit; at its lower bound both effects are equal. A fitted
     value less than 0.1 above that bound is rejected in favour of the simpler effect."""
