@@ -11,6 +11,7 @@ shows the chain on a CPU in minutes and learns nothing.
 ``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: learnt in the nominal twin, in the one that commands mend
 (surrogate ── diagnose --until=noise_floor), and in the surrogate, scored in it; ``--singly=true``: also in each effect alone.
 ``--scored_in=[late.yaml] --real=50 --sim_weight=[0,0.5,0.95]``: co-trained with 50 demonstrations of the surrogate.
+``--episodes=300 --corrections=700``: a second policy learns from 300 demonstrations and 700 corrections of the first.
 """
 
 import dataclasses
@@ -27,7 +28,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -35,15 +35,16 @@ import yaml
 
 from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, parsed, step
-from taccorl.cli import augment, collect, diagnose, execute, merge, surrogate
+from pipelines.surrogate_twin import is_folder, mended, named
+from taccorl.cli import augment, collect, execute, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
-from taccorl.cli.diagnose import DiagnoseConfig
+from taccorl.cli.correct import CorrectConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
 from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.cli.parse import command, shared_fields
-from taccorl.cli.surrogate import SurrogateConfig
+from taccorl.data.dataset import Dataset
 from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.episodes.sources.mimicgen.spec import mimic_spec_path
@@ -54,8 +55,7 @@ from taccorl.sim.effects.added import present
 from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.task import CLEARANCES_M, tasks
 from taccorl.sim.twin import TwinConfig
-from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
-from taccorl.surrogate.writing import PRESSES, SWEEPS, TWIN
+from taccorl.sim.twin_file import load_twin, save_twin
 from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 SMALL = ("--episodes=2", "--scored=2", "--executed=8", "--episode_length=12", "--workers=1", "--cache=host")
@@ -95,6 +95,9 @@ class LearnConfig:
     the parts, which only a simulator knows."""
     sim_weight: list[float] = field(default_factory=list)
     """α: weight of the twin's loss beside --real, 0.5 if not given. 0: those of --real alone are learnt from."""
+    corrections: int = 0
+    """Corrections of each policy (taccorl correct: the expert takes over at drawn times), from which, beside its demonstrations,
+    another policy learns."""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
@@ -137,10 +140,10 @@ class Made(NamedTuple):
 
     task: str
     dataset: Path
-    store: Path
-    """Folder of the store: intermediate results, decoded frames among them."""
+    asked: CollectConfig
+    """How the twin's demonstrations were made; its ``store`` has decoded frames among other intermediate results."""
     about: dict[str, Any]
-    """Of what they are: twin, sources, real, sim_weight."""
+    """Of what they are: twin, sources, real, sim_weight, corrected (how many are no corrections)."""
     robots: list[Path | None]
     """Twins to score in."""
 
@@ -190,7 +193,7 @@ def _check(config: LearnConfig) -> None:
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
     ones = ("executed", "episodes", "rows_per_picture", "workers", "scored")
     ones += ("batch_size", "physics_steps", "episode_length")
-    for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "sources": 0, "real": 0}).items():
+    for name, least in (dict.fromkeys(ones, 1) | dict.fromkeys(("seeds", "sources", "real", "corrections"), 0)).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
         numbers = value if isinstance(value, list) else [least if value is None else value]
@@ -202,8 +205,10 @@ def _check(config: LearnConfig) -> None:
     if not config.scored_in and ({"mended", "surrogate"} & {*config.twins} or config.singly or config.real):
         asked = "--singly" if config.singly else f"--real={config.real}" if config.real else f"--twins={config.twins}"
         raise SystemExit(f"{asked}: of which surrogate? Give its twin file as --scored_in=")
-    if config.real and (config.singly or len(config.episodes) > 1 or any(map(_is_folder, config.twins))):
+    if config.real and (config.singly or len(config.episodes) > 1 or any(map(is_folder, config.twins))):
         raise SystemExit(f"--real={config.real}: takes one number of --episodes, no --singly, and no folder of --twins")
+    if config.corrections and (config.real or any(map(is_folder, config.twins))):
+        raise SystemExit(f"--corrections={config.corrections}: takes no --real, and no folder of --twins")
     if not all(0 <= weight <= 1 for weight in config.sim_weight):
         raise SystemExit(f"--sim_weight={config.sim_weight}: shares of the loss, 0 … 1")
     if config.sim_weight and not config.real:
@@ -217,7 +222,7 @@ def _check(config: LearnConfig) -> None:
         raise SystemExit(str(error)) from error
     for name, known in (
         ("task", tuple(tasks)),
-        ("twins", ("nominal", "mended", "surrogate", *filter(_is_folder, config.twins))),
+        ("twins", ("nominal", "mended", "surrogate", *filter(is_folder, config.twins))),
         ("difficulty", tuple(CLEARANCES_M)),
         ("pictures", PICTURES),
         ("sensors", tuple(SENSORS)),
@@ -238,8 +243,10 @@ def _twins(config: LearnConfig) -> dict[Path | None, list[Path | None]]:
     scored: dict[Path | None, list[Path | None]] = {}
     for word in config.twins:
         for robot in config.scored_in or [None]:
-            made_in = Path(word) if _is_folder(word) else None if word == "nominal" or robot is None else robot
-            robots = scored.setdefault(mended(config, robot) if word == "mended" and robot else made_in, [])
+            made_in = Path(word) if is_folder(word) else None if word == "nominal" or robot is None else robot
+            if word == "mended" and robot:
+                made_in = mended(robot, config.out, config.workers)
+            robots = scored.setdefault(made_in, [])
             robots += [robot, *(_single(config, robot) if config.singly and robot and word == "nominal" else [])]
     return {made_in: list(dict.fromkeys(robots)) for made_in, robots in scored.items()}
 
@@ -258,41 +265,6 @@ def _single(config: LearnConfig, robot: Path) -> list[Path | None]:
     return [None, *files]
 
 
-def _is_folder(twin: str | Path) -> bool:
-    return any(Path(twin).glob("*.yaml"))
-
-
-def named(twin: Path) -> str:
-    """Name and digest of a twin file, or of a folder of them."""
-    files = sorted(twin.glob("*.yaml")) or [twin]
-    digests = "".join(twin_digest(load_twin(file)) for file in files)
-    return f"{twin.stem}_{(sha256(digests.encode()).hexdigest() if files != [twin] else digests)[:6]}"
-
-
-def mended(config: LearnConfig, robot: Path) -> Path:
-    """The twin that commands make of sweeps and presses of the surrogate ``robot``, where it is not there yet. It starts from the
-    nominal one, and nothing of ``robot`` but the recordings is read."""
-    folder = config.out / "surrogates" / named(robot)
-    done, twin = folder / f"mended_{robot.stem}.yaml", folder / "sweeps" / TWIN
-    if done.exists():
-        return done
-    folder.mkdir(parents=True, exist_ok=True)
-    for pads in ("no", "left", "right"):
-        name = "sweeps" if pads == "no" else f"{pads}_presses"
-        recorded, found = folder / name, folder / f"{name}_diagnosis"
-        if not recorded.exists():
-            design = "chirp" if pads == "no" else "pack"  # presses have none
-            step(surrogate.run, SurrogateConfig(secret=0, twin=robot, pads=pads, design=design, out=recorded))
-        if not (found / TWIN).exists():
-            data = recorded / (SWEEPS if pads == "no" else PRESSES)
-            asked = DiagnoseConfig(measurements=data, twin=twin, until="noise_floor", out=found)
-            asked = dataclasses.replace(asked, workers=config.workers, accept=["lost_samples"])  # as drivers lose some
-            step(diagnose.run, asked, (0, 1))  # 1: something is left that no effect explains
-        twin = found / TWIN
-    shutil.copy(twin, done.with_suffix(".unfinished"))
-    return done.with_suffix(".unfinished").rename(done)
-
-
 def datasets(config: LearnConfig) -> Iterator[Made]:
     """Make the demonstrations of every combination, as far as they are not there."""
     few, there = dataclasses.replace(config, episodes=[config.real]), set[tuple[Path, float]]()
@@ -303,15 +275,21 @@ def datasets(config: LearnConfig) -> Iterator[Made]:
         if many and not config.real:
             yield Made(task, *many, about, robots)
         for robot, weight in itertools.product(filter(None, robots), weights):
-            real, store = demonstrations(few, task, robot, domain="surrogate")
+            real, asked = demonstrations(few, task, robot, domain="surrogate")
             sim = [many[0]] if many and weight else []
             both = real.with_name(f"{sim[0].name if sim else 'nothing'}_and_{real.name}")
             if (both, weight) not in there:
-                frames: dict[str, Any] = {"pictures": "cache", "resolution": RESOLUTION}
-                step(merge.run, MergeConfig(real=[real], sim=sim, out=both, store=store, **frames))
+                _merge(config, both, sim, [real])
                 mixed = {"real": config.real, "sim_weight": weight} | ({} if sim else {"twin": "", "demonstrations": 0})
-                yield Made(task, both, store, about | mixed, [robot])
+                yield Made(task, both, asked, about | mixed, [robot])
             there.add((both, weight))
+
+
+def _merge(config: LearnConfig, out: Path, sim: list[Path], real: list[Path]) -> None:
+    asked = MergeConfig(
+        real=real, sim=sim, out=out, store=config.out / "store", pictures="cache", resolution=RESOLUTION
+    )
+    step(merge.run, asked)
 
 
 def demonstrations(
@@ -320,20 +298,22 @@ def demonstrations(
     made_in: Path | None,
     sources: int = 0,
     domain: Literal["twin", "surrogate"] = "twin",
-) -> tuple[Path, Path]:
+) -> tuple[Path, CollectConfig]:
     """Make the demonstrations of a task in a twin, if they are not there: the expert's own, or MimicGen's of ``sources`` of them.
-    ``domain``: surrogate, if the twin stands for the robot: other scenes, no poses of the parts. Returns the dataset's folder and
-    the store."""
-    folder, store, end = config.out / task, config.out / "store", f"_mimicgen_{sources}" if sources else ""
-    if made_in is not None and _is_folder(made_in):
+    ``domain``: surrogate, if the twin stands for the robot: other scenes, no poses of the parts. Returns the dataset's folder,
+    and how it was made."""
+    folder, end = config.out / task, f"_mimicgen_{sources}" if sources else ""
+    if made_in is not None and is_folder(made_in):
         files = sorted(made_in.glob("*.yaml"))
         each, workers = (math.ceil(whole / len(files)) for whole in (max(config.episodes), config.workers))
         some = dataclasses.replace(config, episodes=[each], workers=workers)
         with ThreadPoolExecutor(config.workers) as pool:
-            parts = [made for made, _ in pool.map(lambda file: demonstrations(some, task, file, sources), files)]
+            parts, (asked, *_) = zip(
+                *pool.map(lambda file: demonstrations(some, task, file, sources), files), strict=True
+            )
         both = f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{named(made_in)}{end}"
-        step(merge.run, MergeConfig(sim=parts, out=folder / both, store=store, pictures="cache", resolution=RESOLUTION))
-        return folder / both, store
+        _merge(config, folder / both, list(parts), [])
+        return folder / both, asked
     name, whole = ("", TwinConfig()) if made_in is None else (f"_{named(made_in)}", load_twin(made_in))
     is_robot = domain == "surrogate"
     end += "_as_robot" * is_robot
@@ -347,7 +327,7 @@ def demonstrations(
         source=ExpertSource(hands=config.hands),
         episodes=max(config.episodes),
         out=dataset,
-        store=store,
+        store=config.out / "store",
         difficulty=config.difficulty[0],
         twin=twin,
         pictures="cache",
@@ -382,17 +362,19 @@ def demonstrations(
             step(execute.run, ExecuteConfig(**shared_fields(own, ExecuteConfig) | done))
     except DatasetError as error:
         raise SystemExit(f"{error}\nother demonstrations need another --out") from error
-    return dataset, store
+    return dataset, own
 
 
 def _learned(config: LearnConfig, made: Made, settings: tuple[int, int, str, str], gpus: "queue.Queue[str]") -> Learned:
     """Train a policy on a GPU that is free, and score it in each of ``made.robots``."""
     seed, episodes, pictures, sensors = settings
-    words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={made.store}", f"--seed={seed}"]
+    words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={made.asked.store}", f"--seed={seed}"]
     changes = RANDOMISED if pictures == "randomised" else []
     words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors], *changes]
-    if episodes < max(config.episodes):
-        words.append(f"--dataset.episodes={json.dumps(list(range(episodes)))}")
+    corrected, most = made.about.get("corrected", episodes), max(config.episodes)
+    if corrected < most or corrected < episodes:  # corrections follow all demonstrations
+        ids = [*range(corrected), *range(most, most + episodes - corrected)]
+        words.append(f"--dataset.episodes={json.dumps(ids)}")
     features = (made.dataset / "meta" / "info.json").read_text(encoding="utf-8")
     if "observation.is_sim" in features:  # without real rows: merged of several twins
         words.append(f"--policy.sim_weight={made.about.get('sim_weight', 1):g}")
@@ -408,7 +390,30 @@ def _learned(config: LearnConfig, made: Made, settings: tuple[int, int, str, str
         gpus.put(gpu)
     cells = itertools.product(config.difficulty, config.executed, config.hide, made.robots)
     scores = [_scored(config, (made.task, pictures), training, about, cell, gpu) for cell in cells]
-    return Learned(training.policy, made.dataset, made.store, scores)
+    if config.corrections and "corrected" not in made.about:
+        better = _corrected(config, made, training, about, (pictures, gpu))
+        settings = seed, episodes + config.corrections, pictures, sensors
+        scores += _learned(config, better, settings, gpus).scores
+    return Learned(training.policy, made.dataset, made.asked.store, scores)
+
+
+def _corrected(config: LearnConfig, made: Made, training: Training, about: dict, acts: tuple[str, str]) -> Made:
+    """``made`` and behind it corrections of the policy ``training``, at least as many as are wanted. Raises SystemExit: fewer."""
+    fixes = made.dataset.with_name(f"{made.dataset.name}_corrections_{config.corrections}_of_{training.folder.name}")
+    choice = PolicyChoice(path=training.policy, n_action_steps=config.executed[0], device=config.score_device)
+    own = {"policy": choice, "hands": config.hands, "takeover": "all", "before_grasp": True, "out": fixes}
+    scenes = math.ceil(config.corrections / 3)  # of four corrections each, more than one may fail
+    own |= {"episodes": scenes, "per_episode": 4, "num_envs": math.ceil(scenes / config.workers)}
+    own |= {"policy_workers": config.workers, "episode_length": config.episode_length, "policy_pictures": acts[0]}
+    asked = CorrectConfig(**shared_fields(made.asked, CorrectConfig) | own)
+    if not fixes.exists():
+        words = [sys.executable, "-m", "taccorl.cli.main", *command("correct", asked)[1:]]
+        _logged(words, fixes.with_suffix(".log"), acts[1], about, one_thread=True)
+    if (there := Dataset(fixes).num_episodes) < config.corrections:
+        raise SystemExit(f"{fixes}: {there} corrections, fewer than --corrections={config.corrections}")
+    both = fixes.with_name(f"{fixes.name}_too")
+    _merge(config, both, [made.dataset, fixes], [])
+    return made._replace(dataset=both, about=made.about | {"corrected": about["demonstrations"]})
 
 
 def _scored(
@@ -471,6 +476,7 @@ def _row(score: Path) -> str:
     low, high = (100 * end for end in one["interval_95"])
     executed, hidden = score.name.split("_")[3], ", ".join(scenes["hidden"]) or "–"
     made = f"{about['demonstrations']}{' of {sources} sources'.format(**about) if 'sources' in about else ''}"
+    made += ", of the expert alone {corrected}".format(**about) if "corrected" in about else ""
     made += " + {real} of the surrogate, α = {sim_weight:g}".format(**about) if "real" in about else ""
     cells = [scenes["tasks"][0], about["sensors"], made, about["seed"]]
     cells += [scenes["pictures"], scenes["difficulty"], executed, hidden, f"{one['successes']} of {one['n']}"]

@@ -151,7 +151,8 @@ def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
     mixed = _grouped([{"stage": "", **r} for r in rows if "real" in r], "scored_in", "real", "sim_weight", "stage")
-    own = _grouped([row for row in seen if PLAIN.items() <= row.items() and "sources" not in row], "task", "sensors")
+    plain = [row for row in seen if PLAIN.items() <= row.items() and not {"sources", "corrected"} & row.keys()]
+    own = _grouped(plain, "task", "sensors")
     harder = [row for row in seen if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])]
     cells = _grouped(harder, "task", "pictures", "demonstrations", "difficulty", "executed", "sensors")
     table_1, table_2, table_3, table_4, table_5, table_6 = [], [], [], [], [], []
@@ -199,7 +200,7 @@ their number, each training (`*`: one). 0.5 mm of clearance, 8 actions executed 
 ![completed by demonstrations]({GRIPS.name})
 
 Clear pictures, 2500 steps (of 3500 demonstrations 3500). Of 10 demonstrations MimicGen made the others, with pushes
-and the expert in contact.
+and the expert in contact. Corrections: the expert takes over from a policy of the demonstrations.
 
 {_table(f"task | policy | grips | {' | '.join(map(str, DEMONSTRATIONS))} demonstrations", table_5)}
 
@@ -266,6 +267,7 @@ def grips(rows: Rows, task: str = "assembly_1") -> dict[tuple[str, str], dict[in
     for row in sorted(rows, key=lambda row: (row["sensors"] != "touch", -row.get("sources", 3500), row["seed"])):
         if (PLAIN | {"task": task}).items() <= row.items() and "stage" not in row:
             of = f"{row['sources']} grips" if "sources" in row else "each its own grip"
+            of += f"; of more than {row['corrected']} corrections" if "corrected" in row else ""
             found[SENSORS[row["sensors"]], of][row["demonstrations"]].append(row)
     return found
 

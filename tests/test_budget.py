@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_558,
     "taccorl/views": 2_550,
-    "tests": 56_615,
-    "pipelines": 6_242,
+    "tests": 56_636,
+    "pipelines": 6_296,
 }
 MOST_LINES_OF_A_FILE = 500
 

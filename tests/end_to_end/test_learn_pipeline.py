@@ -64,9 +64,27 @@ def test_demonstrations_of_a_surrogate_are_merged_as_the_robot_s(tmp_path: Path)
     assert PARTS_KEY not in Dataset(alone.dataset).info["features"]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_second_policy_learns_from_the_demonstrations_and_from_corrections_of_the_first(tmp_path: Path) -> None:
+    words = ["--small", "--episodes=[1,2]", "--corrections=2", f"--out={tmp_path}"]
+    first, _ = learn.main(words)
+    about = [json.loads((score / "settings.json").read_text()) for score in first.scores]
+    assert [(one["demonstrations"], one.get("corrected")) for one in about] == [(1, None), (3, 1)]
+    config = json.loads((first.scores[1].parent / "checkpoints/last/pretrained_model/train_config.json").read_text())
+    assert config["dataset"]["episodes"] == [0, 2, 3]  # of two demonstrations the first; what is behind them
+    learnt = Dataset(root := Path(config["dataset"]["root"]))
+    fixes = Dataset(root.with_name(root.name.removesuffix("_too")))
+    for k, part in ((0, Dataset(first.dataset)), (2, fixes)):
+        assert np.array_equal(learnt.episode(k).arrays["action"], part.episode(0).arrays["action"])
+    assert "takeover_step" in fixes.episode_facts(0)["provenance"]["simulation"]["correction"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["--corrections=-1"], "corrections=-1: at least 0"),
+        ([f"--scored_in=[{LATE}]", "--real=5", "--corrections=9"], "corrections=9: takes no --real"),
         (["--train=configs/learn/smal.yaml"], "no such file"),
         (["--executed=17"], "at most 16, the chunk_size"),
         (["--seeds=[]"], "seeds=.*: at least 0"),

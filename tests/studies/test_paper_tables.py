@@ -40,9 +40,12 @@ def test_cells_are_what_was_counted():
     alone = "0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* |"
     assert f"| late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | not run | {alone}" in page(beside)
     grip = ROW | {"task": "assembly_1", "demonstrations": 100}
-    told = page([grip, grip | {"sources": 10, "demonstrations": 1000, "successes": 48}, grip | {"stage": "ppo"}])
+    many = grip | {"demonstrations": 1000, "successes": 48}
+    told = page([grip, many | {"sources": 10}, many | {"corrected": 300, "successes": 96}, grip | {"stage": "ppo"}])
     assert "| cameras and touch | each its own grip | 0 % (0 … 4) of 96* | not run | not run | not run |" in told
     assert "| cameras and touch | 10 grips | not run | not run | 50 % (40 … 60) of 96* | not run |" in told
+    assert "; of more than 300 corrections | not run | not run | 100 % (96 … 100) of 96* | not run |" in told
+    assert "| assembly_1 | cameras and touch | 47 %; 92 % | 0 % (0 … 4) of 96* |" in told
 
 
 @pytest.mark.parametrize(
