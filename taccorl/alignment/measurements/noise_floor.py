@@ -271,8 +271,8 @@ class _Blocks:
 
 def _repeat_blocks(rate_hz: float, name: str, laid: Overlay, kind: Kind) -> _Blocks:
     rows = _block_rows(rate_hz)
-    squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
-    return _Blocks(_without_beginning(squares), rows, float(rows), name)
+    squares = _mean_squares(without_beginning(laid.difference[kind], rate_hz), rows) / laid.noise_gain
+    return _Blocks(squares, rows, float(rows), name)
 
 
 def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -282,14 +282,17 @@ def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
     return _Blocks(squares, rows, float(rows))
 
 
-def _without_beginning(squares: np.ndarray) -> np.ndarray:
-    """(B, J) with NaN at first, while the two differ ``OTHER_START`` times as much as later: a joint with dry friction rests
-    elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+def without_beginning(difference: np.ndarray, rate_hz: float) -> np.ndarray:
+    """(T, J) with NaN at first, in whole blocks, while the two differ ``OTHER_START`` times as much as later: a joint with dry
+    friction rests elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+    rows = _block_rows(rate_hz)
+    squares = _mean_squares(difference, rows)
     if not len(squares):
-        return squares
+        return difference
     measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
     usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
-    return np.where(np.logical_and.accumulate(squares > usual, axis=0), np.nan, squares)
+    blocks = np.logical_and.accumulate(squares > usual, axis=0).sum(axis=0)
+    return np.where(np.arange(len(difference))[:, None] < rows * blocks, np.nan, difference)
 
 
 def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:

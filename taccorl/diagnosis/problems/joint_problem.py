@@ -212,7 +212,8 @@ class JointProblem(WithoutMaps):
             newer = 2.0 * bool(self.model.joint.facts["effort_after"])
             speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
             facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
-        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0))
+        driven_by = base.get(EFFORT_SCALE.name, 1.0) if self._first else 1.0
+        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), driven_by)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
