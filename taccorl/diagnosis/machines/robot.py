@@ -14,6 +14,7 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_fit
 from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.controller.drive_law import FOLLOWED
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -138,15 +139,23 @@ class RobotMachine(Machine):
             (use, self._whole(m)) for use in USES for m in getattr(measurements, use)
         ]
         every = [m for _, m in uses]
-        floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
-        levels = {signal: floor.value for signal, floor in floors["position"].items()}
-        traces, clock, held = [], {}, set()
-        for k, (use, m) in enumerate(uses):
+        traces, clock, held, replayed, left = [], {}, set(), [], []
+        for k, m in enumerate(every):
             progress(m.name, k, len(uses))
             moved = moving(m.with_position_targets(m.measured))
             known = [s for s in moved if s in self.robot.config.joints]
             held |= {s for s in moved if s not in self.robot.config.joints}
-            response = replay_joints(self.robot, m, known)
+            replayed.append((known, replay_joints(self.robot, m, known)))
+            followed = [FOLLOWED * (m.target_kind(s) == "effort") for s in m.signals]
+            left.append(
+                dataclasses.replace(m, effort=m.effort - np.array(followed) * np.nan_to_num(replayed[-1][1].effort))
+            )
+        left *= any("effort" in m.target_kinds for m in every)
+        floors: dict[Kind, dict[str, SignalFloor]] = {
+            kind: noise_floor(every, kind, left) for kind in ("position", "effort")
+        }
+        levels = {signal: floor.value for signal, floor in floors["position"].items()}
+        for (use, m), (known, response) in zip(uses, replayed, strict=True):
             positions = m.with_position_targets(np.nan_to_num(response.reported))
             held_there = [m.column(s) for s in known if self.robot.config.joints[s].law == "effort"]
             response.reported[:, held_there] = np.nan
