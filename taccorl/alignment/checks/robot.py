@@ -221,10 +221,12 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: 
         return []
     nearest = min(robot.rigid.joints.values(), key=lambda f: abs(np.log(max(f.inertia + f.armature, 1e-9) / seen))).name
     hint = f" That is the size of {nearest}: are columns exchanged?" if nearest != name else ""
+    unit, rotor = "kg·m²" if m.units[j] == "rad" else "kg", model.joint.rigid(motion, []).rotor_inertia
+    if seen > known and rotor == 0.0:  # a small joint is mostly rotor
+        hint = f" It has no rotor: a motor behind a gear adds its own, here `rotor_inertia: {seen - known:.3g}`.{hint}"
     text = (
-        f"effort and acceleration of {name} say {seen:.3g} {'kg·m²' if m.units[j] == 'rad' else 'kg'}, the model with its rotor "
-        f"{known:.3g}: {seen / known:.2g} times.{hint}{in_degrees(seen / known, name, m.units[j])} Else its effort is in another "
-        f"unit: write {_line(m, name)}, or "
-        f"rotor_inertia and gear of {name} in {robot.path.name}"
+        f"effort and acceleration of {name} say {seen:.3g} {unit}, the model with its rotor {known:.3g}: {seen / known:.2g} "
+        f"times.{hint}{in_degrees(seen / known, name, m.units[j])} Else its effort is in another unit: write {_line(m, name)}, "
+        f"or rotor_inertia and gear of {name} in {robot.path.name}"
     )
     return [find("wrong_inertia", name, text)]

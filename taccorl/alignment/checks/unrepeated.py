@@ -4,9 +4,10 @@
     bursts      the smallest share of half-second blocks that holds 80 % of the squared difference
     dropped     pulses that point backwards along the motion, found by ``held_commands`` in every recording
 
-With a ratio above 3 the floor from repeats would hide a missing effect of that size, whatever its cause. Dropped commands
-are reported where pulses of the right sign clearly outnumber those of the opposite sign; a disturbance torque or dry friction
-produces both alike. Events that gather at one place between two turns of the target are play or sticking.
+What differs until a joint that rested elsewhere is moved is left out. With a ratio above 3 the floor from repeats would hide a
+missing effect of that size, whatever its cause. Dropped commands are reported where pulses of the right sign clearly outnumber
+those of the opposite sign; a disturbance torque or dry friction produces both alike. Events that gather at one place between two
+turns of the target are play or sticking.
 
 Letters in shapes: T rows, J signals, B blocks of rows.
 """
@@ -26,6 +27,7 @@ from taccorl.alignment.measurements.noise_floor import (
     SignalFloor,
     laid_pairs,
     noise_floor,
+    without_beginning,
 )
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
@@ -83,9 +85,15 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
         except TaccorlError as error:
             yield name, not_judged("", what, str(error))
             continue
+        # Where no target was logged, positions that differ are another motion.
         moved = [s for s in floors if any(np.ptp(m.target[:, m.column(s)]) > 0 for m in group)]
+        moved = [s for s in moved if group[0].target_kind(s) != "effort"]
+        later = [without_beginning(laid.difference["position"], a.rate_hz) for a, _, laid in pairs]
         differences = {
-            s: [Pair(a.name, b.name, laid.time_s, laid.difference["position"][:, a.column(s)]) for a, b, laid in pairs]
+            s: [
+                Pair(a.name, b.name, laid.time_s, own[:, a.column(s)])
+                for (a, b, laid), own in zip(pairs, later, strict=True)
+            ]
             for s in moved
         }
         if moved and not any(np.isfinite(pair.difference).any() for own in differences.values() for pair in own):

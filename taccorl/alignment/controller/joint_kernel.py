@@ -232,11 +232,10 @@ def _simulated(
     one_way = p.asymmetric_friction__torque_nm * p.asymmetric_friction__asymmetry
     asymmetry = where(coulomb != 0.0, one_way / coulomb, 0.0)
     bend_rad = p.presliding__presliding_rad + p.coulomb_friction__presliding_rad
-    load_share = p.load_friction__share
     viscous, drag = p.viscous_friction__damping_nms_per_rad, p.quadratic_drag__drag_nms2_per_rad2
     sliding_nm, stribeck_speed = p.stribeck_friction__torque_nm, p.stribeck_friction__stribeck_rad_per_s
     power_nm, exponent = p.power_law_friction__torque_nm, p.power_law_friction__exponent
-    power_asymmetry = p.power_law_friction__asymmetry
+    load_share, power_asymmetry = p.load_friction__share, p.power_law_friction__asymmetry
     spot_nm, spot_angle = p.position_dependent_friction__torque_nm, p.position_dependent_friction__angle_rad
     spot_width = p.position_dependent_friction__width_rad
     cogging_nm, periods, phase = p.cogging__torque_nm, p.cogging__periods, p.cogging__phase_rad
@@ -248,20 +247,17 @@ def _simulated(
     lag_s, fade_rate = p.torque_lag__time_constant_s, p.torque_fade__rate_per_min / 60.0
     torque_scale, reverse_gain = p.torque_scale__factor, p.direction_gain__factor
     compliance = p.joint_compliance__compliance_rad_per_nm
-    answers = np.empty((2, rows, LANES))
-    reported, effort = answers
+    reported, effort = answers = np.empty((2, rows, LANES))
     command = arriving(p, numbers, sent, hold, h)
     if kind == VELOCITY:
         for n in range(len(command)):
             store(command, n, where(load(command, n) < 0.0, reverse_gain, 1.0) * load(command, n))
-    is_late = holds(p.sensor_delay__delay_s > 0.0)
+    is_late, carries = holds(p.sensor_delay__delay_s > 0.0), np.any(carrying != 0.0)
     readings = np.empty((len(command) if is_late else 0, LANES))
-    carries = np.any(carrying != 0.0)
     gravity_sin, gravity_cos = p.gravity_sin + unbalance_sin, p.gravity_cos + unbalance_cos
     weighs = (gravity_sin != 0.0) | (gravity_cos != 0.0) | (p.compensation_sin != 0.0) | (p.compensation_cos != 0.0)
-    has_weight = holds(weighs)
+    has_weight, half_play = holds(weighs), 0.5 * p.backlash__play_rad
     geared = holds((p.backlash__play_rad > 0.0) | (compliance > 0.0))
-    half_play = 0.5 * p.backlash__play_rad
     ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
     early = 0.5 * h if midpoint and geared else 0.0
     into = where((half_play > 0.0) & (compliance == 0.0), 1.0, 0.5 if midpoint else 1.0)  # of the gear; 1 damps it
@@ -316,10 +312,12 @@ def _simulated(
     holding = torque_scale * _of_direction(p, where(integral_rate > 0.0, needed, torque + carried))
     missing = needed - holding * (torque + carried)
     speeds = none + 1.0 if kind == VELOCITY else p.commands_speed  # 1: the integral is that of a speed's error
-    went = none + 1.0 if kind == VELOCITY else p.encoder_scale__factor * (p.kd / p.kp + 0.5 * h)
+    of_speed = none + 1.0 if kind == VELOCITY else p.kd / where(p.kp > 0.0, p.kp, 1.0)
+    went = none + 1.0 if kind == VELOCITY else p.encoder_scale__factor * (of_speed + 0.5 * h)
+    slow_went, late_went = speeds * of_speed * turned * slow_s, speeds * of_speed * (lost - 0.5 * p.speed_age)
     if with_integral:
-        of_error = p.kd if kind == VELOCITY else p.kp
-        integral = where(integral_rate > 0.0, missing / (holding * of_error * integral_rate), 0.0)
+        of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
+        integral = where(integral_rate > 0.0, missing / (holding * of_error), 0.0)
         torque += where(integral_rate > 0.0, missing / holding, 0.0)
         missing = where(integral_rate > 0.0, 0.0, missing)
     z = where(has_bristle, min(max(-missing, -static), static) / bristle, 0.0)
@@ -357,14 +355,15 @@ def _simulated(
         if not midpoint:
             until_now = where(p.command_delay__delay_s > 0.0, now, until_now)
         given, acts = none, now if midpoint else until_now
+        summed = integral + slow_went * late_v + late_went * v  # the sum of a late speed lacks so much of the way
         if with_given:
-            given = _asked(p, kind, acts, acts, q, v, integral, supply[part], on[part], added[part])[0]
+            given = _asked(p, kind, acts, acts, q, v, summed, supply[part], on[part], added[part])[0]
             given = where(lag_s > 0.0, torque, given)
         if within == 0:
             if effort_after > 0:
                 by = load(command, n + hold * min(effort_after - 1, parts - 1))
             seen = part if effort_after > 0 else max(part - 1, 0)
-            shown, by_position, by_speed = _asked(p, kind, by, by, q, v, integral, supply[part], on[part], added[seen])
+            shown, by_position, by_speed = _asked(p, kind, by, by, q, v, summed, supply[part], on[part], added[seen])
             by_speed -= on[part] * p.back_emf  # which has no age
             older = p.effort_age * by_position * v + shown_lead * by_speed * acceleration
             if with_filter:
@@ -391,7 +390,8 @@ def _simulated(
         if with_integral:  # that of a speed is taken ahead as the position is, which is its other part
             came = h * (now if kind == VELOCITY else now - p.encoder_scale__factor * q)
             integral += ahead * speeds * came
-        asked, stiffness, damping = _asked(p, kind, now, acts, q, v, integral, supply[part], on[part], added[part])
+            summed += ahead * speeds * came
+        asked, stiffness, damping = _asked(p, kind, now, acts, q, v, summed, supply[part], on[part], added[part])
         by_controller = damping - on[part] * p.back_emf  # 0 while the duty is at its end
         if with_filter:
             slow = turned * (1.0 - fresh_share) * by_controller

@@ -79,6 +79,8 @@ class Numbers(NamedTuple):
     """Overrides: name of a field of ``drive_numbers.Drive`` → value that is used instead of the joint's own."""
     waits_s: float = 0.0
     """Time for which a row's target waits until the drive's loop reads it [s]; the row's effort is newer by the same time."""
+    effort_scale: float = 1.0
+    """Ratio of the recorded effort to the torque that drives a model of law effort."""
 
 
 class _Prepared(NamedTuple):
@@ -240,7 +242,7 @@ def _side_by_side(
     for model, (case, bodies, numbers) in zip(models, prepared, strict=True):
         joint, (sent, parts, hold, step_s) = model.joint, of_model[model]
         late_s = joint.target_late_s
-        when = late_s, parts, hold, step_s
+        when = late_s, parts, hold, step_s, case.effort_scale
         kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
         # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
         gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
@@ -263,8 +265,10 @@ def _side_by_side(
         geared = drive["backlash__play_rad"] > 0.0 or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
         finer = math.ceil(step_s / GEAR_STEP_S - 1e-9) if geared and drive["midpoint"] > 0.0 else 1
         loads = motion.coupling_nm + held_n + joint.moving_masses_nm(motion, bodies)
-        missing.setdefault((finer, geared, *when), (sent, {}))[1][keys[-1]] = (tuple(drive.values()), loads)
-    for (finer, _, _, parts, hold, step_s), (sent, those) in missing.items():
+        missing.setdefault((finer, geared, *when), (sent._replace(added=sent.added / case.effort_scale), {}))[1][
+            keys[-1]
+        ] = (tuple(drive.values()), loads)
+    for (finer, _, _, parts, hold, step_s, _), (sent, those) in missing.items():
         drives, loads = zip(*those.values(), strict=True)
         start = motion.start, hold * finer, parts, step_s / finer, motion.start_speed, int(each_step)
         found = simulate_all(drives, sent.target, loads, carrying, *sent[1:], *start)
@@ -283,13 +287,13 @@ def _holding(
     """With the effort of a law effort: what holds the model at the measured position is beyond the effort that drives it, and
     ``torque_ff``, which the recorded effort lacks, is in neither. Within ``ENDS_S`` of either end it is the recorded one."""
     sent, parts, _, _ = of
-    before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])
+    before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]]) / case.effort_scale
     # What a row shows is of the part before it, whose target is half a part old.
     slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
     held = answer.effort - before - case.gains.torque_ff + case.gains.kp * slope
     since = motion.time_s - motion.time_s[0]
     is_judged = np.minimum(since, since[-1] - since) >= ENDS_S
-    return JointResponse(answer.reported, held * is_judged + motion.effort)
+    return JointResponse(answer.reported, held * is_judged + motion.effort / case.effort_scale)
 
 
 @lru_cache(maxsize=32)

@@ -133,12 +133,16 @@ class SignalFloor:
         return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
 
 
-def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") -> dict[str, SignalFloor]:
+def noise_floor(
+    measurements: Sequence[Measurement], kind: Kind = "position", unexplained: Sequence[Measurement] = ()
+) -> dict[str, SignalFloor]:
     """Estimate the noise floor of every signal.
 
     Args:
         measurements: measurements of one robot. Those with ``repeat_of`` are aligned with the recording that they repeat.
         kind: quantity whose noise is estimated.
+        unexplained: the same measurements with what a twin leaves of the efforts of joints without a target. Repeats of a motion
+            that was not the same twice differ less in it; the noise of single rows, which a twin smooths, is then the least.
 
     Returns:
         Signal → its floor; signals that were never recorded (effort, velocity) are left out.
@@ -154,7 +158,9 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
             f"noise floor: {other.name} and {measurements[0].name} have different signals; read them separately"
         )
     blocks: dict[Method, list[_Blocks]] = {
-        "repeats": [_repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in laid_pairs(measurements)],
+        "repeats": [
+            _repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in laid_pairs(unexplained or measurements)
+        ],
         "cycles": [_cycle_blocks(m, kind) for m in measurements],
         "rest": [_rest_blocks(m, kind) for m in measurements],
         "residue": [_residue_blocks(m, kind) for m in measurements],
@@ -171,7 +177,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
             rounding = step / math.sqrt(12)
             found.append(Estimate("quantisation", rounding, rounding, rounding, int(np.isfinite(values).sum())))
         last = float(max(NUMBER * max(1e-3, np.nanmax(np.abs(values))), EXACT * (kind == "effort") * np.nanstd(values)))
-        used = _chosen(found) or Estimate("number", last, last, last, 0)
+        used = _chosen(found, bool(unexplained)) or Estimate("number", last, last, last, 0)
         if used.value < last:
             used = Estimate("number", last, last, last, used.n)
         name = {"position": unit, "velocity": UNITS[unit][0], "effort": UNITS[unit][1]}[kind]
@@ -234,9 +240,9 @@ def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
     return np.sqrt([float(_median(c, found[0].freedom)) if len(c) else np.nan for c in own])
 
 
-def _chosen(found: list[Estimate]) -> Estimate | None:
+def _chosen(found: list[Estimate], is_smoothed: bool) -> Estimate | None:
     """Repeats; else the surer one of rest and residue, unless the other lies above its interval, or cycles if these are larger;
-    never below rounding."""
+    never below rounding, nor below noise of rows if repeats are ``is_smoothed``."""
     by = {e.method: e for e in found}
     surer, other = by.get("rest"), by.get("residue")
     if surer is None or (other is not None and other.high - other.low < surer.high - surer.low):
@@ -244,6 +250,7 @@ def _chosen(found: list[Estimate]) -> Estimate | None:
     if surer is not None and other is not None and other.low > surer.high:
         surer = other
     own = [by["repeats"]] if "repeats" in by else [e for e in (surer, by.get("cycles")) if e is not None]
+    own += [surer] if is_smoothed and surer is not None else []
     own += [by["quantisation"]] if "quantisation" in by else []
     return max(own, key=lambda e: e.value, default=None)
 
@@ -271,8 +278,8 @@ class _Blocks:
 
 def _repeat_blocks(rate_hz: float, name: str, laid: Overlay, kind: Kind) -> _Blocks:
     rows = _block_rows(rate_hz)
-    squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
-    return _Blocks(_without_beginning(squares), rows, float(rows), name)
+    squares = _mean_squares(without_beginning(laid.difference[kind], rate_hz), rows) / laid.noise_gain
+    return _Blocks(squares, rows, float(rows), name)
 
 
 def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -282,14 +289,17 @@ def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
     return _Blocks(squares, rows, float(rows))
 
 
-def _without_beginning(squares: np.ndarray) -> np.ndarray:
-    """(B, J) with NaN at first, while the two differ ``OTHER_START`` times as much as later: a joint with dry friction rests
-    elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+def without_beginning(difference: np.ndarray, rate_hz: float) -> np.ndarray:
+    """(T, J) with NaN at first, in whole blocks, while the two differ ``OTHER_START`` times as much as later: a joint with dry
+    friction rests elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+    rows = _block_rows(rate_hz)
+    squares = _mean_squares(difference, rows)
     if not len(squares):
-        return squares
+        return difference
     measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
     usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
-    return np.where(np.logical_and.accumulate(squares > usual, axis=0), np.nan, squares)
+    blocks = np.logical_and.accumulate(squares > usual, axis=0).sum(axis=0)
+    return np.where(np.arange(len(difference))[:, None] < rows * blocks, np.nan, difference)
 
 
 def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:

@@ -14,13 +14,14 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_fit
 from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.controller.drive_law import FOLLOWED
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
-from taccorl.alignment.measurements.folder import Measurements, Use
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.data.finding import Finding as DataFinding
@@ -134,19 +135,21 @@ class RobotMachine(Machine):
         return found
 
     def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
-        uses: list[tuple[Use, Measurement]] = [
-            (use, self._whole(m)) for use in USES for m in getattr(measurements, use)
-        ]
+        uses = [(use, self._whole(m)) for use in USES for m in getattr(measurements, use)]
         every = [m for _, m in uses]
-        floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
-        levels = {signal: floor.value for signal, floor in floors["position"].items()}
-        traces, clock, held = [], {}, set()
-        for k, (use, m) in enumerate(uses):
+        traces, clock, held, replayed, left = [], {}, set(), [], []
+        for k, m in enumerate(every):
             progress(m.name, k, len(uses))
             moved = moving(m.with_position_targets(m.measured))
             known = [s for s in moved if s in self.robot.config.joints]
             held |= {s for s in moved if s not in self.robot.config.joints}
-            response = replay_joints(self.robot, m, known)
+            replayed.append((known, response := replay_joints(self.robot, m, known)))
+            followed = FOLLOWED * np.array([m.target_kind(s) == "effort" for s in m.signals])
+            left.append(dataclasses.replace(m, effort=m.effort - followed * np.nan_to_num(response.effort)))
+        left *= any("effort" in m.target_kinds for m in every)
+        floors: dict[Kind, dict[str, SignalFloor]] = {k: noise_floor(every, k, left) for k in ("position", "effort")}
+        levels = {signal: floor.value for signal, floor in floors["position"].items()}
+        for (use, m), (known, response) in zip(uses, replayed, strict=True):
             positions = m.with_position_targets(np.nan_to_num(response.reported))
             held_there = [m.column(s) for s in known if self.robot.config.joints[s].law == "effort"]
             response.reported[:, held_there] = np.nan

@@ -120,11 +120,13 @@ class AxisProblem(WithoutMaps):
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
         models = [JointModel(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
-        waits = [base.get("loop_waits_s", 0.0) for base, _ in cases]
-        numbers = [Numbers(m.gains, c[1], waits_s=w) for m, c, w in zip(models, cases, waits, strict=True)]
+        is_input, scales = self._kinds[0] == "effort", [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
+        numbers = [
+            Numbers(m.gains, own, waits_s=base.get("loop_waits_s", 0.0), effort_scale=by if is_input else 1.0)
+            for m, (base, own), by in zip(models, cases, scales, strict=True)
+        ]
         motions = [measured_part(recording) for recording in recordings]
-        scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
-        channels = slice(self._kinds[0] == "effort", 1 + self.effort)
+        channels = slice(is_input, 1 + self.effort)
         return [
             [whole_rows([a.reported, scale * a.effort][channels], r) for a, scale in zip(those, scales, strict=True)]
             for those, r in zip(simulate_each(models, motions, numbers, self._answers), recordings, strict=True)

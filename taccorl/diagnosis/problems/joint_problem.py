@@ -13,7 +13,7 @@ import numpy as np
 from taccorl.alignment.checks.motion import plateau
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
-from taccorl.alignment.controller.drive_law import WINDING_WITHIN
+from taccorl.alignment.controller.drive_law import FOLLOWED, WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import LANES
 from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -125,13 +125,17 @@ class JointProblem(WithoutMaps):
         self._first = int(self.model.joint.target_kind == "effort")  # then the position is the input, and no channel
         if self._first and not self.effort:
             raise TaccorlError(f"{signal}: law effort needs the effort of every recording")
-        self.floors = floors_of(everything, signal, effort=self.effort)[self._first :]
+        left = [self._unexplained(m, own) for m in everything if self._first]
+        self.floors = floors_of(everything, signal, effort=self.effort, unexplained=left)[self._first :]
         """Noise floors over all recordings; a recording whose motion was repeated has its own."""
         root = motions(everything)
         repeated = [r for r in root.values() if sum(other == r for other in root.values()) > 1]
         groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
         self._own_floors = {
-            r: floors_of(group, signal, effort=self.effort)[self._first :] for r, group in groups.items()
+            r: floors_of(group, signal, effort=self.effort, unexplained=[m for m in left if root[m.name] == r])[
+                self._first :
+            ]
+            for r, group in groups.items()
         }
         self._motion = root
         sides = (measurements.fit, measurements.validation, measurements.test)
@@ -212,7 +216,8 @@ class JointProblem(WithoutMaps):
             newer = 2.0 * bool(self.model.joint.facts["effort_after"])
             speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
             facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
-        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0))
+        driven_by = base.get(EFFORT_SCALE.name, 1.0) if self._first else 1.0
+        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), driven_by)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -262,6 +267,12 @@ class JointProblem(WithoutMaps):
         ]
         found = [dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found]
         return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
+
+    def _unexplained(self, m: Measurement, own: Sequence[Effect]) -> Measurement:
+        """``m`` with what the twin, with its effects ``own``, leaves of the joint's effort."""
+        motion, effort = motion_of(m, self.signal, self.model.joint), m.effort.astype(float)
+        effort[:, m.column(self.signal)] -= FOLLOWED * self.model.simulate(motion, self.model.gains, own).effort
+        return dataclasses.replace(m, effort=effort)
 
     def _recording(self, m: Measurement) -> Recording:
         kinds, motion = ("position", "effort"), motion_of(m, self.signal, self.model.joint)
@@ -352,15 +363,18 @@ def _within(name: str, value: float) -> Free:
     return Free(name=name, unit=unit, start=value, low=value / WINDING_WITHIN, high=value * WINDING_WITHIN, log=True)
 
 
-def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:
+def floors_of(
+    measurements: Sequence[Measurement], signal: str, *, effort: bool, unexplained: Sequence[Measurement] = ()
+) -> list[SignalFloor]:
     """Noise floors of one signal: of the position, and of the effort if ``effort`` is true, in this order.
+    ``unexplained``: as for ``noise_floor``.
 
     Raises:
         TaccorlError: the joint was never measured.
     """
     found = []
     for kind in ("position", "effort")[: 1 + effort]:
-        floors = noise_floor(measurements, kind)
+        floors = noise_floor(measurements, kind, unexplained)
         if signal not in floors:
             raise TaccorlError(f"{signal}: its {kind} was not measured in any recording")
         found.append(floors[signal])

@@ -16,8 +16,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
+from taccorl.diagnosis.search.evidence import gain_of
 from taccorl.diagnosis.search.fit import Fit, best_fit
-from taccorl.diagnosis.search.fits import STEPS, Fits, Model, model_of, refusal
+from taccorl.diagnosis.search.fits import PROBED, STEPS, Fits, Model, best, model_of, refusal
 from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Values, with_held, with_scale
 from taccorl.diagnosis.search.result import Changed
 
@@ -54,7 +55,8 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
     intervals = model.intervals()
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
-            moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
+            ends = {f.name: intervals.get(f.name, 2 * (model.values.get(f.name, f.start),)) for f in frees}
+            moved = [f for f in frees if not ends[f.name][0] <= fits.given[f.name] <= ends[f.name][1]]
             change = {f.name: abs(model.values[f.name] - fits.given[f.name]) for f in moved}
             first = {f.name: abs(fit.values[f.name] - fits.given[f.name]) for f in moved}
             least = {name: max(NEGLIGIBLE * abs(fits.given[name]), BACK * more) for name, more in first.items()}
@@ -168,3 +170,27 @@ def of_gains(fits: Fits, model: Fit) -> list[str]:
         "measurements.yaml)."
         for gain, (when, old, new) in moved.items()
     ]
+
+
+def better_than_present(fits: Fits, answer: Model, names: Sequence[str]) -> list[str]:
+    """Remarks on effects of the twin in whose place others do much better, where the search ended above the floor: such an
+    effect may have been added while another was missing. None where the other one does still better beside the twin's: then
+    only the other one is missing."""
+    remarks = []
+    for name in fits.present if not fits.at_floor(answer) else ():
+        part = fits.without(answer, name)
+        others = [n for n in names if n not in answer.names]
+        found = [m for m in fits.children(part, others, PROBED) if m.full and not fits.why_not(m, part)]
+        instead = best(found, fits.config) if found else answer
+        if gain_of(instead.squares, answer.squares) < fits.config.sure_gain:
+            continue
+        new = instead.names[-1]
+        if not fits.at_floor(instead):
+            starts = [answer.fit.values | instead.fit.values, instead.fit.values | answer.fit.values]
+            if not refusal(fits.model_of(fits.fitted((*answer.names, new), starts)), instead, fits.config):
+                continue
+        remarks.append(
+            f"{new} in place of {name}, which the twin has, would leave {instead.error:.2f} instead of {answer.error:.2f} noise "
+            f"floors, and beside it no less: if a diagnosis added {name}, remove it from the twin's file and diagnose again."
+        )
+    return remarks

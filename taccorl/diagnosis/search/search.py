@@ -24,10 +24,16 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.diagnosis.search.changed_numbers import changed_numbers, moved_gains, of_gains, of_refit
+from taccorl.diagnosis.search.changed_numbers import (
+    better_than_present,
+    changed_numbers,
+    moved_gains,
+    of_gains,
+    of_refit,
+)
 from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit
-from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
+from taccorl.diagnosis.search.fits import PROBED_BESIDE, Fits, Model, best, better, refusal
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import (
     EFFORT_SCALE,
@@ -131,7 +137,7 @@ def diagnose(
             *of_refit(fits, answer),
             *_of_pairs(beam, answer),
             *of_gains(fits, model),
-            *(() if beam.remarks else _better_than_present(beam, answer)),
+            *(() if beam.remarks else better_than_present(fits, answer, beam.names)),
         ),
         at_bound=tuple(f.name for f in model.ended),
         undetermined=_undetermined(model),
@@ -183,7 +189,7 @@ class Beam:
             if found is not answer:
                 better_ones = [k for k, m in grown.values() if not fits.why_not(k, m) and not refusal(k, answer, c)]
                 more = self.much(level[0])  # which may hide on validation recordings
-                yield (answer := fits.polished(found))
+                yield (answer := self._both(fits.polished(found)))
                 if depth > 0:  # what was added first may only have been the nearest to two that are missing
                     answer = self._exchanged(answer, further=False)
                 rest = sorted((k for k in better_ones if k.names != found.names), key=lambda k: above_floor(k.squares))
@@ -196,6 +202,19 @@ class Beam:
             if not level:
                 break
         yield self._exchanged(self._simpler(answer))
+
+    def _both(self, answer: Model) -> Model:
+        """The best of ``answer`` and of models with two effects in place of one that lies between them, as friction over a power
+        of the speed lies between Coulomb and viscous friction; with more effects only if ``answer`` is above the floor."""
+        fits, most = self.fits, self.config.max_effects
+        for name in fits.added(answer):
+            cls = fits.problem.candidates[name].cls
+            both = [n for n in (*cls.reduces_to, *cls.equals_when_wide) if n in self.names]
+            names = tuple(dict.fromkeys(n for own in answer.names for n in (both if own == name else [own])))
+            more = len(names) - len(answer.names)
+            if len(both) > 1 and more <= (0 if fits.at_floor(answer) else most - len(fits.added(answer))):
+                fits.grown(fits.whole(names, answer.fit.values))
+        return best([answer, *self.sound(answer)], self.config)
 
     def _simpler(self, answer: Model) -> Model:
         """The best of ``answer``, at the floor, and of the simpler forms of its effects with another effect: two effects often
@@ -472,27 +491,3 @@ def _of_pairs(beam: Beam, answer: Model) -> list[str]:
         "on validation recordings, as one of two missing effects may: --until=noise_floor tries pairs."
         for m in beam.much(fits.base)[:1]
     ]
-
-
-def _better_than_present(beam: Beam, answer: Model) -> list[str]:
-    """Remarks on effects of the twin in whose place others do much better, where the search ended above the floor: such an
-    effect may have been added while another was missing. None where the other one does still better beside the twin's: then
-    only the other one is missing."""
-    fits, remarks = beam.fits, []
-    for name in fits.present if not fits.at_floor(answer) else ():
-        part = fits.without(answer, name)
-        others = [n for n in beam.names if n not in answer.names]
-        found = [m for m in fits.children(part, others, PROBED) if m.full and not fits.why_not(m, part)]
-        instead = best(found, fits.config) if found else answer
-        if gain_of(instead.squares, answer.squares) < fits.config.sure_gain:
-            continue
-        new = instead.names[-1]
-        if not fits.at_floor(instead):
-            starts = [answer.fit.values | instead.fit.values, instead.fit.values | answer.fit.values]
-            if not refusal(fits.model_of(fits.fitted((*answer.names, new), starts)), instead, fits.config):
-                continue
-        remarks.append(
-            f"{new} in place of {name}, which the twin has, would leave {instead.error:.2f} instead of {answer.error:.2f} noise "
-            f"floors, and beside it no less: if a diagnosis added {name}, remove it from the twin's file and diagnose again."
-        )
-    return remarks

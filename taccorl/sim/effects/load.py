@@ -31,7 +31,7 @@ class Armature(JointEffect):
     of the motion's frequency."""
 
     added_kgm2: float = number(
-        "ΔJ", "kg·m²", 0, 0.05, (0, 1),
+        "ΔJ", "kg·m²", 0, 0.05, (0, 1000),
         "a choice; 0.007–0.020 fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification)", over_kp=True,
     )  # fmt: skip
 

@@ -175,6 +175,25 @@ def test_a_robot_that_repeats_is_silent():
     assert said(pair(0)) == set()
 
 
+def test_a_joint_that_rests_elsewhere_until_it_is_moved_repeats():
+    """Dry friction holds it 20 mrad aside for 1.5 s: 50 times the noise in all."""
+    first, second = pair(2)
+    aside = second.measured + 20e-3 * (second.time_s[:, None] < 1.5)
+    assert said([first, dataclasses.replace(second, measured=aside)]) == set()
+    assert said([first, dataclasses.replace(second, measured=aside[::-1])]) == {"does_not_repeat"}
+
+
+def test_positions_that_differ_without_a_target_are_another_motion():
+    first, second = (
+        {"measured": m.measured + 2e-3 * k * np.sin(20 * m.time_s)[:, None]} for k, m in enumerate(pair(3))
+    )
+    made = [
+        dataclasses.replace(m, **own, target=own["measured"]) for m, own in zip(pair(3), (first, second), strict=True)
+    ]
+    assert said(made) == {"does_not_repeat"}  # as if these positions had been asked for
+    assert said([dataclasses.replace(m, target_kinds=("effort",)) for m in made]) == set()
+
+
 def test_rare_bursts_are_left_out_of_the_floor_and_reported_with_their_times():
     first, second = pair(1)
     bump = 8e-3 * np.exp(-(((first.time_s - 6.0) / 0.05) ** 2))

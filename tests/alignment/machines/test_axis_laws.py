@@ -133,6 +133,34 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
     assert found.reported[-1] == pytest.approx(0.3, abs=1e-3) and found.effort[-1] == pytest.approx(0.6, rel=0.01)
 
 
+@pytest.mark.parametrize("law", ["cascade", "velocity"])
+def test_an_integral_adds_up_a_speed_as_late_as_the_loop_knows_it(law):
+    """A loop of 1 kHz smooths the speed of two readings by a quarter in each period: 1 ms · (1 − ¼) / ¼ = 3 ms late. The sum of
+    that speed lacks 20 · 4 N·m/rad · 3 ms = 0.24 N·m·s/rad of damping, which is 8 … 20 mrad here."""
+    time_s, hz, rate = np.arange(600) / RATE_HZ, 1000, 20.0
+    wave = 0.3 * np.sin(2 * np.pi * (0.3 + 0.4 * time_s) * time_s)
+    target = wave if law == "cascade" else np.gradient(wave, time_s)
+    q = v = late = total = torque = before = 0.0
+    truth = np.empty(len(target))
+    for step in range(len(target) * round(1 / (RATE_HZ * DT_S))):
+        row, within = divmod(step, round(1 / (RATE_HZ * DT_S)))
+        truth[row] = q if within == 0 else truth[row]
+        if step % round(1 / (hz * DT_S)) == 0:
+            late, before = late + 0.25 * ((q - before) * hz - late), q
+            error = (8.0 * (target[row] - q) if law == "cascade" else target[row]) - late
+            total += error / hz
+            torque = 4.0 * (error + rate * total)
+        v += DT_S * torque / 0.08
+        q += DT_S * v
+    gains = {"kp": 8.0, "kd": 4.0} if law == "cascade" else {"kd": 4.0}
+    effect = EffectEntry("integral_action", {"rate_per_s": rate})
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.08, law=law, **gains, loop_hz=hz, speed_late_s=3e-3)
+    found = answer(
+        dataclasses.replace(axis, effects=(effect,)), recording(target, "position" if law == "cascade" else law)
+    )
+    assert np.abs(found.reported - truth).max() < 3e-3, np.abs(found.reported - truth).max()
+
+
 def test_a_torque_accelerates_and_none_lets_the_axis_coast():
     """0.01 N·m on 0.02 kg·m² for 0.5 s: 0.0625 rad and 0.25 rad/s, kept with the motor off."""
     axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")

@@ -466,6 +466,10 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
         assert f"{line}{qd} in" in checks(dataclasses.replace(degrees, velocity=factor * slope))["beyond_limits"]
     assert "`effort_scale: {elbow: -1}`" in checks(with_effort(-1.0))["reversed_effort"]
     assert "8 times. That is" in checks(with_effort(8.0))["wrong_inertia"]
+    bare = robot(tmp_path, ROBOT_YAML.replace("rotor_inertia: 2.0e-5, gear: 50.0, ", ""), TWO_LINKS)
+    heavier = with_effort(8.0)  # 8 · 0.09 kg·m², of which the link is 0.04
+    (found,) = check_robot(bare, heavier, bare.joint("elbow").whole(heavier), ["elbow"])
+    assert found.check == "wrong_inertia" and "`rotor_inertia: 0.677`" in found.text, found.text
     assert "`unit: deg` for elbow.q and" in checks(with_effort(np.pi / 180))["wrong_inertia"]  # as of q in degrees
     assert "mA" in checks(with_effort(1000.0))["beyond_effort"]
     # Efforts of the law, kp (q* − q) − kd q̇, in mA at 0.5 N·m/A: the unit follows from the gains, whatever the inertia is.

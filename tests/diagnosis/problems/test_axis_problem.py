@@ -86,6 +86,10 @@ def test_a_log_of_position_and_force_alone_shows_the_friction(slide: Measurement
     moving = np.abs(np.gradient(recording.data.measured, 1e-3)) > 0.1
     assert np.median(np.abs(left[0.0][moving])) == pytest.approx(FRICTION_N, rel=0.05)
     assert np.sqrt(np.mean(left[FRICTION_N] ** 2)) < 2.0 * NOISE_N
+    one = without_target(slide.fit[0])
+    twice = AxisProblem(axis, Measurements((dataclasses.replace(one, effort=2.0 * one.effort),)))
+    answer = twice.simulate(twice.start | {"effort_scale": 2.0}, [friction(**numbers)], twice.fit[0])
+    assert np.sqrt(np.mean((twice.fit[0].measured - answer) ** 2)) < 2.0 * 2.0 * NOISE_N, "half of the efforts drive it"
     start = problem.start | {"coulomb_friction.torque_nm": 5.0}
     found = best_fit(problem, problem.fit, ("coulomb_friction",), [start], 20)
     assert found.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.01)

@@ -1,14 +1,17 @@
 """Wrong numbers of a machine's file: named with old and new value, and with the error that the old one leaves."""
 
+import dataclasses
 import math
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, record
 
 from taccorl.diagnosis.search.changed_numbers import STATED
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.sim.effects.effect import number
 
 NOISE = 0.1  # one floor
 
@@ -59,6 +62,25 @@ def test_an_effect_that_is_missing_and_a_wrong_number_of_the_file_are_told_apart
     assert d.changed[0].alone and d.changed[0].without > d.errors["fitted"]["validation"]
     right = found(Ripple, Bump, hidden=[Ripple(strength=2.0), Bump(strength=3.0)], stated={"ripple.strength": 2.0})
     assert right.names == ("ripple", "bump") and right.changed == ()
+
+
+@dataclasses.dataclass(kw_only=True)
+class Bristled(Ripple):
+    """A ripple that may have a slower bump of its own."""
+
+    name: ClassVar = "bristled"
+    optional: ClassVar = ("bent",)
+    bent: float = number("b", "1", 0, 1.0, (0, 50), "made up")
+
+    def signal(self, t: np.ndarray, seed: int) -> np.ndarray:
+        return np.sin(40.0 * t + seed) + self.bent * np.exp(-(((t - 0.6) / 0.2) ** 2))
+
+
+def test_a_number_that_only_one_of_the_fits_has_is_judged_by_the_value_that_the_other_one_has():
+    """The file's ripple has no bump of its own. It takes one until the real bump is there, and then none, as the file says."""
+    hidden = [Bristled(strength=2.0), Bump(strength=6.0)]
+    d = found(Bristled, Bump, hidden=hidden, stated={"bristled.strength": 0.5, "bristled.bent": 0.0})
+    assert set(d.names) == {"bristled", "bump"} and [c.name for c in d.changed] == ["bristled.strength"]
 
 
 def test_a_number_of_the_drive_that_moved_is_named_with_the_effects_that_do_as_well(monkeypatch: pytest.MonkeyPatch):

@@ -224,6 +224,29 @@ def test_two_simple_effects_are_preferred_to_one_with_more_numbers_that_contains
     assert errors == sorted(errors, reverse=True)
 
 
+@dataclasses.dataclass(kw_only=True)
+class Between(Squire):
+    """What lies between a ripple and bumps, and is neither: a tenth of it is a signal of its own."""
+
+    name: ClassVar = "between"
+    reduces_to: ClassVar = {"ripple": "idle"}
+    equals_when_wide: ClassVar = {"bumps": "idle"}
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 3.0 * Bumps.signal(t, seed) + 0.1 * np.sin(77.0 * t)
+
+
+def test_both_effects_between_which_the_first_one_lies_take_its_place_before_others_are_tried_beside_it():
+    fit, validation, test = made(Ripple(strength=3.0), Bumps(strength=9.0))
+    said: list[str] = []
+    found = diagnose(MadeProblem(Ripple, Bumps, Between), fit, validation, test, progress=said.append)
+    assert set(found.names) == {"ripple", "bumps"} and found.status == "at_floor"
+    assert not any(text.startswith("between, ") for text in said)
+    alone = diagnose(MadeProblem(Ripple, Bumps, Between), fit, validation, test, config=SearchConfig(max_effects=1))
+    assert alone.names == ("between",)
+
+
 class Driven(MadeProblem):
     """The first number is a gain that the twin states."""
 
