@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_146,
+    "taccorl/alignment": 15_173,
     "taccorl/cli": 5_180,
     "taccorl/data": 8_808,
-    "taccorl/diagnosis": 11_397,
+    "taccorl/diagnosis": 11_437,
     "taccorl/episodes": 4_930,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_558,
     "taccorl/views": 2_550,
-    "tests": 56_636,
+    "tests": 56_756,
     "pipelines": 6_296,
 }
 MOST_LINES_OF_A_FILE = 500
