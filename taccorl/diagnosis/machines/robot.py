@@ -21,7 +21,7 @@ from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
-from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.data.finding import Finding as DataFinding
@@ -135,7 +135,7 @@ class RobotMachine(Machine):
         return found
 
     def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
-        uses = [(use, self._whole(m)) for use in USES for m in getattr(measurements, use)]
+        uses: list[tuple[Use, Measurement]] = [(u, self._whole(m)) for u in USES for m in getattr(measurements, u)]
         every = [m for _, m in uses]
         traces, clock, held, replayed, left = [], {}, set(), [], []
         for k, m in enumerate(every):
