@@ -11,7 +11,7 @@ third row, and the arms are pushed off their path at times:
         --resolution=84x112 --rows_per_picture=3 --part_poses=true --engine.workers=16 \\
         --out=outputs/many
 
-A person demonstrates with ``--source.type=keyboard`` or ``leader``; actions are stored in ``outputs/teleop``, and
+A person demonstrates with leader arms, ``--source.type=leader``; actions are stored in ``outputs/teleop``, and
 ``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.
 """
 
@@ -55,7 +55,7 @@ class CollectConfig(OriginOptions, PictureOptions, RandomizedOptions):
     task: str | None = None
     """Task: {tasks}. Files of actions state their own."""
     source: Source = field(default_factory=ExpertSource)
-    """Source of the demonstrations: --source.type=expert, keyboard, leader, actions."""
+    """Source of the demonstrations: --source.type=expert, leader, actions."""
     episodes: int = 20
     """Number of successful demonstrations to write."""
     out: Path | None = None

@@ -207,7 +207,7 @@ def test_a_twin_that_changes_during_the_run_is_not_mixed_with_the_one_before(tmp
 
 
 def test_an_engine_for_what_has_an_order_is_refused(tmp_path, capsys):
-    for words in (["--as_recording=true"], ["--source.type=keyboard"]):
+    for words in (["--as_recording=true"], ["--source.type=leader"]):
         assert cli(["collect", *ARGUMENTS, *words, f"--out={tmp_path / 'x'}", "--engine.workers=2"]) == 2
         assert "--engine" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

@@ -59,8 +59,8 @@ class ActionLog:
     """Appends actions to a new file ``folder/TASK_SEED_NNN.jsonl``. Each action is written at once, and the file is synchronised
     to disk every second."""
 
-    def __init__(self, folder: Path, sim: Simulation, source: str) -> None:
-        """Create the file for the actions of ``source`` in simulation 0 of ``sim``, which has just been reset."""
+    def __init__(self, folder: Path, sim: Simulation) -> None:
+        """Create the file for actions in simulation 0 of ``sim``, which has just been reset."""
         scene = scene_of(sim)
         folder.mkdir(parents=True, exist_ok=True)
         self.path, self._descriptor = _create(folder, f"{scene['task']}_{scene['seed']}")
@@ -70,7 +70,6 @@ class ActionLog:
                 "format": FORMAT,
                 **scene,
                 "time_limit_s": sim.judge.limit_steps / CONTROL_HZ,
-                "source": source,
                 "names": list(ROBOT.action_names),
                 "units": "rad, gripper openings in m",
                 "control_hz": CONTROL_HZ,
@@ -131,7 +130,7 @@ class ActionFile:
 
     path: Path
     header: dict[str, Any]
-    """First line of the file: the scene, the source, versions."""
+    """First line of the file: the scene, versions."""
     actions: np.ndarray
     """(T, 14) float32 actions [rad, m]."""
     end: str | None
@@ -176,10 +175,9 @@ def _value(path: Path, number: int, line: bytes) -> Any:
         raise TaccorlError(f"{path}:{number}: is damaged: {error}") from error
 
 
-def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFile | None:
-    """The newest finished demonstration of the same scene by the same kind of source, recorded with this version of MuJoCo; None
-    without one."""
-    wanted = {**scene, "source": source, "mujoco": mujoco.__version__}
+def find_finished(folder: Path, scene: dict[str, Any]) -> ActionFile | None:
+    """The newest finished demonstration of the same scene, recorded with this version of MuJoCo; None without one."""
+    wanted = {**scene, "mujoco": mujoco.__version__}
     for path in sorted(folder.glob(f"{scene['task']}_{scene['seed']}_*.jsonl"), reverse=True):
         file = ActionFile.read(path)
         if file.end == "finished" and all(file.header.get(key) == value for key, value in wanted.items()):
@@ -209,7 +207,7 @@ def replay(file: ActionFile, sim: Simulation) -> Actions:
 @Source.register_subclass("actions")
 @dataclass(frozen=True, kw_only=True)
 class ActionsSource(Source):
-    """Source that executes action files again: the actions of a person or another source, in the original scenes."""
+    """Source that executes action files again: the actions of a person, in the original scenes."""
 
     path: str
     """An action file, or a folder of them (outputs/teleop); discarded demonstrations in a folder are skipped."""
