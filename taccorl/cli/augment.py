@@ -3,7 +3,7 @@
 Generate a LeRobot dataset of many new, successful demonstrations with touch and pictures from a few demonstrations in the twin
 (``taccorl collect``): MimicGen for two hands, which keeps the path of held objects. Yield, failures by cause, with a command that
 shows one of each, and different grips of the sources are printed at the end. The dataset is the same for any number of workers:
---engine.workers=2, --engine.type=ray, --engine.type=slurm. An attempt that kills its process twice, or does not end within ten
+--engine.workers=2, --engine.type=ray. An attempt that kills its process twice, or does not end within ten
 minutes, counts as failed. With --engine.workers=1 attempts run in the command's own process, which such an attempt would end.
 
 --rows=actions writes seeds and float32 actions, 24 kB an episode, instead of a dataset: physics only. ``taccorl execute`` makes

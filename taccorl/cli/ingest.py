@@ -56,7 +56,7 @@ class IngestConfig:
     replace: bool = False
     """If `out` holds another dataset, move that one aside (out.old-1, …) and publish the new one."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where recordings are ingested: --engine.type=local --engine.workers=2, slurm, ray."""
+    """Where recordings are ingested: --engine.type=local --engine.workers=2, or ray."""
 
 
 @dataclass(kw_only=True)

@@ -36,11 +36,9 @@ VERBS = {
         "view": "an episode in Rerun: pictures, touch, joints, arms",
     },
     "store": {"lineage": "inputs of every result: `lineage explain PATH`; delete unneeded ones: `lineage prune`"},
-    "shell": {"completion": "`completion bash`, zsh or fish: a script that completes verbs, options and files there"},
 }
 """Heading of the list of commands → verb → description."""
 SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune"), "task": ("new",)}
-SECOND_WORDS |= {"completion": ("bash", "zsh", "fish")}
 """Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 
 ONE_THREAD = ("compare", "align", "diagnose", "excite")
