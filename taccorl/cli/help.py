@@ -30,7 +30,7 @@ SHOWN = {
     "excite": "twin pads effects measurements out",
     "surrogate": "secret effects signal strength pads twin reveal out",
     "serve-surrogate": "task secret faults port",
-    "ingest": "spec out dry_run watch domain replace",
+    "ingest": "spec out dry_run domain replace",
     "ingest inspect": "draft",
     "check": "spec quick repair",
     "merge": "real sim pictures resolution out",

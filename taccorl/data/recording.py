@@ -336,7 +336,9 @@ class Recording:
         """Origin that the file's metadata state. Raises TaccorlError: they state a real domain of a simulated recording, or
         several domains (RecordingError)."""
         records = self.reader.metadata.values()
-        stated = [Origin.read(r) for r in records if r.get("domain") in DOMAINS]  # other people's key may have any value
+        stated = [
+            Origin.read(r) for r in records if r.get("domain") in DOMAINS
+        ]  # other people's key may have any value
         named = [Origin(text=r["origin"]) for r in records if "origin" in r]
         domains = {str(origin.domain) for origin in stated}
         if len(domains) > 1:

@@ -2,10 +2,6 @@
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -79,67 +75,6 @@ def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(
     Path("out").mkdir()
     code, text = said(good, "--spec", "piper_flexitac_mcap", "--out", "out")
     assert (code, Path("out/meta/info.json").is_file()) == (0, True), text
-
-
-def watching(folder: Path, *words: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(folder), SPEC, "--watch=true", *words]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-
-
-def next_line(process: subprocess.Popen[str], word: str) -> str:
-    assert process.stdout is not None
-    for line in process.stdout:
-        if word in line:
-            return line
-    raise AssertionError(f"ended without {word!r}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_watching_ingests_what_arrives_and_publishes_the_same_dataset_at_the_end(good, tmp_path, said, end):
-    folder = tmp_path / "recordings"
-    folder.mkdir()
-    process = watching(folder, "--out=watched", "--store=store")
-    try:
-        next_line(process, "watching")
-        content, file = good.read_bytes(), folder / "good.mcap"
-        file.write_bytes(content[: len(content) // 2])  # a recorder at work
-        time.sleep(3)
-        file.write_bytes(content)
-        arrived = next_line(process, "good.mcap")
-        assert "written, 1 episodes, 70 rows" in arrived  # not the half file, which would be split or refused
-        (folder / "late.mcap").write_bytes(content[:1000])
-        time.sleep(1.5)
-        process.send_signal(end)
-        rest = process.communicate(timeout=60)[0]
-    finally:
-        process.kill()
-    assert process.returncode == 0, rest
-    assert "late.mcap" in next(line for line in rest.splitlines() if "left out" in line)
-    (folder / "late.mcap").unlink()
-    assert said(folder, SPEC, "--out=plain", "--store=other")[0] == 0
-    rows = {p.relative_to("plain"): p.read_bytes() for p in Path("plain/data").rglob("*.parquet")}
-    assert rows and rows == {p.relative_to("watched"): p.read_bytes() for p in Path("watched/data").rglob("*.parquet")}
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("--dry_run=true",), "--dry_run"),
-        (("--out=in/dataset",), "--out=in/dataset"),
-        (("--store=in/store",), "--store=in/store"),
-        (("--out=there",), "there"),
-    ],
-)
-def test_watching_refuses_at_once_what_could_not_end_well(words, named, said):
-    Path("in").mkdir()
-    Path("there").mkdir()
-    Path("there/file").write_text("mine")
-    code, text = said("in", SPEC, "--watch=true", *words)
-    assert code == 2 and named in text, text
-    assert sorted(p.name for p in Path.cwd().iterdir()) == ["in", "there"]
-    code, text = said("nowhere", SPEC, "--watch=true")
-    assert code == 2 and "nowhere" in text
 
 
 @pytest.mark.parametrize("dry_run", ["true", "false"])
