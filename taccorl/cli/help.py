@@ -14,10 +14,9 @@ WIDTH = 100
 """Most columns of the short help."""
 SHOWN = {
     "collect": "task episodes out source.type as_recording twin difficulty seed engine.workers",
-    "augment": "source task episodes out rows engine.workers",
+    "augment": "source task episodes out pictures engine.workers",
     "task new": "",
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
-    "execute": "source out pictures engine.workers",
     "evaluate": "policy.path policy.type task episodes seed against twin robot pictures hide out",
     "post-train": "policy.path env.task env.twin anchor.dataset anchor.weight iterations resume rerun out",
     "init-robot": "out dataset",

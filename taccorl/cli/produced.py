@@ -1,4 +1,4 @@
-"""What the verbs that produce episodes (collect, augment, correct, execute) have in common: options, places, and the end."""
+"""What the verbs that produce episodes (collect, augment, correct) have in common: options, places, and the end."""
 
 import shlex
 import time

@@ -146,7 +146,6 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(raised, code, word
         (("collect", "--task=assembly_1", "--episodes=0"), "--episodes=0"),
         (("collect", "--task=assembly_1", "--out=full"), "full"),
         (("augment", "--task=assembly_2", "--source=nope"), "nope"),
-        (("execute", "--source=full", "--out=new"), "full"),
         (("merge", "--real=full", "--out=new"), "full"),
         (("ingest", "full", "--spec=piper_flexitac_mcap", "--out=new"), "full"),
         (("align", "full", "--workers=0"), "--workers=0"),

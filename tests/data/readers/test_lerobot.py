@@ -260,7 +260,7 @@ def test_a_dataset_without_baselines_gives_the_counts_it_has(ours: Path, tmp_pat
 def test_a_camera_without_videos_is_missed_only_by_specs_that_read_it(ours: Path, tmp_path: Path, how: str) -> None:
     root, key = shutil.copytree(ours, tmp_path / "d"), "observation.images.front"
     shutil.rmtree(root / "videos" / key)
-    if how == "not in the table":  # as taccorl execute --pictures=cache leaves it
+    if how == "not in the table":  # as taccorl collect --pictures=cache leaves it
         (path,) = (root / "meta/episodes").glob("*/*.parquet")
         table = pq.read_table(path)
         pq.write_table(table.drop_columns([n for n in table.column_names if n.startswith(f"videos/{key}/")]), path)
