@@ -1,6 +1,6 @@
 """Plan of numbered attempts in the twin: what all of them have in common, and what a kind of attempt defines.
 
-``produce`` runs any plan. Kinds: ``CollectPlan`` (expert, person, action files), ``AugmentPlan`` (MimicGen), ``CorrectionPlan``
+``produce`` runs any plan. Kinds: ``CollectPlan`` (expert, person), ``AugmentPlan`` (MimicGen), ``CorrectionPlan``
 (policy, then expert).
 """
 

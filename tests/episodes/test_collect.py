@@ -17,7 +17,7 @@ from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
 from taccorl.episodes.attempt import Attempt, Source, Targets, outcome_of
-from taccorl.episodes.plan import Made
+from taccorl.episodes.plan import Listed, Made
 from taccorl.episodes.produce import produce
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.episodes.sources.collect import CollectPlan, Needed, attempt, collect_recordings
@@ -329,11 +329,10 @@ class Stretched(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class Three(CollectPlan):
-    """Ends after three attempts."""
+    """Three attempts."""
 
-    @property
-    def num_attempts(self):
-        return 3
+    def schedule(self, at_once):
+        return Listed(range(3))
 
 
 @pytest.mark.parametrize("rows", [3, 0])

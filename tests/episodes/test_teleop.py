@@ -20,7 +20,7 @@ from taccorl.episodes.sources import teleop
 from taccorl.episodes.sources.collect import CollectPlan, attempt
 from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.episodes.sources.teleop import Command, LeaderHands, LeaderSource
-from taccorl.episodes.sources.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
+from taccorl.episodes.sources.teleop_actions import ActionFile, ActionLog, find_finished, scene_of
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
@@ -134,7 +134,6 @@ def test_discarded_attempt_is_kept_apart_and_the_scene_begins_anew(tmp_path, ben
     assert (second.end, len(second.actions)) == ("finished", 1 + 30)
     assert first.header["seed"] == second.header["seed"]
     np.testing.assert_array_equal(column(recorder, "action"), second.actions)
-    assert ActionsSource(path=str(tmp_path)).files()[0].path == second.path, "a folder's discarded files are left out"
 
 
 def test_window_closed_in_the_middle_loses_nothing_and_asks_anew_next_time(tmp_path, bench, monkeypatch):
@@ -164,12 +163,11 @@ def test_person_has_more_time_than_the_task_gives_an_expert_and_so_has_the_re_ex
     hasty = type("Hasty", (tasks.get("bench"),), {"time_limit_s": 0.2})  # out of time after 6 control steps
     sim = Simulation(hasty())
     with_script(monkeypatch, [ENTER, *[[]] * 10, ENTER, *[[]] * 40])
-    recorder = run(CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path))), sim)
-    assert len(recorder.rows) == 10 + 30
+    plan = CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path)))
+    assert len(run(plan, sim).rows) == 10 + 30
     assert outcome_of(sim) == "unfinished"
-    (path,) = tmp_path.iterdir()
-    other = Simulation(hasty())
-    assert len(run(ActionsSource(path=str(path)).plan(CollectPlan(task="")), other).rows) == 40
+    with_script(monkeypatch, [])
+    assert len(run(plan, Simulation(hasty())).rows) == 40
 
 
 # action files ------------------------------------------------------------------------------------------------------------
@@ -196,17 +194,12 @@ def test_experts_actions_re_executed_give_bit_identical_rows(tmp_path):
         original = run(dataclasses.replace(plan, source=expert), sim)
         log.end("finished", outcome_of(sim))
     assert outcome_of(sim) == "success", "choose another seed: this one is to show a success"
-    replayed = ActionsSource(path=str(log.path)).plan(CollectPlan(task=""))
-    assert (replayed.task, replayed.randomization, replayed.episodes) == ("assembly_1", 0.5, 1)
-    assert replayed.attempt_seed(0) == plan.attempt_seed(0)
-    other = replayed.make()
-    again = run(replayed, other)
+    other = plan.make()
+    again = run(dataclasses.replace(plan, source=LeaderSource(folder=str(tmp_path))), other)
     assert outcome_of(other) == "success"
     assert len(again.rows) == len(original.rows)
     for key in original.rows[0]:
         np.testing.assert_array_equal(column(again, key), column(original, key), err_msg=key, strict=True)
-    with pytest.raises(TaccorlError, match="all 1 action files"):
-        replayed.attempt_seed(1)
 
 
 def write(folder: Path, sim: Simulation, actions: np.ndarray, end: str | None, outcome: str = "unfinished") -> Path:
@@ -283,37 +276,11 @@ def test_only_a_finished_demonstration_of_the_very_scene_is_taken_for_one(tmp_pa
 
 
 def test_re_execution_that_does_not_end_as_recorded_is_an_error(tmp_path, sim):
-    plan = ActionsSource(path=str(write(tmp_path, sim, random_actions(3) * 0, "finished", "success"))).plan(
-        CollectPlan(task="")
-    )
+    plan = CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path)))
+    sim.reset([plan.attempt_seed(0)])
+    write(tmp_path, sim, random_actions(3) * 0, "finished", "success")
     with pytest.raises(TaccorlError, match=r"recorded as success after 3 .* unfinished"):
         run(plan, sim)
-
-
-def test_plan_of_action_files_is_theirs_and_says_where_the_command_line_differs(tmp_path, sim):
-    paths = [write(tmp_path, sim, random_actions(2), "finished", outcome) for outcome in ("unfinished", "success")]
-    source = ActionsSource(path=str(tmp_path))
-    plan = source.plan(CollectPlan(task="bench"))
-    assert plan.episodes == 1
-    assert [file.path for file in plan.files] == [paths[1], paths[0]], "a success first: that is what is collected"
-    assert [f.path for f in source.plan(CollectPlan(task="", keep_failures=True)).files] == paths
-    for wrong, says in (
-        (CollectPlan(task="puzzle"), "--task=puzzle"),
-        (CollectPlan(task="", difficulty="hard"), "--difficulty"),
-    ):
-        with pytest.raises(TaccorlError, match=says):
-            source.plan(wrong)
-    with pytest.raises(TaccorlError, match="2 action files"):
-        run(plan, sim)  # two of one scene
-    with pytest.raises(TaccorlError, match="is not there"):
-        ActionsSource(path=str(tmp_path / "nothing")).plan(CollectPlan(task=""))
-
-
-def test_other_actions_under_the_same_path_are_another_source(tmp_path, sim):
-    path = write(tmp_path, sim, random_actions(2), "finished")
-    before = ActionsSource(path=str(path))
-    path.write_bytes(path.read_bytes().replace(b'"finished"', b'"discarded"'))
-    assert before != ActionsSource(path=str(path))
 
 
 # display -----------------------------------------------------------------------------------------------------------------

@@ -100,8 +100,8 @@ class ViewerWindow:
 def _check_display() -> None:
     """A window can be opened here; MuJoCo's viewer would wait for ever if not."""
     way_out = (
-        "Let the scripted expert demonstrate (--source.type=expert), re-execute action files (--source.type=actions), or run "
-        "this where there is a screen: at the machine itself, through ssh -X, or with an X server such as Xvfb."
+        "Let the scripted expert demonstrate (--source.type=expert), or run this where there is a screen: at the machine "
+        "itself, through ssh -X, or with an X server such as Xvfb."
     )
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise TaccorlError(f"no display for MuJoCo's viewer: DISPLAY and WAYLAND_DISPLAY are not set. {way_out}")
