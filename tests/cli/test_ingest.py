@@ -71,12 +71,6 @@ def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path,
         assert "Traceback" not in error
 
 
-def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(good, said):
-    Path("out").mkdir()
-    code, text = said(good, "--spec", "piper_flexitac_mcap", "--out", "out")
-    assert (code, Path("out/meta/info.json").is_file()) == (0, True), text
-
-
 @pytest.mark.parametrize("dry_run", ["true", "false"])
 def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run, tmp_path, said):
     (folder := tmp_path / "in").mkdir()
@@ -141,13 +135,6 @@ def test_inspect_shows_channels_and_names_the_spec_that_fits(good, said):
     assert f"fits the shipped spec: taccorl ingest {good} {SPEC}" in text
     assert "stand-in recording, not a robot" in text
     assert list(Path.cwd().iterdir()) == []
-
-
-def test_inspect_reads_a_dataset_too(dataset, said):
-    code, text = said("inspect", dataset)
-    assert code == 0
-    assert "observation.tactile/left_a" in text
-    assert "taccorl_lerobot" in text
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(good, tmp_path, said):
