@@ -24,10 +24,9 @@ import yaml
 from pipelines.lerobot_commands import FIRST_SEED, Scoring, Training
 from pipelines.steps import chosen, lerobot, parsed, step
 from pipelines.surrogate_twin import ORIGIN, draw_surrogate_twin
-from taccorl.cli import augment, collect, execute, ingest, merge
+from taccorl.cli import augment, collect, ingest, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
-from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.evaluation.statistics import told_rate, wilson_interval
@@ -97,9 +96,7 @@ def main(words: list[str]) -> None:
     if cached:
         size = yaml.safe_load(recipe.read_text(encoding="utf-8"))["policy"].get("image_resolution")
         frames = {"pictures": "cache", "resolution": f"{size[0]}x{size[1]}" if size else None}
-        actions = out / "actions"
-        step(augment.run, dataclasses.replace(made, rows="actions", out=actions))
-        step(execute.run, ExecuteConfig(source=[actions], out=many, store=store, part_poses=True, **frames))
+        step(augment.run, dataclasses.replace(made, part_poses=True, rows_per_picture=1, **frames))
         step(merge.run, MergeConfig(real=[real], sim=[many], out=both, store=store, **frames))
         cache = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}"]
     else:

@@ -28,8 +28,7 @@ def section(cls: type[Effect]) -> list[str]:
         text = f"{p.typical:g} ({p.low:g}…{p.high:g}) {unit}".rstrip() + absent
         numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]
-    lines += [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]
-    return [*lines, f"- **Record:** {cls.to_record}"]
+    return lines + [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]
 
 
 if __name__ == "__main__":

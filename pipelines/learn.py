@@ -36,12 +36,11 @@ import yaml
 from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, parsed, step
 from pipelines.surrogate_twin import is_folder, mended, named
-from taccorl.cli import augment, collect, execute, merge
+from taccorl.cli import augment, collect, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.correct import CorrectConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
-from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.cli.parse import command, shared_fields
 from taccorl.data.dataset import Dataset
@@ -80,7 +79,7 @@ class LearnConfig:
     )
     """Spread of the grips, pulses, errors of the expert: --hands.grasp_m=0.004 …"""
     sources: list[int] = field(default_factory=lambda: [0])
-    """Demonstrations of the expert of which MimicGen (taccorl augment, execute), with pushes and the expert in contact, makes
+    """Demonstrations of the expert of which MimicGen (taccorl augment), with pushes and the expert in contact, makes
     the others; 0: all are the expert's own."""
     twins: list[str] = field(default_factory=lambda: ["nominal"])
     """Twins of the demonstrations: nominal; mended, which taccorl diagnose makes of sweeps and presses of each twin of
@@ -343,7 +342,7 @@ def demonstrations(
         if not sources:
             step(collect.run, own)
         else:  # of the expert without pulses, as MimicGen disturbs the arms itself
-            few, many, spec = (dataset.with_name(f"{dataset.name}_{n}") for n in ("sources", "actions", "spec.yaml"))
+            few, spec = (dataset.with_name(f"{dataset.name}_{n}") for n in ("sources", "spec.yaml"))
             pushed = {"contact_mode": "closed_loop_expert", "disturbance": {"joint_rad": config.hands.pulse_rad}}
             cut = yaml.safe_load(mimic_spec_path(task).read_text(encoding="utf-8"))
             spec.write_text(yaml.safe_dump(cut | {"datagen_config": pushed}), encoding="utf-8")
@@ -356,10 +355,8 @@ def demonstrations(
                 "part_poses": False,
             }
             step(collect.run, dataclasses.replace(own, source=plain, episodes=sources, out=few, **bare))
-            moved: dict[str, Any] = {"source": few, "spec": str(spec), "rows": "actions", "images": False, "out": many}
+            moved: dict[str, Any] = {"source": few, "spec": str(spec)}
             step(augment.run, AugmentConfig(**shared_fields(own, AugmentConfig) | moved))
-            done: dict[str, Any] = {"source": [many]}
-            step(execute.run, ExecuteConfig(**shared_fields(own, ExecuteConfig) | done))
     except DatasetError as error:
         raise SystemExit(f"{error}\nother demonstrations need another --out") from error
     return dataset, own

@@ -81,8 +81,8 @@ def test_the_wheel_holds_what_commands_read_besides_python(tmp_path: Path, monke
 
 
 PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
-OWN_MESSAGES = {"lineage/cluster.py", "lineage/processes.py"}
-"""Between this run's processes: through pipes, and a folder that the run itself has made."""
+OWN_MESSAGES = {"lineage/processes.py"}
+"""Between this run's processes, through pipes."""
 UNSAFE = re.compile(r"torch\.(load|save)|.*\.(read_pickle|to_pickle|unsafe_load|full_load)|yaml\.load")
 SUSPECT = re.compile(rf"{'|'.join(PICKLES)}|torch\s*\.\s*(load|save)|yaml\s*\.\s*load|(unsafe|full)_load|weights_only")
 """Text without which a source file holds none of these, and need not be parsed."""

@@ -3,11 +3,11 @@
 Generate a LeRobot dataset of many new, successful demonstrations with touch and pictures from a few demonstrations in the twin
 (``taccorl collect``): MimicGen for two hands, which keeps the path of held objects. Yield, failures by cause, with a command that
 shows one of each, and different grips of the sources are printed at the end. The dataset is the same for any number of workers:
---engine.workers=2, --engine.type=ray, --engine.type=slurm. An attempt that kills its process twice, or does not end within ten
+--engine.workers=2, --engine.type=ray. An attempt that kills its process twice, or does not end within ten
 minutes, counts as failed. With --engine.workers=1 attempts run in the command's own process, which such an attempt would end.
 
---rows=actions writes seeds and float32 actions, 24 kB an episode, instead of a dataset: physics only. ``taccorl execute`` makes
-the dataset on the machine where it is needed.
+With --pictures=cache no video is encoded: frames are rendered into the cache from which lerobot-train --dataset.cache=… reads
+them, at the policy's --resolution.
 """
 
 import shlex
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import verb
-from taccorl.cli.produced import OriginOptions, Place, SceneOptions, own_first, settings
+from taccorl.cli.produced import OriginOptions, PictureOptions, Place, SceneOptions, own_first, settings
 from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @own_first
 @dataclass(kw_only=True)
-class AugmentConfig(OriginOptions, SceneOptions):
+class AugmentConfig(OriginOptions, PictureOptions, SceneOptions):
     """Generate many demonstrations from a few."""
 
     source: Path
@@ -40,8 +40,6 @@ class AugmentConfig(OriginOptions, SceneOptions):
     """The dataset's folder; outputs/TASK_augmented if not given. It must be empty or not exist."""
     spec: str | None = None
     """MimicGen settings: a file like mimicgen.yaml of a task's folder; the task's own if not given."""
-    rows: str = "dataset"
-    """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute."""
 
 
 @verb(AugmentConfig)
@@ -55,15 +53,14 @@ def run(config: AugmentConfig) -> int:
 
     plan = _plan(config, Store(config.store))
     place = Place.of(config, plan, config.out or Path("outputs") / f"{config.task}_augmented", [config.source])
-    out, store = place.out, place.store
-    produced = produce(plan, out, store, Attempts(plan.episodes, is_success), config.engine)
+    store = place.store
+    produced = produce(plan, place.out, store, Attempts(plan.episodes, is_success), config.engine)
     report = produced.report
     lines = [f"yield:   {told_rate(report['episodes'], report['attempts'])}", *view_commands(plan, produced, store)]
     lines.append(f"sources: {grips_words(report['grips'])}")
     lines += [f"warning: {': '.join(grips_warning(plan.task))}"] * bool(report["grips"]["few"])
     place.written(plan, produced, lines)
-    execute = shlex.join(["taccorl", "execute", f"--source={out}", f"--out={out}_dataset"])
-    print(f"next:    {place.next_command(plan) if plan.rows == 'dataset' else execute}")
+    print(f"next:    {place.next_command(plan)}")
     return 0
 
 

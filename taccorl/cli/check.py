@@ -125,8 +125,6 @@ def _check_dataset(config: CheckConfig) -> int:
     findings += _bookkeeping(dataset, config.quick)
     findings += [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
-    origins = {dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes)}
-    findings += [Finding("derived_domain", "note", "origin", str(o)) for o in sorted(origins, key=str) if o.derived]
     episodes: dict[int, Episode] = {}
     for index in range(dataset.num_episodes):
         try:

@@ -11,8 +11,8 @@ third row, and the arms are pushed off their path at times:
         --resolution=84x112 --rows_per_picture=3 --part_poses=true --engine.workers=16 \\
         --out=outputs/many
 
-A person demonstrates with ``--source.type=keyboard`` or ``leader``; actions are stored in ``outputs/teleop``, and
-``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.
+A person demonstrates with leader arms, ``--source.type=leader``; actions are stored in ``outputs/teleop``, and the same command
+makes the episodes of finished demonstrations again.
 """
 
 import contextlib
@@ -31,7 +31,6 @@ from taccorl.episodes.produce import produce
 from taccorl.episodes.sources import teleop
 from taccorl.episodes.sources.collect import CollectPlan, collect_recordings
 from taccorl.episodes.sources.expert import ExpertSource
-from taccorl.episodes.sources.teleop_actions import ActionsSource
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import LocalEngine
@@ -53,9 +52,9 @@ class CollectConfig(OriginOptions, PictureOptions, RandomizedOptions):
     """Collect demonstrations in the twin."""
 
     task: str | None = None
-    """Task: {tasks}. Files of actions state their own."""
+    """Task: {tasks}."""
     source: Source = field(default_factory=ExpertSource)
-    """Source of the demonstrations: --source.type=expert, keyboard, leader, actions."""
+    """Source of the demonstrations: --source.type=expert or leader."""
     episodes: int = 20
     """Number of successful demonstrations to write."""
     out: Path | None = None
@@ -69,13 +68,11 @@ class CollectConfig(OriginOptions, PictureOptions, RandomizedOptions):
 @verb(CollectConfig)
 def run(config: CollectConfig) -> int:
     """Collect the demonstrations. Returns the exit status 0."""
-    if not config.task and not isinstance(config.source, ActionsSource):
+    if not config.task:
         from taccorl.sim.task import tasks
 
         raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
     plan = CollectPlan(**settings(config, CollectPlan, task=config.task or ""))
-    if isinstance(plan.source, ActionsSource):
-        plan = plan.source.plan(plan)
     if config.engine != LocalEngine() and (config.as_recording or not plan.repeatable):
         why = "--as_recording=true" if config.as_recording else "a person demonstrates"
         raise TaccorlError(f"--engine: with several processes the attempts have no order, and {why}: remove --engine")

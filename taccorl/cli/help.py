@@ -14,10 +14,9 @@ WIDTH = 100
 """Most columns of the short help."""
 SHOWN = {
     "collect": "task episodes out source.type as_recording twin difficulty seed engine.workers",
-    "augment": "source task episodes out rows engine.workers",
+    "augment": "source task episodes out pictures engine.workers",
     "task new": "",
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
-    "execute": "source out pictures engine.workers",
     "evaluate": "policy.path policy.type task episodes seed against twin robot pictures hide out",
     "post-train": "policy.path env.task env.twin anchor.dataset anchor.weight iterations resume rerun out",
     "init-robot": "out dataset",
@@ -30,11 +29,11 @@ SHOWN = {
     "excite": "twin pads effects measurements out",
     "surrogate": "secret effects signal strength pads twin reveal out",
     "serve-surrogate": "task secret faults port",
-    "ingest": "spec out dry_run watch domain replace",
+    "ingest": "spec out dry_run domain replace",
     "ingest inspect": "draft",
     "check": "spec quick repair",
     "merge": "real sim pictures resolution out",
-    "view": "episode spec against align serve save screenshot sheet",
+    "view": "episode spec against align serve save sheet",
     "lineage explain": "store",
     "lineage prune": "store keep yes",
 }

@@ -1,18 +1,14 @@
 """``taccorl ingest recordings/ --spec=piper_flexitac_mcap --out=outputs/my_dataset``
 
 Turn recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one LeRobot v3 dataset with touch.
-``--watch=true`` ingests recordings as they arrive in a folder, until Ctrl-C.
 ``taccorl ingest inspect FILE`` prints the contents of a recording and drafts its specs.
 """
 
-import contextlib
 import ctypes
 import dataclasses
 import json
 import os
 import shlex
-import signal
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,7 +19,7 @@ from taccorl.cli.card import add_card
 from taccorl.cli.output_lock import check_apart
 from taccorl.cli.parse import parse
 from taccorl.data.origin import DOMAINS, Domain, Origin
-from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, nearest, printable
+from taccorl.errors import DatasetError, InTheWayError, TaccorlError, nearest, printable
 from taccorl.lineage.destinations import check_writable, is_free, write_new
 from taccorl.lineage.engines import Engine, LocalEngine
 
@@ -31,7 +27,6 @@ if TYPE_CHECKING:
     from taccorl.data.ingest import Job
     from taccorl.data.inspection import Inventory
     from taccorl.data.recording import Source
-    from taccorl.data.spec import RecordingSpec
 
 
 @dataclass(kw_only=True)
@@ -48,15 +43,12 @@ class IngestConfig:
     """Folder that keeps finished recordings, so that a second run continues where the first ended."""
     dry_run: bool = False
     """Read, align and check, but write no dataset (two rows are written into a scratch folder as a test)."""
-    watch: bool = False
-    """Ingest recordings as they arrive in the folders, with one line each, until Ctrl-C or SIGTERM; then publish the dataset of
-    all complete ones. A recording is complete when its files have not changed for 5 s."""
     domain: str | None = None
     """Who made the recordings that do not say so themselves: real (a robot), surrogate (a simulation in its place) or twin."""
     replace: bool = False
     """If `out` holds another dataset, move that one aside (out.old-1, …) and publish the new one."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where recordings are ingested: --engine.type=local --engine.workers=2, slurm, ray."""
+    """Where recordings are ingested: --engine.type=local --engine.workers=2, or ray."""
 
 
 @dataclass(kw_only=True)
@@ -109,17 +101,12 @@ def run(config: IngestConfig) -> int:
     if config.domain not in (None, *DOMAINS):
         raise TaccorlError(f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}")
     if config.spec is None:
-        config = dataclasses.replace(config, spec=chosen_spec(config.paths, config.watch))
+        config = dataclasses.replace(config, spec=chosen_spec(config.paths))
     assert config.spec is not None
     spec = load_recording_spec(config.spec)
     skipped: list[str] = []
-    if config.watch:
-        jobs = _watch(config, spec, skipped)
-        if not jobs:
-            print("no recording arrived; nothing was written")
-            return 0
-    else:
-        jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped, _domain(config))
+    domain = cast("Domain | None", config.domain)
+    jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped, domain)
     for line in skipped:
         print(f"not read: {printable(line)}")
     _check_out(config, jobs)
@@ -142,76 +129,14 @@ def run(config: IngestConfig) -> int:
     return 1 if bad else 0
 
 
-def chosen_spec(paths: Sequence[Path], watch: bool = False) -> str:
+def chosen_spec(paths: Sequence[Path]) -> str:
     """Name of the shipped spec that fits recordings for which the user gave none, which is printed. Raises TaccorlError: none
     fits, or several do."""
     from taccorl.data.inspection import choose_spec
 
-    if watch:
-        raise TaccorlError("--watch=true needs --spec=…: what will arrive is unknown")
     name = choose_spec(paths)
     print(f"spec:    {name}, whose topics these are (--spec={name})")
     return name
-
-
-def _domain(config: IngestConfig) -> "Domain | None":
-    return cast("Domain | None", config.domain)
-
-
-def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "list[Job]":
-    """Ingest what arrives until the user stops it; returns all that are complete then. ``skipped``: is told what else lies in
-    the folders then and why it is not read."""
-    from taccorl.cli.progress import Bars
-    from taccorl.data.ingest import SETTLED_S, Arrivals, Job, find_jobs, ingest_each
-    from taccorl.lineage.store import Store
-
-    if config.dry_run:
-        raise TaccorlError("--watch=true writes each recording's rows into the store; remove --dry_run")
-    for path in config.paths:
-        if not path.is_dir():
-            raise TaccorlError(f"{path}: there is no such folder to watch; create it, or remove --watch")
-    _check_out(config, [])
-    if not is_free(config.out) and not config.replace:
-        raise InTheWayError(f"{config.out} exists: give another --out, or --replace=true to move it aside at the end.")
-    Store(config.store).make()
-
-    def find() -> "list[Job]":
-        skipped.clear()
-        jobs: dict[str, Job] = {}
-        for path in config.paths:
-            with contextlib.suppress(RecordingError):  # nothing there yet
-                found = find_jobs([path], spec, str(config.spec), config.store, False, skipped, _domain(config))
-                jobs |= {job.source.name: job for job in found}
-        return list(jobs.values())
-
-    arrivals = Arrivals(find)
-    print(f"watching {', '.join(map(str, config.paths))}; Ctrl-C ends it and writes {config.out}", flush=True)
-    stopping = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        while True:
-            for job in arrivals.look(time.monotonic()):
-                begin_s = time.monotonic()
-                with Bars(1) as bars:
-                    [entry] = ingest_each([job], progress=bars.update)
-                print(_arrived(entry, time.monotonic() - begin_s), flush=True)
-            time.sleep(1.0)
-    except KeyboardInterrupt:
-        print()
-    finally:
-        signal.signal(signal.SIGTERM, stopping)
-    for job in arrivals.growing:
-        print(f"left out, changed in the last {SETTLED_S:.0f} s: {printable(job.source.name)}")
-    return arrivals.complete
-
-
-def _arrived(entry: dict[str, Any], seconds: float) -> str:
-    """One line about a recording."""
-    written = [e for e in entry["episodes"] if e["outcome"] == "written"]
-    name = entry["recording"] + (f"#{entry['part']}" if entry["part"] else "")
-    line = f"{time.strftime('%H:%M:%S')} {name}: {entry['outcome']}"
-    if written:
-        line += f", {len(written)} episodes, {sum(e['rows'] for e in written)} rows"
-    return printable(f"{line} ({seconds:.1f} s)" + (f": {entry['reason']}" if entry["reason"] else ""))
 
 
 def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
@@ -223,11 +148,8 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
         raise DatasetError(f"--out={out} is not the name of a folder: give a name")
     if inside := [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]:
         raise DatasetError(f"{inside[0]} is an input, and lies in --out={out}: give another --out")
-    for name, place in (("out", whole), ("store", store))[: 1 + config.watch]:
-        if within := [path for path in config.paths if path.is_dir() and place.is_relative_to(path.resolve())]:
-            raise TaccorlError(
-                f"--{name}={getattr(config, name)} lies in {within[0]}, which is read: give another folder"
-            )
+    if within := [path for path in config.paths if path.is_dir() and whole.is_relative_to(path.resolve())]:
+        raise TaccorlError(f"--out={out} lies in {within[0]}, which is read: give another folder")
     check_apart(out, [("--store", config.store)])
     check_path(store)
     if config.dry_run:

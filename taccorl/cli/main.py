@@ -16,7 +16,6 @@ VERBS = {
         "task": "`task new NAME` writes a working task of your own, which collect, augment and evaluate then know",
         "augment": "a few demonstrations from the twin → many new ones (MimicGen)",
         "correct": "the expert takes over where a policy fails → dataset of its corrections (DAgger)",
-        "execute": "stored actions (augment --rows=actions) → LeRobot dataset, or frames for training without any video",
         "evaluate": "success rate of a policy in the twin, its interval, failures; comparison of two policies on the same scenes",
         "post-train": "a policy → a better one: PPO in the twin, kept close to real demonstrations",
         "init-robot": "MJCF or URDF of your own robot → a robot file for compare, diagnose and add-effect",
@@ -36,17 +35,15 @@ VERBS = {
         "view": "an episode in Rerun: pictures, touch, joints, arms",
     },
     "store": {"lineage": "inputs of every result: `lineage explain PATH`; delete unneeded ones: `lineage prune`"},
-    "shell": {"completion": "`completion bash`, zsh or fish: a script that completes verbs, options and files there"},
 }
 """Heading of the list of commands → verb → description."""
 SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune"), "task": ("new",)}
-SECOND_WORDS |= {"completion": ("bash", "zsh", "fish")}
 """Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 
 ONE_THREAD = ("compare", "align", "diagnose", "excite")
 """Verbs whose linear algebra runs in one thread unless the environment states another number: their matrices have some ten
 columns, and threads that wait for work doubled the CPU time of ``diagnose``."""
-_KEEPS = ("collect", "augment", "correct", "execute", "ingest", "merge")
+_KEEPS = ("collect", "augment", "correct", "ingest", "merge")
 """Verbs that keep finished work in a store."""
 
 

@@ -5,7 +5,7 @@ Merge datasets of the robot and of the twin into one for co-training. Every row 
 are computed anew over all rows.
 
 ``--pictures=cache --resolution=112x112`` writes no videos: frames of all datasets are put into the cache from which
-``lerobot-train --dataset.cache=gpu|host|disk`` reads them, also those of ``taccorl execute --pictures=cache``. Only with that
+``lerobot-train --dataset.cache=gpu|host|disk`` reads them, also those of ``taccorl collect --pictures=cache``. Only with that
 option can such a dataset be trained on.
 """
 

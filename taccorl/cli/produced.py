@@ -1,4 +1,4 @@
-"""What the verbs that produce episodes (collect, augment, correct, execute) have in common: options, places, and the end."""
+"""What the verbs that produce episodes (collect, augment, correct) have in common: options, places, and the end."""
 
 import shlex
 import time
@@ -29,7 +29,7 @@ class KeptOptions:
     """Folder that keeps finished attempts and rendered frames, so that a second run continues where the first ended;
     lerobot-train finds the frames by --dataset.cache_store."""
     engine: Engine = field(default_factory=LocalEngine)
-    """Where attempts run: --engine.type=local --engine.workers=16, slurm, ray."""
+    """Where attempts run: --engine.type=local --engine.workers=16, or ray."""
 
 
 @dataclass(kw_only=True)

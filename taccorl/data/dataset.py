@@ -29,7 +29,7 @@ from taccorl.data.video_files import frame_problems, video_frames
 from taccorl.errors import DatasetError, TaccorlError, no_such_path
 
 PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
-DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
+DATASET_STAGES = {"collection": "collect", "corrections": "correct", "augmented": "augment"}
 """Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in their order."""
 ROWS_PER_PICTURE = "rows_per_picture"
 """Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
@@ -69,7 +69,7 @@ class Dataset:
         cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
         known = {name.rpartition("/")[0] for name in self._table[0]} if self._table else set()
         self.unstored = tuple(key for key in cameras if self._table and f"videos/{key}" not in known)
-        """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in training's frame cache."""
+        """Cameras without videos: ``taccorl collect --pictures=cache`` stored their frames only in training's frame cache."""
         self.cameras = [key for key in cameras if key not in self.unstored]
         if self.unstored:
             kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}

@@ -44,7 +44,7 @@ def require_videos(root: Path) -> None:
     pictures = any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
     if pictures and (unstored := Dataset(root).unstored):
         text = f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
-        raise DatasetError(f"{text}--pictures=cache, or make it with taccorl execute --pictures=video")
+        raise DatasetError(f"{text}--pictures=cache, or make it with taccorl collect --pictures=video")
 
 
 @dataclass(eq=False)

@@ -336,10 +336,11 @@ class Recording:
         """Origin that the file's metadata state. Raises TaccorlError: they state a real domain of a simulated recording, or
         several domains (RecordingError)."""
         records = self.reader.metadata.values()
-        ours = [r for r in records if r.get("domain") in DOMAINS]  # other people's key may have any value
-        stated = [Origin.read(r) for r in ours]
-        named = [Origin.read({"origin": r["origin"]}) for r in records if "origin" in r and r not in ours]
-        domains = {origin.domain for origin in (*stated, *named) if origin.domain is not None}
+        stated = [
+            Origin.read(r) for r in records if r.get("domain") in DOMAINS
+        ]  # other people's key may have any value
+        named = [Origin(text=r["origin"]) for r in records if "origin" in r]
+        domains = {str(origin.domain) for origin in stated}
         if len(domains) > 1:
             raise RecordingError(f"{self.source.name}: its metadata state the domains {', '.join(sorted(domains))}")
         return next(iter(stated or named), Origin())

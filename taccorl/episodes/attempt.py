@@ -43,7 +43,7 @@ Actions = Iterator[Targets]
 
 @dataclass(frozen=True, kw_only=True)
 class Source(draccus.ChoiceRegistry, abc.ABC):
-    """Who demonstrates: --source.type=expert, keyboard, leader, actions."""
+    """Who demonstrates: --source.type=expert or leader."""
 
     repeatable: ClassVar[bool] = True
     """True if the same seed gives the same actions."""

@@ -1,7 +1,7 @@
 """Plan of numbered attempts in the twin: what all of them have in common, and what a kind of attempt defines.
 
-``produce`` runs any plan. Kinds: ``CollectPlan`` (expert, person, action files), ``AugmentPlan`` (MimicGen), ``CorrectPlan``
-(policy, then expert), ``ExecutePlan`` (stored actions).
+``produce`` runs any plan. Kinds: ``CollectPlan`` (expert, person), ``AugmentPlan`` (MimicGen), ``CorrectionPlan``
+(policy, then expert).
 """
 
 import abc
@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 import taccorl
-from taccorl.data.dataset import PROVENANCE, Dataset
+from taccorl.data.dataset import Dataset
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Attempt, Entry, read_json, write_attempt
@@ -45,7 +45,7 @@ class Made:
     """A finished attempt in the store."""
 
     artefact: Artefact
-    """entry.json; of a kept attempt also dataset/ with episodes.json, or the actions from which rows are made."""
+    """entry.json; of a kept attempt also dataset/ with episodes.json."""
     entry: Entry
     seconds: dict[str, float] = field(default_factory=dict)
     """Part of the work → time it took [s]; empty if the attempt was in the store."""
@@ -305,11 +305,6 @@ class Plan(abc.ABC):
         the first attempt, when only settings that do not depend on attempts are known."""
         return {"task": self.task}
 
-    def report_at(self, out: Path) -> dict[str, Any] | None:
-        """Report of what is at ``out``; None if there is none."""
-        path = out / PROVENANCE / REPORT
-        return read_json(path) if path.is_file() else None
-
     def items_of(self, report: dict[str, Any]) -> Iterable[Any] | None:
         """Attempts of which a dataset with that report may be made; None if it cannot be one of this plan's."""
         return [entry["attempt"] for entry in report["entries"]] if report["episodes"] == self.episodes else None
@@ -335,11 +330,6 @@ class Plan(abc.ABC):
     def nothing(self, report: dict[str, Any], out: Path) -> TaccorlError:
         """The error if no attempt is kept."""
         return TaccorlError(f"{self.task}: no attempt succeeded, nothing was written to {out}: {report['outcomes']}")
-
-    def write(self, report: dict[str, Any], kept: list[Path], folder: Path) -> bool:
-        """Write the kept attempts, in the folders ``kept``, into ``folder`` in a format of this plan. Returns False if it has
-        none: the caller then writes a LeRobot dataset."""
-        return False
 
 
 _kept: dict[str, Any] = {}

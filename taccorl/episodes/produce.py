@@ -89,8 +89,7 @@ def produce(
         raise plan.nothing(report, out)
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
-        if not plan.write(report, inputs, folder):
-            _assemble(spec, report, inputs, folder, plan.cached_rows, engine)
+        _assemble(spec, report, inputs, folder, plan.cached_rows, engine)
 
     config = plan.dataset_config([each.entry for each in made])
     store.run(plan.dataset.bound(write), config, kept, destination=out)
@@ -178,8 +177,8 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
         if (
             manifest["stage"] == plan.dataset.name
             and manifest["config"].items() >= config.items()
-            and (report := plan.report_at(out)) is not None
-            and plan.may_be_made_of(report, {entry["key"] for entry in manifest["inputs"]}, store)
+            and (report := out / PROVENANCE / REPORT).is_file()
+            and plan.may_be_made_of(read_json(report), {entry["key"] for entry in manifest["inputs"]}, store)
         ):
             return  # made of attempts of this very plan, and of as many successes
         other = [key for key in config if manifest["config"].get(key) != config[key]] or [

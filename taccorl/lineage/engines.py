@@ -1,22 +1,22 @@
-"""Engines run one function on many items: in this process, in several, or on a cluster.
+"""Engines run one function on many items: in this process, in several, or on a Ray cluster.
 
-``--engine.type=local --engine.workers=8``, ``--engine.type=slurm --engine.partition=cpu``, ``--engine.type=ray``
+``--engine.type=local --engine.workers=8``, ``--engine.type=ray --engine.tasks=100``
 
 Results come in the order of the items. An item that fails does not stop the others; at the end one `EngineError` names
 every item that failed. Finished work is in the store, so the next run does only the rest.
 """
 
 import abc
-import functools
+import importlib
 import itertools
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import draccus
 
-from taccorl.lineage import cluster
+from taccorl.errors import TaccorlError
 from taccorl.lineage.errors import EngineError
 from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, attempt, run_in_processes
 
@@ -124,56 +124,53 @@ class LocalEngine(Engine):
             take(index, attempt(fn, items[index]))
 
 
+@Engine.register_subclass("ray")
 @dataclass(frozen=True, kw_only=True)
-class _ClusterEngine(Engine):
-    """One job on a cluster, through datatrove (extra ``cluster``); ``on_done`` is called at its end."""
+class RayEngine(Engine):
+    """The Ray cluster of RAY_ADDRESS, else one on this machine (extra ``ray``). All nodes must see the folder of the store."""
 
-    work_dir: Path = Path("outputs/cluster")
-    """Folder for items, results and logs that all nodes can access. The store must also be in such a folder."""
     tasks: int = 100
-    """Most tasks of a job (elements of Slurm's job array, below the cluster's MaxArraySize); each runs every tasks-th item."""
+    """Most tasks at the same time; each runs every tasks-th item, in a process of its own, so that an item that kills it, or
+    hangs, costs no other. ``on_done`` is called when a task has ended."""
     cpus_per_task: int = 1
-    """Number of CPU cores of one task."""
-    mem_per_cpu_gb: int = 4
-    """Memory that a task gets for each of its CPU cores [GB]."""
+    """Number of CPU cores that Ray reserves for a task."""
 
     @property
     def at_once(self) -> int:
         return self.tasks
 
-    def _submit(self, run, fn, items, first, name, take, care) -> None:
-        """``Engine._run`` by ``run``, a function of ``cluster``, as one job of the items from ``first`` on."""
-        run(
-            cluster.Job.create(self.work_dir, fn, items[first:], name, care),
-            lambda index, outcome: take(first + index, outcome),
-            tasks=min(self.tasks, len(items) - first),
-            cpus_per_task=self.cpus_per_task,
-            mem_per_cpu_gb=self.mem_per_cpu_gb,
-        )
-
-
-@Engine.register_subclass("slurm")
-@dataclass(frozen=True, kw_only=True)
-class SlurmEngine(_ClusterEngine):
-    """A Slurm cluster. Waits until the job has ended."""
-
-    partition: str
-    """Name of the Slurm partition."""
-    time: str = "24:00:00"
-    """Time limit of one task, in Slurm's format."""
-
     def _run(self, fn, items, first, name, take, care) -> None:
-        run = functools.partial(cluster.run_on_slurm, partition=self.partition, time=self.time)
-        self._submit(run, fn, items, first, name, take, care)
+        ray = start_ray()
+        task = ray.remote(_outcomes).options(num_cpus=self.cpus_per_task)
+        shares = [range(start, len(items), self.tasks) for start in range(first, min(first + self.tasks, len(items)))]
+        running = {task.remote(fn, [items[i] for i in share], care): share for share in shares}
+        while running:
+            (ended,), _ = ray.wait(list(running))
+            share = running.pop(ended)
+            try:
+                outcomes = ray.get(ended)
+            except ray.exceptions.RayError as error:
+                outcomes = [Failed(f"its task ended without a result: {error}")] * len(share)
+            for index, outcome in zip(share, outcomes, strict=True):
+                take(index, outcome)
 
 
-@Engine.register_subclass("ray")
-@dataclass(frozen=True, kw_only=True)
-class RayEngine(_ClusterEngine):
-    """A running Ray cluster."""
+def _outcomes(fn: Callable[[Any], Any], items: list[Any], care: Care) -> list[Done | Failed]:
+    """Outcomes of all items, in their order, from another process of this machine."""
+    outcomes: dict[int, Done | Failed] = {}
+    run_in_processes(fn, items, 1, str, outcomes.__setitem__, care)
+    return [outcomes[index] for index in range(len(items))]
 
-    def _run(self, fn, items, first, name, take, care) -> None:
-        self._submit(cluster.run_on_ray, fn, items, first, name, take, care)
+
+def start_ray() -> Any:
+    """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine. Raises
+    TaccorlError: Ray is not installed."""
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ModuleNotFoundError as error:
+        raise TaccorlError('Ray is not installed: pip install "lerobot_policy_taccorl[ray]"') from error
+    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING)
+    return ray
 
 
 def _failure_text(failures: list[tuple[str, Failed]], num_items: int) -> str:

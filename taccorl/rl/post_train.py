@@ -26,6 +26,7 @@ from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.policy_actor import Checkpoint, needs_images, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
 from taccorl.lineage.destinations import is_free
+from taccorl.lineage.engines import start_ray
 from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
 from taccorl.policies.tactile_pi05.weights import load_checkpoint
 from taccorl.rl import checkpoint, run_settings
@@ -37,7 +38,7 @@ from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO
 from taccorl.rl.rollout import Clock, collect, first_episodes
 from taccorl.rl.settings import PostTrainSettings
-from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard, start_ray
+from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard
 from taccorl.rl.start_states import NUM_STATES, StartStates
 from taccorl.rl.twin_shard import make_shard
 from taccorl.rl.twin_world import TwinWorld

@@ -6,8 +6,6 @@ Results do not depend on the place.
 """
 
 import contextlib
-import importlib
-import logging
 import multiprocessing
 import traceback
 from abc import ABC, abstractmethod
@@ -127,14 +125,3 @@ class RayShard(Shard):
 
     def close(self) -> None:
         self._ray.kill(self._actor)  # it holds nothing that must be saved
-
-
-def start_ray() -> Any:
-    """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine. Raises
-    TaccorlError: Ray is not installed."""
-    try:
-        ray: Any = importlib.import_module("ray")
-    except ModuleNotFoundError as error:
-        raise TaccorlError("--env.ray=true: Ray is not installed: pip install 'taccorl[ray]'") from error
-    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING)
-    return ray

@@ -145,7 +145,7 @@ def merge_domains(
     Args:
         real: datasets of the robot, or of a surrogate that stands for it.
         sim: datasets of the twin.
-        videos: False: the result states its cameras and has no videos, as of ``taccorl execute --pictures=cache``;
+        videos: False: the result states its cameras and has no videos, as of ``taccorl collect --pictures=cache``;
             ``frame_cache.join_frames`` stores its frames.
 
     Raises:

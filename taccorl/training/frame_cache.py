@@ -380,8 +380,7 @@ def _command(root: Path, dataset: Dataset) -> str:
     if "observation.is_sim" in dataset.info["features"]:
         words = "merge --real=… --sim=…"
     else:
-        command = DATASET_STAGES.get(read_manifest(root).get("stage", ""), "execute")
-        words = {"execute": "execute --source=…"}.get(command, f"{command} …")
+        words = DATASET_STAGES.get(read_manifest(root).get("stage", ""), "collect") + " …"
     return f"taccorl {words} --out={root} --pictures=cache"
 
 

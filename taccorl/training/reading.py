@@ -288,7 +288,7 @@ class FastReader(DatasetReader):
             if self._cache is None and self.cameras:
                 raise DatasetError(
                     f"{self.root}: has no videos of {', '.join(cameras)}; its frames are only in the frame cache of training: "
-                    "give --dataset.cache=gpu (host, disk), or make a dataset with videos by taccorl execute --pictures=video"
+                    "give --dataset.cache=gpu (host, disk), or make a dataset with videos by taccorl collect --pictures=video"
                 )
             assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
             for key in cameras:  # LeRobot puts ImageNet's there

@@ -269,7 +269,7 @@ def _cameras(dataset: Dataset) -> list[str]:
     if not cameras or "sim.state" not in features:
         raise DatasetError(
             f"{dataset.root}: has {len(cameras)} cameras and {'' if 'sim.state' in features else 'no '}sim.state: frames can "
-            "be rendered only for datasets of the twin with both: taccorl execute --pictures=cache"
+            "be rendered only for datasets of the twin with both: taccorl collect --pictures=cache"
         )
     return cameras
 
@@ -284,6 +284,6 @@ def _opened(root: Path) -> tuple[Dataset, Simulation]:
         dataset = Dataset(root)
         told: Any = dataset.episode_facts(0).get("provenance", {}).get("simulation")
         if not isinstance(told, dict) or "twin" not in told:
-            raise DatasetError(f"{root}: does not state in which twin it was made; make it with taccorl execute")
+            raise DatasetError(f"{root}: does not state in which twin it was made; make it with taccorl collect")
         _open[root] = dataset, make_simulation(told)
     return _open[root]

@@ -145,8 +145,6 @@ def _origin(dataset: Dataset, origins: Counter[Origin]) -> Section:
     for part in _read(dataset, "cotrain.json", []):
         kind = "simulated" if part["is_sim"] else "given as real"
         rows.append([f"{kind}: {Path(part['dataset']).name}", str(part["episodes"])])
-    if any(origin.derived for origin in origins):
-        notes.append("Derived: written before taccorl stored domains; the text or the simulator's columns tell it.")
     if any(origin.domain is None for origin in origins):
         notes.append("Where the domain is not stated, nothing here says whether a robot or a simulator made the data.")
     if manifest := dataset.provenance:

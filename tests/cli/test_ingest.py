@@ -2,10 +2,6 @@
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -75,73 +71,6 @@ def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path,
         assert "Traceback" not in error
 
 
-def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(good, said):
-    Path("out").mkdir()
-    code, text = said(good, "--spec", "piper_flexitac_mcap", "--out", "out")
-    assert (code, Path("out/meta/info.json").is_file()) == (0, True), text
-
-
-def watching(folder: Path, *words: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(folder), SPEC, "--watch=true", *words]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-
-
-def next_line(process: subprocess.Popen[str], word: str) -> str:
-    assert process.stdout is not None
-    for line in process.stdout:
-        if word in line:
-            return line
-    raise AssertionError(f"ended without {word!r}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_watching_ingests_what_arrives_and_publishes_the_same_dataset_at_the_end(good, tmp_path, said, end):
-    folder = tmp_path / "recordings"
-    folder.mkdir()
-    process = watching(folder, "--out=watched", "--store=store")
-    try:
-        next_line(process, "watching")
-        content, file = good.read_bytes(), folder / "good.mcap"
-        file.write_bytes(content[: len(content) // 2])  # a recorder at work
-        time.sleep(3)
-        file.write_bytes(content)
-        arrived = next_line(process, "good.mcap")
-        assert "written, 1 episodes, 70 rows" in arrived  # not the half file, which would be split or refused
-        (folder / "late.mcap").write_bytes(content[:1000])
-        time.sleep(1.5)
-        process.send_signal(end)
-        rest = process.communicate(timeout=60)[0]
-    finally:
-        process.kill()
-    assert process.returncode == 0, rest
-    assert "late.mcap" in next(line for line in rest.splitlines() if "left out" in line)
-    (folder / "late.mcap").unlink()
-    assert said(folder, SPEC, "--out=plain", "--store=other")[0] == 0
-    rows = {p.relative_to("plain"): p.read_bytes() for p in Path("plain/data").rglob("*.parquet")}
-    assert rows and rows == {p.relative_to("watched"): p.read_bytes() for p in Path("watched/data").rglob("*.parquet")}
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("--dry_run=true",), "--dry_run"),
-        (("--out=in/dataset",), "--out=in/dataset"),
-        (("--store=in/store",), "--store=in/store"),
-        (("--out=there",), "there"),
-    ],
-)
-def test_watching_refuses_at_once_what_could_not_end_well(words, named, said):
-    Path("in").mkdir()
-    Path("there").mkdir()
-    Path("there/file").write_text("mine")
-    code, text = said("in", SPEC, "--watch=true", *words)
-    assert code == 2 and named in text, text
-    assert sorted(p.name for p in Path.cwd().iterdir()) == ["in", "there"]
-    code, text = said("nowhere", SPEC, "--watch=true")
-    assert code == 2 and "nowhere" in text
-
-
 @pytest.mark.parametrize("dry_run", ["true", "false"])
 def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run, tmp_path, said):
     (folder := tmp_path / "in").mkdir()
@@ -206,13 +135,6 @@ def test_inspect_shows_channels_and_names_the_spec_that_fits(good, said):
     assert f"fits the shipped spec: taccorl ingest {good} {SPEC}" in text
     assert "stand-in recording, not a robot" in text
     assert list(Path.cwd().iterdir()) == []
-
-
-def test_inspect_reads_a_dataset_too(dataset, said):
-    code, text = said("inspect", dataset)
-    assert code == 0
-    assert "observation.tactile/left_a" in text
-    assert "taccorl_lerobot" in text
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(good, tmp_path, said):

@@ -448,16 +448,3 @@ def test_a_store_that_is_read_only_is_told_at_once(tmp_path, spec, good, monkeyp
 
 
 # ---- many at once ----
-
-
-@pytest.mark.slow
-def test_two_workers_write_the_same_bytes_as_one(ingests, good, tmp_path):
-    assert ingests.run(good) == 0
-    assert ingests.run(good, out=tmp_path / "out2", store=tmp_path / "store2", engine__workers=2) == 0
-    one, two = (
-        # name the folder
-        {path: data for path, data in content(out).items() if not path.startswith(("README.md", ".card"))}
-        for out in (ingests.out, tmp_path / "out2")
-    )
-    assert two == one and "meta/info.json" in one
-    assert json.loads((tmp_path / "out2.ingest_report.json").read_text()) == ingests.report()

@@ -1,4 +1,4 @@
-"""Origin of data: stated, kept through every step, derived only for data written before there was a domain, never made real."""
+"""Origin of data: stated, kept through every step, never made real."""
 
 import json
 import shutil
@@ -8,11 +8,10 @@ import h5py
 import pytest
 
 from taccorl.alignment.measurements.folder import read_measurements
-from taccorl.cli.main import main
 from taccorl.data.cutting import Cutter
 from taccorl.data.dataset import Dataset
 from taccorl.data.ingest import Job, ingest_one
-from taccorl.data.origin import Origin, stated_origin
+from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources, load_recording
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import DatasetError, TaccorlError
@@ -44,36 +43,14 @@ def hdf5(tmp_path: Path) -> Path:
 # ---- the value ----
 
 
-@pytest.mark.parametrize(
-    ("text", "domain"),
-    [
-        ("surrogate stand-in, not a robot", "surrogate"),
-        ("surrogate recording from the MuJoCo twin, not a robot", "surrogate"),
-        ("simulated servo (taccorl.diagnosis.surrogate.pendulum)", "surrogate"),
-        ("MuJoCo twin, not a robot", "twin"),
-        ("twin replay of: recording_3.mcap", "twin"),
-        ("arm 2, Tuesday", None),
-    ],
-)
-def test_texts_written_before_there_was_a_domain_give_it_and_the_label_says_so(text: str, domain: str | None) -> None:
-    found = Origin.read({"origin": text})
-    assert (found.domain, found.text, found.derived) == (domain, text, domain is not None)
-    assert ("(derived)" in str(found)) == found.derived
-
-
 def test_a_simulator_s_columns_are_of_the_twin_where_nothing_is_stated() -> None:
-    assert Origin.read({}, ["action", "sim.state"]) == Origin("twin", "", derived=True)
+    assert Origin.read({}, ["action", "sim.state"]) == Origin("twin", "")
     assert Origin.read({}, ["action"]) == Origin()
     assert Origin.read({"domain": None, "origin": ""}, ["sim.state"]) == Origin()  # stated: not known
 
 
 def test_what_is_stated_is_read_back_as_it_was_and_no_text_overrules_it() -> None:
-    for origin in (
-        Origin("real", "arm 2"),
-        Origin("surrogate", "MuJoCo twin"),
-        Origin("twin", "x", derived=True),
-        Origin(),
-    ):
+    for origin in (Origin("real", "arm 2"), Origin("surrogate", "MuJoCo twin"), Origin("twin", "x"), Origin()):
         assert Origin.read(json.loads(json.dumps(origin.record()))) == origin
 
 
@@ -82,12 +59,9 @@ def test_an_unknown_domain_is_refused_with_its_value() -> None:
         Origin.read({"domain": "reel"})
 
 
-@pytest.mark.parametrize("text", ["stand-in recording, not a robot", "surrogate: anything", "MuJoCo twin"])
-def test_no_text_of_a_simulation_goes_with_real(text: str) -> None:
+def test_no_text_of_a_simulation_goes_with_real() -> None:
     with pytest.raises(TaccorlError, match="contradicts the data"):
-        Origin("real", text)
-    with pytest.raises(TaccorlError, match="contradicts the data"):
-        stated_origin("real", text)
+        Origin("real", "stand-in recording, not a robot")
 
 
 def test_a_simulator_s_columns_go_with_no_real_domain() -> None:
@@ -121,9 +95,6 @@ def test_a_recording_that_states_two_domains_is_refused(hdf5: Path, tmp_path: Pa
     recording = load_recording(find_sources(hdf5, reader=spec.reader)[0][1], spec, tmp_path)
     recording.reader.metadata = {"joined": {"domain": "real"}, **recording.reader.metadata}
     with pytest.raises(TaccorlError, match=r"episode_0.*real, surrogate"):
-        _ = recording.origin
-    recording.reader.metadata = {"joined": {"domain": "real"}, "old": {"origin": "surrogate stand-in"}}
-    with pytest.raises(TaccorlError, match=r"real, surrogate"):
         _ = recording.origin
 
 
@@ -169,21 +140,8 @@ def test_a_table_s_user_states_its_domain_in_the_columns_file_or_for_the_folder(
         ("", "", Origin()),
         ("domain: real\norigin: bench 4\n", "", Origin("real", "bench 4")),
         ("origin: bench 4\n", "domain: real\n", Origin("real", "bench 4")),
-        ("origin: simulated servo (made up)\n", "", Origin("surrogate", "simulated servo (made up)", derived=True)),
+        ("origin: bench 4\n", "", Origin(None, "bench 4")),
     ):
         (tmp_path / "columns.yaml").write_text(COLUMNS + columns)
         (tmp_path / "measurements.yaml").write_text("columns: columns.yaml\n" + index)
         assert [m.origin for m in read_measurements(tmp_path).all] == [expected]
-
-
-def test_check_says_that_a_domain_was_derived(dataset, tmp_path, capsys):
-    old = tmp_path / "old"
-    shutil.copytree(dataset, old)
-    path = old / "meta/taccorl/episodes.json"
-    records = json.loads(path.read_text())
-    path.write_text(
-        json.dumps([{k: v for k, v in r.items() if k != "domain"} | {"origin": "surrogate stand-in"} for r in records])
-    )
-    assert Dataset(old).episode(0).origin == Origin("surrogate", "surrogate stand-in", derived=True)
-    main(["check", str(old), "--quick=true", "--pictures=false"])
-    assert "surrogate (derived): surrogate stand-in" in " ".join(capsys.readouterr().out.split())

@@ -46,7 +46,7 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))
     assert learn.main(words)[:2] == [less, done]
-    assert commands == ["collect", "collect", "augment", "execute"]  # which find what they made; no training
+    assert commands == ["collect", "collect", "augment"]  # which find what they made; no training
 
 
 @pytest.mark.slow

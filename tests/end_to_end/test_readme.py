@@ -5,6 +5,7 @@ What is given here is made up: stand-in recordings, and surrogates of a PiPER an
 hours as they stand are made small (``SMALL``); blocks below a comment that says so are not run.
 """
 
+import importlib
 import os
 import re
 import shlex
@@ -12,13 +13,14 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 
-from taccorl.cli.completion import options_of
 from taccorl.cli.main import VERBS
+from taccorl.cli.parse import _inner_names
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -41,6 +43,8 @@ SMALL = {  # verb → options that take the place of the line's own, or are adde
     "view": ("--save=episode.rrd",),  # there is no screen
     "lerobot-train": ("--steps=2", "--batch_size=2", "--num_workers=0", "--save_checkpoint=false"),
 }
+ELSEWHERE = {"serve-surrogate": "taccorl.robot_plugin.surrogate_server"}
+"""Verb → module that defines its options, if not the verb's own."""
 PAGES = ("README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md"))))
 
 
@@ -82,6 +86,16 @@ def sections() -> list[Command]:
 def masked(text: str) -> str:
     """``text`` without its numbers and the widths of its columns, which another processor may change."""
     return re.sub(r"\s+", " ", re.sub(r"-?\d[\d.,]*", "0", text))
+
+
+def options_of(verb: str) -> set[str]:
+    """Names of the options of a verb and of its second words, nested ones with a dot: ``engine.workers``."""
+    module = importlib.import_module(ELSEWHERE.get(verb, f"taccorl.cli.{verb.replace('-', '_')}"))
+    configs = [kind for name, kind in vars(module).items() if name.endswith("Config") and is_dataclass(kind)]
+    hints = [(name.rstrip("_"), hint) for config in configs for name, hint in get_type_hints(config).items()]
+    return {"config_path"}.union(
+        *({name, *(f"{name}.{inner}" for inner in _inner_names(hint))} for name, hint in hints)
+    )
 
 
 def unknown_options(command: Command) -> list[str]:

@@ -17,7 +17,7 @@ from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
 from taccorl.episodes.attempt import Attempt, Source, Targets, outcome_of
-from taccorl.episodes.plan import Made
+from taccorl.episodes.plan import Listed, Made
 from taccorl.episodes.produce import produce
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.episodes.sources.collect import CollectPlan, Needed, attempt, collect_recordings
@@ -207,7 +207,7 @@ def test_a_twin_that_changes_during_the_run_is_not_mixed_with_the_one_before(tmp
 
 
 def test_an_engine_for_what_has_an_order_is_refused(tmp_path, capsys):
-    for words in (["--as_recording=true"], ["--source.type=keyboard"]):
+    for words in (["--as_recording=true"], ["--source.type=leader"]):
         assert cli(["collect", *ARGUMENTS, *words, f"--out={tmp_path / 'x'}", "--engine.workers=2"]) == 2
         assert "--engine" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
@@ -329,11 +329,10 @@ class Stretched(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class Three(CollectPlan):
-    """Ends after three attempts."""
+    """Three attempts."""
 
-    @property
-    def num_attempts(self):
-        return 3
+    def schedule(self, at_once):
+        return Listed(range(3))
 
 
 @pytest.mark.parametrize("rows", [3, 0])

@@ -1,4 +1,4 @@
-"""Teleoperation without a window: keys and leader arms → actions; action files that survive and give the same bits."""
+"""Teleoperation without a window: leader arms → actions; action files that survive and give the same bits."""
 
 import dataclasses
 import json
@@ -19,20 +19,16 @@ from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.episodes.sources import teleop
 from taccorl.episodes.sources.collect import CollectPlan, attempt
 from taccorl.episodes.sources.expert import ExpertSource
-from taccorl.episodes.sources.teleop import KeyboardSource, LeaderHands, LeaderSource
-from taccorl.episodes.sources.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
-from taccorl.episodes.sources.teleop_jog import AXES, COMMAND_KEYS, Command, Jogger, Keyboard
+from taccorl.episodes.sources.teleop import Command, LeaderHands, LeaderSource
+from taccorl.episodes.sources.teleop_actions import ActionFile, ActionLog, find_finished, scene_of
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts.hands import EXACT
-from taccorl.tasks.experts.se3 import rotvec
 from tests.fresh_python import fresh_python
 
-UP, DOWN, LEFT, RIGHT, HOME, END = 265, 264, 263, 262, 268, 269  # mjui.h, the same as GLFW's
-INSERT, DELETE, PAGE_DOWN, ENTER, F9, SPACE = 260, 261, 267, 257, 298, 32
-DT_S = 1 / 30
+ENTER, F9 = [Command.GO], [Command.DISCARD]
 
 
 @pytest.fixture(scope="module")
@@ -46,163 +42,49 @@ def sim(bench: Simulation) -> Simulation:
     return bench
 
 
-@pytest.fixture
-def jogger(sim: Simulation) -> Jogger:
-    return Jogger(sim, no_keys)
-
-
-def no_keys(taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-    return np.zeros(7), []
-
-
-def tap(jogger: Jogger, *codes: int) -> None:
-    """Press keys, one after the other."""
-    keyboard = Keyboard()
-    for code in codes:
-        jogger.jog(keyboard.requested_steps([code], ())[0])
-
-
-def settle(sim: Simulation, jogger: Jogger, seconds: float = 1.5) -> None:
-    for _ in range(round(seconds / DT_S)):
-        sim.step(jogger.targets()[None])
-
-
-# keys ------------------------------------------------------------------------------------------------------------------
-
-
 def test_none_of_our_keys_means_something_to_mujocos_viewer():
     toggles = [*mujoco.mjVISSTRING, *mujoco.mjRNDSTRING]  # name, default, key
     theirs = {ord(key) for _, _, key in toggles if key}
     theirs |= set(range(ord("0"), ord("6")))  # groups of geoms, with shift of sites
     theirs |= {256, 258, 259, 266, ord("["), ord("]"), *range(290, 297)}  # Esc Tab Backspace Page Up, cameras, F1–F7
     assert set(map(ord, "ABCDEFGHIJKLMNOPQRSTUVWXYZ")) <= theirs, "no letter is free: the lists above are complete"
-    ours = [code for axis in AXES for code in (*axis.more, *axis.less)] + list(COMMAND_KEYS)
-    assert not theirs & set(ours)
-    assert len(set(ours)) == len(ours) == 6 * 2 + 6 + 2 + 4  # moves twice (keypad), turns, gripper, commands
+    assert theirs.isdisjoint(command.code for command in Command)
 
 
-@pytest.mark.parametrize(
-    ("code", "moved_mm"),
-    [(UP, (5, 0, 0)), (DOWN, (-5, 0, 0)), (LEFT, (0, 5, 0)), (RIGHT, (0, -5, 0)), (HOME, (0, 0, 5)), (END, (0, 0, -5))],
-)
-def test_tap_moves_goal_by_a_step_along_the_bench(jogger, code, moved_mm):
-    before, other = jogger.hands["left"].goal.copy(), jogger.hands["right"].goal.copy()
-    tap(jogger, code)
-    after = jogger.hands["left"].goal
-    np.testing.assert_allclose((after - before)[:3, 3] * 1e3, moved_mm, atol=1e-9)
-    np.testing.assert_array_equal(after[:3, :3], before[:3, :3])
-    np.testing.assert_array_equal(jogger.hands["right"].goal, other)
-
-
-@pytest.mark.parametrize(("codes", "axis"), [("67", 2), ("89", 1), ("-=", 0)])
-def test_turn_is_about_the_hands_own_axis_and_leaves_the_tcp_where_it_is(jogger, codes, axis):
-    before = jogger.hands["left"].goal.copy()
-    tap(jogger, ord(codes[0]))
-    after = jogger.hands["left"].goal.copy()
-    expected = np.zeros(3)
-    expected[axis] = 0.05
-    np.testing.assert_allclose(rotvec(before, after), expected, atol=1e-9)
-    np.testing.assert_array_equal(after[:3, 3], before[:3, 3])
-    tap(jogger, ord(codes[1]))
-    np.testing.assert_allclose(jogger.hands["left"].goal, before, atol=1e-12)
-
-
-def test_space_switches_the_arm_and_page_down_the_step(jogger):
-    keyboard = Keyboard()
-    assert keyboard.requested_steps([SPACE, PAGE_DOWN], ())[1] == [Command.SWITCH_ARM, Command.STEP_SIZE]
-    jogger.switch_arm()
-    jogger.next_size()
-    left, right = jogger.hands["left"].goal.copy(), jogger.hands["right"].goal.copy()
-    tap(jogger, HOME)
-    np.testing.assert_array_equal(jogger.hands["left"].goal, left)
-    np.testing.assert_allclose((jogger.hands["right"].goal - right)[:3, 3], (0, 0, 0.02), atol=1e-12)
-    jogger.switch_arm()
-    jogger.next_size()
-    assert (jogger.arm, jogger.size.move_m) == ("left", 0.001)
-
-
-def test_held_key_goes_on_at_eight_steps_a_second_after_a_quarter():
-    keyboard = Keyboard()
-    total = keyboard.requested_steps([LEFT], {LEFT})[0]
-    for _ in range(29):
-        total = total + keyboard.requested_steps([], {LEFT})[0]
-    assert total[1] == pytest.approx(1 + (30 - 8) * 8 / 30)
-    assert not keyboard.requested_steps([], ())[0].any(), "let go: nothing moves on"
-    assert not keyboard.requested_steps([], {LEFT})[0].any(), "down again: a new quarter of a second"
-
-
-def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim, jogger):
-    hand = jogger.hands["left"]
-    tap(jogger, *[INSERT] * 3)
-    assert hand.opening_m == ROBOT.opening_max_m
-    tap(jogger, *[DELETE] * 14)
-    # 30 N / 2000 N/m = 15 mm below what the gripper has reached, whatever is asked for
-    assert hand.opening_m == pytest.approx(sim.proprioception()[0, 6] - 0.015)
-    for _ in range(40):
-        tap(jogger, DELETE)
-        sim.step(jogger.targets()[None])
-    assert hand.opening_m == 0.0
-    assert sim.proprioception()[0, 6] == pytest.approx(0.0, abs=1e-3)
-    assert sim.proprioception()[0, 13] == pytest.approx(ROBOT.opening_max_m, abs=1e-3), "the other one is still open"
-
-
-def test_target_out_of_reach_is_refused_with_its_error_and_does_not_run_away(jogger):
-    jogger.next_size()
-    tap(jogger, *[UP] * 60)  # 1.2 m: the arm is 0.6 m long
-    hand, kinematics = jogger.hands["left"], jogger.kinematics["left"]
-    assert "out of reach by" in jogger.notice
-    assert 0.02 < hand.goal[0, 3] < 0.8
-    assert kinematics.solve(hand.goal, hand.joints_rad)[1] < 5e-4
-    edge = hand.goal.copy()
-    tap(jogger, UP)
-    np.testing.assert_array_equal(hand.goal, edge)
-    tap(jogger, DOWN)
-    assert jogger.notice == ""
-    assert hand.goal[0, 3] == pytest.approx(edge[0, 3] - 0.02), "one step back is one step back"
-
-
-def test_hand_follows_its_goal_no_faster_than_a_quarter_metre_a_second(jogger):
-    jogger.next_size()
-    tap(jogger, *[HOME] * 3)  # 60 mm at once
-    hand, kinematics = jogger.hands["left"], jogger.kinematics["left"]
-    heights = [hand.pose[2, 3]]
-    for _ in range(10):
-        jogger.targets()
-        heights.append(kinematics.pose(hand.joints_rad)[2, 3])
-    assert np.diff(heights).max() == pytest.approx(0.25 / 30, rel=0.01)
-    assert heights[-1] - heights[0] == pytest.approx(0.06, abs=2e-5)
-
-
-# whole attempts, with a window that a script types into ------------------------------------------------------------------
+# whole attempts, with a window and leader arms that follow a script -------------------------------------------------------
 
 
 class ScriptedWindow:
-    """Types some keys at each control step; when it knows no more, it is closed."""
+    """Presses the keys of one list at each control step, and moves a joint of each arm; when the script is over, it is closed.
+    Also stands in for the leader arms."""
 
-    def __init__(self, script: Iterable[Sequence[int]]) -> None:
+    def __init__(self, script: Iterable[Sequence[Command]]) -> None:
         self.script, self.now, self.shown = iter(script), [], []
+        self.target = np.array([0.0, 1.6, -1.0, 0.0, 0.9, 0.0, 0.035] * 2)
 
-    def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
+    def tick(self, sim: Simulation, lines: Sequence[str]) -> None:
         self.shown.append(" | ".join(lines))
         keys = next(self.script, None)
         if keys is None:
             raise teleop._WindowClosed("the window was closed")
         self.now = list(keys)
 
-    def taps(self) -> list[int]:
+    def commands(self) -> list[Command]:
         taken, self.now = self.now, []
         return taken
 
-    def held(self, codes: Iterable[int]) -> set[int]:
-        return set()
+    def read(self) -> np.ndarray:
+        self.target = self.target + 0.001 * np.eye(14)[0] + 0.0005 * np.eye(14)[7]
+        return self.target
 
     def close(self) -> None:
         self.script = iter(())
 
 
-def with_script(monkeypatch: pytest.MonkeyPatch, script: Iterable[Sequence[int]]) -> ScriptedWindow:
+def with_script(monkeypatch: pytest.MonkeyPatch, script: Iterable[Sequence[Command]]) -> ScriptedWindow:
     window = ScriptedWindow(script)
     monkeypatch.setattr(teleop, "ViewerWindow", lambda sim: window)
+    teleop.use_leader_driver(lambda source: window)
     teleop._sessions.clear()
     return window
 
@@ -217,30 +99,23 @@ def column(recorder: EpisodeRecorder, key: str) -> np.ndarray:
     return np.stack([row[key] for row in recorder.rows])
 
 
-DRIVE = [[UP], [UP], [], [SPACE], [HOME], [DELETE], []]
-
-
-def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(tmp_path, bench, monkeypatch):
-    window = with_script(monkeypatch, [[], [LEFT], [ENTER], *DRIVE, [ENTER], *[[UP]] * 40])
-    plan = CollectPlan(task="bench", source=KeyboardSource(folder=str(tmp_path)), seed=3)
+def test_attempt_is_the_re_execution_of_the_file_it_left(tmp_path, bench, monkeypatch):
+    window = with_script(monkeypatch, [[], ENTER, *[[]] * 7, ENTER, *[[]] * 40])
+    plan = CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path)), seed=3)
     recorder = run(plan, bench)
     (path,) = tmp_path.iterdir()
     file = ActionFile.read(path)
     assert path.name == f"bench_{plan.attempt_seed(0)}_000.jsonl"
-    assert (file.end, file.outcome, file.header["source"]) == ("finished", "unfinished", "keyboard")
+    assert (file.end, file.outcome) == ("finished", "unfinished")
     assert file.scene == scene_of(bench)
-    assert len(recorder.rows) == len(file.actions) == len(DRIVE) + 30, (
-        "what was driven, and a second in which all holds still"
-    )
+    assert len(recorder.rows) == len(file.actions) == 7 + 30, "what was driven, and a second in which all holds still"
     np.testing.assert_array_equal(column(recorder, "action"), file.actions)
     assert (file.actions[-30:] == file.actions[-31]).all()
-    assert np.ptp(file.actions[:, :6], axis=0).max() > 0.01
-    assert np.ptp(file.actions[:, 7:13], axis=0).max() > 0.005, "the right hand was raised"
+    assert (np.diff(file.actions[:7, [0, 7]], axis=0) > 0).all(), "both arms follow"
     driven = teleop._sessions[bench].sim
     # live and re-executed: the same bits
     np.testing.assert_array_equal(driven.arrays["qpos"], bench.arrays["qpos"], strict=True)
     assert "begin" in window.shown[0]
-    assert any("right hand, step medium" in shown for shown in window.shown)
 
     with_script(monkeypatch, [])  # a person who is not there
     again = run(plan, bench)
@@ -251,33 +126,32 @@ def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(tmp_path, benc
 
 
 def test_discarded_attempt_is_kept_apart_and_the_scene_begins_anew(tmp_path, bench, monkeypatch):
-    with_script(monkeypatch, [[ENTER], [UP], [UP], [F9], [ENTER], [LEFT], [ENTER], *[[]] * 40])
-    source = KeyboardSource(folder=str(tmp_path))
+    with_script(monkeypatch, [ENTER, [], [], F9, ENTER, [], ENTER, *[[]] * 40])
+    source = LeaderSource(folder=str(tmp_path))
     recorder = run(CollectPlan(task="bench", source=source, seed=3), bench)
     first, second = (ActionFile.read(path) for path in sorted(tmp_path.iterdir()))
     assert (first.end, len(first.actions)) == ("discarded", 2)
     assert (second.end, len(second.actions)) == ("finished", 1 + 30)
     assert first.header["seed"] == second.header["seed"]
     np.testing.assert_array_equal(column(recorder, "action"), second.actions)
-    assert ActionsSource(path=str(tmp_path)).files()[0].path == second.path, "a folder's discarded files are left out"
 
 
 def test_window_closed_in_the_middle_loses_nothing_and_asks_anew_next_time(tmp_path, bench, monkeypatch):
-    plan = CollectPlan(task="bench", source=KeyboardSource(folder=str(tmp_path)), seed=3)
-    with_script(monkeypatch, [[ENTER], [UP], [UP], [UP]])
+    plan = CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path)), seed=3)
+    with_script(monkeypatch, [ENTER, [], [], []])
     with pytest.raises(TaccorlError, match=r"3 actions are in .*_000\.jsonl"):
         run(plan, bench)
     cut = ActionFile.read(next(tmp_path.iterdir()))
     assert (cut.end, len(cut.actions)) == (None, 3)
-    with_script(monkeypatch, [[ENTER], [LEFT], [ENTER], *[[]] * 40])
+    with_script(monkeypatch, [ENTER, [], ENTER, *[[]] * 40])
     assert len(run(plan, bench).rows) == 31
 
 
 def test_failure_waits_for_the_person_who_tries_again_or_keeps_it(tmp_path, monkeypatch):
-    script = [[ENTER], *[[UP]] * 6, [], [], [F9], [ENTER], *[[LEFT]] * 6, [], [ENTER]]
+    script = [ENTER, *[[]] * 6, [], [], F9, ENTER, *[[]] * 6, [], ENTER]
     window = with_script(monkeypatch, script)
     sim = Simulation(tasks.get("bench")())
-    recorder = run(CollectPlan(task="bench", source=KeyboardSource(folder=str(tmp_path), time_limit_s=0.2)), sim)
+    recorder = run(CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path), time_limit_s=0.2)), sim)
     ends = [(file.end, file.outcome, len(file.actions)) for file in map(ActionFile.read, sorted(tmp_path.iterdir()))]
     assert ends == [("discarded", "timeout", 6), ("finished", "timeout", 6)]
     assert len(recorder.rows) == 6
@@ -288,13 +162,12 @@ def test_failure_waits_for_the_person_who_tries_again_or_keeps_it(tmp_path, monk
 def test_person_has_more_time_than_the_task_gives_an_expert_and_so_has_the_re_execution(tmp_path, monkeypatch):
     hasty = type("Hasty", (tasks.get("bench"),), {"time_limit_s": 0.2})  # out of time after 6 control steps
     sim = Simulation(hasty())
-    with_script(monkeypatch, [[ENTER], *[[UP]] * 10, [ENTER], *[[]] * 40])
-    recorder = run(CollectPlan(task="bench", source=KeyboardSource(folder=str(tmp_path))), sim)
-    assert len(recorder.rows) == 10 + 30
+    with_script(monkeypatch, [ENTER, *[[]] * 10, ENTER, *[[]] * 40])
+    plan = CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path)))
+    assert len(run(plan, sim).rows) == 10 + 30
     assert outcome_of(sim) == "unfinished"
-    (path,) = tmp_path.iterdir()
-    other = Simulation(hasty())
-    assert len(run(ActionsSource(path=str(path)).plan(CollectPlan(task="")), other).rows) == 40
+    with_script(monkeypatch, [])
+    assert len(run(plan, Simulation(hasty())).rows) == 40
 
 
 # action files ------------------------------------------------------------------------------------------------------------
@@ -316,26 +189,21 @@ def test_experts_actions_re_executed_give_bit_identical_rows(tmp_path):
     plan = CollectPlan(task="assembly_1", randomization=0.5)
     sim = plan.make()
     sim.reset([plan.attempt_seed(0)])
-    with ActionLog(tmp_path, sim, "expert") as log:
+    with ActionLog(tmp_path, sim) as log:
         expert = Overheard(log=log, hands=dataclasses.replace(EXACT, speed=2.0))  # hasty: a short episode does
         original = run(dataclasses.replace(plan, source=expert), sim)
         log.end("finished", outcome_of(sim))
     assert outcome_of(sim) == "success", "choose another seed: this one is to show a success"
-    replayed = ActionsSource(path=str(log.path)).plan(CollectPlan(task=""))
-    assert (replayed.task, replayed.randomization, replayed.episodes) == ("assembly_1", 0.5, 1)
-    assert replayed.attempt_seed(0) == plan.attempt_seed(0)
-    other = replayed.make()
-    again = run(replayed, other)
+    other = plan.make()
+    again = run(dataclasses.replace(plan, source=LeaderSource(folder=str(tmp_path))), other)
     assert outcome_of(other) == "success"
     assert len(again.rows) == len(original.rows)
     for key in original.rows[0]:
         np.testing.assert_array_equal(column(again, key), column(original, key), err_msg=key, strict=True)
-    with pytest.raises(TaccorlError, match="all 1 action files"):
-        replayed.attempt_seed(1)
 
 
 def write(folder: Path, sim: Simulation, actions: np.ndarray, end: str | None, outcome: str = "unfinished") -> Path:
-    with ActionLog(folder, sim, "keyboard") as log:
+    with ActionLog(folder, sim) as log:
         for action in actions:
             log.append(action)
         if end:
@@ -365,7 +233,7 @@ def test_float32_actions_come_back_bit_for_bit_wherever_the_file_is_cut(tmp_path
 
 
 def test_actions_reach_the_file_at_once_and_the_disk_each_second(tmp_path, sim, monkeypatch):
-    log = ActionLog(tmp_path, sim, "keyboard")
+    log = ActionLog(tmp_path, sim)
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(log.num_actions))
     for k, action in enumerate(random_actions(75)):
@@ -397,49 +265,22 @@ def test_only_a_finished_demonstration_of_the_very_scene_is_taken_for_one(tmp_pa
     scene = scene_of(sim)
     write(tmp_path, sim, random_actions(2), "discarded")
     write(tmp_path, sim, random_actions(2), None)
-    assert find_finished(tmp_path, scene, "keyboard") is None
+    assert find_finished(tmp_path, scene) is None
     path = write(tmp_path, sim, random_actions(2), "finished")
-    found = find_finished(tmp_path, scene, "keyboard")
+    found = find_finished(tmp_path, scene)
     assert found is not None and found.path == path
-    assert find_finished(tmp_path, scene, "leader") is None
     for key, other in (("difficulty", "hard"), ("twin", "effects: [x]"), ("randomization", 0.5)):
-        assert find_finished(tmp_path, {**scene, key: other}, "keyboard") is None, key
+        assert find_finished(tmp_path, {**scene, key: other}) is None, key
     path.write_text(path.read_text().replace(f'"mujoco": "{mujoco.__version__}"', '"mujoco": "3.9.0"'))
-    assert find_finished(tmp_path, scene, "keyboard") is None, "another MuJoCo: not surely the same bits"
+    assert find_finished(tmp_path, scene) is None, "another MuJoCo: not surely the same bits"
 
 
 def test_re_execution_that_does_not_end_as_recorded_is_an_error(tmp_path, sim):
-    plan = ActionsSource(path=str(write(tmp_path, sim, random_actions(3) * 0, "finished", "success"))).plan(
-        CollectPlan(task="")
-    )
+    plan = CollectPlan(task="bench", source=LeaderSource(folder=str(tmp_path)))
+    sim.reset([plan.attempt_seed(0)])
+    write(tmp_path, sim, random_actions(3) * 0, "finished", "success")
     with pytest.raises(TaccorlError, match=r"recorded as success after 3 .* unfinished"):
         run(plan, sim)
-
-
-def test_plan_of_action_files_is_theirs_and_says_where_the_command_line_differs(tmp_path, sim):
-    paths = [write(tmp_path, sim, random_actions(2), "finished", outcome) for outcome in ("unfinished", "success")]
-    source = ActionsSource(path=str(tmp_path))
-    plan = source.plan(CollectPlan(task="bench"))
-    assert plan.episodes == 1
-    assert [file.path for file in plan.files] == [paths[1], paths[0]], "a success first: that is what is collected"
-    assert [f.path for f in source.plan(CollectPlan(task="", keep_failures=True)).files] == paths
-    for wrong, says in (
-        (CollectPlan(task="puzzle"), "--task=puzzle"),
-        (CollectPlan(task="", difficulty="hard"), "--difficulty"),
-    ):
-        with pytest.raises(TaccorlError, match=says):
-            source.plan(wrong)
-    with pytest.raises(TaccorlError, match="2 action files"):
-        run(plan, sim)  # two of one scene
-    with pytest.raises(TaccorlError, match="is not there"):
-        ActionsSource(path=str(tmp_path / "nothing")).plan(CollectPlan(task=""))
-
-
-def test_other_actions_under_the_same_path_are_another_source(tmp_path, sim):
-    path = write(tmp_path, sim, random_actions(2), "finished")
-    before = ActionsSource(path=str(path))
-    path.write_bytes(path.read_bytes().replace(b'"finished"', b'"discarded"'))
-    assert before != ActionsSource(path=str(path))
 
 
 # display -----------------------------------------------------------------------------------------------------------------
@@ -447,10 +288,10 @@ def test_other_actions_under_the_same_path_are_another_source(tmp_path, sim):
 
 @pytest.mark.slow
 def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path):
-    command = ["-m", "taccorl.cli.main", "collect", "--task=bench", "--source.type=keyboard", "--images=false"]
+    command = ["-m", "taccorl.cli.main", "collect", "--task=bench", "--source.type=leader", "--images=false"]
     done = fresh_python(*command, "--store=store", "--out=out", cwd=tmp_path, without=("DISPLAY", "WAYLAND_DISPLAY"))
     assert done.returncode == 2
-    assert "no display: DISPLAY and WAYLAND_DISPLAY are not set" in done.stderr
+    assert "DISPLAY and WAYLAND_DISPLAY are not set" in done.stderr
     assert "--source.type=expert" in done.stderr and "Traceback" not in done.stderr
 
 
@@ -601,23 +442,22 @@ def test_arms_catch_up_with_the_leader_slowly_and_then_follow_at_once(sim):
     leader = Still()
     hands = LeaderHands(sim, leader)
     start = sim.targets[0].copy()
-    actions = [hands.act([])[0] for _ in range(90)]
+    actions = [hands.read() for _ in range(90)]
     steps = np.abs(np.diff([start, *actions], axis=0))
     assert steps[:, [0, 1, 2, 3, 4, 5]].max() == pytest.approx(0.6 / 30, abs=1e-6)
     np.testing.assert_allclose(actions[-1], leader.target, atol=1e-6)
     leader.target = leader.target + np.eye(14)[0] * 0.3
-    np.testing.assert_allclose(hands.act([])[0], leader.target, atol=1e-6)
+    np.testing.assert_allclose(hands.read(), leader.target, atol=1e-6)
     leader.target = leader.target + np.eye(14)[1] * 2.0  # beyond the joint's limit
-    assert hands.act([])[0][1] == np.float32(ROBOT.action_high[1])
-    assert "beyond the twin's range: left_joint2" in hands.lines()[0]
+    assert hands.read()[1] == np.float32(ROBOT.action_high[1])
+    assert "beyond the twin's range: left_joint2" in hands.lines[0]
 
 
 def test_leader_drives_a_whole_attempt(tmp_path, bench, leader_kind, monkeypatch):
     from taccorl.lerobot_plugin.leader import open_leader
 
+    with_script(monkeypatch, [ENTER, *[[]] * 70, ENTER, *[[]] * 40])
     teleop.use_leader_driver(open_leader)
-    with_script(monkeypatch, [[ENTER], *[[]] * 70, [ENTER], *[[]] * 40])
     recorder = run(CollectPlan(task="bench", source=pair(tmp_path)), bench)
     assert len(recorder.rows) == 70 + 30
     np.testing.assert_allclose(column(recorder, "action")[-1], [0, 1.6, -1, 0, 0.9, 0, 0.035] * 2, atol=1e-6)
-    assert ActionFile.read(next((tmp_path / "teleop").iterdir())).header["source"] == "leader"

@@ -257,7 +257,7 @@ def test_actions_are_those_of_lerobot_eval(checkpoint, monkeypatch):
     assert all(np.array_equal(a.actions, b.actions) for a, b in zip(ours, again, strict=True))
 
 
-@pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.cluster.Job", "no_such_package.Step"])
+@pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.store.Store", "no_such_package.Step"])
 def test_a_class_that_is_no_step_is_not_called(checkpoint, tmp_path, named):
     """LeRobot imports and calls the class that a processor's file names."""
     foreign, mark = shutil.copytree(checkpoint, tmp_path / "foreign"), tmp_path / "executed"

@@ -19,10 +19,10 @@ import draccus
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.lineage import cluster, processes
-from taccorl.lineage.engines import Engine, LocalEngine, RayEngine, SlurmEngine
+from taccorl.lineage import engines, processes
+from taccorl.lineage.engines import Engine, LocalEngine, RayEngine
 from taccorl.lineage.errors import EngineError
-from taccorl.lineage.processes import Care, Failed, _work
+from taccorl.lineage.processes import Care, Done, Failed, _work
 from tests.fresh_python import fresh_python
 
 from . import toys
@@ -284,9 +284,6 @@ def is_running(pid: int) -> bool:
     return state not in ("Z", "X")  # a zombie has ended; only its entry waits for whoever adopted it
 
 
-# Clusters. datatrove is not installed with the tests: what is ours is tested, its executors are not.
-
-
 @dataclass
 class AnyConfig:
     engine: Engine = field(default_factory=LocalEngine)
@@ -295,41 +292,13 @@ class AnyConfig:
 def test_engine_is_chosen_on_the_command_line():
     assert draccus.parse(AnyConfig, args=[]).engine == LocalEngine(workers=1)
     assert draccus.parse(AnyConfig, args=["--engine.type=local", "--engine.workers=3"]).engine == LocalEngine(workers=3)
-    slurm = draccus.parse(AnyConfig, args=["--engine.type=slurm", "--engine.partition=cpu"]).engine
-    assert slurm == SlurmEngine(partition="cpu")
+    assert draccus.parse(AnyConfig, args=["--engine.type=ray", "--engine.tasks=2"]).engine == RayEngine(tasks=2)
 
 
-@pytest.mark.parametrize("engine", [SlurmEngine(partition="cpu"), RayEngine()])
-def test_cluster_without_datatrove_says_what_to_install(engine, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "datatrove", None)  # as if not installed, wherever this runs
-    monkeypatch.setitem(sys.modules, "datatrove.executor", None)
-    with pytest.raises(TaccorlError, match=r"pip install lerobot_policy_taccorl\[cluster\]"):
-        engine.map(toys.double, [1, 2])
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_job_folder_carries_items_to_tasks_and_results_back_and_names_what_was_lost(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "require_datatrove", lambda: None)
-    job = cluster.Job.create(tmp_path, toys.refuse_odd, [0, 1, 2, 4, 6], str)
-    for rank in (0, 2):  # of three tasks, the one with items 1 and 4 was killed
-        cluster.RankTask(job.folder)(None, rank=rank, world_size=3)
-    outcomes, taken = {}, set()
-    job.collect(taken, outcomes.__setitem__)
-    assert outcomes == {0: cluster.Done(0), 2: cluster.Done(2), 3: cluster.Done(4)}
-    cluster.RankTask(job.folder)(None, rank=1, world_size=5)
-    job.collect(taken, outcomes.__setitem__)
-    assert outcomes[1] == cluster.Failed("RecordingError: recording 1 is odd")
-    job.name_the_lost(taken, outcomes.__setitem__)
-    assert outcomes[4].reason == f"its task ended without a result; logs: {job.folder / 'logs'}"
-    assert len(outcomes) == 5
-
-
-def test_function_of_the_started_script_cannot_go_to_a_cluster(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "require_datatrove", lambda: None)
-    monkeypatch.setattr(make_generator, "__module__", "__main__")
-    with pytest.raises(EngineError, match="Move it into a module"):
-        cluster.Job.create(tmp_path, make_generator, [1], str)
+def test_without_ray_the_way_to_it_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if not installed, wherever this runs
+    with pytest.raises(TaccorlError, match=r"pip install \"lerobot_policy_taccorl\[ray\]\""):
+        RayEngine().map(toys.double, [1, 2])
 
 
 TWICE = Care(tries=2)
@@ -397,15 +366,19 @@ def test_an_exception_is_no_end_of_a_process(tmp_path):
         LocalEngine(workers=2).map(toys.refuse_odd, [0, 1], care=TWICE, instead=lambda *_: 5)
 
 
-class OneAfterAnother:
-    """datatrove's Ray executor as far as it is used, in this process: it stands in where Ray is not installed."""
+class RayHere:
+    """Ray as far as it is used, in this process: it stands in where Ray is not installed. Results are their references."""
 
-    def __init__(self, pipeline: list[Callable[..., Any]], *, tasks: int, **_: Any) -> None:
-        self.pipeline, self.tasks = pipeline, tasks
+    exceptions = SimpleNamespace(RayError=ConnectionError)
 
-    def run(self) -> None:
-        for rank in range(self.tasks):
-            self.pipeline[0](None, rank, self.tasks)
+    def remote(self, function: Callable[..., list[Any]]) -> Any:
+        return SimpleNamespace(options=lambda **_: SimpleNamespace(remote=lambda *args: tuple(function(*args))))
+
+    def wait(self, references: list[Any]) -> tuple[list[Any], list[Any]]:
+        return references[-1:], references[:-1]
+
+    def get(self, reference: tuple[Any, ...]) -> tuple[Any, ...]:
+        return reference
 
 
 NAMES = ("a", "always", "once", "b", "hangs", "c")
@@ -421,20 +394,32 @@ ON_A_CLUSTER = [
 
 def on_ray(folder: Path) -> list[Any]:
     care = Care(limit_s=2.0, tries=2)
-    engine = RayEngine(work_dir=folder / "work", tasks=2, mem_per_cpu_gb=1)
-    return engine.map(fate, [folder / name for name in NAMES], care=care, instead=spoken)
+    return RayEngine(tasks=2).map(fate, [folder / name for name in NAMES], care=care, instead=spoken)
 
 
 @pytest.mark.slow
 def test_a_task_of_a_cluster_outlives_its_items(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "require_datatrove", lambda: SimpleNamespace(RayPipelineExecutor=OneAfterAnother))
+    monkeypatch.setattr(engines, "start_ray", RayHere)
     assert on_ray(tmp_path) == ON_A_CLUSTER
+
+
+def test_items_of_a_task_that_a_cluster_lost_are_named(monkeypatch):
+    class Lossy(RayHere):
+        def get(self, reference: tuple[Any, ...]) -> tuple[Any, ...]:
+            if Done(2) in reference:
+                raise ConnectionError("a node died")
+            return reference
+
+    monkeypatch.setattr(engines, "start_ray", Lossy)
+    with pytest.raises(
+        EngineError, match=r"(?s)2 of 5 items failed.*  1: its task ended .*: a node died\n  4: its task"
+    ):
+        RayEngine(tasks=3).map(toys.double, range(5))
 
 
 @pytest.mark.slow
 def test_the_same_on_ray_itself(tmp_path, monkeypatch):
-    ray = pytest.importorskip("ray", reason="extra cluster: ray")
-    pytest.importorskip("datatrove.executor", reason="extra cluster: datatrove")
+    ray = pytest.importorskip("ray", reason="extra ray")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(toys.__file__).parents[1]), *sys.path]))
     ray.init(address="local", num_cpus=2, include_dashboard=False)
     try:

@@ -99,7 +99,7 @@ def test_the_step_uses_the_state_as_it_is_and_comes_back_from_its_configuration(
 
 def test_what_is_missing_or_of_another_task_is_named():
     step, state = PartPosesStep(names=NAMES), torch.zeros(1, 14)
-    with pytest.raises(TaccorlError, match=r"no observation.environment_state.*execute --part_poses=true"):
+    with pytest.raises(TaccorlError, match=r"no observation.environment_state.*collect --part_poses=true"):
         step.observation({"observation.state": state})
     with pytest.raises(TaccorlError, match=r"36 numbers.*the 18 of plug, cradle"):
         step.observation({"observation.state": state, PARTS_KEY: torch.zeros(1, 36)})
@@ -129,7 +129,7 @@ def dataset_of(names: list[str] | None) -> Any:
 def test_a_dataset_without_poses_or_of_other_parts_is_refused_with_the_way_out(option):
     config = TactilePI05Config(backbone="tiny", tactile=False, **option)
     with pytest.raises(
-        TaccorlError, match=r"has no observation.environment_state: make it with taccorl execute --part_poses"
+        TaccorlError, match=r"has no observation.environment_state: make it with taccorl collect --part_poses"
     ):
         config.match_dataset(dataset_of(None))
     config.match_dataset(dataset_of(NAMES))

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.lineage.engines import start_ray
 from taccorl.rl import shards
-from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard, start_ray
+from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard
 from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import PRIVILEGED, make_shard
 from taccorl.sim.twin import TwinConfig
@@ -38,12 +39,6 @@ def maker(**changes: Any) -> Any:
 def call(shard: Shard, method: str, *args: Any) -> Any:
     shard.start(method, *args)
     return shard.result()
-
-
-def test_without_ray_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(TaccorlError, match=r"taccorl\[ray\]"):
-        start_ray()
 
 
 def agree(there: Shard) -> None:

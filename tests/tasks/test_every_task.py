@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.task_pictures import PAGE, with_rows
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.mimicgen.schedule import rehearse
 from taccorl.episodes.sources.mimicgen.spec import check_task, load_mimic_spec
@@ -82,12 +81,6 @@ def test_rows_are_drawn_within_their_bounds_and_every_one_moves_the_reset(sim):
 
 def test_all_but_the_empty_bench_can_be_demonstrated_and_multiplied():
     assert set(tasks_with_expert()) == set(WITH_SPEC) == set(tasks) - {"bench"}
-
-
-def test_the_page_of_the_twin_shows_each_with_its_picture():
-    page = (ROOT / PAGE).read_text(encoding="utf-8")
-    assert with_rows(page) == page, "run make pictures"
-    assert [name for name in tasks_with_expert() if not (ROOT / "docs" / f"task_{name}.png").is_file()] == []
 
 
 @pytest.mark.parametrize("name", WITH_SPEC)

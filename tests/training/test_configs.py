@@ -14,7 +14,7 @@ from taccorl.cli.post_train import PostTrainConfig
 from taccorl.sim.twin_file import load_twin
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-ALL = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*"))
+ALL = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.yaml"))
 
 
 def lerobot_train(path: Path | None, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:

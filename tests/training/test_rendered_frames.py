@@ -21,7 +21,6 @@ from taccorl.data.origin import Origin
 from taccorl.data.spec import FeatureSpec
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
-from taccorl.episodes.sources.mimicgen.execute import ExecutePlan, stored_sources
 from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.errors import DatasetError, TaccorlError
@@ -69,7 +68,7 @@ def test_the_plain_reader_refuses_it_with_the_way_out_and_check_does_not_crash(d
 
 def test_frames_that_the_cache_lacks_are_named_with_the_command(declared, tmp_path, monkeypatch):
     request = CacheRequest(place="host", resolution=(20, 28), store=tmp_path / "store", device="cpu")
-    said = r"declared: has no videos of .*no frames of it at 20×28 pixels: taccorl execute .*--resolution=20x28"
+    said = r"declared: has no videos of .*no frames of it at 20×28 pixels: taccorl collect .*--resolution=20x28"
     with pytest.raises(DatasetError, match=said):
         load(declared, monkeypatch, request).__getitems__([0])
 
@@ -96,13 +95,11 @@ def test_a_dataset_without_cameras_or_states_has_nothing_to_render(declared, tmp
 def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected, tmp_path, monkeypatch):
     store, quiet = Store(tmp_path / "store"), lambda _: None
     robot = Origin("surrogate", "made up, not a robot")
-    own = {"spec": load_mimic_spec("assembly_2"), "sources": store.dataset(collected), "origin": robot}
-    produce(AugmentPlan(episodes=1, rows="actions", **own), tmp_path / "actions", store, quiet)
-    sources = stored_sources([tmp_path / "actions"], store)
-    produce(ExecutePlan(sources=sources), tmp_path / "video", store, quiet)
+    own = {"spec": load_mimic_spec("assembly_2"), "sources": store.dataset(collected), "origin": robot, "episodes": 1}
+    produce(AugmentPlan(**own), tmp_path / "video", store, quiet)
     with monkeypatch.context() as patch:
         patch.setattr(av, "open", lambda *_, **__: pytest.fail("PyAV is not needed"))
-        produce(ExecutePlan(sources=sources, pictures="cache"), tmp_path / "cache", store, quiet)
+        produce(AugmentPlan(pictures="cache", **own), tmp_path / "cache", store, quiet)
         artefact, seconds = render_frames(tmp_path / "cache", (28, 28), store, LocalEngine(), quiet)
     assert set(seconds) == {"rendering", "resizing and writing"}
     video, numbers = Dataset(tmp_path / "video"), Dataset(tmp_path / "cache")
@@ -127,38 +124,34 @@ def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected
 @pytest.mark.slow
 def test_frames_of_an_episode_are_rendered_once_and_copied_into_the_next_dataset(collected, tmp_path, monkeypatch):
     store, said = Store(tmp_path / "store"), []
-    for seed in (0, 1):
-        own = {"spec": load_mimic_spec("assembly_2"), "sources": store.dataset(collected), "seed": seed}
-        produce(AugmentPlan(episodes=1, rows="actions", **own), tmp_path / f"actions_{seed}", store, lambda _: None)
-    sources = (tmp_path / "actions_1", tmp_path / "actions_0")
+    own = {"spec": load_mimic_spec("assembly_2"), "sources": store.dataset(collected), "pictures": "cache"}
 
-    def made(name: str, sources: tuple[Path, ...], size: tuple[int, int] = (28, 28)) -> tuple[Dataset, np.ndarray]:
-        plan = ExecutePlan(sources=stored_sources(sources, store), pictures="cache")
-        produce(plan, tmp_path / name, store, lambda _: None)
+    def made(name: str, episodes: int, size: tuple[int, int] = (28, 28)) -> tuple[Dataset, np.ndarray]:
+        produce(AugmentPlan(episodes=episodes, **own), tmp_path / name, store, lambda _: None)
         said.clear()
         artefact, _ = render_frames(tmp_path / name, size, store, LocalEngine(), said.append)
         return Dataset(tmp_path / name), np.load(artefact.path / f"{FRONT}.npy")
 
-    _, frames_of_one = made("one", sources[1:])
+    _, frames_of_one = made("one", 1)
     assert said == ["episode 0 of 1: rendered"]
     assert len(rendered_frames._rendered_before(store, FramesConfig((28, 28)))) == 1
     with monkeypatch.context() as patch:  # another MuJoCo may draw other pictures
         patch.setattr(rendered_frames, "software", lambda: {"mujoco": "3.0.0"})
         assert rendered_frames._rendered_before(store, FramesConfig((28, 28))) == {}
-    both, frames_of_both = made("both", sources)
-    assert said == ["episode 0 of 2: rendered", "episode 1 of 2: copied"]
+    both, frames_of_both = made("both", 2)
+    assert sorted(said) == ["episode 0 of 2: copied", "episode 1 of 2: rendered"]
     first = both.first_row(1)
     assert first == both.num_rows(0) > 0
-    np.testing.assert_array_equal(frames_of_both[first:], frames_of_one)
-    assert frames_of_both[:first].std() > 10  # the other was rendered, too
+    np.testing.assert_array_equal(frames_of_both[:first], frames_of_one)
+    assert frames_of_both[first:].std() > 10  # the other was rendered, too
 
-    made("one again", sources[1:], (14, 14))
+    made("one again", 1, (14, 14))
     assert said == ["episode 0 of 1: rendered"], "another resolution"
     with (tmp_path / "both" / "meta" / "info.json").open("a") as file:  # no longer what its frames were made of
         file.write(" ")
     shutil.rmtree(tmp_path / "one")
-    made("twice", sources[::-1])
-    assert said == ["episode 0 of 2: rendered", "episode 1 of 2: rendered"]
+    made("three", 3)
+    assert said == [f"episode {k} of 3: rendered" for k in range(3)]
 
 
 @pytest.fixture

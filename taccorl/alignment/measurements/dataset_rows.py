@@ -27,7 +27,7 @@ from taccorl.alignment.measurements.recorded import TACTILE, signal_names, signa
 from taccorl.alignment.measurements.tables import TableSpec, measurement_of_columns, wanted_columns
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
-from taccorl.data.origin import UNSTATED, stated_origin
+from taccorl.data.origin import UNSTATED, Origin
 from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
@@ -90,7 +90,7 @@ def _from_columns(dataset: Dataset, columns: TableSpec, k: int) -> Measurement:
         bad = np.flatnonzero(~np.isfinite(numbers))
         if len(bad):
             raise RecordingError(f"{name}: column {column!r}: row {bad[0]} is not finite; remove the episode")
-    stated, found = stated_origin(columns.domain, columns.origin), dataset.episode_facts(k).get("origin", UNSTATED)
+    stated, found = Origin(columns.domain, columns.origin), dataset.episode_facts(k).get("origin", UNSTATED)
     m = measurement_of_columns(
         dataset.data_file(k),
         {column: numbers.astype(float) for column, numbers in values.items()},

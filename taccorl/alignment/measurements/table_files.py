@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import scipy.io
 
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
-from taccorl.data.origin import Domain, Origin, labelled, stated_origin
+from taccorl.data.origin import Domain, Origin, labelled
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, TaccorlError, nearest
 
@@ -101,7 +101,7 @@ def origin_lines(origin: Origin) -> str:
 def table_origin(path: Path, spec: FileForm) -> Origin:
     """Origin of a table: as its own lines state it, else as its columns file does. Raises RecordingError: the two state different
     domains, or a line states an unknown one."""
-    stated = stated_origin(spec.domain, spec.origin)
+    stated = Origin(spec.domain, spec.origin)
     if path.suffix != ".csv" or not (lines := _stated(path, _encoding(path, spec))):
         return stated
     try:

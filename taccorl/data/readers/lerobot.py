@@ -137,22 +137,16 @@ class LerobotReader(Reader):
         return ""
 
     def _check_action_time(self) -> None:
-        """Check that ``lead_frames`` of the command agrees with the ``action_time`` that one of our datasets states: 1; where an
-        older one of ours states none, 1 if the twin made it and 0 if ingest did."""
-        action_time, lead = self.dataset.spec.action_time, 1
-        if not action_time:
-            provenance = self.dataset.episode_facts(self.index).get("provenance") or {}
-            lead = int(bool(provenance.get("simulation"))) if (self.source.path / _SPEC_FILE).is_file() else None
+        """Check that ``lead_frames`` of the command is 1 if the dataset is one of ours, which states its ``action_time``."""
+        action_time = self.dataset.spec.action_time
         commands = self.spec.features[ACTION].channels if self.spec and ACTION in self.spec.features else ()
-        for name in commands if lead is not None else ():
+        for name in commands if action_time else ():
             assert self.spec is not None
             channel = self.spec.channels[name]
-            if channel.topic == ACTION and channel.lead_frames not in (lead, None):
-                meaning = "reached at row k + 1" if lead else "in force at row k"
-                meaning = "sent after row k" if action_time == "this_row" else meaning
-                stated = action_time or "is not stated, an older taccorl ingested it"
+            if channel.topic == ACTION and channel.lead_frames not in (1, None):
+                meaning = "sent after row k" if action_time == "this_row" else "reached at row k + 1"
                 text = f"{self.source.name}: row k of its {ACTION} is the command {meaning} ({_SPEC_FILE}: action_time "
-                text += f"{stated}): channel {name!r} has `lead_frames: {channel.lead_frames}`, it needs {lead}"
+                text += f"{action_time}): channel {name!r} has `lead_frames: {channel.lead_frames}`, it needs 1"
                 raise RecordingError(text)
 
     def _times_ns(self, topics: list[str]) -> dict[str, list[int]]:

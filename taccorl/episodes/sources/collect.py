@@ -46,11 +46,6 @@ class CollectPlan(Plan):
     def repeatable(self) -> bool:
         return self.source.repeatable
 
-    @property
-    def num_attempts(self) -> int | None:
-        """Largest number of attempts; None: as many as needed."""
-        return None
-
     def hopeless(self, attempts: int, successes: int) -> bool:
         """True if an automatic demonstrator fails so often (fewer than a quarter of at least 20 ``attempts`` are ``successes``)
         that the task or the twin must be faulty. There is no limit for a person.
@@ -95,10 +90,7 @@ class CollectPlan(Plan):
         return super().dataset_config(entries) | seeds | {"twin": self.scene["twin"]} | self.kept_pictures
 
     def items_of(self, report: dict[str, Any]) -> Sequence[int] | None:
-        count, enough = report["attempts"], self.num_attempts
-        if report["outcomes"].get("success", 0) != self.episodes and count != enough:
-            return None
-        return None if enough is not None and count > enough else range(count)
+        return range(report["attempts"]) if report["outcomes"].get("success", 0) == self.episodes else None
 
 
 def attempt(plan: CollectPlan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> Attempt:
@@ -166,10 +158,6 @@ class Needed:
             number = min(number, self._unjudged - self._started)
         if not plan.repeatable:
             number = min(number, 1 - running)  # a person's attempts follow one another
-        if plan.num_attempts is not None:
-            left = plan.num_attempts - self._started
-            # past the last, the plan states what is missing
-            number = min(number, left if left or running or plan.keep_failures else 1)
         started, self._started = self._started, self._started + max(number, 0)
         return range(started, self._started)
 

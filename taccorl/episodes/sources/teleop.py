@@ -1,19 +1,19 @@
-"""Teleoperation in the twin with MuJoCo's viewer: ``taccorl collect --source.type=keyboard | leader``.
+"""Teleoperation of the twin by leader arms, with MuJoCo's viewer: ``taccorl collect --source.type=leader``.
 
 The person's actions are written to an action file at once (teleop_actions.py). The episode is then made by executing that file
 again: it is as exact as an expert's, and nothing is lost when rendering or encoding fails. The same command continues where the
 last one ended: a finished demonstration of a scene is executed again, not requested again.
 """
 
-import abc
 import copy
+import enum
 import os
 import queue
 import sys
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,7 +23,6 @@ import numpy as np
 
 from taccorl.episodes.attempt import Actions, Source, outcome_of
 from taccorl.episodes.sources.teleop_actions import ActionLog, find_finished, give_time, replay, scene_of
-from taccorl.episodes.sources.teleop_jog import AXES, Command, Jogger, Keyboard, key_map, label
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
@@ -32,6 +31,17 @@ from taccorl.sim.twin import CONTROL_HZ
 _AFTER_S = 1.0  # what is called finished is watched for so long, as in the experts' episodes
 _CATCH_UP_STEP = ROBOT.per_action(0.6, 0.1) / CONTROL_HZ  # rad/s and m/s until arms and leader first agree
 _LATE_S = 0.2  # a machine that is later than this is too slow for real time: it does not try to catch up
+
+
+class Command(enum.Enum):
+    """Commands of the person: name of the key, its code (GLFW's), its function. MuJoCo's viewer leaves these keys free: it takes
+    all letters, 0–5, F1–F7 and most punctuation (tests/episodes/test_teleop.py)."""
+
+    GO = ("Enter", 257, "begin; when done: finish (all holds still for 1 s while the task is judged)")
+    DISCARD = ("F9", 298, "discard, and the same scene from its beginning")
+
+    def __init__(self, key: str, code: int, meaning: str) -> None:
+        self.key, self.code, self.meaning = key, code, meaning
 
 
 class _WindowClosed(TaccorlError):
@@ -49,13 +59,12 @@ class ViewerWindow:
         # A copy: what somebody changes in the viewer's panels must not reach the simulation.
         self._model = copy.copy(sim.model)
         self._data = mujoco.MjData(self._model)
-        self._taps: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self._window: Any = None
+        self._pressed: queue.SimpleQueue[int] = queue.SimpleQueue()  # filled in the window's thread
         self._said: list[str] = []
         self._next_s = 0.0
         try:
             self._viewer = mujoco.viewer.launch_passive(
-                self._model, self._data, key_callback=self._pressed, show_left_ui=False, show_right_ui=False
+                self._model, self._data, key_callback=self._pressed.put, show_left_ui=False, show_right_ui=False
             )
         except RuntimeError as error:  # macOS: not run under mjpython
             raise TaccorlError(f"MuJoCo's viewer does not open: {error}") from error
@@ -63,16 +72,9 @@ class ViewerWindow:
             self._viewer.cam.lookat[:] = (0.3, 0.0, 0.1)
             self._viewer.cam.azimuth, self._viewer.cam.elevation, self._viewer.cam.distance = 0.0, -40.0, 1.3
 
-    def _pressed(self, code: int) -> None:
-        """MuJoCo calls this in the window's thread, when a key goes down; not again while it stays down."""
-        import glfw
-
-        self._window = self._window or glfw.get_current_context()
-        self._taps.put(code)
-
-    def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
-        """Wait for the next control step, then show simulation 0, the text ``lines``, and a mark at each of the world poses
-        ``goals`` (4, 4). Raises TaccorlError: the person has closed the window."""
+    def tick(self, sim: Simulation, lines: Sequence[str]) -> None:
+        """Wait for the next control step, then show simulation 0 and the text ``lines``. Raises TaccorlError: the person has
+        closed the window."""
         now_s = time.monotonic()
         if now_s - self._next_s > _LATE_S:
             self._next_s = now_s
@@ -81,39 +83,15 @@ class ViewerWindow:
         if not self._viewer.is_running():
             raise _WindowClosed("the window was closed. Run the same command again to continue.")
         mujoco.mj_setState(self._model, self._data, sim.batch.state[0], mujoco.mjtState.mjSTATE_INTEGRATION)
-        with self._viewer.lock():
-            self._mark(goals)
         self._viewer.sync(state_only=True)
         if self._said != list(lines):
             self._said = list(lines)
             self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines), ""))
 
-    def _mark(self, goals: Sequence[np.ndarray]) -> None:
-        scene = self._viewer.user_scn
-        scene.ngeom = len(goals)
-        for k, goal in enumerate(goals):
-            mujoco.mjv_initGeom(
-                scene.geoms[k],
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.array([0.008, 0, 0]),
-                goal[:3, 3],
-                np.eye(3).ravel(),
-                np.array([0.1, 0.7, 0.2, 0.6], np.float32),
-            )
-
-    def taps(self) -> list[int]:
-        """Codes of the keys pressed since the last call."""
-        return [self._taps.get() for _ in range(self._taps.qsize())]
-
-    def held(self, codes: Collection[int]) -> set[int]:
-        """Those of the key codes ``codes`` that are pressed now."""
-        import glfw
-
-        # The window is destroyed only after its thread has had the lock and asked to exit: while we hold it, it lives.
-        with self._viewer.lock():
-            if self._window is None or not self._viewer.is_running():
-                return set()
-            return {code for code in codes if glfw.get_key(self._window, code) == glfw.PRESS}
+    def commands(self) -> list[Command]:
+        """Commands of the keys pressed since the last call; other keys are MuJoCo's."""
+        codes = [self._pressed.get() for _ in range(self._pressed.qsize())]
+        return [command for code in codes for command in Command if command.code == code]
 
     def close(self) -> None:
         self._viewer.close()
@@ -122,8 +100,8 @@ class ViewerWindow:
 def _check_display() -> None:
     """A window can be opened here; MuJoCo's viewer would wait for ever if not."""
     way_out = (
-        "Let the scripted expert demonstrate (--source.type=expert), re-execute action files (--source.type=actions), or run "
-        "this where there is a screen: at the machine itself, through ssh -X, or with an X server such as Xvfb."
+        "Let the scripted expert demonstrate (--source.type=expert), or run this where there is a screen: at the machine "
+        "itself, through ssh -X, or with an X server such as Xvfb."
     )
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise TaccorlError(f"no display for MuJoCo's viewer: DISPLAY and WAYLAND_DISPLAY are not set. {way_out}")
@@ -137,9 +115,20 @@ def _check_display() -> None:
         raise TaccorlError(f"no display: DISPLAY={os.environ.get('DISPLAY', '')} does not respond ({why}). {way_out}")
 
 
+OpenLeader = Callable[["LeaderSource"], Any]
+"""Function that opens the leader arms which a source describes: ``read()`` gives their joint angles [rad] and openings [m], (14,)
+in the order of actions, ``close()`` disconnects."""
+_drivers: list[OpenLeader] = []
+
+
+def use_leader_driver(driver: OpenLeader) -> None:
+    """Set the function that opens leader arms. The command line passes LeRobot's, which is in a higher layer."""
+    _drivers[:] = [driver]
+
+
 @dataclass
 class _Session:
-    """What stays open from attempt to attempt: the simulation that the person drives, its window, the device."""
+    """What stays open from attempt to attempt: the simulation that the person drives, its window, the leader arms."""
 
     sim: Simulation
     window: ViewerWindow
@@ -147,40 +136,44 @@ class _Session:
 
     def close(self) -> None:
         self.window.close()
-        if hasattr(self.device, "close"):
-            self.device.close()
+        self.device.close()
 
 
 _sessions: weakref.WeakKeyDictionary[Simulation, _Session] = weakref.WeakKeyDictionary()
 
 
+@Source.register_subclass("leader")
 @dataclass(frozen=True, kw_only=True)
-class HumanSource(Source):
-    """Base of sources in which a person demonstrates; subclasses define the input device."""
+class LeaderSource(Source):
+    """Leader arms: any LeRobot teleoperator with 14 values, or with a mapping of its values to the 14."""
 
     folder: str = "outputs/teleop"
     """Folder for action files."""
     time_limit_s: float = 300.0
     """Time limit of an attempt [s], in place of the task's own, which is made for experts that move both hands at once."""
+    teleop: str = ""
+    """LeRobot's name of the teleoperator: bi_rebot_102_leader, bi_openarm_leader, …"""
+    options: str = ""
+    """YAML or JSON file with the teleoperator's own options (ports, calibration id), named as in LeRobot."""
+    names: dict[str, str | None] = field(default_factory=dict)
+    """The teleoperator's name of a value → taccorl's (left_joint_1.pos … right_gripper.pos), or null: not used. Only names that
+    differ are needed."""
+    joint_unit: str = ""
+    """Unit of its joints: rad, deg, or range_m100_100 (−100 … 100 over the range of our joint). Must be given, because the
+    teleoperator does not state it."""
+    gripper_unit: str = ""
+    """Unit of its grippers: m, or range_0_100 (0 closed, 100 open)."""
     repeatable: ClassVar[bool] = False
-
-    @abc.abstractmethod
-    def device(self, window: ViewerWindow) -> Any:
-        """Open the input device, and print its controls. Called once; the device is read at each control step."""
-
-    @abc.abstractmethod
-    def hands(self, sim: Simulation, window: ViewerWindow, device: Any) -> "Jogger | LeaderHands":
-        """Controls of an attempt that starts now."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
         """Actions of the finished demonstration of this scene; if there is none, the person is asked to demonstrate now. Raises
         TaccorlError: there is no display or no device, or the person has closed the window."""
-        scene, name = scene_of(sim), self.get_choice_name(type(self))
+        scene = scene_of(sim)
         folder = Path(self.folder).expanduser()
-        file = find_finished(folder, scene, name)
+        file = find_finished(folder, scene)
         if file is None:
-            self._demonstrate(self._session(sim), folder, scene["seed"], name)
-            file = find_finished(folder, scene, name)
+            self._demonstrate(self._session(sim), folder, scene["seed"])
+            file = find_finished(folder, scene)
             assert file is not None, "a demonstration that has just been finished is there"
         else:
             print(f"re-executing {file.path}; move it away, or give another --seed, to demonstrate anew")
@@ -192,7 +185,7 @@ class HumanSource(Source):
             own.reset(sim.seeds[:1])
             window = ViewerWindow(own)
             try:
-                session = _Session(own, window, self.device(window))
+                session = _Session(own, window, self._open())
             except BaseException:
                 window.close()
                 raise
@@ -200,14 +193,22 @@ class HumanSource(Source):
             _sessions[sim] = session
         return _sessions[sim]
 
-    def _demonstrate(self, session: _Session, folder: Path, seed: int, name: str) -> None:
+    def _open(self) -> Any:
+        if not _drivers:
+            raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
+        device = _drivers[0](self)
+        keys = "\n".join(f"  {command.key:8}{command.meaning}" for command in Command)
+        print(f"{self.teleop}: connected. Keys, in the window:\n{keys}")
+        return device
+
+    def _demonstrate(self, session: _Session, folder: Path, seed: int) -> None:
         """Until the person has finished the scene, however often that takes."""
         finished = False
         while not finished:
             session.sim.reset([seed])
             give_time(session.sim, self.time_limit_s)
             self._wait_for_begin(session)
-            with ActionLog(folder, session.sim, name) as log:
+            with ActionLog(folder, session.sim) as log:
                 try:
                     finished = self._drive(session, log)
                 except (_WindowClosed, KeyboardInterrupt) as error:
@@ -218,24 +219,24 @@ class HumanSource(Source):
                 log.end("finished" if finished else "discarded", outcome_of(session.sim))
 
     def _wait_for_begin(self, session: _Session) -> None:
-        lines = [session.sim.task.instruction, f"{label(Command.GO)}: begin"]
-        hands = self.hands(session.sim, session.window, session.device)
-        session.window.taps()  # what was typed while the last episode was made does not count
-        while Command.GO not in hands.act(session.window.taps())[1]:
-            session.window.tick(session.sim, lines, [])
+        lines = [session.sim.task.instruction, f"{Command.GO.key}: begin"]
+        session.window.commands()  # what was typed while the last episode was made does not count
+        while Command.GO not in session.window.commands():
+            session.device.read()  # a wrong unit is an error before the attempt begins
+            session.window.tick(session.sim, lines)
 
     def _drive(self, session: _Session, log: ActionLog) -> bool:
         """One attempt in real time; False if it is to be done again."""
         sim, window = session.sim, session.window
-        hands = self.hands(sim, window, session.device)
+        hands = LeaderHands(sim, session.device)
         action, watched, done = None, 0, False
         while not sim.judge.success[0] and watched < _AFTER_S * CONTROL_HZ:
             failure = str(sim.judge.failure[0])
-            lines = [sim.task.instruction, *hands.lines()]
+            lines = [sim.task.instruction, *hands.lines]
             if failure:
-                lines.append(f"{failure}! {label(Command.DISCARD)}: again; {label(Command.GO)}: keep as failed")
-            window.tick(sim, lines, hands.goals())
-            asked, commands = hands.act(window.taps())
+                lines.append(f"{failure}! {Command.DISCARD.key}: again; {Command.GO.key}: keep as failed")
+            window.tick(sim, lines)
+            asked, commands = hands.read(), window.commands()
             if Command.DISCARD in commands:
                 return False
             done = done or Command.GO in commands
@@ -250,91 +251,27 @@ class HumanSource(Source):
         return True
 
 
-# keyboard ---------------------------------------------------------------------------------------------------
-
-
-@Source.register_subclass("keyboard")
-@dataclass(frozen=True, kw_only=True)
-class KeyboardSource(HumanSource):
-    """Keys in MuJoCo's viewer move one hand at a time; the keys are printed."""
-
-    def device(self, window: ViewerWindow) -> None:
-        print(f"keys, in the window:\n{key_map()}\nThe mouse and all other keys are MuJoCo's.")
-
-    def hands(self, sim: Simulation, window: ViewerWindow, device: None) -> Jogger:
-        keyboard, codes = Keyboard(), [code for axis in AXES for code in (*axis.more, *axis.less)]
-        return Jogger(sim, lambda taps: keyboard.requested_steps(taps, window.held(codes)))
-
-
-# leader arms -------------------------------------------------------------------------------------------------------------
-
-
-OpenLeader = Callable[["LeaderSource"], Any]
-"""Function that opens the leader arms which a source describes: ``read()`` gives their joint angles [rad] and openings [m], (14,)
-in the order of actions, ``close()`` disconnects."""
-_drivers: list[OpenLeader] = []
-
-
-def use_leader_driver(driver: OpenLeader) -> None:
-    """Set the function that opens leader arms. The command line passes LeRobot's, which is in a higher layer."""
-    _drivers[:] = [driver]
-
-
-@Source.register_subclass("leader")
-@dataclass(frozen=True, kw_only=True)
-class LeaderSource(HumanSource):
-    """Leader arms: any LeRobot teleoperator with 14 values, or with a mapping of its values to the 14."""
-
-    teleop: str = ""
-    """LeRobot's name of the teleoperator: bi_rebot_102_leader, bi_openarm_leader, …"""
-    options: str = ""
-    """YAML or JSON file with the teleoperator's own options (ports, calibration id), named as in LeRobot."""
-    names: dict[str, str | None] = field(default_factory=dict)
-    """The teleoperator's name of a value → taccorl's (left_joint_1.pos … right_gripper.pos), or null: not used. Only names that
-    differ are needed."""
-    joint_unit: str = ""
-    """Unit of its joints: rad, deg, or range_m100_100 (−100 … 100 over the range of our joint). Must be given, because the
-    teleoperator does not state it."""
-    gripper_unit: str = ""
-    """Unit of its grippers: m, or range_0_100 (0 closed, 100 open)."""
-
-    def device(self, window: ViewerWindow) -> Any:
-        if not _drivers:
-            raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
-        device = _drivers[0](self)
-        print(f"{self.teleop}: connected. Keys, in the window: {label(Command.GO)} and {label(Command.DISCARD)}")
-        print(key_map())
-        return device
-
-    def hands(self, sim: Simulation, window: ViewerWindow, device: Any) -> "LeaderHands":
-        return LeaderHands(sim, device)
-
-
 class LeaderHands:
     """Controls by leader arms: the twin's arms follow them, slowly at first, because they start at other angles."""
 
     def __init__(self, sim: Simulation, device: Any) -> None:
-        self._device, self._keyboard = device, Keyboard()
+        self._device = device
         self._now = sim.targets[0].copy()
         self._caught_up = False
-        self._lines: list[str] = []
+        self.lines: list[str] = []
+        """Status lines of the last reading: values beyond the twin's range, and how far the arms are behind."""
 
-    def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
+    def read(self) -> np.ndarray:
+        """Read the leader arms: the action (14,) [rad, m] of the next control step, float32."""
         read = self._device.read()
         wanted = np.clip(read, ROBOT.action_low, ROBOT.action_high)
         beyond = [name for name, off in zip(ROBOT.action_names, read != wanted, strict=True) if off]
-        self._lines = [f"beyond the twin's range: {', '.join(beyond)}"] if beyond else []
+        self.lines = [f"beyond the twin's range: {', '.join(beyond)}"] if beyond else []
         if not self._caught_up:
             away = wanted - self._now
             step = np.clip(away, -_CATCH_UP_STEP, _CATCH_UP_STEP)
             self._caught_up = bool((step == away).all())
             wanted = wanted if self._caught_up else self._now + step
-            self._lines.append(f"catching up with the leader: {np.abs(away).max():.2f} to go")
+            self.lines.append(f"catching up with the leader: {np.abs(away).max():.2f} to go")
         self._now = wanted
-        return wanted.astype(np.float32), self._keyboard.requested_steps(taps, ())[1]
-
-    def lines(self) -> list[str]:
-        return self._lines
-
-    def goals(self) -> list[np.ndarray]:
-        return []
+        return wanted.astype(np.float32)

@@ -7,36 +7,29 @@ A file is one JSON value a line, so that a process killed at any moment leaves o
     {"end": "finished", "outcome": "success"}          or "discarded"; missing if the demonstrator's process was cut off
 """
 
-import dataclasses
 import json
-import logging
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import mujoco
 import numpy as np
 
 import taccorl
-from taccorl.episodes.attempt import Actions, Source, Targets, outcome_of
-from taccorl.episodes.plan import twin_of_text
-from taccorl.episodes.sources.collect import CollectPlan
+from taccorl.episodes.attempt import Actions, Targets, outcome_of
 from taccorl.errors import TaccorlError
-from taccorl.lineage.digest import digest_bytes
 from taccorl.lineage.files import flush
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
-from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.twin_file import twin_text
 
 FORMAT = "taccorl actions 1"
 _SCENE = ("task", "difficulty", "randomization", "seed", "twin")
 """What must be equal for a file to be of the same scene."""
 _ENDS = ("finished", "discarded")
-
-logger = logging.getLogger(__name__)
 
 
 def scene_of(sim: Simulation) -> dict[str, Any]:
@@ -59,8 +52,8 @@ class ActionLog:
     """Appends actions to a new file ``folder/TASK_SEED_NNN.jsonl``. Each action is written at once, and the file is synchronised
     to disk every second."""
 
-    def __init__(self, folder: Path, sim: Simulation, source: str) -> None:
-        """Create the file for the actions of ``source`` in simulation 0 of ``sim``, which has just been reset."""
+    def __init__(self, folder: Path, sim: Simulation) -> None:
+        """Create the file for actions in simulation 0 of ``sim``, which has just been reset."""
         scene = scene_of(sim)
         folder.mkdir(parents=True, exist_ok=True)
         self.path, self._descriptor = _create(folder, f"{scene['task']}_{scene['seed']}")
@@ -70,7 +63,6 @@ class ActionLog:
                 "format": FORMAT,
                 **scene,
                 "time_limit_s": sim.judge.limit_steps / CONTROL_HZ,
-                "source": source,
                 "names": list(ROBOT.action_names),
                 "units": "rad, gripper openings in m",
                 "control_hz": CONTROL_HZ,
@@ -131,7 +123,7 @@ class ActionFile:
 
     path: Path
     header: dict[str, Any]
-    """First line of the file: the scene, the source, versions."""
+    """First line of the file: the scene, versions."""
     actions: np.ndarray
     """(T, 14) float32 actions [rad, m]."""
     end: str | None
@@ -176,10 +168,9 @@ def _value(path: Path, number: int, line: bytes) -> Any:
         raise TaccorlError(f"{path}:{number}: is damaged: {error}") from error
 
 
-def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFile | None:
-    """The newest finished demonstration of the same scene by the same kind of source, recorded with this version of MuJoCo; None
-    without one."""
-    wanted = {**scene, "source": source, "mujoco": mujoco.__version__}
+def find_finished(folder: Path, scene: dict[str, Any]) -> ActionFile | None:
+    """The newest finished demonstration of the same scene, recorded with this version of MuJoCo; None without one."""
+    wanted = {**scene, "mujoco": mujoco.__version__}
     for path in sorted(folder.glob(f"{scene['task']}_{scene['seed']}_*.jsonl"), reverse=True):
         file = ActionFile.read(path)
         if file.end == "finished" and all(file.header.get(key) == value for key, value in wanted.items()):
@@ -190,11 +181,6 @@ def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFil
 def replay(file: ActionFile, sim: Simulation) -> Actions:
     """Iterate over the actions of a file, as a source does. Raises TaccorlError: the episode had ended with these actions when
     they were recorded, and does not end now."""
-    if file.header.get("mujoco") != mujoco.__version__:
-        logger.warning(
-            "%s: recorded with MuJoCo %s, this is %s: results may differ in the last bits",
-            *(file.path, file.header.get("mujoco"), mujoco.__version__),
-        )
     give_time(sim, file.header["time_limit_s"])
     for action in file.actions:
         yield Targets(action, action)
@@ -204,96 +190,3 @@ def replay(file: ActionFile, sim: Simulation) -> Actions:
             f"{file.header.get('mujoco')}, taccorl {file.header.get('taccorl')}), but its outcome here is {outcome_of(sim)}: "
             "the twin differs from the one in which it was recorded. Nothing of it was kept."
         )
-
-
-@Source.register_subclass("actions")
-@dataclass(frozen=True, kw_only=True)
-class ActionsSource(Source):
-    """Source that executes action files again: the actions of a person or another source, in the original scenes."""
-
-    path: str
-    """An action file, or a folder of them (outputs/teleop); discarded demonstrations in a folder are skipped."""
-    digest: str = field(init=False, default="")
-    """Digest of the files' contents, so that other actions have other keys in the store."""
-
-    _MADE_BY_FILE: ClassVar[tuple[str, ...]] = ("task", "difficulty", "randomization")
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "digest", digest_bytes(*(path.read_bytes() for path in self._paths())))
-
-    def _paths(self) -> list[Path]:
-        path = Path(self.path).expanduser()  # the shell leaves the ~ of --source.path=~/x alone
-        return sorted(path.glob("*.jsonl")) if path.is_dir() else [path] * path.is_file()
-
-    def files(self) -> list[ActionFile]:
-        """All action files, in the order in which they were made. Raises TaccorlError: there is no file, or one is damaged."""
-        paths = self._paths()
-        files = [ActionFile.read(path) for path in paths]
-        if not Path(self.path).expanduser().is_file():
-            files = [file for file in files if file.end != "discarded"]
-        if not files:
-            what = "holds only discarded action files" if paths else "is not there, or holds no action files (*.jsonl)"
-            raise TaccorlError(f"--source.path={self.path} {what}; teleoperation writes them to outputs/teleop")
-        return sorted(files, key=lambda file: (str(file.header.get("created")), file.path))
-
-    def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        scene = scene_of(sim)
-        files = [file for file in self.files() if file.scene == scene]
-        if len(files) != 1:
-            what = f"{len(files)} action files ({', '.join(f.path.name for f in files)})" if files else "no action file"
-            raise TaccorlError(f"{self.path}: {what} of {scene['task']} with seed {scene['seed']}; one is needed")
-        return replay(files[0], sim)
-
-    def plan(self, plan: CollectPlan) -> "ReplayPlan":
-        """``plan`` with the scenes of the files: their task, difficulty, twin, randomisation and seeds. Raises TaccorlError: the
-        files are of several twins or tasks, or of another one than ``plan`` states."""
-        files = [file for file in self.files() if plan.task in ("", file.header["task"])]
-        if not files:
-            raise TaccorlError(f"{self.path}: no action file of --task={plan.task}")
-        first = files[0]
-        for file in files:
-            for key in (*self._MADE_BY_FILE, "twin"):
-                if file.header[key] != first.header[key]:
-                    raise TaccorlError(
-                        f"{file.path} is of another {key} than {first.path}: give them one by one"
-                        + (", or give --task=…" if key == "task" else "")
-                    )
-        default = {f.name: f.default for f in dataclasses.fields(CollectPlan)}
-        for key in self._MADE_BY_FILE[1:]:
-            asked = getattr(plan, key)
-            if asked not in (default[key], first.header[key]):
-                raise TaccorlError(f"{first.path} is of {key} {first.header[key]}, not {asked}: remove --{key}")
-        if plan.twin and twin_text(plan.twin_config()) != first.header["twin"]:
-            raise TaccorlError(f"{first.path} was recorded in another twin than {plan.twin}: remove --twin")
-        given = {f.name: getattr(plan, f.name) for f in dataclasses.fields(CollectPlan)}
-        given |= {key: first.header[key] for key in self._MADE_BY_FILE} | {"twin": None, "source": self}
-        good = sum(file.outcome == "success" for file in files)
-        given["episodes"] = min(plan.episodes, good or len(files))
-        # Successes first, so that the others are not needed; last where all are wanted: with the last one collecting ends.
-        files.sort(key=lambda file: (file.outcome == "success") == plan.keep_failures)
-        return ReplayPlan(**given, files=tuple(files))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayPlan(CollectPlan):
-    """A plan whose attempts are the scenes of action files, in their order."""
-
-    files: tuple[ActionFile, ...]
-    """Action files, in the order of the attempts."""
-
-    def twin_config(self) -> TwinConfig:
-        return twin_of_text(self.files[0].header["twin"])
-
-    @property
-    def num_attempts(self) -> int:
-        return len(self.files)
-
-    def attempt_seed(self, k: int) -> int:
-        """Scene seed of file ``k``. Raises TaccorlError: there are fewer files, because too few of them end in success."""
-        if k >= len(self.files):
-            names = ", ".join(file.path.name for file in self.files)
-            raise TaccorlError(
-                f"{self.files[0].path.parent}: all {k} action files were re-executed, and fewer than {self.episodes} of them "
-                f"succeed; request fewer: --episodes=…  Files: {names}"
-            )
-        return int(self.files[k].header["seed"])

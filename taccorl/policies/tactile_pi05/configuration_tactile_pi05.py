@@ -47,7 +47,7 @@ class TactilePI05Config(PI05Config):
     names of the actions are those of the two arms whose geometry is known."""
     part_poses: bool = False
     """Add the poses of the task's parts to the state's token (see ``part_poses``). Only a simulator knows them: the dataset must
-    be made with taccorl execute --part_poses=true."""
+    be made with taccorl collect --part_poses=true."""
     part_names: list[str] | None = None
     """Names of the entries of ``observation.environment_state``, the poses of the parts: ``plug.x`` … ``plug.z`` (position) and
     ``plug.r00`` … ``plug.r21`` (first two columns of the rotation matrix), part after part. None: read from the dataset when
@@ -268,7 +268,7 @@ class TactilePI05Config(PI05Config):
         TaccorlError: neither a dataset nor a checkpoint has stated them."""
         if self.part_names is None:
             raise TaccorlError(
-                "tactile_pi05 does not know the task's parts: make the policy from a dataset (taccorl execute "
+                "tactile_pi05 does not know the task's parts: make the policy from a dataset (taccorl collect "
                 "--part_poses=true) or a checkpoint, or set --policy.part_names"
             )
         return self.part_names

@@ -154,7 +154,7 @@ def _match_parts(config: Any, meta: Any, where: str) -> None:
             return  # a checkpoint goes on without its pose loss
         option = "--policy.part_poses=true" if config.part_poses else f"--policy.pose_loss={config.pose_loss:g}"
         raise TaccorlError(
-            f"{option}: {where} has no {PARTS_KEY}: make it with taccorl execute --part_poses=true. It has: "
+            f"{option}: {where} has no {PARTS_KEY}: make it with taccorl collect --part_poses=true. It has: "
             f"{', '.join(k for k in meta.features if k.startswith('observation.'))}"
         )
     names = list(meta.features[PARTS_KEY]["names"])

@@ -115,7 +115,7 @@ class PartPosesStep(ArmStep):
             return observation
         if PARTS_KEY not in observation:
             raise TaccorlError(
-                f"--policy.part_poses=true: the observation has no {PARTS_KEY}. Make datasets with taccorl execute "
+                f"--policy.part_poses=true: the observation has no {PARTS_KEY}. Make datasets with taccorl collect "
                 "--part_poses=true, and environments with part_poses=True (LeRobot's: --env.part_poses=true)"
             )
         poses = torch.as_tensor(observation[PARTS_KEY])

@@ -105,7 +105,7 @@ def test_mcap_is_read_at_the_command_s_own_200_hz(recorded, moved):
     assert recorded.rate_hz == 200.0
     assert recorded.signals == ROBOT.action_names
     assert recorded.instruction == NO_LOSS.instruction  # of the first start marker
-    assert recorded.origin == Origin("surrogate", "surrogate recording", derived=True)
+    assert recorded.origin == Origin(None, "surrogate recording")
     assert recorded.time_s[-1] > SECONDS + LEAD_S  # rests included
     rows, samples = truth_rows(recorded, moved.trajectory)
     assert len(rows) == len(moved.trajectory.time_s)

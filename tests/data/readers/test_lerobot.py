@@ -141,34 +141,13 @@ def test_a_taccorl_dataset_comes_back_row_for_row_through_its_recording_spec(our
         assert row == ROWS[index] - 1
 
 
-def older(ours: Path, copy: Path) -> Path:
-    """The dataset as ingest wrote it before ``action_time``."""
-    shutil.copytree(ours, copy)
-    path = copy / "meta/taccorl/dataset_spec.json"
-    told = json.loads(path.read_text())
-    del told["action_time"]
-    path.write_text(json.dumps(told))
-    return copy
-
-
 def lerobot_spec(lead_frames: int) -> RecordingSpec:
     spec = load_recording_spec("taccorl_lerobot")
     command = dataclasses.replace(spec.channels["command"], lead_frames=lead_frames)
     return dataclasses.replace(spec, channels={**spec.channels, "command": command})
 
 
-def test_an_older_dataset_is_brought_to_the_convention_and_never_read_as_if_it_had_it(ours, tmp_path):
-    _, source = find_sources(older(ours, tmp_path / "older"))[0]
-    with (
-        pytest.raises(RecordingError, match=r"in force at row k .*older taccorl.*`lead_frames: 1`, it needs 0"),
-        opened(source, lerobot_spec(1)),
-    ):
-        pass
-    with opened(source, lerobot_spec(0)) as recording:
-        (episode,) = Cutter(recording).cut().episodes
-        assert episode.num_rows == ROWS[0] - 1  # nothing was in force at the row after the last
-        assert np.array_equal(episode.arrays["observation.state"], made_episode(0).arrays["observation.state"][:-1])
-        assert np.array_equal(episode.arrays["action"], made_episode(0).arrays["action"][1:])
+def test_a_command_is_read_as_the_dataset_states_its_time(ours):
     with (
         pytest.raises(RecordingError, match=r"reached at row k \+ 1 .*action_time next_row\).*it needs 1"),
         opened(find_sources(ours)[0][1], lerobot_spec(0)),
@@ -260,7 +239,7 @@ def test_a_dataset_without_baselines_gives_the_counts_it_has(ours: Path, tmp_pat
 def test_a_camera_without_videos_is_missed_only_by_specs_that_read_it(ours: Path, tmp_path: Path, how: str) -> None:
     root, key = shutil.copytree(ours, tmp_path / "d"), "observation.images.front"
     shutil.rmtree(root / "videos" / key)
-    if how == "not in the table":  # as taccorl execute --pictures=cache leaves it
+    if how == "not in the table":  # as taccorl collect --pictures=cache leaves it
         (path,) = (root / "meta/episodes").glob("*/*.parquet")
         table = pq.read_table(path)
         pq.write_table(table.drop_columns([n for n in table.column_names if n.startswith(f"videos/{key}/")]), path)

@@ -188,13 +188,12 @@ def test_what_hardly_ever_succeeds_is_stopped(plan, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_ray_gives_the_bytes_of_this_process(augmented, plan, tmp_path, monkeypatch):
-    ray = pytest.importorskip("ray", reason="extra cluster: ray")
-    pytest.importorskip("datatrove.executor", reason="extra cluster: datatrove")
+    ray = pytest.importorskip("ray", reason="extra ray")
     folder, report = augmented
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
     ray.init(address="local", num_cpus=2, include_dashboard=False)
     try:
-        engine = RayEngine(work_dir=tmp_path / "work", mem_per_cpu_gb=2)
+        engine = RayEngine()
         told = produce(plan(), tmp_path / "new", Store(tmp_path / "store"), quiet, engine).report
     finally:
         ray.shutdown()

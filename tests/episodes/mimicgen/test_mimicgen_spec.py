@@ -42,6 +42,12 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {time_s: 1}}", r"without joint_rad"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {joint_rad: .nan}}", r"found '\.nan'"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {disturbance: {joint_rad: .inf}}", r"found '\.inf'"),
+        ("task: assembly_2", "task: assembly_2\ndatagen_config: {contact_mode: closed_loop_exprt}", r"mean 'closed_loop_expert'"),
+        (
+            "task: assembly_2",
+            "task: assembly_2\ndatagen_config: {contact_mode: closed_loop_expert, retarget: eef_command}",
+            r"retarget: eef_command sends poses as commanded",
+        ),
         ("task: assembly_2", "task: assembly_2\ngates: {max_force_n: -5}", r"-5: nothing would pass; give a number > 0"),
         (
             "[[left, 1], [right, 1]], constraint_type: coordination, coordination_scheme: replay}",

@@ -1,7 +1,7 @@
 """Plan that generates demonstrations from source demonstrations (MimicGen) until N attempts have succeeded.
 
 Attempts are numbered, and the successes with the lowest numbers are written. An attempt stores its actions; the rows of a
-success, with touch and pictures, are an artefact of their own, which ``rows: actions`` leaves out.
+success, with touch and pictures, are an artefact of their own.
 """
 
 import dataclasses
@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,8 +22,8 @@ from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation, read
 from taccorl.episodes.sources.mimicgen.grips import grips_report
 from taccorl.episodes.sources.mimicgen.source import SourcePool
 from taccorl.episodes.sources.mimicgen.spec import GatesSpec, MimicSpec, check_task
-from taccorl.episodes.sources.mimicgen.stored import META, Demonstration, execute, write_stored
-from taccorl.errors import TaccorlError, nearest
+from taccorl.episodes.sources.mimicgen.stored import Demonstration, execute
+from taccorl.errors import TaccorlError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.manifest import DATASET_MANIFEST, read_manifest
 from taccorl.lineage.processes import Failed
@@ -38,10 +38,6 @@ _HOPELESS = 0.05  # of a hundred attempts
 _HUNDRED = 100
 _ATTEMPT = Stage("mimicgen", version=5)
 _ROWS = Stage("mimicgen_rows", version=3)
-_AUGMENTED = Stage("augmented", version=4, manifest=DATASET_MANIFEST)
-_ACTIONS = Stage("actions", version=3)
-
-Rows = Literal["dataset", "actions"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,23 +50,16 @@ class AugmentPlan(Plan):
     """Dataset of the sources (``Store.dataset``)."""
     episodes: int = 200
     """Number of successful episodes to generate, in the plan's twin, which may differ from that of the sources."""
-    rows: Rows = "dataset"
-    """Kind of output: a LeRobot dataset, or seeds and actions (``stored.py``). The attempts are the same."""
 
+    dataset: ClassVar[Stage] = Stage("augmented", version=4, manifest=DATASET_MANIFEST)
     counts_errors: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", self.spec.task)
         super().__post_init__()
-        if self.rows not in get_args(Rows):
-            raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
 
     def scene_seed(self, k: int) -> int:
         return attempt_seeds(self.seed, self.task, k)[0]
-
-    @property
-    def dataset(self) -> Stage:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return _AUGMENTED if self.rows == "dataset" else _ACTIONS
 
     def make(self) -> Simulation:
         """Make the simulation of this plan, whose task the spec must fit."""
@@ -93,7 +82,8 @@ class AugmentPlan(Plan):
         return Rounds(self)
 
     def config(self, item: int) -> dict[str, Any]:
-        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, **told_origin(self.origin)}
+        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "videos": self.stored_as == "video"}
+        own |= {"part_poses": self.part_poses, **told_origin(self.origin)}
         return canonical(self.scene | own | {"root_seed": self.seed, "attempt": item})
 
     def inputs(self, item: int) -> list[Artefact]:
@@ -104,7 +94,7 @@ class AugmentPlan(Plan):
     @property
     def steps(self) -> tuple[Step, ...]:
         # Rows are a function of the sources alone, as the attempt is: their key is known where the attempt is gone.
-        return (Step(_ATTEMPT, self._physics), *[Step(_ROWS, self._rows)] * (self.rows == "dataset"))
+        return (Step(_ATTEMPT, self._physics), Step(_ROWS, self._rows))
 
     def _physics(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
         done = self.opened().actor.run(item)
@@ -130,25 +120,13 @@ class AugmentPlan(Plan):
         return entry | done.facts
 
     def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
-        own = super().dataset_config(entries) | {"spec": self.spec.digest}
+        own = super().dataset_config(entries) | {"spec": self.spec.digest} | self.kept_pictures
         return own | ({} if entries is None else {"attempts": len(entries)})
-
-    def report_at(self, out: Path) -> dict[str, Any] | None:
-        if self.rows == "dataset":
-            return super().report_at(out)
-        return read_json(out / META)["report"] if (out / META).is_file() else None
 
     def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
         report = super().report(entries)
         report["entries"] = [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries]
         return report | {"grips": grips_report(self.opened().actor.pool.sources)}
-
-    def write(self, report: dict[str, Any], kept: list[Path], folder: Path) -> bool:
-        if self.rows == "dataset":
-            return False
-        common = self.config(0) | {"sources": self.inputs(0)[0].digest}
-        write_stored(folder, common, dataclasses.asdict(self.spec), report, [demonstration_of(path) for path in kept])
-        return True
 
 
 class Rounds:
