@@ -40,7 +40,17 @@ EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
 ROBOT_TRIALS = 20
 """Trials of a task on a robot, as in the paper."""
-_OF_TWIN = ("difficulty", "twin", "randomization", "pictures", "hide", "physics", "batch_size", "workers")
+_OF_TWIN = (
+    "difficulty",
+    "twin",
+    "randomization",
+    "pictures",
+    "hide",
+    "physics",
+    "batch_size",
+    "workers",
+    "before_mate",
+)
 """Options that configure the simulation, refused with a robot."""
 
 
@@ -97,6 +107,10 @@ class EvaluateConfig:
     workers: int = 1
     """Processes among which the scenes are divided, each with a policy of its own; several GPUs are used in turn. As with another
     batch_size, a policy that draws noise gets other random numbers."""
+    before_mate: int = 0
+    """Number of further scenes in which the expert brings a part before its mate, displaced by up to 4 mm, and policies are asked
+    where they aim: how much of a displacement they keep (0: they aim at the axis) and how far the aims of different grips lie
+    apart. In evaluation.json and on the page. 0: not asked."""
     failures: int = 4
     """Number of failed episodes that are saved with pictures as a Rerun file; 0: none."""
     robot: dict[str, Any] = field(default_factory=dict)
@@ -198,12 +212,19 @@ def run(config: EvaluateConfig) -> int:
         rollouts.append(_scored(config, scenes, one))
         rows.append([rollout.row for rollout in rollouts[-1]])
         write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
+    aimed = {}
+    if config.before_mate:
+        from taccorl.evaluation.before_mate import aims_of
+
+        asked = [one.checkpoint for one in opened if one.checkpoint is not None]
+        aimed = aims_of(scenes, asked, config.before_mate, config.policy.device, config.seed, Steps(every_s=10))
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     found = dataclasses.replace(
         found,
         rows=[row for own in rows for row in own],
         comparisons=compare(rows[0], rows[1]) if len(rows) == 2 else {},
+        aimed=aimed,
         wall_s=wall_s,
     )
     write_rows(found.rows, config.out / ROWS_FILE)
@@ -343,6 +364,11 @@ def _check_places(config: EvaluateConfig) -> None:
         raise TaccorlError(line)
     if warp is not None:
         open_device(warp.device)  # before weights are loaded
+    if config.before_mate < 0 or config.before_mate == 1:
+        raise TaccorlError(f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared")
+    if config.before_mate and config.policy.path is None:
+        line = f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
+        raise TaccorlError(line)
 
 
 def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:

@@ -49,6 +49,8 @@ class Evaluation:
     """Episodes of all policies."""
     comparisons: Mapping[str, PairedComparison] = field(default_factory=dict)
     """Task → comparison of the first policy with the second on the same scenes."""
+    aimed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Policy → task → its aims before the mate."""
     executed: Mapping[str, str]
     """Policy → executed actions of a chunk, such as ``8 of 16``."""
     against: str | None
@@ -66,10 +68,12 @@ class Evaluation:
     @property
     def about(self) -> dict[str, str]:
         """Resolved settings, versions and digests, by name."""
+        aims = [(f"{name}, {task}", a["text"]) for name, own in self.aimed.items() for task, a in own.items()]
         twin = {} if self.robot else {"digest of the twin": digest_bytes(twin_text(self.scenes.twin_config()).encode())}
         return {
             **{f"digest of {one.name}": one.digest for one in self.policies},
             **{f"executed actions of {name}": text for name, text in self.executed.items()},
+            **{f"{of}, before the mate": text for of, text in aims},
             **{name: str(value) for name, value in scenes_to_json(self.scenes).items()},
             **twin,
             **{f"robot's {name}": str(value) for name, value in self.robot.items()},
@@ -88,6 +92,7 @@ class Evaluation:
             "wall_s": self.wall_s,
             "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(self.rows)],
             "comparisons": {task: c.to_json() for task, c in self.comparisons.items()},
+            "before_mate": self.aimed,
             "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in self.policies},
         }
 

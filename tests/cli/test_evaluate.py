@@ -66,6 +66,8 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle", "--policy.type=expert", "--physics=warp", "--failures=2"), "give --failures=0"),
         (("--task=puzzle", "--policy.type=expert", "--physics=warp", "--workers=2"), "--workers=2: --physics=warp runs all"),
         (("--task=puzzle", "--policy.path=x", "--robot.type=taccorl_surrogate", "--physics=warp"), "--physics has no effect"),
+        (("--task=puzzle", "--policy.path=x", "--before_mate=1"), "--before_mate=1: 0, or 2 or more"),
+        (("--task=puzzle", "--policy.type=expert", "--before_mate=2"), "--before_mate=2: asks a policy"),
         (("--task=puzzle", "--policy.type=expert", "--pictures=randomized"), "did you mean 'randomised'"),
         (("--task=puzzle", "--policy.type=expert", "--hide=touch,camera"), "--hide=camera: "),
         (("--task=puzzle", "--policy.type=expert", "--hide=touch"), "the expert reads no sensor"),
@@ -109,7 +111,7 @@ def test_another_twin_is_scored_on_the_same_scenes(said: Any, tmp_path: Path) ->
 def test_a_checkpoint_is_preflighted_scored_and_shown(said: Any, checkpoint: Path, tmp_path: Path) -> None:
     code, shown = said(
         *("evaluate", f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_1", "--against=expert"),
-        *(*SHORT, "--failures=1", "--pictures=randomised", "--out=scored"),
+        *(*SHORT, "--failures=1", "--pictures=randomised", "--before_mate=2", "--out=scored"),
     )
     assert code == 0 and "preflight of" in shown
     rows = read_rows(tmp_path / "scored/episodes.jsonl")
@@ -118,6 +120,9 @@ def test_a_checkpoint_is_preflighted_scored_and_shown(said: Any, checkpoint: Pat
     page = (tmp_path / "scored/report.html").read_text()
     assert "data:image/jpeg;base64," in page and "Paired comparison" in page and "Checkpoint and environment" in page
     summary = json.loads((tmp_path / "scored/evaluation.json").read_text())
+    held = summary["before_mate"][str(checkpoint)]["assembly_1"]
+    assert held["grips"] == 2 and [len(held[k]) for k in ("kept", "error_m")] == [2, 2]
+    assert f"{checkpoint}, assembly_1, before the mate: keeps {held['kept'][0]:.2f} and" in shown
     assert [p["name"] for p in summary["policies"]] == [str(checkpoint), "expert"]
     assert len(summary["policies"][0]["digest"]) == 64 and summary["comparisons"]["assembly_1"]["n"] == 2
     assert summary["scenes"]["pictures"] == "randomised" and "<td>randomised</td>" in page

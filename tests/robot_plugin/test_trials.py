@@ -121,6 +121,7 @@ def test_a_trial_whose_server_dies_is_void(served: Start, evaluate: Any, tmp_pat
     ("words", "said"),
     [
         (("--twin=none.yaml",), "--twin has no effect with --robot.type: remove it"),
+        (("--before_mate=2",), "--before_mate has no effect"),
         (("--against=expert",), "--against=FOLDER of an earlier evaluation at most"),
         (("--robot.prt=1",), "prt"),
         (("--robot.type=taccorl_surogate",), "did you mean 'taccorl_surrogate'"),
