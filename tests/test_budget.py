@@ -7,15 +7,15 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_173,
-    "taccorl/cli": 4_833,
+    "taccorl/cli": 4_859,
     "taccorl/data": 8_734,
     "taccorl/diagnosis": 11_437,
     "taccorl/episodes": 4_182,
-    "taccorl/evaluation": 1_650,
+    "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_054,
     "taccorl/policies": 3_462,
-    "taccorl/report": 2_484,
+    "taccorl/report": 2_489,
     "taccorl/rl": 2_467,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_557,
     "taccorl/views": 2_433,
-    "tests": 55_681,
+    "tests": 55_865,
     "pipelines": 6_289,
 }
 MOST_LINES_OF_A_FILE = 500
