@@ -47,7 +47,7 @@ from taccorl.data.dataset import Dataset
 from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.episodes.sources.mimicgen.spec import mimic_spec_path
-from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
 from taccorl.sim.effects.added import present
@@ -338,27 +338,18 @@ def demonstrations(
         seed=int(is_robot),
         engine=LocalEngine(workers=config.workers),
     )
-    try:
-        if not sources:
-            step(collect.run, own)
-        else:  # of the expert without pulses, as MimicGen disturbs the arms itself
-            few, spec = (dataset.with_name(f"{dataset.name}_{n}") for n in ("sources", "spec.yaml"))
-            pushed = {"contact_mode": "closed_loop_expert", "disturbance": {"joint_rad": config.hands.pulse_rad}}
-            cut = yaml.safe_load(mimic_spec_path(task).read_text(encoding="utf-8"))
-            spec.write_text(yaml.safe_dump(cut | {"datagen_config": pushed}), encoding="utf-8")
-            plain = ExpertSource(hands=dataclasses.replace(config.hands, pulse_rad=0.0))
-            bare = {
-                "images": False,
-                "pictures": "video",
-                "resolution": None,
-                "rows_per_picture": 1,
-                "part_poses": False,
-            }
-            step(collect.run, dataclasses.replace(own, source=plain, episodes=sources, out=few, **bare))
-            moved: dict[str, Any] = {"source": few, "spec": str(spec)}
-            step(augment.run, AugmentConfig(**shared_fields(own, AugmentConfig) | moved))
-    except DatasetError as error:
-        raise SystemExit(f"{error}\nother demonstrations need another --out") from error
+    if not sources:
+        step(collect.run, own)
+    else:  # of the expert without pulses, as MimicGen disturbs the arms itself
+        few, spec = (dataset.with_name(f"{dataset.name}_{n}") for n in ("sources", "spec.yaml"))
+        pushed = {"contact_mode": "closed_loop_expert", "disturbance": {"joint_rad": config.hands.pulse_rad}}
+        cut = yaml.safe_load(mimic_spec_path(task).read_text(encoding="utf-8"))
+        spec.write_text(yaml.safe_dump(cut | {"datagen_config": pushed}), encoding="utf-8")
+        plain = ExpertSource(hands=dataclasses.replace(config.hands, pulse_rad=0.0))
+        bare = {"images": False, "pictures": "video", "resolution": None, "rows_per_picture": 1, "part_poses": False}
+        step(collect.run, dataclasses.replace(own, source=plain, episodes=sources, out=few, **bare))
+        moved: dict[str, Any] = {"source": few, "spec": str(spec)}
+        step(augment.run, AugmentConfig(**shared_fields(own, AugmentConfig) | moved))
     return dataset, own
 
 
@@ -407,7 +398,7 @@ def _corrected(config: LearnConfig, made: Made, training: Training, about: dict,
         words = [sys.executable, "-m", "taccorl.cli.main", *command("correct", asked)[1:]]
         _logged(words, fixes.with_suffix(".log"), acts[1], about, one_thread=True)
     if (there := Dataset(fixes).num_episodes) < config.corrections:
-        raise SystemExit(f"{fixes}: {there} corrections, fewer than --corrections={config.corrections}")
+        raise SystemExit(f"{fixes}: {there} corrections, too few; give --corrections={there} or less")
     both = fixes.with_name(f"{fixes.name}_too")
     _merge(config, both, [made.dataset, fixes], [])
     return made._replace(dataset=both, about=made.about | {"corrected": about["demonstrations"]})

@@ -13,8 +13,8 @@ import typing
 WIDTH = 100
 """Most columns of the short help."""
 SHOWN = {
-    "collect": "task episodes out source.type as_recording twin difficulty seed engine.workers",
-    "augment": "source task episodes out pictures engine.workers",
+    "collect": "task episodes out source.type as_recording twin difficulty seed pictures resolution part_poses engine.workers",
+    "augment": "source task episodes out pictures resolution part_poses engine.workers",
     "task new": "",
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
     "evaluate": "policy.path policy.type task episodes seed against twin robot pictures hide out",

@@ -157,6 +157,8 @@ class Plan(abc.ABC):
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
         if not 0 <= self.randomization <= 1:
             raise TaccorlError(f"--randomization={self.randomization:g}: give a share of the reset ranges, 0 to 1")
+        if self.pictures == "cache" and not self.images:
+            raise TaccorlError("--pictures=cache and --images=false contradict one another: remove one")
         if (how := self.stored_as) not in get_args(PicturesAs):
             raise TaccorlError(f"--pictures={how}: {nearest(how, get_args(PicturesAs))}")
         if self.rows_per_picture > 1 and how != "cache":

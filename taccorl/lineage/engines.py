@@ -10,6 +10,7 @@ import abc
 import importlib
 import itertools
 import logging
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -135,6 +136,11 @@ class RayEngine(Engine):
     cpus_per_task: int = 1
     """Number of CPU cores that Ray reserves for a task."""
 
+    def __post_init__(self) -> None:
+        for name in ("tasks", "cpus_per_task"):
+            if getattr(self, name) < 1:
+                raise EngineError(f"--engine.{name}={getattr(self, name)}: at least 1")
+
     @property
     def at_once(self) -> int:
         return self.tasks
@@ -164,12 +170,21 @@ def _outcomes(fn: Callable[[Any], Any], items: list[Any], care: Care) -> list[Do
 
 def start_ray() -> Any:
     """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine. Raises
-    TaccorlError: Ray is not installed."""
+    TaccorlError: Ray is not installed, or cannot be reached."""
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError as error:
         raise TaccorlError('Ray is not installed: pip install "lerobot_policy_taccorl[ray]"') from error
-    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING)
+    address = os.environ.get("RAY_ADDRESS", "local")
+    silent: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.WARNING}
+    if address == "local":
+        silent["include_dashboard"] = False
+    else:
+        print(f"Ray: connecting to RAY_ADDRESS={address}", flush=True)
+    try:
+        ray.init(address, ignore_reinit_error=True, **silent)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise TaccorlError(f"RAY_ADDRESS={address}: no Ray there ({error}); start it, or unset RAY_ADDRESS") from error
     return ray
 
 

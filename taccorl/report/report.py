@@ -101,7 +101,13 @@ class Report:
                 short={use: own.short(use, other) for use, other in _PAIRS} if own else None,
                 worst=own.worst if own else None,
             )
+            if self._is_input(f.part):  # excite plans motions by targets
+                found[f.part] = dataclasses.replace(found[f.part], command="")
         return found
+
+    def _is_input(self, part: str) -> bool:
+        """Whether the part's position is its input (law effort), so that only its effort is compared."""
+        return not self.comparison.of(part) and bool(self.comparison.of(part, "effort"))
 
     def _clock_or_effect(self, part: str, d: Diagnosis) -> list[str]:
         """Text: most recordings of the part show a lead that the added effect and an offset of the clock explain alike."""
@@ -118,7 +124,10 @@ class Report:
 
     def _repeated(self, part: str) -> bool:
         """Whether noise floors of the part include the variation between repeats."""
-        traces, touches = self.comparison.of(part), self.comparison.touches
+        traces, touches = (
+            self.comparison.of(part, "effort" if self._is_input(part) else "position"),
+            self.comparison.touches,
+        )
         if traces:
             return not any(t.floor.lower_bound for t in traces)
         return bool(touches) and all(t.repeated for t in touches)

@@ -127,7 +127,7 @@ def test_every_third_row_has_a_picture_in_the_cache_and_part_poses_beside_it(tmp
     [
         (["--pictures=vidoe"], "did you mean 'video'"),
         (["--rows_per_picture=3"], "rows_per_picture=3 needs --pictures=cache"),
-        (["--images=false", "--pictures=cache"], "needs --pictures=cache"),
+        (["--pictures=cache", "--images=false"], "contradict one another: remove one"),
         (["--pictures=cache", "--rows_per_picture=-1"], "rows_per_picture=-1: at least 1"),
         (["--pictures=cache", "--as_recording=true"], "as_recording"),
     ],

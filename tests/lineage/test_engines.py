@@ -438,3 +438,9 @@ def test_a_worker_that_is_ready_after_all_work_is_done_ends_without_a_word(capfd
     worker.join(timeout=60)
     assert worker.exitcode == 0
     assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["tasks", "cpus_per_task"])
+def test_ray_needs_at_least_one_task_and_one_core(option: str) -> None:
+    with pytest.raises(EngineError, match=f"--engine.{option}=0: at least 1"):
+        RayEngine(**{option: 0})

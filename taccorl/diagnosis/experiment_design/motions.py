@@ -260,8 +260,8 @@ def ground_of(
     drive = machine.drive(part)
     if drive.target_kind in ("torque", "effort"):
         raise TaccorlError(
-            f"{part} is driven by {drive.target_kind}: one that moves the real machine within limits cannot be planned from its "
-            "model; plan the motion for a position or velocity law"
+            f"{part} is driven by {drive.target_kind}: a motion that keeps the real machine within limits cannot be planned "
+            "from its model; plan the motion for a position or velocity law"
         )
     moved = [m for m in (measurements.all if measurements else ()) if _moved(m, part)]
     seen = [m.measured[:, m.column(part)] for m in moved]
