@@ -243,8 +243,9 @@ class RobotJoint(DriveJoint):
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:
         if cls is Payload:  # bounds for this robot's size
-            far = self._robot.reach_m(self.signal)
-            return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
+            far, most = self._robot.reach_m(self.signal), next(p.high for p in cls.parameters() if p.name == "mass_kg")
+            mass = ("mass_kg", -min(self._robot.removable_kg(self._payload_in), most), most)
+            return bounded("payload", (mass, *((name, -far, far) for name in PAYLOAD_AT)))
         if self.unit == "rad":
             return cls
         return scaled(cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m"))
