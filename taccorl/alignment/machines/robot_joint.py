@@ -319,7 +319,7 @@ def moved_together(robot: "Robot", m: Measurement) -> Along | None:
     joints. So a position is what the file's drive makes of the targets, and the low-pass filtered rest (``beside_model``). As the
     joints load each other, the accelerations are found by Gauss–Seidel sweeps, which converge for every mass matrix.
     """
-    said = repr((robot.config, m.rate_hz, m.kp, m.kd, m.gain_scale)).encode()
+    said = repr((robot.rigid.path, robot.config, m.rate_hz, m.kp, m.kd, m.gain_scale)).encode()
     arrays = [getattr(m, name).tobytes() for name in ("target", "measured", *m.extra_columns)]
     key = hashlib.sha1(b"".join([said, *arrays])).digest()
     if key not in _KEPT:
