@@ -49,6 +49,8 @@ SWEEPS = 4
 MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
 """Largest number of positions in ``_KEPT``, which serves all joints of a recording; and of entries of its mass matrices."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+LEAST_INERTIA = 0.01
+"""Share of a joint's inertia in the model that a ``payload`` below 0 leaves it at least. A choice, far below any link's."""
 PAYLOAD_AT = ("x_m", "y_m", "z_m")
 """Parameters of ``payload`` for its place along the axes of its body."""
 _SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
@@ -130,7 +132,9 @@ class RobotJoint(DriveJoint):
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = self._terms(motion.pose, self._every_mass(bodies))
-        return terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
+        # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
+        inertia = max(terms.inertia, LEAST_INERTIA * self.known.inertia) + self._config.armature
+        return terms._replace(inertia=inertia, rotor_inertia=self._config.armature)
 
     def inertia_kgm2(self, m: Measurement) -> float:
         """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""

@@ -87,11 +87,11 @@ def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> Non
     np.testing.assert_allclose(elbow.weight_nm(bent_elbow, np.array([np.pi / 2])), 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("mass_kg", [0.5, -0.5])
+@pytest.mark.parametrize("mass_kg", [0.5, -0.25])
 def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_joint_feels_it(
     mass_kg: float, tmp_path: Path
 ) -> None:
-    """0.5 kg, or as much less than the model has, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with
+    """0.5 kg, or 0.25 kg less than the model has, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with
     the elbow bent √(0.5² + 0.3²) m from the shoulder. The controller carries the arm's weight, and not this one's."""
     held = f"effects: [{{effect: payload, mass_kg: {mass_kg}, x_m: 0.1, z_m: 0.0}}]"
     bent = swept(shoulder=np.zeros(400), elbow=np.full(400, 0.5 * np.pi))
