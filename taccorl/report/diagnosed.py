@@ -88,7 +88,7 @@ def _values(e: Effect) -> str:
         f"{p.name} {p.symbol} = {clean(getattr(e, p.name), width.get(p.name, 0.0))}{unit_words(p.unit)} "
         f"({_interval(e.interval, p.name)})"
         for p in e.parameters()
-    )
+    ) + f": {e.reads_as}" * bool(e.reads_as)
 
 
 def _to_add(part: str, names: Sequence[str], options: Sequence[str]) -> str:

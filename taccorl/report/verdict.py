@@ -291,7 +291,8 @@ class _Words:
         primary = self.known.absolute if self.known.pinned_by else self.known.identifiable
         firsts = [next((n for n in primary if n.name.startswith(f"{name}.")), None) for name in added(self.d)]
         words = [n.words() for n in firsts if n is not None]
-        return f" ({', '.join(words)})" if words else ""
+        reads = [f": {e.reads_as}" for e in self.d.effects if e.name in added(self.d) and e.reads_as]
+        return f" ({', '.join(words)}{''.join(reads)})" if words else ""
 
     @property
     def fell(self) -> str:

@@ -31,6 +31,8 @@ from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
 TODO = "TODO"
 """Placeholder for a value that only the user knows; a file that contains it is rejected."""
+REMOVABLE = 0.95
+"""Largest share of a body's mass that a ``payload`` below 0 may remove. A choice: what is left must be above 0."""
 _LEAST_REACH_M = 0.05
 _ALONG = 0.9999  # least cosine between axes that count as parallel
 _HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
@@ -194,10 +196,22 @@ class Robot:
         x, y, z = (float(a + b) for a, b in zip(self.rigid.model.body_ipos[body], offset, strict=True))
         return PointMass(payload.mass_kg, body, (x, y, z))
 
-    def mass_twice(self) -> tuple[str, str]:
-        """A joint whose payload is in the same body as another one's, and text that says so; ("", "") if there is none."""
+    def removable_kg(self, body: int) -> float:
+        """Most mass that a payload below 0 may remove from a body [kg]: a share of that of all bodies fixed to one another."""
+        model = self.rigid.model
+        return REMOVABLE * float(model.body_mass[model.body_weldid == model.body_weldid[body]].sum())
+
+    def wrong_mass(self) -> tuple[str, str]:
+        """A joint whose payload removes more than its body has, or is in the same body as another one's, and text that says so;
+        ("", "") if there is none."""
         bodies: dict[int, str] = {}
         for name, mass in self.masses().items():
+            if mass.mass_kg < -(most := self.removable_kg(mass.body)):
+                text = (
+                    f"payload of {name}: mass_kg is {mass.mass_kg:g} kg, and body {self.body_name(mass.body)} must keep a mass: "
+                    f"give {-most:.4g} kg or more, {REMOVABLE:.0%} of what {self.rigid.path.name} states"
+                )
+                return name, text
             other = bodies.setdefault(mass.body, name)
             if other != name:
                 text = (
@@ -316,7 +330,7 @@ def load_robot(path: Path) -> Robot:
             if link and not (link in bodies and Robot(config, rigid, path).moves_body(name, bodies[link])):
                 raise document.error(key, f"link: {name} moves no body {link!r}; {nearest(link, bodies)}")
     robot = Robot(config, rigid, path)
-    name, why = robot.mass_twice()
+    name, why = robot.wrong_mass()
     if name:
         raise document.error(f"joints/{name}/effects", why)
     return robot

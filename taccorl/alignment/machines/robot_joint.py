@@ -49,6 +49,8 @@ SWEEPS = 4
 MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
 """Largest number of positions in ``_KEPT``, which serves all joints of a recording; and of entries of its mass matrices."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+LEAST_INERTIA = 0.01
+"""Share of a joint's inertia in the model that a ``payload`` below 0 leaves it at least. A choice, far below any link's."""
 PAYLOAD_AT = ("x_m", "y_m", "z_m")
 """Parameters of ``payload`` for its place along the axes of its body."""
 _SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
@@ -130,7 +132,9 @@ class RobotJoint(DriveJoint):
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = self._terms(motion.pose, self._every_mass(bodies))
-        return terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
+        # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
+        inertia = max(terms.inertia, LEAST_INERTIA * self.known.inertia) + self._config.armature
+        return terms._replace(inertia=inertia, rotor_inertia=self._config.armature)
 
     def inertia_kgm2(self, m: Measurement) -> float:
         """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""
@@ -243,8 +247,9 @@ class RobotJoint(DriveJoint):
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:
         if cls is Payload:  # bounds for this robot's size
-            far = self._robot.reach_m(self.signal)
-            return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
+            far, most = self._robot.reach_m(self.signal), next(p.high for p in cls.parameters() if p.name == "mass_kg")
+            mass = ("mass_kg", -min(self._robot.removable_kg(self._payload_in), most), most)
+            return bounded("payload", (mass, *((name, -far, far) for name in PAYLOAD_AT)))
         if self.unit == "rad":
             return cls
         return scaled(cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m"))
@@ -318,7 +323,7 @@ def moved_together(robot: "Robot", m: Measurement) -> Along | None:
     joints. So a position is what the file's drive makes of the targets, and the low-pass filtered rest (``beside_model``). As the
     joints load each other, the accelerations are found by Gauss–Seidel sweeps, which converge for every mass matrix.
     """
-    said = repr((robot.config, m.rate_hz, m.kp, m.kd, m.gain_scale)).encode()
+    said = repr((robot.rigid.path, robot.config, m.rate_hz, m.kp, m.kd, m.gain_scale)).encode()
     arrays = [getattr(m, name).tobytes() for name in ("target", "measured", *m.extra_columns)]
     key = hashlib.sha1(b"".join([said, *arrays])).digest()
     if key not in _KEPT:

@@ -193,7 +193,7 @@ class RobotMachine(Machine):
         if any("payload" in own for own in (found.diagnosis.names, *found.diagnosis.rivals.values())):
             body = self._payload_body(found)
             text = (
-                f"payload: x_m, y_m and z_m are along the axes of {self.robot.body_name(body)} in "
+                f"payload in {self.robot.body_name(body)}: x_m, y_m and z_m are along its axes in "
                 f"{self.robot.rigid.path.name}, from its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
             )
             if idle := self.robot.idle_axes(part, body):
@@ -356,7 +356,7 @@ class RobotMachine(Machine):
             problems = {part: machine.motion_problem(part, measurements, gains) for part in parts}
             idle = set.intersection(*({*robot.idle_axes(part, place)} for part in parts))
             centred = {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
-            mass = candidate(robot.joint(owner).in_units(Payload), {}, link=link, **centred)
+            mass = candidate(machine.robot.joint(owner).in_units(Payload), {}, link=link, **centred)
             return one_mass(problems, {part: group[part].diagnosis for part in parts}, stands_for, mass)
 
         link, found = "", fitted([*group])
@@ -428,7 +428,7 @@ class RobotMachine(Machine):
 
         def unsure(f: Finding) -> tuple[float, int]:
             low, high = f.diagnosis.intervals.get("payload.mass_kg", (0.0, math.inf))
-            return (high - low) / max(low, 1e-9), -self.robot.rigid.model.joint(f.part).id
+            return (high - low) / max(low, -high, 1e-9), -self.robot.rigid.model.joint(f.part).id
 
         owners: dict[int, Finding] = {}
         for f in sorted(findings, key=unsure):
@@ -491,8 +491,8 @@ class RobotMachine(Machine):
             kept = [e for e in config.effects if e.name not in {n.name for n in new}]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]
             robot = robot.with_joint(a.part, dataclasses.replace(config, **numbers, effects=effects_))
-        if (twice := robot.mass_twice())[0]:
-            raise TaccorlError(twice[1])
+        if (wrong := robot.wrong_mass())[0]:
+            raise TaccorlError(wrong[1])
         return dataclasses.replace(self, robot=robot)
 
     def _whole(self, m: Measurement) -> Measurement:

@@ -183,7 +183,8 @@ def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
     for effect in found.effects:
         prefix = f"{effect.name}."
         own = [n.words() for n in known.identifiable if n.name.startswith(prefix)]
-        evidence = "; ".join(part for part in (effect.evidence, f"identified: {', '.join(own)}" * bool(own)) if part)
+        words = effect.evidence, f"identified: {', '.join(own)}" * bool(own), effect.reads_as
+        evidence = "; ".join(filter(None, words))
         mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
         ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
         effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))

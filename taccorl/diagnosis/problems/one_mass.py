@@ -20,7 +20,7 @@ ALIKE = 1.25
 _BESIDE = 0.3
 """Share of its bound at which the mass starts beside the centre of mass of its body, in each direction that can be seen."""
 _OFF = 0.5
-"""Least share of a fitted ``torque_ff`` that a mass must make superfluous to count as its explanation (a choice)."""
+"""Least share of a fitted ``torque_ff``, or of a change of the file, that a mass makes superfluous to count (a choice)."""
 
 
 class OneMassProblem(WithoutMaps):
@@ -84,7 +84,8 @@ class OneMass:
     holds: bool
     """Whether it leaves no joint with a larger error than what was found there alone."""
     is_simpler: bool
-    """Whether it takes fewer numbers than the effects in whose place it stands, and the constant torques that it explains."""
+    """Whether it takes fewer numbers than the effects in whose place it stands, and the constant torques and changes of the
+    file's numbers that it explains."""
     errors: Mapping[str, float]
     """Joint → validation error with the mass [noise floors]."""
 
@@ -116,8 +117,10 @@ def one_mass(
     start: Values = {f"{j}/{name}": value for j, d in alone.items() for name, value in fitted_numbers(d).items()}
     masses = [start.pop(name) for name in list(start) if name.endswith("/payload.mass_kg")]
     start |= dict.fromkeys((f.name for f in payload.frees[1:]), 0.0)
-    start |= {payload.frees[0].name: float(np.median(masses))} if masses else {}
-    beside = [start | {f.name: side * _BESIDE * f.high} for f in payload.frees[1:] for side in (-1.0, 1.0)]
+    mass = payload.frees[0]
+    start |= {mass.name: float(np.median(masses))} if masses else {}
+    beside = [start | {mass.name: -mass.start}] * (mass.low < 0.0 and not masses)
+    beside += [start | {f.name: side * _BESIDE * f.high} for f in payload.frees[1:] for side in (-1.0, 1.0)]
     rough = best_fit(whole, fit_to, (payload.name,), [start, *beside], _FIRST_STEPS)
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
     holds, before, after, errors = True, 0, 1 + len(payload.frees[1:]), {}
@@ -126,6 +129,9 @@ def one_mass(
         holds = holds and here
         before += sum(_least_numbers(name, d, problems[j]) for name in stands_for.get(j, ()))
         before += is_explained(d, model.values.get(f"{j}/{TORQUE_FF.name}"))
+        counted = (TORQUE_FF.name, *stands_for.get(j, ()))
+        now = [(c, model.values.get(f"{j}/{c.name}", c.after)) for c in d.changed if c.name not in counted]
+        before += sum(abs(value - c.before) < _OFF * abs(c.after - c.before) for c, value in now)
     return OneMass(model, holds, after < before, errors)
 
 

@@ -237,6 +237,11 @@ class Effect:
         """Whether all parameters that have an absent value have it."""
         return all(getattr(self, p.name) == p.absent for p in self.parameters() if p.absent is not None)
 
+    @property
+    def reads_as(self) -> str:
+        """What these parameters mean in words, where the name of the effect does not say it; else empty."""
+        return ""
+
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: one dict of parameters for each start; parameters left out have their typical values.

@@ -153,7 +153,7 @@ class EndStop(JointEffect):
 @effect("payload", slot="body", needs="bodies")
 class Payload(ArmEffect):
     """Unknown payload: a ball of mass m fixed to the last body at c, along that body's axes. It adds the torque m g × lever arm
-    to every joint, and its inertia. It has no contacts."""
+    to every joint, and its inertia. It has no contacts. In a robot file, m < 0: what the robot lacks of the model."""
 
     mass_kg: float = number("m", "kg", 0, 0.2, (0, 1.5), "a choice; rated: 1.5 kg (PiPER manual)", over_kp=True)
     x_m: float = number("c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
@@ -164,11 +164,16 @@ class Payload(ArmEffect):
 
     @classmethod
     def accepted(cls, p: Parameter) -> tuple[float, float]:
-        return (-FARTHEST_M, FARTHEST_M) if p.unit == "m" else super().accepted(p)
+        return (-FARTHEST_M, FARTHEST_M) if p.unit == "m" else (-p.high, p.high)
+
+    @property
+    def reads_as(self) -> str:
+        return f"{self.link or 'the last link that it moves'} is lighter than its model" * (self.mass_kg < 0.0)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        if self.link:
-            raise TaccorlError(f"effect payload: link is {self.link!r}, which only robot files can state; remove it")
+        if self.link or self.mass_kg < 0.0:
+            what = f"link is {self.link!r}" if self.link else f"mass_kg is {self.mass_kg:g} kg, below 0"
+            raise TaccorlError(f"effect payload: {what}, which only robot files can state; remove it")
         inertia = 0.4 * self.mass_kg * _RADIUS_M**2
         for arm in self.arms():
             ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")

@@ -87,28 +87,36 @@ def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> Non
     np.testing.assert_allclose(elbow.weight_nm(bent_elbow, np.array([np.pi / 2])), 0.0, atol=1e-6)
 
 
-def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_joint_feels_it(tmp_path: Path) -> None:
-    """0.5 kg, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with the elbow bent √(0.5² + 0.3²) m from
-    the shoulder. The controller carries the arm's weight, and not this one's."""
-    held = "effects: [{effect: payload, mass_kg: 0.5, x_m: 0.1, z_m: 0.0}]"
+@pytest.mark.parametrize("mass_kg", [0.5, -0.25])
+def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_joint_feels_it(
+    mass_kg: float, tmp_path: Path
+) -> None:
+    """0.5 kg, or 0.25 kg less than the model has, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with
+    the elbow bent √(0.5² + 0.3²) m from the shoulder. The controller carries the arm's weight, and not this one's."""
+    held = f"effects: [{{effect: payload, mass_kg: {mass_kg}, x_m: 0.1, z_m: 0.0}}]"
     bent = swept(shoulder=np.zeros(400), elbow=np.full(400, 0.5 * np.pi))
     compensated = ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:")
     without = robot(tmp_path, compensated)
     made = robot(tmp_path, compensated.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
-    for name, inertia, moment_kgm in (("shoulder", 0.5 * (0.25 + 0.09), 0.25), ("elbow", 0.5 * 0.09, 0.15)):
+    for name, square_m2, lever_m in (("shoulder", 0.25 + 0.09, 0.5), ("elbow", 0.09, 0.3)):
         with_it, bare = (
             joint.rigid(motion_of(bent, name, joint), joint.effects([]))
             for joint in (made.joint(name), without.joint(name))
         )
-        assert with_it.inertia - bare.inertia == pytest.approx(inertia, rel=1e-9)
+        assert with_it.inertia - bare.inertia == pytest.approx(mass_kg * square_m2, rel=1e-9)
         at_0 = with_it.gravity_cos - with_it.compensation_cos  # about +y a positive angle lowers the mass
-        assert at_0 == pytest.approx(-9.81 * moment_kgm, rel=1e-6), name
+        assert at_0 == pytest.approx(-9.81 * mass_kg * lever_m, rel=1e-6), name
     idle = {"y_m": 0.0}  # both turn about y
     assert [made.joint(name).selectors(Payload) for name in ("shoulder", "elbow")] == [None, idle], "one mass"
     assert without.joint("shoulder").selectors(Payload) == idle
     twice = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, {held}}}").replace("100.0}", f"100.0, {held}}}")
     with pytest.raises(SpecError, match=r"elbow.*payload.*shoulder.*lower"):
         robot(tmp_path, twice)
+    too_light = compensated.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}").replace(
+        f"{mass_kg}", "-0.96"
+    )
+    with pytest.raises(SpecError, match=r"elbow.*-0\.96 kg, and body lower.*-0\.95 kg or more"):  # of its 1 kg
+        robot(tmp_path, too_light)
     upright = robot(tmp_path, model=TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'))
     assert upright.joint("elbow").selectors(Payload) == {"z_m": 0.0}, "inertia shows it about a vertical axis"
 

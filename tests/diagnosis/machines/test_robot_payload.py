@@ -13,6 +13,7 @@ from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.machines.changed_findings import payloads
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
 from taccorl.diagnosis.machines.robot import RobotMachine
@@ -179,7 +180,7 @@ def test_one_body_has_one_payload(tmp_path: Path) -> None:
     # Bounds of a search follow the robot: half of 0.15 + 0.1 m of links, or twice 0.1 m from the elbow to the centre of mass.
     payload = arm.effect("payload", "elbow", {"mass_kg": 0.1, "x_m": 0.18})
     ends = {p.name: (p.low, p.high) for p in payload.parameters()}
-    assert ends["x_m"] == (-0.2, 0.2) and ends["mass_kg"] == (0.0, 1.5)
+    assert ends["x_m"] == (-0.2, 0.2) and ends["mass_kg"] == (pytest.approx(-0.95 * 0.8), 1.5)
     assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(Payload) == {"y_m": 0.0}
 
 
@@ -255,22 +256,30 @@ def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_link_that_is_too_light_is_named_where_efforts_are_the_input(tmp_path: Path) -> None:
-    """0.15 kg too little in the forearm, which lift and elbow move and the wrist does not: a mass in the hand contradicts it."""
-    heavy = TEACH_MODEL.format(tip="").replace('0.08 0 0.01"\nmass="0.1"', '0.08 0 0.01"\nmass="0.25"')
-    robot = machine(tmp_path, TEACH_MODEL.format(tip=""), TEACH_FILE.replace("kp: 18.0, kd: 0.0", "law: effort"))
+@pytest.mark.parametrize("missing_kg", [0.15, -0.15, 0.0])
+def test_a_link_that_is_too_light_or_too_heavy_is_named_where_efforts_are_the_input(
+    missing_kg: float, tmp_path: Path
+) -> None:
+    """0.15 kg too little or too much in the forearm, which lift and elbow move and the wrist does not: a mass in the hand
+    contradicts it. Of too much, efforts that are off by a factor, with other friction, would explain nearly as much."""
+    plain = TEACH_MODEL.format(tip="")
+    heavy = plain.replace('0.08 0 0.01"\nmass="0.1"', '0.08 0 0.01"\nmass="0.25"')
+    true, model = {0.15: (heavy, plain), -0.15: (plain, heavy), 0.0: (heavy, heavy)}[missing_kg]
+    robot = machine(tmp_path, model, TEACH_FILE.replace("kp: 18.0, kd: 0.0", "law: effort"))
 
     def driven(m: Measurement) -> Measurement:  # the drive's torque jumps with its target at a row: its mean there
         mean = 9.0 * (m.target + np.vstack([m.target[:1], m.target[:-1]])) - 18.0 * m.measured
         return dataclasses.replace(m, target=m.measured.copy(), effort=mean, target_kinds=("effort",) * 3)
 
-    made = [driven(taught(f"episode_{seed}", seed, heavy)) for seed in range(5)]
+    made = [driven(taught(f"episode_{seed}", seed, true)) for seed in range(5)]
     kept = ("payload", "unbalance", "armature", "viscous_friction")
     way = {"search": SearchConfig(max_effects=1), "without": [name for name in effects if name not in kept]}
     found = diagnose_parts(robot, TEACH_JOINTS, Measurements(tuple(made[:3]), tuple(made[3:])), **way)
-    (payload,) = [e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)]
-    low, high = payload.interval["mass_kg"]
-    assert payload.link == "fore" and low <= 0.15 <= high and high - low < 0.03
+    for payload in [e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)]:
+        low, high = payload.interval["mass_kg"]
+        assert payload.link == "fore" and low <= missing_kg <= high and high - low < 0.03
+        assert payload.evidence.endswith("fore is lighter than its model") == (missing_kg < 0.0)
+    assert len(payloads(found)) == (missing_kg != 0.0)
     assert all(f.diagnosis.errors["after"]["validation"] < 1.2 and not f.diagnosis.changed for f in found)
 
 

@@ -6,6 +6,7 @@ import pytest
 from joint_bench import COLUMN, GRAVITY, drive, on_joint5
 from press_bench import RIGHT_HOME, start
 
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 
@@ -45,6 +46,8 @@ def test_a_payload_sags_every_joint_by_its_moment_over_the_stiffness(centre: tup
     sag = loaded.proprioception()[0, 7:13] - RIGHT_HOME
     assert np.abs(expected).max() > 3e-4
     np.testing.assert_allclose(sag, expected, atol=0.02 * np.abs(expected).max())
+    with pytest.raises(TaccorlError, match=r"payload: mass_kg is -0\.3 kg, below 0, which only robot files"):
+        start(make_effect("payload", mass_kg=-0.3))
 
 
 def test_a_lagging_command_of_one_simulation_waits_while_only_another_advances() -> None:
