@@ -299,6 +299,14 @@ def test_a_lead_that_a_clock_explains_as_well_is_a_doubt_where_most_recordings_l
     assert len(own) == doubts
 
 
+@pytest.mark.parametrize(("kind", "has_command"), [("position", True), ("effort", False)])
+def test_no_motion_is_planned_for_a_part_whose_position_is_its_input(one, kind, has_command):
+    replays = comparison(trace(np.zeros(400), 0.3 * np.sin(np.arange(400) / 30), kind=kind))
+    twins = {"coulomb_friction": {"load_friction": ""}}
+    d = changed(one, effects=(make_effect("coulomb_friction", torque_nm=0.25),), base={"torque_ff": 0.01}, twins=twins)
+    assert bool(Report(title="made", comparison=replays, found=[found(d)]).verdicts()[PART].command) == has_command
+
+
 def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_refuses(one):
     friction = make_effect("coulomb_friction", torque_nm=0.25)
     twins = {"coulomb_friction": dict.fromkeys(("asymmetric_friction", "load_friction"), "")}
