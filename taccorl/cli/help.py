@@ -33,7 +33,7 @@ SHOWN = {
     "ingest inspect": "draft",
     "check": "spec quick repair",
     "merge": "real sim pictures resolution out",
-    "view": "episode spec against align serve save sheet",
+    "view": "episode spec against align serve save screenshot sheet",
     "lineage explain": "store",
     "lineage prune": "store keep yes",
 }

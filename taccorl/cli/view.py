@@ -1,7 +1,7 @@
 """``taccorl view PATH [--episode=0] [--spec=piper_flexitac_mcap]``: an episode in Rerun.
 
 PATH is a LeRobot dataset's folder, a recording with the spec that reads it, or an attempt of ``taccorl augment`` in the store,
-which is executed again. Opens a window; where there is no screen: --serve, --save or --sheet.
+which is executed again. Opens a window; where there is no screen: --serve, --save, --screenshot or --sheet.
 
 ``taccorl view A --against=B [--against_episode=0] [--align=contact]``: two episodes in one view, on one time line. B is what A
 may be, or a twin.yaml: that twin executes the actions of A on an empty bench, without pictures and touch.
@@ -62,6 +62,8 @@ class ViewConfig:
     """Rerun file (.rrd) to write. An earlier one of taccorl is replaced; other files are not overwritten."""
     serve: bool = False
     """Serve a web page with the view on this machine until Ctrl-C."""
+    screenshot: Path | None = None
+    """Picture of the view to write (.png), where touch is strongest; overwrites as `save` does."""
     sheet: Path | None = None
     """Contact sheet to write (.png): pictures and pads at some instants, touch and grippers over time; overwrites as `save`
     does."""
@@ -116,7 +118,7 @@ def _check_against(config: ViewConfig, given: Collection[str]) -> None:
     if useless:
         raise TaccorlError(f"--{useless[0]} has no effect without --against=: remove it, or name the other episode")
     if config.against is not None and config.sheet is not None:
-        raise TaccorlError("--sheet shows one episode: remove --against=")
+        raise TaccorlError("--sheet shows one episode: with --against=, use --screenshot=, or remove --against=")
 
 
 @contextlib.contextmanager
@@ -160,7 +162,11 @@ def _check_outputs(config: ViewConfig) -> None:
     """Before any work is done: is there a place for what was asked for?"""
     from taccorl.views.outputs import check_free
 
-    for option, path, ending in (("save", config.save, ".rrd"), ("sheet", config.sheet, ".png")):
+    for option, path, ending in (
+        ("save", config.save, ".rrd"),
+        ("screenshot", config.screenshot, ".png"),
+        ("sheet", config.sheet, ".png"),
+    ):
         if path is not None:
             if path.suffix != ending:
                 raise TaccorlError(f"--{option}={path}: must end in {ending}")
@@ -236,7 +242,12 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
         assert isinstance(shown, Episode)  # checked by _check_against
         contact_sheet(shown, config.sheet)
         print(f"wrote {config.sheet}")
-    return any(path is not None for path in (config.save, config.sheet))
+    if config.screenshot is not None:  # last: it alone needs what a machine may lack
+        from taccorl.views.screenshot import screenshot
+
+        screenshot(shown, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
+        print(f"wrote {config.screenshot}")
+    return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 
 
 @contextlib.contextmanager

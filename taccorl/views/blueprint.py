@@ -20,21 +20,34 @@ EYE_SIZES, EYE_M = 1.1, 1.15
 """Distance of the viewer's eye from the figure: multiples of the figure's size, and the least distance [m]."""
 
 
-def episode_blueprint(episode: Episode) -> rrb.Blueprint:
-    """Blueprint with a view for each kind of data in the episode; it plays from the start."""
+def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
+    """Blueprint with a view for each kind of data in the episode. ``at_s``: time at which the view stops (for pictures) [s];
+    None: it plays from the start."""
     pads = pads_of(episode)
     parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
-    return arranged(rrb.Horizontal(*parts))
+    return arranged(rrb.Horizontal(*parts), time_panel(at_s))
 
 
-PLAYING = rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all")
-"""Time panel that plays from the start, again and again."""
-
-
-def arranged(root: rrb.Container, time: rrb.TimePanel = PLAYING) -> rrb.Blueprint:
+def arranged(root: rrb.Container, time: rrb.TimePanel) -> rrb.Blueprint:
     """Blueprint of the views ``root``, without Rerun's own panels."""
     hidden = rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden")
     return rrb.Blueprint(root, time, *hidden, auto_views=False)
+
+
+def time_panel(at_s: float | None) -> rrb.TimePanel:
+    """Time panel that plays from the start, or stops at ``at_s`` [s]."""
+    if at_s is None:
+        return rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all")
+    # A blueprint cannot set the cursor. A loop one nanosecond long, reached in the first frame, holds it there.
+    at_ns = round(at_s * 1e9)
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline="time",
+        play_state="playing",
+        playback_speed=1e4,
+        loop_mode="selection",
+        time_selection=rrb.components.AbsoluteTimeRange(min=at_ns, max=at_ns + 1),
+    )
 
 
 def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:

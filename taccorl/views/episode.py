@@ -12,7 +12,9 @@
 Time lines: ``time`` (seconds since row 0) and ``frame_index``. ``blueprint.py`` arranges the views.
 """
 
+import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLO
 from taccorl.views.figure import log_figure
 from taccorl.views.groups import groups_of, short_name, vector_keys
 from taccorl.views.outputs import check_free, replacing
+from taccorl.views.part import part_of
 from taccorl.views.provenance import provenance
 from taccorl.views.rrd import EpisodeLog, Progress, no_progress, recording_to
 from taccorl.views.touch import OtherTouch, Pad, contact_gate, other_touch_of, pads_of
@@ -39,32 +42,45 @@ PICTURES_AT_ONCE = 64  # rows; more would only hold more decoded pictures
 EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65A30DFF)
 
 
-def log_episode(log: EpisodeLog, *, native: bool = False) -> None:
-    """Log all data of the episode; missing features are left out. ``native``: the log is for the Rerun program on this machine;
-    a video that it cannot decode is logged as JPEG pictures. Raises DatasetError: a video file differs from the dataset's
-    description."""
+def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = False) -> None:
+    """Log all data of the episode; missing features are left out. ``at_s``: log only those pictures and pads that are shown at
+    this time [s], so that a program that draws one picture need not load a long recording. ``native``: the log is for the
+    Rerun program on this machine; a video that it cannot decode is logged as JPEG pictures. Raises DatasetError: a video file
+    differs from the dataset's description."""
     episode, pads = log.episode, pads_of(log.episode)
+    seen = log if at_s is None else at_one_time(log, at_s)
     log_page(log)
-    log_pictures(log, native=native)
+    log_pictures(seen, native=native)
     for key in vector_keys(episode):
         _log_vector(log, key)
     if pads:
         places = heatmap_places(pads)
-        log_heatmaps(log, places, PAD_COLORS)
+        log_heatmaps(seen, places, PAD_COLORS)
         log_heat_scale(log, pads, places["scale"])
         _log_touch(log, pads)
-    log_other_touch(log, other_touch_of(episode))
+    log_other_touch(seen, other_touch_of(episode))
     log_events(log, pads)
     log_figure(log, pads)
 
 
-def save_episode(episode: Episode, rrd: Path, *, native: bool = False, progress: Progress = no_progress) -> None:
-    """Write the episode and its blueprint as one .rrd file; ``native`` as in ``log_episode``. Raises OutputError: ``rrd`` exists
-    and was not written by taccorl, or the disk is full."""
+def save_episode(
+    episode: Episode, rrd: Path, *, at_s: float | None = None, native: bool = False, progress: Progress = no_progress
+) -> None:
+    """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as in
+    ``log_episode``. Raises OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full."""
     check_free(rrd)
-    with replacing(rrd) as part, recording_to(part, episode_blueprint(episode)) as rec:
+    with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
         rec.send_recording_name(episode.name)
-        log_episode(EpisodeLog(rec, episode, progress=progress), native=native)
+        log_episode(EpisodeLog(rec, episode, progress=progress), at_s=at_s, native=native)
+
+
+def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
+    """Part of an episode for a picture at one time: an episode of one row, the newest at or before ``at_s`` [s] (else the first
+    row), at its original place on the time line."""
+    fps = log.episode.spec.fps
+    row = min(max(math.floor((at_s - log.begins_s) * fps + 1e-6), 0), log.episode.num_rows - 1)
+    part = part_of(log.episode, row / fps, (row + 1) / fps)
+    return dataclasses.replace(log, episode=part, begins_s=log.begins_s + row / fps)
 
 
 def log_page(log: EpisodeLog) -> None:

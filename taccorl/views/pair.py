@@ -69,6 +69,14 @@ class Pair:
         """Number of rows of both episodes together."""
         return sum(e.num_rows for e in self.episodes)
 
+    @property
+    def best_time_s(self) -> float:
+        """Time at which touch is strongest in A while B runs [s]; the middle of that time if A has no touch."""
+        rows = self.common_rows()[0] if len(self.common_rows()[0]) else np.arange(self.episodes[0].num_rows)
+        touch = sum(pad.sum_count[rows] for pad in self.pads[0])
+        row = rows[int(np.argmax(touch)) if np.any(touch) else len(rows) // 2]
+        return self.begins_s[0] + float(self.episodes[0].time_s[row])
+
     def shared_pads(self) -> list[tuple[Pad, Pad]]:
         """Return pairs (pad of A, pad of B) of the pads that both have with the same name, shape and gain, so that counts can be
         subtracted."""

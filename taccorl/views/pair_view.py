@@ -18,9 +18,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from taccorl.data.episode import Episode
-from taccorl.views.blueprint import arranged, figure_view, heatmap_places, plot
+from taccorl.views.blueprint import arranged, figure_view, heatmap_places, plot, time_panel
 from taccorl.views.colors import GROUND_COLOR, NOISE_COLOR, PAIR_COLORS
 from taccorl.views.episode import (
+    at_one_time,
     curve_style,
     log_events,
     log_heat_scale,
@@ -48,24 +49,34 @@ LABEL_TAXELS = 5.0
 TOUCH_KINDS = {"sum": "touch sum of active taxels [counts]", "peak": "touch peak [counts]", "active": "active taxels"}
 
 
-def save_shown(shown: Episode | Pair, rrd: Path, *, native: bool = False, progress: Progress = no_progress) -> None:
+def save_shown(
+    shown: Episode | Pair,
+    rrd: Path,
+    *,
+    at_s: float | None = None,
+    native: bool = False,
+    progress: Progress = no_progress,
+) -> None:
     """Write an episode or a pair and its blueprint as one .rrd file; arguments and errors as ``save_episode``."""
     if isinstance(shown, Episode):
-        save_episode(shown, rrd, native=native, progress=progress)
+        save_episode(shown, rrd, at_s=at_s, native=native, progress=progress)
         return
     check_free(rrd)
-    with replacing(rrd) as part, recording_to(part, pair_blueprint(shown)) as rec:
+    with replacing(rrd) as part, recording_to(part, pair_blueprint(shown, at_s=at_s)) as rec:
         rec.send_recording_name(shown.name)
-        _log_pair(rec, shown, native, progress)
+        _log_pair(rec, shown, at_s, native, progress)
 
 
-def _log_pair(rec: rr.RecordingStream, pair: Pair, native: bool, progress: Progress = no_progress) -> None:
+def _log_pair(
+    rec: rr.RecordingStream, pair: Pair, at_s: float | None, native: bool, progress: Progress = no_progress
+) -> None:
     rec.log("pair", rr.TextDocument(page_of(pair), media_type=rr.MediaType.MARKDOWN), static=True)
     places = _places(pair)
     for k, (episode, pads) in enumerate(zip(pair.episodes, pair.pads, strict=True)):
         log = EpisodeLog(rec, episode, ROOTS[k], pair.begins_s[k], progress)
+        seen = log if at_s is None else at_one_time(log, at_s)
         log_page(log)
-        log_pictures(log, native=native)
+        log_pictures(seen, native=native)
         for curve, key, i in elements_of(episode):
             path = _entity(key, curve)
             name = f"{NAMES[k]} action" if key == "action" else NAMES[k]
@@ -75,12 +86,12 @@ def _log_pair(rec: rr.RecordingStream, pair: Pair, native: bool, progress: Progr
             log_touch_curves(log, pad, PAIR_COLORS[k], NAMES[k], WIDTHS[k])
         if pads:
             place(log, "observation/tactile", 0.0, _row_y(pair, k))
-            log_heatmaps(log, places, [NOISE_COLOR])
+            log_heatmaps(seen, places, [NOISE_COLOR])
             _write_row_name(log, "observation/tactile", NAMES[k], PAIR_COLORS[k], pads[0])
         log_events(log, pads)
         log_figure(log, pads)
     _log_scale(rec, pair, places)
-    _log_difference(rec, pair, places)
+    _log_difference(rec, pair, places, at_s)
 
 
 def _places(pair: Pair) -> dict[str, float]:
@@ -110,12 +121,15 @@ def _log_scale(rec: rr.RecordingStream, pair: Pair, places: dict[str, float]) ->
             return
 
 
-def _log_difference(rec: rr.RecordingStream, pair: Pair, places: dict[str, float]) -> None:
+def _log_difference(rec: rr.RecordingStream, pair: Pair, places: dict[str, float], at_s: float | None) -> None:
     shared = pair.shared_pads()
     rows_a, rows_b = pair.common_rows()
     if not shared or not len(rows_a):
         return
     log = EpisodeLog(rec, pair.episodes[0], "difference/", pair.begins_s[0])
+    if at_s is not None:
+        last = max(int(np.searchsorted(log.begins_s + log.episode.time_s[rows_a], at_s + 1e-6)), 1)
+        rows_a, rows_b = rows_a[last - 1 : last], rows_b[last - 1 : last]
     place(log, "pads", 0.0, _row_y(pair, 2))
     full = pair.full_difference
     for pad_a, pad_b in shared:
@@ -139,12 +153,12 @@ def difference_colors(share: np.ndarray) -> np.ndarray:
     return np.round(ground + np.abs(share) * (np.where(share < 0, a, b) - ground)).astype(np.uint8)
 
 
-def pair_blueprint(pair: Pair) -> rrb.Blueprint:
-    """Pictures and arms on the left, pads in the middle, curves on the right."""
+def pair_blueprint(pair: Pair, *, at_s: float | None = None) -> rrb.Blueprint:
+    """Pictures and arms on the left, pads in the middle, curves on the right; ``at_s`` as in ``episode_blueprint``."""
     columns = [(_scene(pair), 0.95), (_middle(pair), 0.7), (_over_time(pair), 1.4)]
     kept = [(part, share) for part, share in columns if part is not None]
     parts, shares = zip(*kept, strict=True)
-    return arranged(rrb.Horizontal(*parts, column_shares=[*shares]))
+    return arranged(rrb.Horizontal(*parts, column_shares=[*shares]), time_panel(at_s))
 
 
 def _scene(pair: Pair) -> rrb.Container | None:

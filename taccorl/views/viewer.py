@@ -1,4 +1,4 @@
-"""Use the Rerun program on this machine: a window, or a page for a browser (127.0.0.1 only)."""
+"""Use the Rerun program on this machine: a window, a picture without a window, or a page for a browser (127.0.0.1 only)."""
 
 import contextlib
 import os
@@ -18,6 +18,8 @@ from taccorl.errors import TaccorlError
 LOOPBACK = "127.0.0.1"
 START_TIMEOUT_S = 60.0
 """Longest time until the Rerun program answers [s]."""
+PICTURE_TIMEOUT_S = 180.0
+"""Longest time for one picture [s]."""
 
 
 class ViewerError(TaccorlError):
@@ -27,7 +29,7 @@ class ViewerError(TaccorlError):
 def require_screen() -> None:
     """Check that there is a screen for a window. Raises ViewerError: there is no screen; the message names the alternatives."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError("there is no screen (no DISPLAY): use --serve=true, --save=… or --sheet=…")
+        raise ViewerError("there is no screen (no DISPLAY): use --serve=true, --save=… or --screenshot=…")
 
 
 def open_window(rrd: Path) -> None:
@@ -35,6 +37,27 @@ def open_window(rrd: Path) -> None:
     command = [_program(), str(rrd), "--bind", LOOPBACK, "--port", "auto", "--hide-welcome-screen"]
     if subprocess.run(command, env=_environment(), check=False).returncode != 0:
         raise ViewerError("the Rerun window did not open (see its message above): use --serve=true and a browser")
+
+
+def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) -> str | None:
+    """Draw ``rrd`` into ``png`` without a window. Returns None, or the reason why that is not possible on this machine."""
+    command = [_program(), str(rrd), "--headless", "--screenshot-to", str(png), "--bind", LOOPBACK, "--port", "auto"]
+    command += ["--window-size", f"{width_px}x{height_px}"]
+    with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
+        environment = _environment() | {"XDG_RUNTIME_DIR": folder}
+        try:
+            done = subprocess.run(
+                command, env=environment, check=False, capture_output=True, text=True, timeout=PICTURE_TIMEOUT_S
+            )
+        except subprocess.TimeoutExpired:
+            return f"the Rerun program drew nothing within {PICTURE_TIMEOUT_S:.0f} s"
+    if not png.is_file():
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        why = next(
+            (line for line in said if "panicked" in line), said[-1] if said else f"exit status {done.returncode}"
+        )
+        return f"the Rerun program drew nothing: {why.strip()}"
+    return None
 
 
 @contextlib.contextmanager

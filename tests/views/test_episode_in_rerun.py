@@ -279,3 +279,12 @@ def test_touch_of_both_kinds_is_shown_side_by_side(episode: Episode, tmp_path: P
     other, _ = with_other_touch(episode)
     names = assert_no_view_is_empty(logged(other, tmp_path), episode_blueprint(other))
     assert any("counts above baseline" in name for name in names) and any("primary" in name for name in names)
+
+
+def test_a_picture_at_one_time_has_the_colours_of_the_whole_episode(episode: Episode, tmp_path: Path):
+    other, arrays = with_other_touch(without(episode, TOUCH))
+    save_episode(other, tmp_path / "one.rrd", at_s=1.0)
+    entity = read_rrd(tmp_path / "one.rrd")["/touch_values/tactile_primary/0"]
+    values = arrays["observation.tactile.primary"]
+    assert len(entity["DepthImage:buffer"].values) == 1
+    assert tuple(entity["DepthImage:depth_range"].values[0][0]) == (values.min(), values.max())

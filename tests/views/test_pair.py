@@ -16,11 +16,14 @@ from taccorl.errors import TaccorlError
 from taccorl.views.colors import PAIR_COLORS
 from taccorl.views.pair import Align, Pair, page_of
 from taccorl.views.pair_view import difference_colors, pair_blueprint, save_shown
+from taccorl.views.screenshot import screenshot
 from taccorl.views.touch import contact_gate, pads_of
 
 from .made_episode import ORIGIN, TOUCH, made_episode, without
 from .readback import Column, read_rrd
+from .regions import contents
 from .test_episode_in_rerun import assert_no_view_is_empty, views
+from .test_screenshot import TABLE, needs_vulkan, share
 
 TWIN = Origin("twin", "MuJoCo twin, not a robot")
 Logged = dict[str, dict[str, Column]]
@@ -41,8 +44,8 @@ def first_contact_s(episode: Episode) -> float:
     return float(episode.time_s[np.flatnonzero(contact_gate(pads_of(episode)))[0]])
 
 
-def logged(pair: Pair, folder: Path) -> Logged:
-    save_shown(pair, folder / "pair.rrd")
+def logged(pair: Pair, folder: Path, at_s: float | None = None) -> Logged:
+    save_shown(pair, folder / "pair.rrd", at_s=at_s)
     return read_rrd(folder / "pair.rrd")
 
 
@@ -151,3 +154,32 @@ def test_alignment_at_contact_is_refused_where_one_has_none():
     quiet = dataclasses.replace(B, arrays=B.arrays | {TOUCH: np.minimum(B.arrays[TOUCH], 30)})
     with pytest.raises(TaccorlError, match=r"twin, episode 3: no taxel beyond 0\.4 \(30 counts\) in 40 rows"):
         Pair(A, quiet, "contact")
+
+
+def test_a_still_picture_needs_one_row_of_pictures_and_pads(tmp_path: Path):
+    found = logged(Pair(A, B), tmp_path, at_s=1.84)  # row 55 of A, 18 of B
+    for root, row_s in (("a", 55 / 30), ("b", 1.8), ("difference/pads", 55 / 30)):
+        path = f"/{root}/left_a" if "pads" in root else f"/{root}/observation/tactile/left_a"
+        (column,) = [c for name, c in found[path].items() if name.endswith("buffer")]
+        np.testing.assert_allclose(column.time_s, [row_s], atol=1e-8)
+    assert len(found["/a/observation/images/front"]["EncodedImage:blob"].values) == 1
+
+
+@pytest.mark.slow
+@needs_vulkan
+def test_the_rerun_program_draws_both(tmp_path: Path):
+    pair, png = Pair(made_episode(90), B), tmp_path / "pair.png"
+    assert screenshot(pair, png) == "the Rerun program"
+    shown = contents(png, pair_blueprint(pair))
+    for name in ("A front", "B front"):
+        assert share(shown[name], TABLE) > 0.2, name
+    row = round(30 * pair.best_time_s)  # A grips firmly, B not yet
+    patch = 20, 5  # a taxel of the left pads' patch
+    (a, b), (rows_a, rows_b) = pair.shared_pads()[0], pair.common_rows()
+    difference = int(b.counts[rows_b[list(rows_a).index(row)]][patch]) - int(a.counts[row][patch])
+    assert difference < -40
+    color = difference_colors(np.array(difference / pair.full_difference))
+    assert share(shown["touch: counts above baseline"], tuple(map(int, color)), 25) > 0.005
+    for name in ("left_joint_1 [rad]", "right_gripper [m]"):
+        for color in PAIR_COLORS:
+            assert share(shown[name], color, 60) > 0.002, f"{name}: nothing in {color}"
