@@ -7,7 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_192,
-    "taccorl/cli": 4_859,
+    "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
     "taccorl/diagnosis": 11_444,
     "taccorl/episodes": 4_184,
@@ -23,8 +23,8 @@ MOST_LINES = {
     "taccorl/surrogate": 3_537,
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_557,
-    "taccorl/views": 2_433,
-    "tests": 55_899,
+    "taccorl/views": 2_548,
+    "tests": 56_090,
     "pipelines": 6_280,
 }
 MOST_LINES_OF_A_FILE = 500
