@@ -157,7 +157,7 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         (ONE + "  interval: {torque_nm: [1, 0]}\n", 4, "give two numbers, low and high"),
         (ONE + "  interval: {torque_nm: [1]}\n", 4, "expected 2 values, found 1"),
         (ONE + "- effect: coulomb_friction\n", 1, "coulomb_friction acts on left_joint1 twice, entries 1 and 2"),
-        ("effects:\n- effect: payload\n  mass_kg: 2\n", 3, "mass_kg is 2 kg, outside of 0 … 1.5 kg"),
+        ("effects:\n- effect: payload\n  mass_kg: 2\n", 3, "mass_kg is 2 kg, outside of -1.5 … 1.5 kg"),
         ("effects:\n- effect: payload\n  mass_kg: .nan\n", 3, "expected float, found '.nan'"),
         ("effects:\n- effect: dead_taxels\n  share: 0.1\n  pads: [left_c]\n", 4, "no pad 'left_c'; did you mean 'left_"),
         ("effects:\n- effect: payload\n  effect: armature\n", 3, "stands here twice"),
