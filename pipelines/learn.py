@@ -142,7 +142,7 @@ class Made(NamedTuple):
     asked: CollectConfig
     """How the twin's demonstrations were made; its ``store`` has decoded frames among other intermediate results."""
     about: dict[str, Any]
-    """Of what they are: twin, sources, real, sim_weight, corrected (how many are no corrections)."""
+    """Of what they are: twin, sources, real, sim_weight; corrected, the number of demonstrations before corrections."""
     robots: list[Path | None]
     """Twins to score in."""
 
@@ -386,7 +386,8 @@ def _learned(config: LearnConfig, made: Made, settings: tuple[int, int, str, str
 
 
 def _corrected(config: LearnConfig, made: Made, training: Training, about: dict, acts: tuple[str, str]) -> Made:
-    """``made`` and behind it corrections of the policy ``training``, at least as many as are wanted. Raises SystemExit: fewer."""
+    """The demonstrations ``made``, followed by corrections of the policy of ``training``. ``acts``: its pictures and its GPU.
+    Raises SystemExit: there are fewer corrections than are wanted."""
     fixes = made.dataset.with_name(f"{made.dataset.name}_corrections_{config.corrections}_of_{training.folder.name}")
     choice = PolicyChoice(path=training.policy, n_action_steps=config.executed[0], device=config.score_device)
     own = {"policy": choice, "hands": config.hands, "takeover": "all", "before_grasp": True, "out": fixes}

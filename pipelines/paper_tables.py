@@ -267,7 +267,7 @@ def grips(rows: Rows, task: str = "assembly_1") -> dict[tuple[str, str], dict[in
     for row in sorted(rows, key=lambda row: (row["sensors"] != "touch", -row.get("sources", 3500), row["seed"])):
         if (PLAIN | {"task": task}).items() <= row.items() and "stage" not in row:
             of = f"{row['sources']} grips" if "sources" in row else "each its own grip"
-            of += f"; of more than {row['corrected']} corrections" if "corrected" in row else ""
+            of += f" for {row['corrected']}, then corrections" if "corrected" in row else ""
             found[SENSORS[row["sensors"]], of][row["demonstrations"]].append(row)
     return found
 

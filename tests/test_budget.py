@@ -6,16 +6,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_192,
+    "taccorl/alignment": 15_194,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
-    "taccorl/diagnosis": 11_444,
+    "taccorl/diagnosis": 11_445,
     "taccorl/episodes": 4_184,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_069,
     "taccorl/policies": 3_462,
-    "taccorl/report": 2_499,
+    "taccorl/report": 2_500,
     "taccorl/rl": 2_467,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 56_090,
-    "pipelines": 6_280,
+    "tests": 56_093,
+    "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500
 

@@ -77,7 +77,8 @@ Level = Literal["high", "moderate", "low"]
 FLOOR, LITTLE = SearchConfig().floor, SearchConfig().little
 """Largest errors [noise floors] that count as at the floor, and as little above it."""
 BELOW = 0.5
-"""Error [noise floors] below which a floor of repeats that were not the same motion is above what the twin leaves. A choice."""
+"""Validation error [noise floors] below which repeats differ by so much more than the twin is off that their floor hides effects.
+A choice."""
 GONE = 0.2
 """Share of an effect's strength in the file below which an added effect is in place of it. A choice."""
 NEAR = 0.05

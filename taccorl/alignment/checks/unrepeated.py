@@ -85,7 +85,7 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
         except TaccorlError as error:
             yield name, not_judged("", what, str(error))
             continue
-        # Where no target was logged, positions that differ are another motion.
+        # Without logged targets the measured position is the input: repeats with other positions were another motion.
         moved = [s for s in floors if any(np.ptp(m.target[:, m.column(s)]) > 0 for m in group)]
         moved = [s for s in moved if group[0].target_kind(s) != "effort"]
         later = [without_beginning(laid.difference["position"], a.rate_hz) for a, _, laid in pairs]

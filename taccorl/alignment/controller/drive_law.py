@@ -53,8 +53,8 @@ FOLLOW_HZ = 10.0
 """Rate of the spring and damper that hold a model of law effort at the measured position [Hz]: K and 2 K / ω. A choice: with
 K = ω² J, noise of 0.1 mrad is an effort of 0.4 N·m for each kg·m²."""
 FOLLOWED = 0.5
-"""Share of a twin's effort that is taken off before repeats of unlike motions are compared: such a model misses (f / FOLLOW_HZ)²
-of the effort of a motion at f, half of it at 7 Hz."""
+"""Share of the twin's effort that is subtracted from recorded efforts before repeats of unlike motions are compared, under law
+effort. A choice, tried on one simulated arm: at a frequency f the model misses (f / FOLLOW_HZ)² of the effort, half at 7 Hz."""
 MECHANICAL = ("velocity", "acceleration", "load", "position")
 """Needs of effects that a model of law effort can have: it has no controller."""
 OF_READINGS = ("encoder_bias", "encoder_eccentricity", "encoder_scale", "sensor_delay")

@@ -202,8 +202,8 @@ class Robot:
         return REMOVABLE * float(model.body_mass[model.body_weldid == model.body_weldid[body]].sum())
 
     def wrong_mass(self) -> tuple[str, str]:
-        """A joint whose payload removes more than its body has, or is in the same body as another one's, and text that says so;
-        ("", "") if there is none."""
+        """Joint and error message of the first ``payload`` that removes more mass than its body has, or that is in the same body
+        as another joint's; ("", "") if all are valid."""
         bodies: dict[int, str] = {}
         for name, mass in self.masses().items():
             if mass.mass_kg < -(most := self.removable_kg(mass.body)):
@@ -337,7 +337,8 @@ def load_robot(path: Path) -> Robot:
 
 
 def _refuse_todo(path: Path) -> None:
-    """Raises SpecError: lines of the file still say ``TODO``. It quotes each with its comment, which says what to write."""
+    """Raises SpecError: lines of the file still say ``TODO``. The message quotes each line with its comment, which says what to
+    write instead."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

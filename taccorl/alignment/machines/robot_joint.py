@@ -50,7 +50,8 @@ MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
 """Largest number of positions in ``_KEPT``, which serves all joints of a recording; and of entries of its mass matrices."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
 LEAST_INERTIA = 0.01
-"""Share of a joint's inertia in the model that a ``payload`` below 0 leaves it at least. A choice, far below any link's."""
+"""Least inertia of a joint with a ``payload`` of negative mass, as a share of its inertia in the model. A choice: a search may
+try places of the mass that would make the inertia negative."""
 PAYLOAD_AT = ("x_m", "y_m", "z_m")
 """Parameters of ``payload`` for its place along the axes of its body."""
 _SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m

@@ -141,8 +141,8 @@ def noise_floor(
     Args:
         measurements: measurements of one robot. Those with ``repeat_of`` are aligned with the recording that they repeat.
         kind: quantity whose noise is estimated.
-        unexplained: the same measurements with what a twin leaves of the efforts of joints without a target. Repeats of a motion
-            that was not the same twice differ less in it; the noise of single rows, which a twin smooths, is then the least.
+        unexplained: the same measurements, from whose efforts a share of a twin's is subtracted, for joints without a target:
+            repeats whose motions differ then differ less. The noise between rows is then the least that is returned.
 
     Returns:
         Signal → its floor; signals that were never recorded (effort, velocity) are left out.

@@ -147,7 +147,8 @@ class RobotMachine(Machine):
             followed = FOLLOWED * np.array([m.target_kind(s) == "effort" for s in m.signals])
             left.append(dataclasses.replace(m, effort=m.effort - followed * np.nan_to_num(response.effort)))
         left *= any("effort" in m.target_kinds for m in every)
-        floors: dict[Kind, dict[str, SignalFloor]] = {k: noise_floor(every, k, left) for k in ("position", "effort")}
+        floors: dict[Kind, dict[str, SignalFloor]] = {"position": noise_floor(every)}
+        floors["effort"] = noise_floor(every, "effort", left)
         levels = {signal: floor.value for signal, floor in floors["position"].items()}
         for (use, m), (known, response) in zip(uses, replayed, strict=True):
             positions = m.with_position_targets(np.nan_to_num(response.reported))

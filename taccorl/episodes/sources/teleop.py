@@ -128,7 +128,7 @@ def use_leader_driver(driver: OpenLeader) -> None:
 
 @dataclass
 class _Session:
-    """What stays open from attempt to attempt: the simulation that the person drives, its window, the leader arms."""
+    """What stays open between demonstrations: the simulation that the person drives, its window, the leader arms."""
 
     sim: Simulation
     window: ViewerWindow

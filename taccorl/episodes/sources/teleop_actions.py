@@ -53,7 +53,7 @@ class ActionLog:
     to disk every second."""
 
     def __init__(self, folder: Path, sim: Simulation) -> None:
-        """Create the file for actions in simulation 0 of ``sim``, which has just been reset."""
+        """Create the file of the actions that simulation 0 of ``sim`` will execute; it has just been reset to its scene."""
         scene = scene_of(sim)
         folder.mkdir(parents=True, exist_ok=True)
         self.path, self._descriptor = _create(folder, f"{scene['task']}_{scene['seed']}")

@@ -152,7 +152,7 @@ class Effect:
     tell them apart, and which recording can."""
 
     range_by: ClassVar[str] = ""
-    """Words that end the error on a parameter out of its bounds: which keys of the axis file set them; empty if none does."""
+    """End of the message for a parameter outside its bounds: the keys of the axis file that set them; empty if none does."""
     reduces_to: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect, without unit; at its lower bound both effects are equal. A fitted
     value less than 0.1 above that bound is rejected in favour of the simpler effect."""
@@ -239,7 +239,7 @@ class Effect:
 
     @property
     def reads_as(self) -> str:
-        """What these parameters mean in words, where the name of the effect does not say it; else empty."""
+        """What the values of the parameters mean, in words, where the effect's name does not say it; else empty."""
         return ""
 
     @classmethod
