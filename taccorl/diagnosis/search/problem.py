@@ -121,8 +121,9 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
         selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
     """
     frees = tuple(free(p, cls) for p in cls.parameters() if p.name not in selectors)
-    starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
-    return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
+    starts = [{f"{cls.name}.{k}": v for k, v in start.items() if k not in selectors} for start in cls.starts(seen)]
+    unlike = {tuple(start.items()): start for start in starts}.values()
+    return Candidate(cls=cls, frees=frees, starts=tuple(unlike), selectors=selectors)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -166,6 +166,13 @@ class Payload(ArmEffect):
     def accepted(cls, p: Parameter) -> tuple[float, float]:
         return (-FARTHEST_M, FARTHEST_M) if p.unit == "m" else (-p.high, p.high)
 
+    @classmethod
+    def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
+        """Start values of a search: at its typical place, and a quarter of the range of places to either side along each axis."""
+        masses, places = super().starts(seen), [p for p in cls.parameters() if p.unit == "m"]
+        moved = [{p.name: p.typical + side * (p.high - p.low)} for p in places for side in (-0.25, 0.25)]
+        return masses + [masses[-1] | place for place in moved]
+
     @property
     def reads_as(self) -> str:
         return f"{self.link or 'the last link that it moves'} is lighter than its model" * (self.mass_kg < 0.0)
