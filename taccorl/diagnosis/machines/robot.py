@@ -392,7 +392,7 @@ class RobotMachine(Machine):
         return own[0] if own else self.robot.last_body(found.part)
 
     def _assuming(self, part: str, payload: Payload) -> "RobotMachine":
-        """The machine in which a search assumes the place of the payload of ``part``, and for other joints' motion its mass."""
+        """The machine in which a search assumes the place of the payload of ``part``."""
         assumed = {self.robot.body_of(part, payload): self.robot.mass(part, payload)}
         return dataclasses.replace(self, robot=dataclasses.replace(self.robot, assumed=assumed))
 
