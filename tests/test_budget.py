@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_194,
+    "taccorl/alignment": 14_285,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
     "taccorl/diagnosis": 11_445,
@@ -20,11 +20,11 @@ MOST_LINES = {
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
     "taccorl/sim": 9_249,
-    "taccorl/surrogate": 3_537,
+    "taccorl/surrogate": 3_303,
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 56_093,
+    "tests": 56_078,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

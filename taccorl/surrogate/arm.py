@@ -18,10 +18,8 @@ from taccorl.robots import ROBOT
 from taccorl.robots.bimanual_piper import FINGER_MASS_KG, INERTIAS
 from taccorl.sim.robot import RobotConfig
 
-GRAVITY = 9.81
-"""[m/s²]."""
-NUM_JOINTS = ROBOT.num_joints
-"""Joints of one arm, without the gripper."""
+GRAVITY = 9.81  # [m/s²]
+NUM_JOINTS = ROBOT.num_joints  # Joints of one arm, without the gripper
 _BALL_RADIUS_M = 0.02  # of a payload
 
 
@@ -46,7 +44,8 @@ def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, floa
         xx, yy, zz, xy, xz, yz = body.about_com_kgm2()
         about_com = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         inertia[k] = about_com + _of_point(body.mass_kg, np.array(body.com_link_m))
-    for at_kg, at_m, own in (*_hand(config, opening_m), *_balls(balls)):
+    round_ones = [(m, np.array(at), [0.4 * m * _BALL_RADIUS_M**2] * 3) for m, *at in balls]
+    for at_kg, at_m, own in (*_hand(config, opening_m), *round_ones):
         mass[-1] += at_kg
         moment[-1] += at_kg * at_m
         inertia[-1] += np.diag(own) + _of_point(at_kg, at_m)
@@ -64,10 +63,6 @@ def _hand(config: RobotConfig, opening_m: float) -> list[tuple[float, np.ndarray
             pad = np.array([0.0, side * (ROBOT.pad_thickness_m + opening_m) / 2, ROBOT.tcp_from_hand_m])
             parts.append((0.004, pad, [1.4e-6, 1.4e-6, 2e-7]))
     return parts
-
-
-def _balls(balls: tuple[tuple[float, float, float, float], ...]) -> list[tuple[float, np.ndarray, list[float]]]:
-    return [(m, np.array(at), [0.4 * m * _BALL_RADIUS_M**2] * 3) for m, *at in balls]
 
 
 def _of_point(mass: float, at: np.ndarray) -> np.ndarray:
@@ -168,9 +163,8 @@ def mass_matrix(b: Bodies, q):
             for n in range(3):
                 half[k, n] = r[k, 0] * inertia[i, 0, n] + r[k, 1] * inertia[i, 1, n] + r[k, 2] * inertia[i, 2, n]
         # About the parent's origin: R I Rᵀ + (2 p·h + m p·p) 1 − (p hᵀ + h pᵀ + m p pᵀ), with h = R m c
-        trace = 2.0 * (p[0] * turned[0] + p[1] * turned[1] + p[2] * turned[2]) + m * (
-            p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
-        )
+        pp = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+        trace = 2.0 * (p[0] * turned[0] + p[1] * turned[1] + p[2] * turned[2]) + m * pp
         for k in range(3):
             for n in range(3):
                 inertia[i - 1, k, n] += (

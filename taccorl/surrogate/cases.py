@@ -42,8 +42,7 @@ from taccorl.surrogate.plant import STEP_S, Run
 from taccorl.surrogate.robot import NOISE_RAD, PAYLOAD_LINK6_M, PAYLOAD_OFF_M, Robot, free_inertia, inertia_and_weight
 from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable
 
-SEVERITY_FLOORS = (1.0, 30.0)
-"""Range from which the strength of a hidden effect is drawn [floors]."""
+SEVERITY_FLOORS = (1.0, 30.0)  # Range from which the strength of a hidden effect is drawn [floors]
 SEARCHES, CLOSE_ENOUGH = 6, 0.15
 """Most steps of the search for a severity, and accepted error of the result (logarithm of the ratio)."""
 OMEGA_RAD_PER_S, ZETA = (11.0, 24.0), (0.7, 1.5)
@@ -52,10 +51,8 @@ LOOP_FLOORS = 0.5
 """Largest error that the sampling of a loop alone may leave, with refitted gains [floors]; a slower loop is an effect of its own
 (``slow_velocity_filter``)."""
 LOOP_DRAWS, GAIN_DRAWS, SLOWEST_S = 8, 5, PERIODS_STEPS[-1] * STEP_S + FILTER_S[1]
-PAYLOAD_KG = (0.1, 0.5)
-"""Range of the mass that is held in every recording [kg]."""
-COLOUR_S = (0.01, 0.1)
-"""Range of the time constants of coloured encoder noise [s]."""
+PAYLOAD_KG = (0.1, 0.5)  # Range of the mass that is held in every recording [kg]
+COLOUR_S = (0.01, 0.1)  # Range of the time constants of coloured encoder noise [s]
 _RUNAWAY_RAD = 3.0
 _GEARED = ("backlash", "joint_compliance")
 
@@ -128,9 +125,12 @@ class Case:
         return dataclasses.replace(motion, payload_kg=motion.payload_kg + self.payload_kg)
 
     @cached_property
-    def robot(self) -> "Robot":
+    def robot(self) -> Robot:
         """The simulated robot with its hidden effects."""
-        changes = [h.change for h in self.hidden]
+        return self.robot_with([h.change for h in self.hidden])
+
+    def robot_with(self, changes: Sequence[Change]) -> Robot:
+        """The simulated robot with these changes in place of the hidden effects."""
         return Robot(self.signal, self.gains, changes, self.pose, loop=self.loop, payload_m=self.payload_m)
 
 
@@ -165,9 +165,7 @@ def draw_case(
         loaded: a weighed mass is held in every recording.
         coloured: the encoder's noise is correlated over time.
 
-    Raises:
-        TaccorlError: there is no hidden effect of that name, the joint cannot show it, or there is no such joint.
-    """
+    Raises TaccorlError: there is no hidden effect of that name, the joint cannot show it, or there is no such joint."""
     if design not in JUDGED_ON:
         raise TaccorlError(f"no design {design!r}; {nearest(design, JUDGED_ON)}")
     rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode())])
@@ -179,10 +177,9 @@ def draw_case(
     if signal not in joints:
         raise TaccorlError(f"{signal!r} is not a joint of the arms; {nearest(signal, joints)}")
     joint = joint_number(signal)
-    for name, k in zip(effect_names, kinds, strict=True):
-        if joint not in k.joints:
-            seen_on = ", ".join(f"joint{j}" for j in k.joints)
-            raise TaccorlError(f"{name} cannot be seen on {signal}; choose one of {seen_on}")
+    for name in (name for name, k in zip(effect_names, kinds, strict=True) if joint not in k.joints):
+        seen_on = ", ".join(f"joint{j}" for j in kind(name).joints)
+        raise TaccorlError(f"{name} cannot be seen on {signal}; choose one of {seen_on}")
     pose = list(POSES[joint - 1])
     pose[joint - 1] += rng.uniform(-0.1, 0.1)
     inertia, weight = inertia_and_weight(np.array(pose), joint)
@@ -283,9 +280,8 @@ def _with_sampled_loop(
         case, quiet = _quiet(dataclasses.replace(case, gains=_draw_gains(rng, joint, inertia, stiff=False)))
     if geared:
         return as_drawn
-    raise TaccorlError(
-        f"no sampled loop of {case.signal}, seed {case.seed}, is stable and has little effect; choose another seed"
-    )
+    of = f"{case.signal}, seed {case.seed}"
+    raise TaccorlError(f"no sampled loop of {of}, is stable and has little effect; choose another seed")
 
 
 def _draw_gains(rng: np.random.Generator, joint: int, inertia: float, *, stiff: bool) -> tuple[float, float, float]:
@@ -338,10 +334,7 @@ class _Refit:
 
     def left_floors(self, changes: Sequence[Change]) -> float:
         """RMS of the rest, in floors."""
-        case = self.case
-        return self.left_of(
-            Robot(case.signal, case.gains, changes, case.pose, loop=case.loop, payload_m=case.payload_m)
-        )
+        return self.left_of(self.case.robot_with(changes))
 
     def left_of(self, robot: Robot) -> float:
         """The same of a robot in the place of this case's; a loop that runs away leaves more than anything."""

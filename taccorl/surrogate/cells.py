@@ -30,18 +30,12 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread
 from taccorl.surrogate.writing import PRESSES, seal
 
-ORIGIN = "simulated force cells"
-"""Text of the origin of every file."""
-SENSOR = "taxel.yaml"
-"""Name of the cells file."""
-RATE_HZ = 100.0
-"""Row rate of the recordings [Hz]."""
-RATED_N = 20.0
-"""Rated load [N]."""
-HIGHEST_COUNT = 1023
-"""Upper end of the converter [counts]."""
-LOAD_NOISE = 5e-4
-"""Noise of the load cell, as a share of the rated load."""
+ORIGIN = "simulated force cells"  # Text of the origin of every file
+SENSOR = "taxel.yaml"  # Name of the cells file
+RATE_HZ = 100.0  # Row rate of the recordings [Hz]
+RATED_N = 20.0  # Rated load [N]
+HIGHEST_COUNT = 1023  # Upper end of the converter [counts]
+LOAD_NOISE = 5e-4  # Noise of the load cell, as a share of the rated load
 HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "taxel_saturation": lambda rng: {"limit": _between(rng, 8, 60)},
     "taxel_power_law": lambda rng: {"exponent": float(_between(rng, 1.1, 1.6) ** rng.choice([-1.0, 1.0]))},
@@ -59,10 +53,8 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
 }
 """Name of a hidden effect → function that draws its parameters, in the units of the registry; a reading of 10 is the rated
 load."""
-OF_GRIDS = ("taxel_crosstalk", "taxel_ghosting")
-"""Effects that only neighbouring cells can show."""
-Knots = tuple[tuple[float, float], ...]
-"""(time [s], share of the rated load), connected by straight lines."""
+OF_GRIDS = ("taxel_crosstalk", "taxel_ghosting")  # Effects that only neighbouring cells can show
+Knots = tuple[tuple[float, float], ...]  # (time [s], share of the rated load), connected by straight lines
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -104,16 +96,11 @@ RECORDINGS: dict[str, tuple[str, Knots]] = {
 class CellsCase:
     """One simulated sensor of force cells with its hidden effect."""
 
-    seed: int
-    """Seed of everything that is drawn."""
-    shape: tuple[int, int] = (1, 1)
-    """Rows and columns of the cells."""
-    hidden: str = ""
-    """Name of the hidden effect, a key of ``HIDDEN``; empty for a sensor without one."""
-    values: Values = field(default_factory=dict)
-    """Parameters of the hidden effect, in the units of the registry."""
-    sensor: CellsConfig | None = None
-    """Sensor of a user's file; None: a fingertip of 20 N with 0 … 1023 counts."""
+    seed: int  # Seed of everything that is drawn
+    shape: tuple[int, int] = (1, 1)  # Rows and columns of the cells
+    hidden: str = ""  # Name of the hidden effect, a key of ``HIDDEN``; empty for a sensor without one
+    values: Values = field(default_factory=dict)  # Parameters of the hidden effect, in the units of the registry
+    sensor: CellsConfig | None = None  # Sensor of a user's file; None: a fingertip of 20 N with 0 … 1023 counts
 
     def config(self) -> CellsConfig:
         """The sensor as known to its user: without the hidden effect."""
@@ -144,16 +131,13 @@ def draw_cells(hidden: str, seed: int, sensor: CellsConfig | None = None) -> Cel
             raise TaccorlError(
                 f"{sensor.name}: {hidden} needs a grid of cells with a load each (rows, columns, shared: false); choose another"
             )
+        name, known_size = sensor.name, sensor.gain or math.isfinite(sensor.high - sensor.low)
         if sensor.same_place_mm is not None:
-            raise TaccorlError(
-                f"{sensor.name}: simulated cells are pressed at one place; give the file without same_place_mm"
-            )
+            raise TaccorlError(f"{name}: simulated cells are pressed at one place; give the file without same_place_mm")
         if sensor.effects:
-            raise TaccorlError(f"{sensor.name}: its file has {sensor.effects[0].name}; give the file without effects")
-        if not (sensor.gain or math.isfinite(sensor.high - sensor.low)):
-            raise TaccorlError(
-                f"{sensor.name}: nothing states the size of its readings; write lowest and highest, or gain"
-            )
+            raise TaccorlError(f"{name}: its file has {sensor.effects[0].name}; give the file without effects")
+        if not known_size:
+            raise TaccorlError(f"{name}: nothing states the size of its readings; write lowest and highest, or gain")
     values = HIDDEN[hidden](rng) if hidden else {}
     return CellsCase(seed=seed, shape=shape, hidden=hidden, values=values, sensor=sensor)
 
@@ -193,19 +177,13 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
     time_ms = np.arange(0.0, stretched[-1], MILLISECOND)
     load = _rounded(np.interp(time_ms, stretched, knots[:, 1] * (1.0 + 0.005 * rng.standard_normal())))
     places = np.linspace(0, 2 * np.pi, cells, endpoint=False)
-    moves = (
-        np.ones((len(time_ms), cells))
-        if config.load.shared
-        else 0.5 + 0.5 * np.sin(2 * np.pi * time_ms[:, None] / 11.0 + places)
-    )
-    pressed = 10.0 * load[:, None] * moves  # (M, K)
+    moves = 0.5 + 0.5 * np.sin(2 * np.pi * time_ms[:, None] / 11.0 + places)
+    pressed = 10.0 * load[:, None] * (np.ones_like(moves) if config.load.shared else moves)  # (M, K)
     warm_k = 5.0 + 6.0 * np.sin(2 * np.pi * time_ms / 37.0 + rng.uniform(0, 6))
 
     true = _hidden(case, pressed, time_ms, warm_k)
-    rows = np.round(
-        (np.arange(0.005, time_ms[-1] - 0.01, 1 / rate_hz) + 1e-3 * rng.uniform(-1, 1)) / MILLISECOND
-    ).astype(int)
-    rows = np.clip(np.unique(rows), 0, len(time_ms) - 1)
+    stamps = np.arange(0.005, time_ms[-1] - 0.01, 1 / rate_hz) + 1e-3 * rng.uniform(-1, 1)
+    rows = np.clip(np.unique(np.round(stamps / MILLISECOND).astype(int)), 0, len(time_ms) - 1)
     noise = noise_count * rng.standard_normal((len(rows), cells)) + coloured_count * _coloured(rng, len(rows), cells)
     value = gain * true[rows] + offset + noise
     count = np.clip(np.round(value) if counted else value, config.low, config.high)
@@ -234,12 +212,7 @@ def write_cells(case: CellsCase, folder: Path) -> int:
     FOLDER/presses/*.csv, measurements.yaml, columns.yaml    for ``taccorl compare`` and ``diagnose``
     FOLDER/taxel.yaml                                        the sensor as known to its user; not of a user's own file
 
-    Returns:
-        Number of recordings.
-
-    Raises:
-        FileExistsError: the folder exists.
-    """
+    Returns number of recordings. Raises FileExistsError: the folder exists."""
     config = case.config()
     presses = folder / PRESSES
     folder.mkdir(parents=True)
@@ -256,12 +229,8 @@ def write_cells(case: CellsCase, folder: Path) -> int:
             writer.writerows([[f"{x:.6g}" for x in row] for row in zip(*columns, strict=True)])
     uses = [f"  {name}.csv: {{use: {use}}}" for name, (use, _) in RECORDINGS.items() if name != "presses_again"]
     uses.append("  presses_again.csv: {use: fit, repeat_of: presses.csv}")
-    columns = [
-        "time: {column: t, unit: s}",
-        "temperature: {column: temperature_c}",
-        "domain: surrogate",
-        f"origin: {ORIGIN}",
-    ]
+    columns = ["time: {column: t, unit: s}", "temperature: {column: temperature_c}"]
+    columns += ["domain: surrogate", f"origin: {ORIGIN}"]
     columns += [f"load: {{column: {kind}, unit: {config.load.unit}}}"] if config.load.shared else []
     columns.append("cells:")
     for cell in config.names:

@@ -18,8 +18,7 @@ ARM_STATUS = "piper_msgs/msg/PiperStatusMsg"
 TF = "tf2_msgs/msg/TFMessage"
 SERVICE_EVENT = "piper_msgs/srv/Enable_Event"
 
-Message = dict[str, Any]
-"""Fields of a ROS message; nested messages are dicts."""
+Message = dict[str, Any]  # Fields of a ROS message; nested messages are dicts
 
 
 def _definition(fields: str, used: Mapping[str, str] = MappingProxyType({})) -> str:
@@ -65,8 +64,7 @@ ROS2_DEFINITIONS = {
 class MessageWriter:
     """Writes messages to an MCAP writer, opening a channel when a topic first appears."""
 
-    profile = "ros2"
-    """Profile of the file."""
+    profile = "ros2"  # Profile of the file
 
     def __init__(self, writer: Writer) -> None:
         self.writer, self._counts = writer, Counter[str]()
@@ -74,12 +72,8 @@ class MessageWriter:
         self._types = functools.cache(self._register)
 
     def write(self, topic: str, ros_type: str, message: Message | bytes, log_ns: int) -> None:
-        """Write one message; a message given as bytes is written unchanged.
-
-        Args:
-            ros_type: name of the ROS type, such as ``JOINT_STATE``.
-            log_ns: log time [ns].
-        """
+        """Write one message; a message given as bytes is written unchanged. ``ros_type``: name of the ROS type, such as
+        ``JOINT_STATE``. ``log_ns``: log time [ns]."""
         if topic not in self._channels:
             schema_id, encode = self._types(ros_type)
             self._channels[topic] = self.writer.register_channel(topic, MessageEncoding.CDR, schema_id), encode

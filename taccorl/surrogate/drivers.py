@@ -21,23 +21,18 @@ START_UNIX_NS = 1_780_000_000 * 10**9  # wall clock when every recording begins
 ARMS, CAMERAS, JOINT_NAMES = ROBOT.arms, ROBOT.cameras, (*ROBOT.joints, "gripper")  # as piper_ros names them
 PADS = ("left_robot_left_finger", "left_robot_right_finger", "right_robot_left_finger", "right_robot_right_finger")
 PAD_WIRE_SHAPE = (12, 32)  # rows across the finger, columns from palm to finger tip, as FlexiTac's board sends them
-STATE_TOPICS = {arm: f"/joint_states_{arm}" for arm in ARMS}
-"""Arm → topic of its measured joints."""
-COMMAND_TOPICS = {arm: f"/joint_states_ctrl_{arm}" for arm in ARMS}
-"""Arm → topic of its commands."""
+STATE_TOPICS = {arm: f"/joint_states_{arm}" for arm in ARMS}  # Arm → topic of its measured joints
+COMMAND_TOPICS = {arm: f"/joint_states_ctrl_{arm}" for arm in ARMS}  # Arm → topic of its commands
 CAMERA_TOPICS = {
     "front": "/camera_f/color/image_raw/compressed",
     "left_wrist": "/camera_l/color/image_raw/compressed",
     "right_wrist": "/camera_r/color/image_raw/compressed",
 }
 """Camera → topic of its pictures."""
-PAD_TOPICS = {pad: f"/{pad}" for pad in PADS}
-"""Pad → topic of its frames."""
-EPISODE_TOPIC = "/episode"
-"""Topic of the markers of episodes."""
+PAD_TOPICS = {pad: f"/{pad}" for pad in PADS}  # Pad → topic of its frames
+EPISODE_TOPIC = "/episode"  # Topic of the markers of episodes
 EXTRA_TOPICS_HZ = {"/arm_status_left": 50, "/tf": 30, "/enable_srv/_service_event": 2}  # no data spec names these
-JOINT_HZ, CAMERA_HZ, PAD_HZ = 200, 30, 100
-"""Message rates [Hz]."""
+JOINT_HZ, CAMERA_HZ, PAD_HZ = 200, 30, 100  # Message rates [Hz]
 PIPER_RAD_PER_DEG = 0.017444  # in piper_ros; π/180 would be 0.0174533, so published positions are 0.053 % too small
 SCAN_S = 0.010  # a FlexiTac frame is read row by row during its whole period
 _SLICE_S = 1  # streams work in slices of this length, so memory does not grow with pictures and readings
@@ -79,35 +74,18 @@ class Marks(NamedTuple):
 
     start_s: float
     end_s: float
-    outcome: str
-    """Closing marker: success, failure or discard."""
+    outcome: str  # Closing marker: success, failure or discard
 
 
 class TrueSignals:
     """Base of sources of true signals at N instants, given in seconds since the start of the recording."""
 
-    plans: Sequence[Marks]
-    """Markers of every episode."""
+    plans: Sequence[Marks]  # Markers of every episode
 
     def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14) of one of the signals below, named by its method."""
+        """(N, 14) of joints and grippers at ``time_s`` (N,) [s]: their state or command [rad, m], velocity [rad/s, m/s] or effort
+        [N·m, N]."""
         raise NotImplementedError
-
-    def state(self, time_s: np.ndarray) -> np.ndarray:
-        """Joints [rad] and gripper openings [m], (N, 14), at ``time_s`` (N,) [s]."""
-        return self.at("state", time_s)
-
-    def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands (N, 14) [rad, m] at ``time_s`` (N,) [s]."""
-        return self.at("command", time_s)
-
-    def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Velocities (N, 14) [rad/s, m/s] at ``time_s`` (N,) [s]."""
-        return self.at("velocity", time_s)
-
-    def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]."""
-        return self.at("effort", time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """(N, 12, 32) counts above baseline in wire order; ``time_s`` is (N,), or (N, 12) with one instant per row of the
@@ -192,10 +170,10 @@ class Streams:
             last_stamp_s = float(stamp_s[-1])
             jitter_s = np.abs(rng.normal(0, config.joint_latency_jitter_s, len(ticks)))
             arrival_s = tick_s + config.joint_latency_s + jitter_s
-            joints = story.command(stamp_s) if command else story.state(stamp_s)
+            joints = story.at("command" if command else "state", stamp_s)
             position = as_piper_publishes(joints)[:, columns].tolist()
-            velocity = story.velocity(stamp_s)[:, own_joints].tolist()
-            effort = story.effort(stamp_s)[:, columns].tolist()
+            velocity = story.at("velocity", stamp_s)[:, own_joints].tolist()
+            effort = story.at("effort", stamp_s)[:, columns].tolist()
             for n, stamp in enumerate(stamp_s.tolist()):
                 log_s = max(log_s, float(arrival_s[n]))
                 message = {"header": _header(stamp, ""), "name": list(JOINT_NAMES), "position": position[n]}
@@ -244,8 +222,7 @@ class Streams:
 
     def _markers(self) -> Iterator[Event]:
         for plan in self.story.plans:
-            marks = ((plan.start_s, f"start:{self.config.instruction}"), (plan.end_s, plan.outcome))
-            for time_s, text in marks:
+            for time_s, text in ((plan.start_s, f"start:{self.config.instruction}"), (plan.end_s, plan.outcome)):
                 yield Event(time_s, time_s, EPISODE_TOPIC, messages.STRING, {"data": text})
 
     def _extra(self, topic: str) -> Iterator[Event]:
@@ -268,10 +245,8 @@ class Streams:
 def pad_message(wire: np.ndarray) -> messages.Message:
     """Message of one frame ``wire`` (12, 32) uint8."""
     rows, columns = PAD_WIRE_SHAPE
-    dim = [
-        {"label": "rows", "size": rows, "stride": rows * columns},
-        {"label": "cols", "size": columns, "stride": columns},
-    ]
+    sizes = (("rows", rows, rows * columns), ("cols", columns, columns))
+    dim = [{"label": label, "size": size, "stride": stride} for label, size, stride in sizes]
     return {"layout": {"dim": dim, "data_offset": 0}, "data": wire.tobytes()}
 
 

@@ -8,6 +8,7 @@ names; their code is not used.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,9 @@ class Kind:
 class Hidden:
     """One hidden effect, as it is in the sealed truth."""
 
-    name: str
-    """Name of the effect, a key of ``KINDS`` (on pads of ``touch_hidden.TOUCH_KINDS``)."""
-    values: Values
-    """Its parameters."""
-    severity: float
-    """Its strength, on the scale of ``Kind.severity``."""
+    name: str  # Name of the effect, a key of ``KINDS`` (on pads of ``touch_hidden.TOUCH_KINDS``)
+    values: Values  # Its parameters
+    severity: float  # Its strength, on the scale of ``Kind.severity``
     registered: bool
     """True: the effect is in the registry. False: a diagnosis cannot name it, and should report "something else"."""
     selectors: Mapping[str, Any] = field(default_factory=dict)
@@ -127,46 +125,62 @@ def _range(low: float, high: float) -> Callable[[Scale], tuple[float, float]]:
     return lambda scale: (low, high)
 
 
-def _sign(rng: np.random.Generator) -> float:
-    return float(rng.choice([-1.0, 1.0]))
-
-
 def _uniform(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Scale], Values]:
     return lambda rng, scale: {name: float(rng.uniform(*ends)) for name, ends in ranges.items()}
 
 
 def _signed(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Scale], Values]:
-    return lambda rng, scale: {"sign": _sign(rng)} | _uniform(**ranges)(rng, scale)
+    return lambda rng, scale: {"sign": float(rng.choice([-1.0, 1.0]))} | _uniform(**ranges)(rng, scale)
 
 
 _SLIP = _range(2e-4, 0.1)  # rad by which a torque turns the joint against its K_p
 _PHASE = (-math.pi, math.pi)
+_KP = attrgetter("kp")
+
+
+def _wave(least: int, most: int) -> Callable[[np.random.Generator, Scale], Values]:
+    return lambda rng, scale: {"periods": float(rng.integers(least, most + 1))} | _uniform(phase_rad=_PHASE)(rng, scale)
 
 
 def _drive(**fields: float) -> Change:
     return Change(drive=fields)
 
 
-def _one(
-    parameter: str,
-    field: str,
+def _kind(
+    fields: Mapping[str, str],
     severity: Callable[[Scale], tuple[float, float]],
     size: Callable[[Scale], float] = lambda c: 1.0,
     **rest: Any,
 ) -> Kind:
-    """The kind with one parameter, its severity times ``size``, which is a field of the drive."""
-    values, plant = lambda s, c, shape: {parameter: s * size(c)}, lambda v: _drive(**{field: v[parameter]})
-    return Kind(severity=severity, values=values, plant=plant, **rest)
+    """The kind whose first parameter is its severity times ``size``, beside those of its shape. ``fields``: parameter → field of
+    the drive."""
+    first = next(iter(fields))
+    return Kind(
+        severity=severity,
+        values=lambda s, c, shape: {first: s * size(c), **shape},
+        plant=lambda v: _drive(**{field: v[name] for name, field in fields.items()}),
+        **rest,
+    )
 
 
-def _encoder_wave(v: Values) -> Change:
-    waves = v.get("periods", 1.0)
-    return _drive(encoder_wave=v["amplitude_rad"], encoder_waves=waves, encoder_phase=v["phase_rad"])
+def _either_way(parameter: str, field: str, low: float, high: float, absent: float = 0.0, **rest: Any) -> Kind:
+    """The kind with one parameter, which lies above or below its absent value by its severity."""
+    return Kind(
+        severity=_range(low, high),
+        shape=_signed(),
+        values=lambda s, c, shape: {parameter: absent + shape["sign"] * s},
+        plant=lambda v: _drive(**{field: v[parameter]}),
+        **rest,
+    )
 
+
+_OUTSIDE: dict[str, Any] = {"registered": False}
+_SOFT_OUTSIDE: dict[str, Any] = {"registered": False, "stiff": False}
+_WAVE = {"amplitude_rad": "encoder_wave", "periods": "encoder_waves", "phase_rad": "encoder_phase"}
 
 KINDS: dict[str, Kind] = {
     # friction
-    "viscous_friction": _one("damping_nms_per_rad", "viscous", _range(0.02, 1.0), lambda c: c.kd),
+    "viscous_friction": _kind({"damping_nms_per_rad": "viscous"}, _range(0.02, 1.0), lambda c: c.kd),
     "coulomb_friction": Kind(
         severity=_SLIP,
         values=lambda s, c, shape: {"torque_nm": s * c.kp},
@@ -189,8 +203,8 @@ KINDS: dict[str, Kind] = {
         values=lambda s, c, shape: {"torque_nm": s * c.kp, "asymmetry": shape["sign"] * shape["asymmetry"]},
         plant=lambda v: _drive(coulomb=v["torque_nm"], asymmetry=v["asymmetry"]),
     ),
-    "load_friction": _one("share", "load_share", _range(0.005, 0.5)),
-    "quadratic_drag": _one("drag_nms2_per_rad2", "quadratic", _range(0.01, 1.0), lambda c: c.kd / c.speed),
+    "load_friction": _kind({"share": "load_share"}, _range(0.005, 0.5)),
+    "quadratic_drag": _kind({"drag_nms2_per_rad2": "quadratic"}, _range(0.01, 1.0), lambda c: c.kd / c.speed),
     "position_dependent_friction": Kind(
         severity=_SLIP,
         shape=_uniform(place=(-0.6, 0.6), width_rad=(0.05, 0.3)),
@@ -211,7 +225,7 @@ KINDS: dict[str, Kind] = {
         },
         plant=lambda v: _drive(stop=v["stiffness_nm_per_rad"], stop_angle=v["angle_rad"]),
     ),
-    "armature": _one("added_kgm2", "motor_inertia", _range(0.02, 3.0), lambda c: c.inertia, stiff=False),
+    "armature": _kind({"added_kgm2": "motor_inertia"}, _range(0.02, 3.0), lambda c: c.inertia, stiff=False),
     "gravity_mismatch": Kind(
         severity=_range(0.005, 1.0),
         shape=_signed(),
@@ -237,38 +251,33 @@ KINDS: dict[str, Kind] = {
         },
         plant=lambda v: _drive(spring=v["stiffness_nm_per_rad"], spring_rest=v["rest_rad"]),
     ),
-    "cogging": Kind(
-        severity=_SLIP,
-        shape=lambda rng, c: {"periods": float(rng.integers(8, 33)), "phase_rad": float(rng.uniform(*_PHASE))},
-        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: _drive(cogging=v["torque_nm"], cogging_periods=v["periods"], cogging_phase=v["phase_rad"]),
+    "cogging": _kind(
+        {"torque_nm": "cogging", "periods": "cogging_periods", "phase_rad": "cogging_phase"},
+        _SLIP,
+        _KP,
+        shape=_wave(8, 32),
     ),
     # the command's way
-    "command_delay": _one("delay_s", "delay", _range(5e-4, 0.1)),
-    "command_lag": _one("time_constant_s", "lag", _range(1e-3, 0.2)),
+    "command_delay": _kind({"delay_s": "delay"}, _range(5e-4, 0.1)),
+    "command_lag": _kind({"time_constant_s": "lag"}, _range(1e-3, 0.2)),
     "slew_limit": Kind(
         severity=_range(0.02, 0.85),
         values=lambda s, c, shape: {"speed_rad_per_s": (1.0 - s) * c.speed},
         plant=lambda v: _drive(slew=v["speed_rad_per_s"]),
     ),
-    "velocity_feedforward": _one("share", "feedforward", _range(0.02, 1.0)),
+    "velocity_feedforward": _kind({"share": "feedforward"}, _range(0.02, 1.0)),
     "dropped_commands": Kind(
         severity=_range(0.01, 0.1),
         values=lambda s, c, shape: {"probability": s},
         plant=lambda v: Change(dropped=v["probability"]),
     ),
     # the loop
-    "error_deadband": _one("width_rad", "deadband", _range(2e-4, 0.05)),
-    "integral_action": _one("rate_per_s", "integral", _range(0.02, 5.0)),
+    "error_deadband": _kind({"width_rad": "deadband"}, _range(2e-4, 0.05)),
+    "integral_action": _kind({"rate_per_s": "integral"}, _range(0.02, 5.0)),
     # From K_d / K_p on it would oscillate.
-    "torque_lag": _one("time_constant_s", "torque_lag", lambda c: (2e-4, 0.5 * c.kd / c.kp), stiff=False),
-    "torque_scale": Kind(
-        severity=_range(0.02, 0.5),
-        shape=_signed(),
-        values=lambda s, c, shape: {"factor": 1.0 + shape["sign"] * s},
-        plant=lambda v: _drive(torque_scale=v["factor"]),
-        joints=(2, 3, 5),  # without weight it is a factor of all gains
-    ),
+    "torque_lag": _kind({"time_constant_s": "torque_lag"}, lambda c: (2e-4, 0.5 * c.kd / c.kp), stiff=False),
+    # Without weight it is a factor of all gains.
+    "torque_scale": _either_way("factor", "torque_scale", 0.02, 0.5, absent=1.0, joints=(2, 3, 5)),
     "torque_saturation": Kind(
         severity=_range(0.02, 0.7),
         values=lambda s, c, shape: {"torque_max_nm": (1.0 - s) * c.torque},
@@ -289,7 +298,7 @@ KINDS: dict[str, Kind] = {
     ),
     # the gear
     # Behind it there must be more than the rotor.
-    "backlash": _one("play_rad", "play", _range(3e-4, 0.03), joints=(1, 2, 3), stiff=False),
+    "backlash": _kind({"play_rad": "play"}, _range(3e-4, 0.03), joints=(1, 2, 3), stiff=False),
     "joint_compliance": Kind(
         severity=_range(0.005, 2.0),
         shape=_uniform(damping_s=(0.001, 0.004)),
@@ -299,23 +308,13 @@ KINDS: dict[str, Kind] = {
         stiff=False,
     ),
     # the encoder
-    "encoder_scale": Kind(
-        severity=_range(5e-4, 0.1),
-        shape=_signed(),
-        values=lambda s, c, shape: {"factor": 1.0 + shape["sign"] * s},
-        plant=lambda v: _drive(encoder_scale=v["factor"]),
-    ),
-    "encoder_bias": Kind(
-        severity=_range(1e-3, 0.2),
-        shape=_signed(),
-        values=lambda s, c, shape: {"bias_rad": shape["sign"] * s},
-        plant=lambda v: _drive(encoder_bias=v["bias_rad"]),
-    ),
+    "encoder_scale": _either_way("factor", "encoder_scale", 5e-4, 0.1, absent=1.0),
+    "encoder_bias": _either_way("bias_rad", "encoder_bias", 1e-3, 0.2),
     "encoder_eccentricity": Kind(
         severity=_range(5e-4, 0.05),
         shape=_uniform(phase_rad=_PHASE),
         values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=_encoder_wave,
+        plant=lambda v: _drive(encoder_wave=v["amplitude_rad"], encoder_waves=1.0, encoder_phase=v["phase_rad"]),
     ),
     "sensor_delay": Kind(
         severity=_range(5e-4, 0.1),
@@ -323,53 +322,42 @@ KINDS: dict[str, Kind] = {
         plant=lambda v: Change(report_delay_s=v["delay_s"]),
     ),
     # outside the registry
-    "loop_delay": _one(  # from about J / K_d on it would oscillate
-        "delay_s",
-        "loop_delay",
-        lambda c: (1e-4, 0.5 * c.inertia / c.kd),
-        stiff=False,
-        registered=False,
-        near=("torque_lag",),
+    "loop_delay": _kind(  # from about J / K_d on it would oscillate
+        {"delay_s": "loop_delay"}, lambda c: (1e-4, 0.5 * c.inertia / c.kd), near=("torque_lag",), **_SOFT_OUTSIDE
     ),
-    "angle_friction": Kind(
-        severity=_SLIP,
+    "angle_friction": _kind(
+        {"torque_nm": "coulomb", "share": "angle_share", "phase_rad": "angle_phase"},
+        _SLIP,
+        _KP,
         shape=_uniform(share=(0.6, 0.95), phase_rad=_PHASE),
-        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: _drive(coulomb=v["torque_nm"], angle_share=v["share"], angle_phase=v["phase_rad"]),
-        registered=False,
         near=("position_dependent_friction", "coulomb_friction"),
+        **_OUTSIDE,
     ),
-    "gear_error": Kind(
-        severity=_range(5e-4, 0.05),
-        shape=lambda rng, c: {"periods": float(rng.integers(5, 12)), "phase_rad": float(rng.uniform(*_PHASE))},
-        values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=_encoder_wave,
-        registered=False,
-        near=("encoder_eccentricity", "cogging"),
+    "gear_error": _kind(
+        _WAVE, _range(5e-4, 0.05), shape=_wave(5, 11), near=("encoder_eccentricity", "cogging"), **_OUTSIDE
     ),
-    "magnetic_hysteresis": Kind(
-        severity=_SLIP,
+    "magnetic_hysteresis": _kind(
+        {"torque_nm": "hysteresis", "width_rad": "hysteresis_width"},
+        _SLIP,
+        _KP,
         shape=_uniform(width_rad=(0.04, 0.2)),
-        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: _drive(hysteresis=v["torque_nm"], hysteresis_width=v["width_rad"]),
-        registered=False,
         near=("coulomb_friction", "stribeck_friction"),  # which slide only after some travel, too
+        **_OUTSIDE,
     ),
-    "warming_friction": Kind(
-        severity=_SLIP,
+    "warming_friction": _kind(
+        {"torque_nm": "coulomb", "rate_per_s": "warm_up"},
+        _SLIP,
+        _KP,
         shape=_uniform(rate_per_s=(0.04, 0.065)),
-        values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: _drive(coulomb=v["torque_nm"], warm_up=v["rate_per_s"]),
-        registered=False,
         near=("coulomb_friction", "torque_fade"),
+        **_OUTSIDE,
     ),
     "slow_velocity_filter": Kind(
         severity=lambda c: (1e-3, 2.0 * c.inertia / c.kd),
         values=lambda s, c, shape: {"time_constant_s": s},
         plant=lambda v: _drive(loop_steps=8, velocity_filter=v["time_constant_s"]),
-        stiff=False,
-        registered=False,
         near=("torque_lag", "armature"),  # at low frequencies it is an inertia of −K_d τ
+        **_SOFT_OUTSIDE,
     ),
     "hung_mass": Kind(  # a tool or cable that swings on the link
         severity=_range(0.02, 1.0),
@@ -378,36 +366,21 @@ KINDS: dict[str, Kind] = {
         plant=lambda v: _drive(
             hung_inertia=v["inertia_kgm2"], hung_rad_per_s=2 * math.pi * v["hz"], hung_damping=v["damping"]
         ),
-        stiff=False,
-        registered=False,
         near=("armature", "payload", "joint_compliance"),
+        **_SOFT_OUTSIDE,
     ),
     "voltage_sag": Kind(
         severity=_range(0.05, 5.0),
         shape=_uniform(time_s=(0.02, 0.1)),
         values=lambda s, c, shape: {"per_w": s / (c.torque * c.speed), **shape},
         plant=lambda v: _drive(sag=v["per_w"], sag_time=v["time_s"]),
-        stiff=False,
-        registered=False,
         near=("torque_speed_limit", "torque_saturation"),
+        **_SOFT_OUTSIDE,
     ),
-    "encoder_interpolation": Kind(  # between the lines of its disc
-        severity=_range(1e-4, 5e-3),
-        shape=lambda rng, c: {"periods": float(rng.integers(40, 121)), "phase_rad": float(rng.uniform(*_PHASE))},
-        values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=_encoder_wave,
-        registered=False,
-        near=("encoder_eccentricity", "cogging"),
+    "encoder_interpolation": _kind(  # between the lines of its disc
+        _WAVE, _range(1e-4, 5e-3), shape=_wave(40, 120), near=("encoder_eccentricity", "cogging"), **_OUTSIDE
     ),
-    "one_way_gains": Kind(
-        severity=_range(0.01, 0.5),
-        shape=_signed(),
-        values=lambda s, c, shape: {"share": shape["sign"] * s},
-        plant=lambda v: _drive(one_way=v["share"]),
-        stiff=False,
-        registered=False,
-        near=("asymmetric_friction",),
-    ),
+    "one_way_gains": _either_way("share", "one_way", 0.01, 0.5, near=("asymmetric_friction",), **_SOFT_OUTSIDE),
 }
 """Name → kind of hidden effect."""
 NOT_FITTED = ("dropped_commands",)

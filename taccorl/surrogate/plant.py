@@ -26,14 +26,10 @@ import numpy as np
 
 from taccorl.surrogate.arm import GRAVITY, NUM_JOINTS, Bodies, factor, mass_matrix, solve, torques
 
-SUBSTEPS = 8
-"""Number of integration steps per millisecond."""
-STEP_S = 1e-3 / SUBSTEPS
-"""Integration step [s]."""
-COMMAND_MS = 5
-"""Period of commands [ms]: they come at 200 Hz and are held."""
-Values = dict[str, float]
-"""Name of a parameter → value in its unit."""
+SUBSTEPS = 8  # Number of integration steps per millisecond
+STEP_S = 1e-3 / SUBSTEPS  # Integration step [s]
+COMMAND_MS = 5  # Period of commands [ms]: they come at 200 Hz and are held
+Values = dict[str, float]  # Name of a parameter → value in its unit
 
 
 class Drive(NamedTuple):
@@ -115,20 +111,16 @@ class Change:
     drive: Values = field(default_factory=dict)
     """Changes of fields of ``Drive``. Torques, inertias and delays are added, ``torque_scale`` is multiplied, others are
     replaced."""
-    carried: float = 1.0
-    """Factor on the share of the weight that the controller compensates."""
+    carried: float = 1.0  # Factor on the share of the weight that the controller compensates
     ball: tuple[float, float, float, float] | None = None
     """Point mass fixed to the arm's last link: mass [kg], then its position x, y, z in the frame of link 6 [m]. None: no mass is
     added."""
-    report_delay_s: float = 0.0
-    """Delay of the reported angles [s]."""
+    report_delay_s: float = 0.0  # Delay of the reported angles [s]
     dropped: float = 0.0
     """Probability that a command is lost, 0 … 1. The lost commands are drawn anew for each recording."""
 
 
-_ADD = frozenset(
-    ("viscous", "quadratic", "coulomb", "stribeck", "motor_inertia", "cogging", "delay", "integral", "encoder_bias")
-)
+_ADD = "viscous", "quadratic", "coulomb", "stribeck", "motor_inertia", "cogging", "delay", "integral", "encoder_bias"
 
 
 def changed(drive: Drive, changes: list[Change]) -> Drive:
@@ -159,12 +151,9 @@ class Arm(NamedTuple):
 class Run(NamedTuple):
     """State of the arm at every millisecond, before the controller acts."""
 
-    angle: np.ndarray
-    """(M, 6) true angles of the motors, on the motor's side of the gear [rad]."""
-    velocity: np.ndarray
-    """(M, 6) velocities of the motors [rad/s]."""
-    effort: np.ndarray
-    """(M, 6) motor torques without gravity compensation, half a millisecond old [N·m]."""
+    angle: np.ndarray  # (M, 6) true angles of the motors, on the motor's side of the gear [rad]
+    velocity: np.ndarray  # (M, 6) velocities of the motors [rad/s]
+    effort: np.ndarray  # (M, 6) motor torques without gravity compensation, half a millisecond old [N·m]
 
 
 @numba.njit(cache=True)
@@ -208,10 +197,7 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     kp, kd = arm.kp.copy(), arm.kd.copy()
     kp[joint], kd[joint] = d.kp, 0.0
     given = np.zeros(NUM_JOINTS)
-    held, carried = (
-        np.zeros(NUM_JOINTS),
-        np.zeros(NUM_JOINTS),
-    )  # torques that the controllers hold; damping comes on top
+    held, carried = np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS)  # of the controllers; damping comes on top
     weight = torques(arm.bodies, q, zero, zero, GRAVITY)[joint]
     carry = arm.carried * torques(arm.believed, q, zero, zero, GRAVITY)[joint]
     # Integral action has done its work long ago.
@@ -226,9 +212,8 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     lag_share = 1.0 - math.exp(-h / d.torque_lag) if d.torque_lag > 0.0 else 1.0
     command_share = 1.0 - math.exp(-1e-3 / d.lag) if d.lag > 0.0 else 1.0
     bristle, wound = 0.0, 0.0
-    most = (
-        d.coulomb + d.stribeck + d.spot + 3.0 * d.load_share
-    )  # of friction, for the bristles' stiffness; loads are of 3 N·m
+    # of friction, for the bristles' stiffness; loads are of 3 N·m
+    most = d.coulomb + d.stribeck + d.spot + 3.0 * d.load_share
     s0 = most / d.presliding
     s1_rest = 1.4 * math.sqrt(s0 * d.motor_inertia)
     inverse = np.empty(NUM_JOINTS)

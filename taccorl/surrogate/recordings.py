@@ -6,6 +6,7 @@ Letters in shapes: T rows, J signals.
 import math
 import zlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -20,8 +21,7 @@ from taccorl.surrogate.cases import Case
 from taccorl.surrogate.plant import COMMAND_MS
 from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD
 
-ORIGIN = "robot simulated apart from the twin, not a robot"
-"""Text of the origin of every recording."""
+ORIGIN = "robot simulated apart from the twin, not a robot"  # Text of the origin of every recording
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
 """Noise of reported velocities, and the step in which PiPER reports them [rad/s]."""
 EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
@@ -64,29 +64,26 @@ def record(case: Case, motion: Motion, prefix: str = "") -> Measurement:
     measured[:, rest] += np.array(ROBOT.torque_ff_nm) / np.array(ROBOT.kp_nm_per_rad)
     measured[:, own] = robot.reported(run)
     velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
-    stated = _stated(case, motion)
+    effort_noise = np.maximum(EFFORT_NOISE_SHARE * np.abs(effort).max(axis=0), EFFORT_NOISE_NM)
+    seen = _noisy(rng, measured, NOISE_RAD, OPENING_NOISE_M, case.colour_s)
     return Measurement(
         name=prefix + motion.name,
         time_s=np.arange(num_rows) / RATE_HZ,
         target=_rounded(target, QUANTUM_RAD, OPENING_QUANTUM_M),
-        measured=_rounded(
-            _noisy(rng, measured, NOISE_RAD, OPENING_NOISE_M, case.colour_s), QUANTUM_RAD, OPENING_QUANTUM_M
-        ),
+        measured=_rounded(seen, QUANTUM_RAD, OPENING_QUANTUM_M),
         velocity=_rounded(_noisy(rng, velocity, SPEED_NOISE_RAD_PER_S, 0.0), SPEED_QUANTUM_RAD_PER_S, 1e-3),
-        effort=_rounded(_noisy(rng, effort, _effort_noise(effort), 0.0), EFFORT_QUANTUM_NM, 1e-3),
+        effort=_rounded(_noisy(rng, effort, effort_noise, 0.0), EFFORT_QUANTUM_NM, 1e-3),
         origin=Origin("surrogate", f"{ORIGIN}; {case.signal} under test"),
         instruction=f"sweep of {case.signal}: {motion.name}",
         repeat_of=motion.repeat_of and prefix + motion.repeat_of,
         payload_kg={ROBOT.arms[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
         # A mass that is held in every recording is one whose place was measured, too.
         payload_position_m={ROBOT.arms[robot.arm]: case.payload_m} if case.payload_kg else {},
-        kp=stated.get("kp", {}),
-        kd=stated.get("kd", {}),
-        gain_scale=stated.get("gain_scale", {}),
+        **_stated(case, motion),
     )
 
 
-def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
+def _stated(case: Case, motion: Motion) -> dict[str, Any]:
     """What is written down of the gains: known ones in every recording, else only by what factor one is driven differently."""
     if not case.gains_known:
         return {"gain_scale": {case.signal: motion.gain}} if motion.gain != 1.0 else {}
@@ -106,11 +103,6 @@ def _noisy(
         noise[0] /= math.sqrt(1.0 - keep**2)
         noise = math.sqrt(1.0 - keep**2) * np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
     return values + size * noise
-
-
-def _effort_noise(effort: np.ndarray) -> np.ndarray:
-    """(J,) N·m."""
-    return np.maximum(EFFORT_NOISE_SHARE * np.abs(effort).max(axis=0), EFFORT_NOISE_NM)
 
 
 def _rounded(values: np.ndarray, joints: float, grippers: float) -> np.ndarray:

@@ -17,16 +17,12 @@ from taccorl.surrogate.arm import GRAVITY, bodies, mass_matrix, torques
 from taccorl.surrogate.plant import COMMAND_MS, SUBSTEPS, Arm, Change, Drive, Run, changed, encoder, simulate
 from taccorl.surrogate.sampled_loop import SampledLoop
 
-LEAD_MS = 1500
-"""Time in which the arm comes to rest at the first target before a recording [ms]."""
+LEAD_MS = 1500  # Time in which the arm comes to rest at the first target before a recording [ms]
 APPROACH_RAD = 0.01
 """Distance from which it approaches that target, from either side [rad]: with friction it then rests beside the target."""
-NOISE_RAD = 2e-4
-"""Standard deviation of an encoder's noise [rad]."""
-QUANTUM_RAD = math.radians(0.001)
-"""Step of PiPER's reported angles [rad]."""
-JITTER_S = 2e-4
-"""Standard deviation of the jitter of the controller's cycles [s]."""
+NOISE_RAD = 2e-4  # Standard deviation of an encoder's noise [rad]
+QUANTUM_RAD = math.radians(0.001)  # Step of PiPER's reported angles [rad]
+JITTER_S = 2e-4  # Standard deviation of the jitter of the controller's cycles [s]
 TWIN_LATE_S = 0.5 * PhysicsConfig().timestep_s
 LATE_S = 0.5e-3 + TWIN_LATE_S
 """Delay that is included in the stated gains [s], so that they are valid for the twin. A controller that samples positions every
@@ -37,22 +33,15 @@ PAYLOAD_LINK6_M = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 PAYLOAD_OFF_M = 0.002
 """Standard deviation, along each axis and between robots, of the true centre from the nominal one [m]: no weight is gripped
 exactly in its middle."""
-LOST_RUN = (0.8, 0.15, 0.05)
-"""Probabilities that one, two or three consecutive commands are lost together."""
-DISTURBANCE_SHARE = 0.01
-"""Unmodelled disturbance torque, as a share of the torque for weight and a motion at 1.5 Hz."""
-DISTURBANCE_HZ = 5.0
-"""Bandwidth of that torque [Hz]."""
+LOST_RUN = (0.8, 0.15, 0.05)  # Probabilities that one, two or three consecutive commands are lost together
+DISTURBANCE_SHARE = 0.01  # Unmodelled disturbance torque, as a share of the torque for weight and a motion at 1.5 Hz
+DISTURBANCE_HZ = 5.0  # Bandwidth of that torque [Hz]
 
 
 class Robot:
-    """The plant with its sensors: simulates reports for commands.
-
-    Args:
-        gains: K_p, K_d, T_ref of the equivalent continuous controller.
-        loop: timing of the loop of the joint under test; None: its velocity loop is continuous.
-        payload_m: (3,) true position of known masses in link 6's frame.
-    """
+    """The plant with its sensors: simulates reports for commands. ``gains``: K_p, K_d, T_ref of the equivalent continuous
+    controller. ``loop``: timing of the loop of the joint under test; None: its velocity loop is continuous. ``payload_m``: (3,)
+    true position of known masses in link 6's frame."""
 
     def __init__(
         self,
@@ -130,12 +119,11 @@ class Robot:
 
     def carried_nm(self, run: Run) -> np.ndarray:
         """(M,) torque of the gravity compensation at the joint under test [N·m]."""
-        angle, zero = self.pose.copy(), np.zeros(ROBOT.num_joints)
-        coarse = np.linspace(run.angle[:, self.joint].min(), run.angle[:, self.joint].max(), 50)
-        weight = []
+        angle, zero, moved = self.pose.copy(), np.zeros(ROBOT.num_joints), run.angle[:, self.joint]
+        coarse, weight = np.linspace(moved.min(), moved.max(), 50), []
         for angle[self.joint] in coarse:
             weight.append(torques(self._believed, angle, zero, zero, GRAVITY)[self.joint])
-        return np.interp(run.angle[:, self.joint], coarse, weight)
+        return np.interp(moved, coarse, weight)
 
     def reported(self, run: Run) -> np.ndarray:
         """(T, 6) angles reported by the encoders at each row, without noise [rad]."""

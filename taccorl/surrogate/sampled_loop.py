@@ -15,10 +15,8 @@ import numpy as np
 
 from taccorl.surrogate.plant import STEP_S
 
-PERIODS_STEPS = (2, 4, 5, 8, 10, 16)
-"""Numbers of integration steps between two samples: 4, 2, 1.6, 1, 0.8 and 0.5 kHz."""
-FILTER_S = (3e-4, 3e-3)
-"""Range of the low-pass's time constant τ [s]: 530 to 53 Hz."""
+PERIODS_STEPS = (2, 4, 5, 8, 10, 16)  # Numbers of integration steps between two samples: 4, 2, 1.6, 1, 0.8 and 0.5 kHz
+FILTER_S = (3e-4, 3e-3)  # Range of the low-pass's time constant τ [s]: 530 to 53 Hz
 MARGIN = 3.2
 """Factor on K_p and K_d at which the loop must still be stable: recordings at twice the gains, and 1.6 for hidden effects."""
 
@@ -27,10 +25,8 @@ MARGIN = 3.2
 class SampledLoop:
     """Timing of one drive's loop."""
 
-    steps: int
-    """Number of integration steps (``STEP_S``) between two samples."""
-    filter_s: float
-    """Time constant τ of the low-pass [s]."""
+    steps: int  # Number of integration steps (``STEP_S``) between two samples
+    filter_s: float  # Time constant τ of the low-pass [s]
 
     @property
     def period_s(self) -> float:
@@ -54,12 +50,8 @@ def draw_loop(rng: np.random.Generator, most_late_s: float = math.inf) -> Sample
 def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float) -> float:
     """Largest modulus of the eigenvalues of the closed loop from one sample to the next; below 1 it is stable.
 
-    State: angle, velocity, last reading, filtered velocity. Between samples the torque u is constant:
-    q ← q + T v + T² u / 2J, v ← v + T u / J.
-
-    Args:
-        kp, kd: K_p [N·m/rad] and K_d [N·m·s/rad].
-    """
+    State: angle, velocity, last reading, filtered velocity. Between samples the torque u is constant: q ← q + T v + T² u / 2J, v
+    ← v + T u / J. ``kp``, ``kd``: K_p [N·m/rad] and K_d [N·m·s/rad]."""
     t, j = loop.period_s, inertia_kgm2
     a = 1.0 - math.exp(-t / loop.filter_s) if loop.filter_s > 0.0 else 1.0
     rate = np.array([a / t, 0.0, -a / t, 1.0 - a])
@@ -72,10 +64,6 @@ def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float
 
 def is_stable(loop: SampledLoop, kp: float, kd: float, inertias_kgm2: Sequence[float]) -> bool:
     """True if the loop is stable at every gain up to ``MARGIN`` times these, for each inertia (in the play of a gear the motor
-    moves alone).
-
-    Args:
-        kp, kd: K_p [N·m/rad] and K_d [N·m·s/rad].
-    """
+    moves alone). ``kp``, ``kd``: K_p [N·m/rad] and K_d [N·m·s/rad]."""
     gains = (1.0, 2.0, MARGIN)
     return all(spectral_radius(loop, f * kp, f * kd, inertia) < 1.0 for f in gains for inertia in inertias_kgm2)

@@ -13,11 +13,12 @@ Letters in shapes: M milliseconds, T frames, K taxels near the object, P = 2 pad
 import dataclasses
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
@@ -32,24 +33,18 @@ from taccorl.surrogate.hidden import Hidden, hidden_in, within_bounds
 from taccorl.surrogate.recordings import ORIGIN
 from taccorl.surrogate.touch_hidden import EXACT_TOUCH, MILLISECOND, board, material, spread, touch_kind
 
-RADIUS_M = {"sphere": 0.012, "rod": 0.008}
-"""Shape of the object → its radius [m]."""
-FRAME_S = 0.01
-"""Time between two frames of the pads [s]."""
+RADIUS_M = {"sphere": 0.012, "rod": 0.008}  # Shape of the object → its radius [m]
+FRAME_S = 0.01  # Time between two frames of the pads [s]
 NOISE_COUNT, MAX_COUNT, RESTING_COUNT = 1.3, 255, (10, 40)
 """Noise of a taxel, upper end of the converter, and range of the resting counts [counts]."""
 ROOM_ERROR_M, ROOM_ERROR_S = 8e-6, 0.5
 """Standard deviation of the true depth from that of the reported opening [m], and the time constant of its change [s]."""
-OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
-"""Noise and step of the reported opening [m]."""
-K_N_PER_M, K_D_S = (600.0, 2000.0), (0.002, 0.02)
-"""Range of k_n [reading per m], and of k_d / k_n [s]."""
-SEVERITY_FLOORS = (1.5, 15.0)
-"""Range from which the strength of a hidden effect is drawn [floors]."""
+OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6  # Noise and step of the reported opening [m]
+K_N_PER_M, K_D_S = (600.0, 2000.0), (0.002, 0.02)  # Range of k_n [reading per m], and of k_d / k_n [s]
+SEVERITY_FLOORS = (1.5, 15.0)  # Range from which the strength of a hidden effect is drawn [floors]
 COUNTS = 75.0  # per reading of 1
 FRAMES_A_ROW = 5  # of the problem that judges: its floor is counted in means over so many
-AWAY_M = -1e-3
-"""Penetration while nothing is pressed [m]: a distance at each pad."""
+AWAY_M = -1e-3  # Penetration while nothing is pressed [m]: a distance at each pad
 _NEAR_M = 1.2e-3  # taxels that stay further off take no part
 
 
@@ -91,15 +86,10 @@ def _ramp(peaks_m: tuple[float, float, float], hold_s: float) -> tuple[tuple[flo
 
 _TASK = ((0, AWAY_M), (2.5, AWAY_M), (2.9, 6.5e-4), (7, 7e-4), (7.2, AWAY_M), (8.5, AWAY_M), (8.8, 9.5e-4))
 _TASK_END = ((14.0, 5e-4), (14.3, AWAY_M), (16.5, AWAY_M))
+_PRESS = Press(name="press", knots=_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8, 10.0, 10.0), x_m=0.001, z_m=0.003)
 FIT = (
-    Press(name="press", knots=_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8, 10.0, 10.0), x_m=0.001, z_m=0.003),
-    Press(
-        name="press_again",
-        knots=_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8, 10.0, 10.0),
-        x_m=0.001,
-        z_m=0.003,
-        repeat_of="press",
-    ),
+    _PRESS,
+    dataclasses.replace(_PRESS, name="press_again", repeat_of="press"),
     Press(name="ramp_and_hold", knots=_ramp((9e-4, 1e-3, 8e-4), 4.0), x_m=-0.004, z_m=-0.010),
     Press(name="rod", knots=_presses((3e-4, 7e-4), (0.15, 0.6), 0.6, 2.5, 2.5), shape="rod", z_m=0.012),
 )
@@ -153,14 +143,10 @@ class TouchCase:
 
 
 @dataclass(frozen=True)
-class TouchRecordings:
+class TouchRecordings(Measurements):
     """Recordings with the object that was pressed in each."""
 
-    fit: tuple[Measurement, ...]
-    validation: tuple[Measurement, ...]
-    test: tuple[Measurement, ...]
-    pressed: dict[str, PressedObject]
-    """Name of a recording → pressed object."""
+    pressed: dict[str, PressedObject] = field(default_factory=dict)  # Name of a recording → pressed object
 
     def motions(self, config: TwinConfig) -> dict[str, list[TouchMotion]]:
         """fit, validation, test → matched contact replays, in the form for ``TouchProblem``."""
@@ -180,9 +166,7 @@ def draw_touch_case(
         arm: left or right; drawn if not given.
         strength: error that each causes on the press [floors]; drawn from 1.5 to 15 if not given.
 
-    Raises:
-        TaccorlError: there is no hidden effect of that name.
-    """
+    Raises TaccorlError: there is no hidden effect of that name."""
     kinds = [touch_kind(name) for name in effect_names]
     rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode()), 3])
     arm = str(rng.choice(ROBOT.arms)) if arm is None else arm
@@ -203,10 +187,10 @@ def draw_touch_case(
             where = {"pads": case.pads} if k.registered else {}
             return Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where)
 
-        severity = find_severity(
-            wanted, k.severity, lambda s, of=of: _left_floors(dataclasses.replace(case, hidden=(of(s),)))
-        )
-        hidden.append(of(severity))
+        def left(severity: float, of=of) -> float:
+            return _left_floors(dataclasses.replace(case, hidden=(of(severity),)))
+
+        hidden.append(of(find_severity(wanted, k.severity, left)))
     case = dataclasses.replace(case, hidden=tuple(hidden))
     return dataclasses.replace(case, left_floors=_left_floors(case) if hidden else 0.0)
 
@@ -224,9 +208,9 @@ def touch_case_of(config: TwinConfig, seed: int, arm: str | None = None) -> Touc
 
 def touch_recordings(case: TouchCase) -> TouchRecordings:
     """Simulate all recordings of these pads. The same case gives the same numbers, bit for bit."""
-    made = {use: tuple(record_touch(case, press) for press in presses) for use, presses in _USES.items()}
+    fit, validation, test = (tuple(record_touch(case, press) for press in presses) for presses in _USES.values())
     pressed = {press.name: pressed_object(case, press) for presses in _USES.values() for press in presses}
-    return TouchRecordings(**made, pressed=pressed)
+    return TouchRecordings(fit, validation, test, pressed=pressed)
 
 
 _USES = {"fit": FIT, "validation": VALIDATION, "test": TEST}
@@ -243,7 +227,8 @@ def record_touch(case: TouchCase, press: Press) -> Measurement:
     """Simulate one recording of the press: joints and openings at 200 Hz, frames of the pads at 100 Hz."""
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(press.name.encode())])
     time_s, depth_m = _penetration(press)
-    error_m = _slow_error(rng, time_s)
+    knots = np.arange(-ROOM_ERROR_S, time_s[-1] + 2 * ROOM_ERROR_S, ROOM_ERROR_S)
+    error_m = ROOM_ERROR_M * np.interp(time_s, knots, rng.standard_normal(len(knots)))
     stamps = np.arange(0.02, time_s[-1] - 0.02, FRAME_S)
     reading = _readings(case, press, time_s, depth_m + error_m, stamps)
     counts = COUNTS * reading + case.resting + NOISE_COUNT * rng.standard_normal(reading.shape)
@@ -283,19 +268,12 @@ def _penetration(press: Press) -> tuple[np.ndarray, np.ndarray]:
     return time_s, depth + wiggle
 
 
-def _slow_error(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
-    """(M,) m."""
-    knots = np.arange(-ROOM_ERROR_S, time_s[-1] + 2 * ROOM_ERROR_S, ROOM_ERROR_S)
-    return ROOM_ERROR_M * np.interp(time_s, knots, rng.standard_normal(len(knots)))
-
-
 def _depth(case: TouchCase, press: Press, side: float, penetration_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Signed depths (M, K) of a pad's taxels that come near, and their flat numbers (K,)."""
     place = {k: v for h in case.hidden if touch_kind(h.name).stage == "place" for k, v in h.values.items()}
     radius = RADIUS_M[press.shape]
-    rows, columns = ROBOT.pad.shape
-    x = (np.arange(columns) - (columns - 1) / 2) * ROBOT.pad.pitch_m
-    y = (np.arange(rows) - (rows - 1) / 2) * ROBOT.pad.pitch_m + place.get("along_m", 0.0)
+    x, y = ROBOT.pad.taxel_axes_m()
+    y = y + place.get("along_m", 0.0)
     # A pad's x runs along the TCP's on finger a and against it on finger b; its y runs to the tips.
     across = (side * x + place.get("across_m", 0.0) - press.x_m) * (press.shape == "sphere")
     beside = (across[None, :] ** 2 + (y[:, None] - press.z_m) ** 2).ravel()
@@ -324,9 +302,8 @@ def _readings(
         taxel, share = np.arange(len(near)), at - before
         pad = np.zeros((len(stamps), rows * columns))
         pad[:, near] = reading[before, taxel] * (1 - share) + reading[before + 1, taxel] * share
-        frames[:, ROBOT.pads.index(f"{case.arm}_{finger}")] = _wired(
-            case, finger, pad.reshape(-1, rows, columns), stamps
-        )
+        wired = _wired(case, finger, pad.reshape(-1, rows, columns), stamps)
+        frames[:, ROBOT.pads.index(f"{case.arm}_{finger}")] = wired
     return frames
 
 
@@ -334,15 +311,14 @@ def _wired(case: TouchCase, finger: str, frames: np.ndarray, stamps: np.ndarray)
     """Frames (T, R, C) of one pad after its wires, its taxels' gains and its zero."""
     for h in case.hidden:
         stage = touch_kind(h.name).stage
+        rng = np.random.default_rng([case.seed, zlib.crc32(f"{h.name} {finger}".encode())])
         if stage == "spread":
             frames = spread(h.name, h.values, frames)
         elif stage == "board":
-            rng = np.random.default_rng([case.seed, zlib.crc32(f"{h.name} {finger}".encode())])
             frames = frames * board(h.name, h.values, rng, ROBOT.pad.shape)
         elif h.name == "warming_gain":
             frames = frames * np.exp(-h.values["fall_per_min"] / 60.0 * stamps)[:, None, None]
         elif h.name == "baseline_drift":
-            rng = np.random.default_rng([case.seed, zlib.crc32(f"{h.name} {finger}".encode())])
             own = 1.0 + 0.05 * rng.standard_normal(ROBOT.pad.shape)  # taxels do not drift alike
             frames = frames + h.values["rate_per_min"] / 60.0 * stamps[:, None, None] * own
     return frames
@@ -363,7 +339,10 @@ def _left_floors(case: TouchCase) -> float:
         ]
         touched = (parts[0].max(axis=0) > 0.1) | (np.abs(with_it).max(axis=0) > 0.1)
         touched &= parts[0].max(axis=0) > 0
-        counts = _looked_at(_means(parts[0])[:, touched].max(axis=1) > 0)
+        # As the problem does: while something touches and for a second after, and one row in five of the others.
+        touching = _means(parts[0])[:, touched].max(axis=1) > 0
+        after = np.convolve(touching, np.ones(round(1.0 / (FRAMES_A_ROW * FRAME_S))))[: len(touching)] > 0
+        counts = after | (np.arange(len(touching)) % 5 == 0)
         seen.append(_means(with_it)[counts][:, touched].ravel())
         model.append(np.stack([_means(p)[counts][:, touched].ravel() for p in parts]))
     y, columns = np.concatenate(seen), np.concatenate(model, axis=1)
@@ -371,12 +350,6 @@ def _left_floors(case: TouchCase) -> float:
     rest = y - np.linalg.lstsq(columns.T, y, rcond=None)[0] @ columns
     floor = math.hypot(NOISE_COUNT / math.sqrt(FRAMES_A_ROW), 0.4 * COUNTS * case.k_n * ROOM_ERROR_M)
     return COUNTS * float(np.sqrt(np.mean(rest**2))) / floor
-
-
-def _looked_at(touching: np.ndarray) -> np.ndarray:
-    """Rows (S,) bool while something touches and for a second after, and one in five of the others: as the problem does."""
-    after = np.convolve(touching, np.ones(round(1.0 / (FRAMES_A_ROW * FRAME_S))))[: len(touching)] > 0
-    return after | (np.arange(len(touching)) % 5 == 0)
 
 
 def _means(frames: np.ndarray) -> np.ndarray:

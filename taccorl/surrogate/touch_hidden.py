@@ -12,26 +12,22 @@ from scipy.signal import lfilter
 
 from taccorl.errors import TaccorlError, nearest
 
-Values = dict[str, float]
-"""Name of a parameter → value in its unit."""
-MILLISECOND = 1e-3
-"""[s]."""
+Values = dict[str, float]  # Name of a parameter → value in its unit
+MILLISECOND = 1e-3  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TouchKind:
     """One kind of hidden effect of pads: its range of strength, its parameters for a strength, and where it acts."""
 
-    severity: tuple[float, float]
-    """Range of the severity, from hardly visible to the largest realistic one."""
+    severity: tuple[float, float]  # Range of the severity, from hardly visible to the largest realistic one
     values: Callable[[float, np.random.Generator], Values]
     """Function (severity, a board's random generator) → parameters with the registry's names. The same generator state gives the
     same form."""
     stage: str
     """Stage at which it acts: place (depths at other positions), material (each taxel at 1 kHz), spread (whole frames), board
     (gains), baseline."""
-    registered: bool = True
-    """True: the effect is in the registry."""
+    registered: bool = True  # True: the effect is in the registry
 
 
 def touch_kind(name: str) -> TouchKind:
@@ -45,13 +41,13 @@ def _one(parameter: str) -> Callable[[float, np.random.Generator], Values]:
     return lambda s, rng: {parameter: s}
 
 
-def _signed(parameter: str, absent: float = 0.0) -> Callable[[float, np.random.Generator], Values]:
-    return lambda s, rng: {parameter: absent + float(rng.choice([-1.0, 1.0])) * s}
+def _signed(parameter: str) -> Callable[[float, np.random.Generator], Values]:
+    return lambda s, rng: {parameter: float(rng.choice([-1.0, 1.0])) * s}
 
 
 def _creep(s: float, rng: np.random.Generator) -> Values:
-    sign = float(rng.choice([-1.0, 1.0]))
-    return {"share": max(sign * s, -0.8), "time_constant_s": float(np.exp(rng.uniform(np.log(0.3), np.log(4.0))))}
+    share = max(float(rng.choice([-1.0, 1.0])) * s, -0.8)
+    return {"share": share, "time_constant_s": float(np.exp(rng.uniform(np.log(0.3), np.log(4.0))))}
 
 
 def _power(s: float, rng: np.random.Generator) -> Values:
@@ -83,23 +79,17 @@ TOUCH_KINDS: dict[str, TouchKind] = {
     "warming_gain": TouchKind(severity=(0.05, 3.0), values=_one("fall_per_min"), stage="baseline", registered=False),
 }
 """Name → kind."""
-REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)
-"""Names of the kinds in the registry."""
-EXACT_TOUCH = tuple(
-    n for n in REGISTERED_TOUCH if TOUCH_KINDS[n].stage not in ("board", "baseline") and n != "taxel_power_law"
-)
+REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)  # Names of the kinds in the registry
+_DRAWN = [name for name, k in TOUCH_KINDS.items() if k.stage in ("board", "baseline")]
+EXACT_TOUCH = tuple(name for name in REGISTERED_TOUCH if name not in (*_DRAWN, "taxel_power_law"))
 """Those that all parameters of the registry determine; single taxels' gains and drifts are drawn."""
 OUTSIDE_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if not k.registered)
 """Names of the kinds outside the registry."""
 
 
 def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray) -> np.ndarray:
-    """Readings (M, K) after an effect of the pad's material or driver, taxel by taxel; rows are milliseconds.
-
-    Args:
-        reading: (M, K) readings before it.
-        rate_mps: (M, K) depth rates [m/s].
-    """
+    """Readings (M, K) after an effect of the pad's material or driver, taxel by taxel; rows are milliseconds. ``reading``: (M, K)
+    readings before it. ``rate_mps``: (M, K) depth rates [m/s]."""
     match name:
         case "taxel_power_law":
             return np.exp(values["exponent"] * np.log(np.maximum(reading, 1e-12))) * (reading > 0)
@@ -166,7 +156,8 @@ def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:
     match name:
         case "taxel_crosstalk":  # along rows, then along columns: corners get a little as well
             for axis in (1, 2):
-                frames = frames + 0.25 * values["share"] * np.diff(_edged(np.diff(frames, axis=axis), axis), axis=axis)
+                flow = np.diff(frames, axis=axis)  # none over the edges
+                frames = frames + 0.25 * values["share"] * np.diff(flow, axis=axis, prepend=0.0, append=0.0)
             return frames
         case "taxel_ghosting":
             wires = np.einsum("trc->tr", frames)[:, :, None] + np.einsum("trc->tc", frames)[:, None, :]
@@ -174,20 +165,9 @@ def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:
     raise AssertionError(name)
 
 
-def _edged(flow: np.ndarray, axis: int) -> np.ndarray:
-    """Nothing flows over the edges."""
-    ends = [(0, 0)] * flow.ndim
-    ends[axis] = (1, 1)
-    return np.pad(flow, ends)
-
-
 def board(name: str, values: Values, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """(R, C) gains of one pad's taxels for a hidden effect of the board.
-
-    Args:
-        name: ``taxel_gain_spread`` or ``dead_taxels``.
-        shape: (R, C).
-    """
+    """(R, C) gains of one pad's taxels for a hidden effect of the board. ``name``: ``taxel_gain_spread`` or ``dead_taxels``.
+    ``shape``: (R, C)."""
     match name:
         case "taxel_gain_spread":
             return np.exp(values["log_std"] * rng.standard_normal(shape))

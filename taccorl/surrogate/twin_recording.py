@@ -19,8 +19,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.trajectory import SAMPLE_HZ, Trajectory
 from taccorl.surrogate.drivers import PADS, DriverConfig, Marks, Streams, TrueSignals, publish
 
-LEAD_S = 1.0
-"""Time of rest before and after the demonstration [s]: the first frames of a pad are its baseline."""
+LEAD_S = 1.0  # Time of rest before and after the demonstration [s]: the first frames of a pad are its baseline
 
 
 class TwinStory(TrueSignals):
@@ -90,8 +89,7 @@ class TwinScene:
         ``frame_ids``: (N,) numbers of the frames, which choose the noise."""
         if camera not in self._renderers:
             self._renderers[camera] = Renderer(self.story.sim.model, (camera,), *self.size)
-        rows, columns = self.size
-        sim = self.story.sim
+        (rows, columns), sim = self.size, self.story.sim
         age_s = sim.effects.picture_age_s(camera)
         config = next(c for c in sim.config.cameras if c.name == camera)
         noise = sensor_noise(rows, columns)
@@ -108,12 +106,8 @@ class TwinScene:
 
 
 def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, success: bool, origin: Origin) -> None:
-    """Write one episode as one recording; an existing file is replaced.
-
-    Args:
-        success: outcome that the closing marker states.
-        origin: stored in the file and in every dataset made from it.
-    """
+    """Write one episode as one recording; an existing file is replaced. ``success``: outcome that the closing marker states.
+    ``origin``: stored in the file and in every dataset made from it."""
     story = TwinStory(sim, trajectory, "success" if success else "failure")
     config = DriverConfig(
         duration_s=story.duration_s,
@@ -124,12 +118,7 @@ def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, succ
     )
     scene = TwinScene(story, config.camera_size)
     try:
-        label = {
-            **labelled(origin),
-            "task": sim.task.name,
-            "seed": str(int(sim.seeds[0])),
-            "instruction": sim.task.instruction,
-        }
+        label = labelled(origin) | {"task": sim.task.name, "seed": str(config.seed), "instruction": config.instruction}
         label["drivers"] = json.dumps({k: v for k, v in asdict(config).items() if isinstance(v, int | float)})
         publish(path, Streams(config, story, scene), label)
     finally:

@@ -30,41 +30,26 @@ from taccorl.robots import ROBOT
 from taccorl.sim.shapes import Capsule, Cylinder
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
+from taccorl.surrogate import drivers
 from taccorl.surrogate.cases import Case
 from taccorl.surrogate.driver_messages import UINT8_ARRAY
-from taccorl.surrogate.drivers import (
-    COMMAND_TOPICS,
-    PAD_TOPICS,
-    PAD_WIRE_SHAPE,
-    PADS,
-    SCAN_S,
-    STATE_TOPICS,
-    DriverConfig,
-    Event,
-    Marks,
-    Streams,
-    TrueSignals,
-    pad_message,
-    publish,
-)
 from taccorl.surrogate.recordings import robot_recordings
 from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 
 SWEEPS, PRESSES, TWIN, TRUTH = "sweeps", "presses", "twin.yaml", "sealed_truth.json"
 """Names of the folders and files in the output folder."""
-FINGERS_LAG_S = 0.03
-"""Time constant with which surrogate fingers follow their command [s]. A choice."""
+FINGERS_LAG_S = 0.03  # Time constant with which surrogate fingers follow their command [s]. A choice.
 _NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
 
 
-class _Rows(TrueSignals):
+class _Rows(drivers.TrueSignals):
     """A measurement as the drivers' story: what stands in its rows, between which nobody asks. A driver that measures no
     velocity or effort sends zeros."""
 
     def __init__(self, measurement: Measurement) -> None:
         self.measurement = measurement
-        self.plans: list[Marks] = []
+        self.plans: list[drivers.Marks] = []
         self.duration_s = measurement.num_rows / measurement.rate_hz
         self._rows = {"state": measurement.measured, "command": measurement.target}
         self._rows |= {name: np.nan_to_num(getattr(measurement, name)) for name in ("velocity", "effort")}
@@ -75,33 +60,32 @@ class _Rows(TrueSignals):
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """(N, 12, 32) in wire order: nothing is touched."""
-        return np.zeros((len(time_s), *PAD_WIRE_SHAPE))
+        return np.zeros((len(time_s), *drivers.PAD_WIRE_SHAPE))
 
 
-class _Sweep(Streams):
+class _Sweep(drivers.Streams):
     """Joints, commands and pads; no camera looks at a sweep."""
 
-    def __init__(self, config: DriverConfig, rows: _Rows) -> None:
+    def __init__(self, config: drivers.DriverConfig, rows: _Rows) -> None:
         super().__init__(config, rows, None)
         self._touch = rows.measurement.touch
 
-    def _pad(self, topic: str, pad: str) -> Iterator[Event]:
+    def _pad(self, topic: str, pad: str) -> Iterator[drivers.Event]:
         """The frames that were measured, byte for byte, logged when they had been scanned: no time is lost on the wire."""
         if self._touch is None:
             yield from super()._pad(topic, pad)
             return
-        wire = (self._touch.counts + self._touch.baseline).reshape(-1, len(PADS), *ROBOT.pad.shape)[:, PADS.index(pad)]
-        for stamp, frame in zip(
-            self._touch.time_s[:, PADS.index(pad)].tolist(), wire.swapaxes(1, 2).astype(np.uint8), strict=True
-        ):
-            yield Event(stamp, stamp - SCAN_S / 2, topic, UINT8_ARRAY, pad_message(frame))
+        shape, k = (-1, len(drivers.PADS), *ROBOT.pad.shape), drivers.PADS.index(pad)
+        wire = (self._touch.counts + self._touch.baseline).reshape(shape)[:, k].swapaxes(1, 2).astype(np.uint8)
+        for stamp, frame in zip(self._touch.time_s[:, k].tolist(), wire, strict=True):
+            yield drivers.Event(stamp, stamp - drivers.SCAN_S / 2, topic, UINT8_ARRAY, drivers.pad_message(frame))
 
-    def all(self) -> list[Iterator[Event]]:
+    def all(self) -> list[Iterator[drivers.Event]]:
         """One stream per topic, each in order of log time."""
         return [
-            *(self._joints(STATE_TOPICS[arm], arm, command=False) for arm in ROBOT.arms),
-            *(self._joints(COMMAND_TOPICS[arm], arm, command=True) for arm in ROBOT.arms),
-            *(self._pad(PAD_TOPICS[pad], pad) for pad in PAD_TOPICS),
+            *(self._joints(drivers.STATE_TOPICS[arm], arm, command=False) for arm in ROBOT.arms),
+            *(self._joints(drivers.COMMAND_TOPICS[arm], arm, command=True) for arm in ROBOT.arms),
+            *(self._pad(drivers.PAD_TOPICS[pad], pad) for pad in drivers.PAD_TOPICS),
         ]
 
 
@@ -109,12 +93,11 @@ def _write_recording(path: Path, measurement: Measurement, seed: int, repeat_of:
     """Write one recording in the format of the robot's drivers; an existing file is replaced. ``repeat_of``: name of the
     recording that it repeats; None if it is no repeat."""
     story = _Rows(measurement)
-    config = DriverConfig(
-        duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
-    )
-    label = labelled(measurement.origin) | {"instruction": measurement.instruction, "repeat_of": repeat_of or ""}
+    told = measurement.instruction
+    config = drivers.DriverConfig(duration_s=story.duration_s, seed=seed, instruction=told, pad_gain_spread=0.0)
+    label = labelled(measurement.origin) | {"instruction": told, "repeat_of": repeat_of or ""}
     label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "gain_scale", "payload_kg")}
-    publish(path, _Sweep(config, story), label)
+    drivers.publish(path, _Sweep(config, story), label)
 
 
 Progress = Callable[[str, int, int], None]
@@ -130,7 +113,7 @@ def write_recordings(cases: Sequence[Case], folder: Path, progress: Progress | N
     return len(uses)
 
 
-def _uses(made: Measurements | TouchRecordings) -> list[tuple[str, Measurement]]:
+def _uses(made: Measurements) -> list[tuple[str, Measurement]]:
     return [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
 
 
@@ -140,16 +123,16 @@ def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress | N
     made = touch_recordings(case)
     uses = [(use, _commanded(m, case.arm)) for use, m in _uses(made)]
     pressed = {name: _pressed(of) for name, of in made.pressed.items()}
-    _write(
-        Path(folder), partial(_fill, truth=case.truth(), twin=case.twin, uses=uses, pressed=pressed, progress=progress)
-    )
+    fill = partial(_fill, truth=case.truth(), twin=case.twin, uses=uses, pressed=pressed, progress=progress)
+    _write(Path(folder), fill)
     return made
 
 
 def _write(folder: Path, fill: Callable[[Path], None]) -> None:
     """All of it beside ``folder`` first, then in its place: half a robot never stands there. Raises TaccorlError: the folder
     holds something that is no surrogate's, or there is no room."""
-    _check_is_surrogate(folder)
+    if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
+        raise TaccorlError(f"{folder}: it contains files that are not of a surrogate robot; give another --out=")
     part = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
     try:
@@ -204,15 +187,10 @@ def _pressed(of: PressedObject) -> dict[str, Any]:
     """As measurements.yaml has it. Surrogate rods lie across the pads."""
     (solid,) = of.solids
     assert isinstance(solid, Capsule | Cylinder)
-    rod = (
-        {"length_m": 2 * solid.half_height_m, "rpy_rad": [0.0, math.pi / 2, 0.0]} if isinstance(solid, Cylinder) else {}
-    )
-    return {
-        "shape": "rod" if rod else "sphere",
-        "radius_m": solid.radius_m,
-        "arm": of.arm,
-        "position_m": of.pose[:3, 3].tolist(),
-    } | rod
+    found = {"shape": "sphere", "radius_m": solid.radius_m, "arm": of.arm, "position_m": of.pose[:3, 3].tolist()}
+    if isinstance(solid, Cylinder):
+        found |= {"shape": "rod", "length_m": 2 * solid.half_height_m, "rpy_rad": [0.0, math.pi / 2, 0.0]}
+    return found
 
 
 def draw_touch_secret(seed: int) -> tuple[str, ...]:
@@ -224,11 +202,6 @@ def draw_touch_secret(seed: int) -> tuple[str, ...]:
         return ()
     outside = [name for name in TOUCH_KINDS if name not in REGISTERED_TOUCH]
     return (str(rng.choice(outside if fate < 0.25 else REGISTERED_TOUCH)),)
-
-
-def _check_is_surrogate(folder: Path) -> None:
-    if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
-        raise TaccorlError(f"{folder}: it contains files that are not of a surrogate robot; give another --out=")
 
 
 def seal(folder: Path, truth: dict[str, object]) -> None:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,8 +112,8 @@ def test_state_and_action_are_the_truth_at_the_newest_samples_time(made):
     [episode] = cut(made.path).episodes
     rows = row_ns(episode)
     for key, topics, truth in (
-        (STATE, STATE_TOPICS, made.truth.story.state),
-        (ACTION, COMMAND_TOPICS, made.truth.story.command),
+        (STATE, STATE_TOPICS, partial(made.truth.story.at, "state")),
+        (ACTION, COMMAND_TOPICS, partial(made.truth.story.at, "command")),
     ):
         for arm, columns in (("left", slice(0, 7)), ("right", slice(7, 14))):
             samples = made.sample_ns(topics[arm])
@@ -344,7 +345,7 @@ def test_a_held_command_that_ends_early_costs_nothing(tmp_path):
     assert found.losses == []
     [episode] = found.episodes
     assert episode.num_rows == 85
-    last = made.truth.story.command(made.truth.sampled_s[topics[0]][-1:])[0, :7]
+    last = made.truth.story.at("command", made.truth.sampled_s[topics[0]][-1:])[0, :7]
     np.testing.assert_allclose(episode.arrays[ACTION][-1, :7], last, atol=1e-5)
 
 

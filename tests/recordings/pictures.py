@@ -60,7 +60,7 @@ class Scene:
         """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s]. The
         noise depends on the number of pictures drawn before."""
         rows, columns = self.size
-        state, rng = self.story.state(time_s), self._rng[camera]
+        state, rng = self.story.at("state", time_s), self._rng[camera]
         for joints, frame_id in zip(state, frame_ids.tolist(), strict=True):
             if camera == "front":
                 picture = self._table.copy()

@@ -194,10 +194,10 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     streams, story = _stand_in(config)
     time_s = np.arange(int(config.duration_s * drivers.CAMERA_HZ)) / drivers.CAMERA_HZ
     arms = {
-        "observations/qpos": drivers.as_piper_publishes(story.state(time_s)),
-        "observations/qvel": story.velocity(time_s),
-        "observations/effort": story.effort(time_s),
-        "action": drivers.as_piper_publishes(story.command(time_s + 1 / drivers.CAMERA_HZ)),
+        "observations/qpos": drivers.as_piper_publishes(story.at("state", time_s)),
+        "observations/qvel": story.at("velocity", time_s),
+        "observations/effort": story.at("effort", time_s),
+        "action": drivers.as_piper_publishes(story.at("command", time_s + 1 / drivers.CAMERA_HZ)),
     }
     if config.joints_in_degrees:
         for name in ("observations/qpos", "action"):

@@ -168,16 +168,19 @@ class Story(TrueSignals):
         return (1 - weight) * grid[i] + weight * grid[i + 1]
 
     def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
-        """State, command of the leader arms, or rate of the state: six joints [rad] and gripper opening [m] of each arm."""
+        """State, command of the leader arms, rate of the state, or effort: six joints [rad] and gripper opening [m] of each
+        arm."""
+        if signal == "effort":
+            return self._effort(time_s)
         return self._sample(
             {"state": self._state, "command": self._command, "velocity": self._velocity}[signal], time_s
         )
 
-    def effort(self, time_s: np.ndarray) -> np.ndarray:
+    def _effort(self, time_s: np.ndarray) -> np.ndarray:
         """Plausible efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]: gravity on the long links, tracking error, and the
         force with which the grippers close."""
-        joints = self.state(time_s)
-        effort = 6.0 * (self.command(time_s) - joints)
+        joints = self.at("state", time_s)
+        effort = 6.0 * (self.at("command", time_s) - joints)
         for arm in ARMS:
             own, own_effort = (rows[:, ROBOT.joint_slice(arm)] for rows in (joints, effort))
             shoulder, elbow = own[:, 1], own[:, 2]

@@ -60,10 +60,10 @@ def refitted(case: Case, measurements, floor: float, hidden=()) -> Gains:
     def gains(x: np.ndarray) -> Gains:
         return Gains(kp * math.exp(x[0]), kd * math.exp(x[1]), torque_ff + 0.01 * kp * x[2])
 
-    found = least_squares(
-        lambda x: errors_floors(case, measurements, gains(x), floor, hidden), np.zeros(3), max_nfev=15
-    )
-    return gains(found.x)
+    def left(x: np.ndarray) -> np.ndarray:
+        return errors_floors(case, measurements, gains(x), floor, hidden)
+
+    return gains(least_squares(left, np.zeros(3), max_nfev=15).x)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
@@ -259,7 +259,7 @@ def test_a_sampled_loop_moves_as_a_lighter_joint_does():
     run = Robot(f"left_joint{JOINT}", (KP, KD, 0.0), [], POSE, loop=LOOP).run(CHIRP, ROOM)
     angle = run.angle[::5, 0] - POSE[JOINT - 1]
     # K_d of the drive is larger by K_p (T / 2 + half of the twin's step), see ``TWIN_LATE_S``.
-    late = (KD + KP * (0.5 * LOOP.period_s + TWIN_LATE_S)) * LOOP.late_s
+    late = (KD + KP * (0.5 * LOOP.period_s + TWIN_LATE_S)) * (LOOP.period_s + LOOP.filter_s)
     assert late / INERTIA == pytest.approx(0.088, abs=0.002)  # K_p from angles and J is 9.6 % too large
     as_light, as_heavy = (rms(angle - linear(inertia)) for inertia in (INERTIA - late, INERTIA))
     assert as_light < 0.4 * as_heavy  # the twin's half step is left
@@ -269,8 +269,8 @@ def test_a_drawn_loop_is_no_later_than_asked():
     rng = np.random.default_rng(0)
     drawn = [draw_loop(rng, 1.5e-3) for _ in range(200)]
     assert {loop.steps for loop in drawn} == {2, 4, 5, 8}
-    assert all(loop.late_s <= 1.5e-3 + 1e-12 and loop.filter_s >= FILTER_S[0] for loop in drawn)
-    assert draw_loop(rng, 1e-4).late_s == pytest.approx(2 * STEP_S + FILTER_S[0])  # nothing is faster
+    assert all(loop.period_s + loop.filter_s <= 1.5e-3 + 1e-12 and loop.filter_s >= FILTER_S[0] for loop in drawn)
+    assert draw_loop(rng, 1e-4) == SampledLoop(steps=2, filter_s=pytest.approx(FILTER_S[0]))  # nothing is faster
 
 
 def test_a_drawn_case_has_a_stable_loop_that_alone_leaves_next_to_nothing():

@@ -13,7 +13,6 @@ Letters in shapes: F frames.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -39,8 +38,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig
 from taccorl.sim.twin import TwinConfig
 
-FEWEST_FRAMES = 4
-"""Least number of frames of a calibration."""
+FEWEST_FRAMES = 4  # Least number of frames of a calibration
 _HOLD_OUT = 4  # one frame in so many is kept out of the fit
 _FEWEST_OUTLINES = 60  # points a frame: less is a fingertip
 _REACH_PX = 6.0  # a held-out outline without an edge within this counts as this far off
@@ -54,17 +52,13 @@ class CameraFrames:
     """Pictures of one camera, and the joint angles reported at their times. Raises TaccorlError: the shapes do not fit
     together."""
 
-    pictures: np.ndarray
-    """(F, rows, columns, 3) uint8 RGB pictures, as recorded or letterboxed by ingest."""
-    joints: np.ndarray
-    """(F, 14) joint angles [rad] and gripper openings [m], in the order of actions."""
+    pictures: np.ndarray  # (F, rows, columns, 3) uint8 RGB pictures, as recorded or letterboxed by ingest
+    joints: np.ndarray  # (F, 14) joint angles [rad] and gripper openings [m], in the order of actions
     stages: dict[str, int] = field(default_factory=dict)
     """"initial", "grasp", "insertion" → index of the frame. These frames are not used in the fit and are shown in the
     overlays."""
-    name: str = "pictures"
-    """Name of the episode, for messages."""
-    origin: Origin = UNSTATED
-    """Origin of the pictures."""
+    name: str = "pictures"  # Name of the episode, for messages
+    origin: Origin = UNSTATED  # Origin of the pictures
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 4 or self.pictures.shape[-1] != 3 or self.pictures.dtype != np.uint8:
@@ -90,10 +84,8 @@ class CameraFit:
 
     camera: CameraConfig
     """The twin's camera with its new offset, for ``save_twin``; unchanged if ``problems`` is not empty."""
-    start: np.ndarray
-    """(6,) pose in the twin before the calibration."""
-    offset: np.ndarray
-    """(6,) estimated pose."""
+    start: np.ndarray  # (6,) pose in the twin before the calibration
+    offset: np.ndarray  # (6,) estimated pose
     half_width: np.ndarray
     """(6,) half width of the estimate's 95 % interval, from edge noise and from errors of the twin's shapes and joint zeros;
     infinite for directions that the pictures do not determine."""
@@ -102,18 +94,14 @@ class CameraFit:
     before_px: float
     """Mean distance across the edges between outlines and picture edges in held-out frames, before the calibration [pixels of
     the pictures]."""
-    after_px: float
-    """The same after the calibration [px]."""
+    after_px: float  # The same after the calibration [px]
     problems: tuple[str, ...]
     """Reasons why the result is not a valid calibration (not converged, not identifiable); empty if it is valid."""
     overlays: dict[str, np.ndarray]
     """Stage → picture as in the paper: picture, twin, outlines before and after, (rows, columns, 3) uint8 RGB."""
-    num_frames: int
-    """Number of frames that the fit used."""
-    num_held_out: int
-    """Number of frames that the fit did not use."""
-    name: str
-    """``CameraFrames.name``."""
+    num_frames: int  # Number of frames that the fit used
+    num_held_out: int  # Number of frames that the fit did not use
+    name: str  # ``CameraFrames.name``
 
     @property
     def converged(self) -> bool:
@@ -150,7 +138,14 @@ def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> C
         inside = view.inside(frames.pictures)
         held = _held_out(frames)
         fit, test = (levels(list(inside[rows]), view.intrinsics) for rows in (~held, held))
-        solution = _solved(view, frames, held, fit)
+        drawn = outlines(view, frames.joints[~held], view.start, view.intrinsics)
+        if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
+            raise TaccorlError(
+                f"camera {camera}: at its pose in the twin, the camera hardly shows the arms in {frames.name}: "
+                f"{len(drawn.points)} points of their outlines in {(~held).sum()} frames. Record the arms in the middle of the "
+                "picture, or correct the camera's mount in the twin by hand"
+            )
+        solution = solve(view, frames.joints[~held], fit, view.start)
         sure = covariance(view, frames.joints[~held], fit[-1], solution)
         before, after = (_judge(view, frames.joints[held], pose, test[-1]) for pose in (view.start, solution.offset))
         problems = _problems(frames, solution, sure, before, after)
@@ -181,17 +176,6 @@ def _held_out(frames: CameraFrames) -> np.ndarray:
     for frame in frames.stages.values():
         held[frame] = held[frame] or held.sum() < spare
     return held
-
-
-def _solved(view: TwinView, frames: CameraFrames, held: np.ndarray, fit: Sequence[Level]) -> Solution:
-    drawn = outlines(view, frames.joints[~held], view.start, view.intrinsics)
-    if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
-        raise TaccorlError(
-            f"camera {view.camera.name}: at its pose in the twin, the camera hardly shows the arms in {frames.name}: "
-            f"{len(drawn.points)} points of their outlines in {(~held).sum()} frames. Record the arms in the middle of the "
-            "picture, or correct the camera's mount in the twin by hand"
-        )
-    return solve(view, frames.joints[~held], fit, view.start)
 
 
 def _judge(view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level) -> tuple[float, float]:
@@ -243,8 +227,7 @@ def _problems(
     return tuple(found)
 
 
-BEFORE_RGB, AFTER_RGB = (230, 60, 50), (40, 200, 90)
-"""Colours of the outlines."""
+BEFORE_RGB, AFTER_RGB = (230, 60, 50), (40, 200, 90)  # Colours of the outlines
 _STRIP = 22  # rows for a panel's title
 
 

@@ -22,22 +22,16 @@ them."""
 _JUMP_M = 0.01  # of depth within one body: one of its shapes stands before another
 _STEEP = 3.0  # such a jump is so many times the steps beside it, else it is a face seen at a slant
 _SMOOTH_PX = 1.0  # of a picture before its edges are looked for
-_STRONG, _LEAST = (
-    6.0,
-    30.0,
-)  # an edge's gradient: so many times the noise's, and at least [counts, sum of Sobel's weights]
+_STRONG, _LEAST = 6.0, 30.0  # an edge's gradient over the noise's, and at least [counts, sum of Sobel's weights]
 
 
 @dataclass(frozen=True)
 class TwinEdges:
     """Points on the outlines of the twin's arms in one view."""
 
-    points: np.ndarray
-    """(P, 3) positions [m] in the camera's frame."""
-    normals: np.ndarray
-    """(P, 2) unit vectors across the edge in the picture; the sign is arbitrary."""
-    bodies: np.ndarray
-    """(P,) index of the body to which the outline belongs."""
+    points: np.ndarray  # (P, 3) positions [m] in the camera's frame
+    normals: np.ndarray  # (P, 2) unit vectors across the edge in the picture; the sign is arbitrary
+    bodies: np.ndarray  # (P,) index of the body to which the outline belongs
 
 
 def twin_edges(bodies: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) -> TwinEdges:
@@ -64,14 +58,8 @@ def twin_edges(bodies: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) 
         within = np.stack([inner[0][v, u], inner[1][v, u]], axis=1)
         normal = np.where(jump[v, u][:, None], within, normal)
         half = np.array([0.5, 0.0]) if axis == 1 else np.array([0.0, 0.5])
-        parts.append(
-            (
-                np.stack([u, v], axis=1) + half,
-                np.minimum(one, other),
-                normal,
-                np.where(nearer, second[v, u], first[v, u]),
-            )
-        )
+        owner = np.where(nearer, second[v, u], first[v, u])
+        parts.append((np.stack([u, v], axis=1) + half, np.minimum(one, other), normal, owner))
     pixels, depth, normals, owners = (np.concatenate(part) for part in zip(*parts, strict=True))
     length = np.linalg.norm(normals, axis=1)
     good = length > 1e-6
@@ -121,12 +109,8 @@ class PictureEdges:
         self, pixels: np.ndarray, normals: np.ndarray, reach_px: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For points at ``pixels`` (P, 2) = (u, v) [px] with ``normals`` (P, 2), the nearest edges of similar direction in the
-        picture.
-
-        Returns:
-            Pixels (P, 2) and normals (P, 2) of those edges, and (P,) bool: there is one within ``reach_px``. The first two are
-            meaningless where the third is false.
-        """
+        picture. Returns pixels (P, 2) and normals (P, 2) of those edges, and (P,) bool: there is one within ``reach_px``. The
+        first two are meaningless where the third is false."""
         rows, columns = self._shape
         inside = np.isfinite(pixels).all(1)
         u, v = (np.where(inside, np.round(pixels[:, k]), -1).astype(int) for k in (0, 1))
@@ -151,9 +135,8 @@ class PictureEdges:
                 continue
             free = np.ones(self._shape, np.uint8)
             free[v[like], u[like]] = 0
-            _, labels = cv2.distanceTransformWithLabels(
-                free, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-            )
+            kind = cv2.DIST_LABEL_PIXEL
+            _, labels = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=kind)
             number = np.empty(labels.max() + 1, np.int32)
             number[labels[v[like], u[like]]] = np.flatnonzero(like)
             maps[k] = number[labels]

@@ -30,7 +30,8 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
     shown = np.column_stack([np.interp(time_s - latency_s, time_s, column) for column in joints.T])
     stages = stage_rows(joints)
     rows = sorted({*stages.values(), *_different(joints, num_frames)})
-    pictures = dict(zip(rows, _pictures(episode, camera, rows), strict=False))
+    first = zip(range(rows[-1] + 1), all_pictures(episode, camera), strict=False)
+    pictures = {row: picture for row, picture in first if row in rows}
     if len(pictures) < len(rows):
         raise TaccorlError(f"{episode.name}: camera {camera} has {len(pictures)} of the {len(rows)} pictures requested")
     return CameraFrames(
@@ -55,17 +56,12 @@ def joint_rows(episode: Episode) -> np.ndarray:
 
 
 def stage_rows(joints: np.ndarray) -> dict[str, int]:
-    """Rows of the stages in the paper's figure, from joints (T, 14) [rad, m] alone.
-
-    Returns:
-        Stage → index of the row: "initial" (0), "grasp" (a hand has just closed; absent if none closes) and "insertion" (hands
-        closest together).
-    """
+    """Rows of the stages in the paper's figure, from joints (T, 14) [rad, m] alone. Returns stage → index of the row: "initial"
+    (0), "grasp" (a hand has just closed; absent if none closes) and "insertion" (hands closest together)."""
     stages = {"initial": 0}
     openings = joints[:, ROBOT.gripper_indices]
-    closed = (openings < openings.min(0) + 0.25 * np.ptp(openings, axis=0)) & (
-        np.ptp(openings, axis=0) > 0.2 * ROBOT.opening_max_m
-    )
+    moved = np.ptp(openings, axis=0)
+    closed = (openings < openings.min(0) + 0.25 * moved) & (moved > 0.2 * ROBOT.opening_max_m)
     if closed.any():
         stages["grasp"] = int(np.argmax(closed.any(1)))
     hands = [link_poses(joints[:, ROBOT.joint_slice(arm)])[:, -1, :3, 3] for arm in ROBOT.arms]
@@ -97,12 +93,3 @@ def all_pictures(episode: Episode, camera: str) -> Iterator[np.ndarray]:
         raise TaccorlError(f"{episode.name} has no camera {camera!r}; {nearest(camera, known)}")
     for pictures in episode.pictures():
         yield pictures[key]
-
-
-def _pictures(episode: Episode, camera: str, rows: list[int]) -> Iterator[np.ndarray]:
-    wanted, last = set(rows), max(rows)
-    for row, picture in enumerate(all_pictures(episode, camera)):
-        if row in wanted:
-            yield picture
-        if row == last:
-            return

@@ -22,11 +22,7 @@ _SMALLEST_ROWS = 100  # of a picture in which edges are looked for
 _REACH_PX = ((16.0, 12.0, 8.0, 6.0), (6.0, 5.0, 4.0), (4.0, 3.0, 3.0, 3.0))  # coarse to fine, render by render
 _MATCHES = 3  # times that points are matched anew between two renders
 _AROUND = np.r_[np.full(3, np.deg2rad(3.0)), np.full(3, 0.03)]  # of the start, searched before the first step
-_TRIED, _KEPT, _FOLLOWED = (
-    256,
-    8,
-    2,
-)  # poses tried around the start; the best, refined in small pictures; and in larger ones
+_TRIED, _KEPT, _FOLLOWED = 256, 8, 2  # poses around the start; the best, refined in small pictures; in larger ones
 _SAME = np.r_[np.full(3, np.deg2rad(0.4)), np.full(3, 0.004)]  # poses closer than this will end in one
 _FAR_PX = 6.0  # a point further from its edge counts no more
 _SOFT_PX = 1.0  # residuals beyond it count less (soft L1)
@@ -35,48 +31,35 @@ _SOFT_PX = 1.0  # residuals beyond it count less (soft L1)
 class Level(NamedTuple):
     """The pictures at one size of the image pyramid."""
 
-    intrinsics: Intrinsics
-    """Intrinsics scaled to this size."""
-    edges: list[PictureEdges]
-    """Edges of each picture, F items."""
+    intrinsics: Intrinsics  # Intrinsics scaled to this size
+    edges: list[PictureEdges]  # Edges of each picture, F items
 
 
 class Outlines(NamedTuple):
     """Points on the arms' outlines in all frames, rendered at one camera pose."""
 
-    points: np.ndarray
-    """(P, 3) positions in the mount's frame [m]."""
-    normals: np.ndarray
-    """(P, 2) unit vectors across the outline in the picture."""
-    frames: np.ndarray
-    """(P,) index of the frame."""
-    bodies: np.ndarray
-    """(P,) index of the body."""
+    points: np.ndarray  # (P, 3) positions in the mount's frame [m]
+    normals: np.ndarray  # (P, 2) unit vectors across the outline in the picture
+    frames: np.ndarray  # (P,) index of the frame
+    bodies: np.ndarray  # (P,) index of the body
 
 
 class Matches(NamedTuple):
     """Picture edges that were matched with points of the outlines."""
 
-    found: np.ndarray
-    """(P,) bool: a picture edge of similar direction is within reach."""
-    edges: np.ndarray
-    """(P, 2) positions of the matched edges as (u, v) [px]."""
-    across: np.ndarray
-    """(P, 2) unit normals of the matched edges."""
+    found: np.ndarray  # (P,) bool: a picture edge of similar direction is within reach
+    edges: np.ndarray  # (P, 2) positions of the matched edges as (u, v) [px]
+    across: np.ndarray  # (P, 2) unit normals of the matched edges
 
 
 @dataclass(frozen=True)
 class Solution:
     """Result of the least squares: pose and misfit."""
 
-    offset: np.ndarray
-    """(6,) estimated pose: rotation vector [rad] and translation [m] relative to the nominal mount."""
-    last_change: np.ndarray
-    """(6,) change of the pose in the last iteration [rad, m]."""
-    outlines: Outlines
-    """Outlines rendered at the last pose."""
-    matches: Matches
-    """Their matches in the pictures."""
+    offset: np.ndarray  # (6,) estimated pose: rotation vector [rad] and translation [m] relative to the nominal mount
+    last_change: np.ndarray  # (6,) change of the pose in the last iteration [rad, m]
+    outlines: Outlines  # Outlines rendered at the last pose
+    matches: Matches  # Their matches in the pictures
 
 
 def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level]:
@@ -92,13 +75,9 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
 
 
 def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics) -> Outlines:
-    """Outlines of the twin's arms in F frames, at most 800 points per frame.
-
-    Args:
-        joints: (F, 14) joint angles and gripper openings [rad, m].
-        offset: (6,) camera pose at which they are rendered [rad, m].
-        at: intrinsics, which state the size of the rendered pictures.
-    """
+    """Outlines of the twin's arms in F frames, at most 800 points per frame. ``joints``: (F, 14) joint angles and gripper
+    openings [rad, m]. ``offset``: (6,) camera pose at which they are rendered [rad, m]. ``at``: intrinsics, which state the size
+    of the rendered pictures."""
     rng = np.random.default_rng(0)
     position, turn = view.pose(offset)
     parts = []

@@ -24,8 +24,7 @@ AXES = ("turn about right", "turn about up", "turn about back", "shift right", "
 SHAPE_M = 0.001
 """Standard deviation, along each axis, of the displacement of a body's outline from the twin's [m]. A choice: covers and fingers
 differ by so much."""
-JOINT_RAD = 0.002
-"""Standard deviation of the error of a joint's zero [rad]. A choice: 1 mm at half a metre."""
+JOINT_RAD = 0.002  # Standard deviation of the error of a joint's zero [rad]. A choice: 1 mm at half a metre.
 WANTED = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 0.004)]
 """Requested accuracy of each number: 0.3°, 4 mm. It is used only to compare angles with lengths."""
 _SHARE = 0.35  # of the longest component: an axis that has less is not named
@@ -37,8 +36,7 @@ class Covariance:
 
     noise: np.ndarray
     """(6, 6) part from the scatter of the distances between the twin's projected outlines and the edges in the pictures."""
-    twin: np.ndarray
-    """(6, 6) part from errors of the twin's shapes and joint zeros."""
+    twin: np.ndarray  # (6, 6) part from errors of the twin's shapes and joint zeros
 
     @property
     def total(self) -> np.ndarray:

@@ -32,22 +32,14 @@ _LEAST_STEP = 15.0  # grey values across an edge whose width is measured
 class LightFit:
     """Tone and blur of a camera relative to the twin. Intervals are 95 %, from the scatter over frames."""
 
-    gain: float
-    """g in log y = γ (log g + log x), for grey values x of the twin and y of the picture."""
-    gain_interval: tuple[float, float]
-    """(low, high)."""
-    gamma: float
-    """γ in the same equation."""
-    gamma_interval: tuple[float, float]
-    """(low, high)."""
-    blur_px: float
-    """Blur of the recorded stream beyond the twin's own [px]; 0 if the pictures are sharper."""
-    blur_interval_px: tuple[float, float]
-    """(low, high) [px]."""
-    grey_before: float
-    """Mean difference of the grey values between picture and twin [levels of 255], away from edges."""
-    grey_after: float
-    """Mean difference of the grey values [levels of 255] after gain and gamma are applied to the twin."""
+    gain: float  # g in log y = γ (log g + log x), for grey values x of the twin and y of the picture
+    gain_interval: tuple[float, float]  # (low, high)
+    gamma: float  # γ in the same equation
+    gamma_interval: tuple[float, float]  # (low, high)
+    blur_px: float  # Blur of the recorded stream beyond the twin's own [px]; 0 if the pictures are sharper
+    blur_interval_px: tuple[float, float]  # (low, high) [px]
+    grey_before: float  # Mean difference of the grey values between picture and twin [levels of 255], away from edges
+    grey_after: float  # Mean difference of the grey values [levels of 255] after gain and gamma are applied to the twin
 
 
 def camera_light(frames: CameraFrames, config: TwinConfig, camera: str) -> LightFit:
@@ -110,9 +102,8 @@ def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
     log_x, log_y, count = np.array(rows).T
     slope, start = np.polyfit(log_x, log_y, 1, w=np.sqrt(np.sqrt(count)))
     if slope <= 0.05:
-        raise TaccorlError(
-            f"camera {camera}: areas that are bright in the twin are dark in the pictures: fit the camera's pose first"
-        )
+        areas = "areas that are bright in the twin are dark in the pictures"
+        raise TaccorlError(f"camera {camera}: {areas}: fit the camera's pose first")
     return np.array([np.exp(start / slope), slope])
 
 
@@ -122,9 +113,8 @@ def _widths(
     """For each frame, of outlines that the picture has as edges: ratio of the gradients after two more blurs, in the picture
     and in the twin."""
     lines = outlines(view, joints, view.start, view.intrinsics)
-    level = next(
-        level for level in levels(list(pictures), view.intrinsics) if level.intrinsics.rows == view.window.rows
-    )
+    every = levels(list(pictures), view.intrinsics)
+    level = next(level for level in every if level.intrinsics.rows == view.window.rows)
     seen = seen_from(view, view.start, lines.points)
     matches = match(lines, seen, level, 3.0)
     here = pixels_of(seen, level.intrinsics)
@@ -133,9 +123,8 @@ def _widths(
         mine = matches.found & (lines.frames == frame)
         found.append((_flatter(picture, matches.edges[mine]), _flatter(twin, here[mine])))
     if sum(len(one) for one, _ in found) < _FEWEST:
-        raise TaccorlError(
-            f"camera {camera}: no edges of the arms are at their positions in the twin; fit the camera's pose first"
-        )
+        none = "no edges of the arms are at their positions in the twin"
+        raise TaccorlError(f"camera {camera}: {none}; fit the camera's pose first")
     return found
 
 
@@ -155,16 +144,11 @@ def _flatter(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def _blur(widths: list[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray) -> float:
-    """σ [px] of the pictures beyond the twin's."""
-    picture, twin = (_variance(np.concatenate([widths[k][side] for k in chosen])) for side in (0, 1))
-    return float(np.sqrt(max(picture - twin, 0.0)))
-
-
-def _variance(ratios: np.ndarray) -> float:
-    """σ² [px²] of edges that flatten so much."""
-    ratio = max(float(np.median(ratios)), 1.001) ** 2
+    """σ [px] of the pictures beyond the twin's, from how much edges flatten."""
+    flatter = (np.median(np.concatenate([widths[k][side] for k in chosen])) for side in (0, 1))
     first, second = (s**2 for s in _BLURS_PX)
-    return (second - ratio * first) / (ratio - 1)
+    picture, twin = ((second - r * first) / (r - 1) for r in (max(float(one), 1.001) ** 2 for one in flatter))
+    return float(np.sqrt(max(picture - twin, 0.0)))
 
 
 def _over_frames(estimate: Callable[[np.ndarray], np.ndarray], num_frames: int) -> np.ndarray:

@@ -35,14 +35,11 @@ _FEWEST_S = 3.0
 class LatencyFit:
     """Estimated latency of a camera, with its interval."""
 
-    latency_s: float
-    """Latency [s]: a picture shows the scene at its time stamp minus this."""
-    interval_s: tuple[float, float]
-    """95 % interval [s], by a bootstrap over blocks of pictures."""
+    latency_s: float  # Latency [s]: a picture shows the scene at its time stamp minus this
+    interval_s: tuple[float, float]  # 95 % interval [s], by a bootstrap over blocks of pictures
     correlation: float
     """Correlation, at that latency, of the motion in the recorded pictures with the motion in the twin's pictures."""
-    problems: tuple[str, ...]
-    """Reasons why the result is not valid; empty if it is."""
+    problems: tuple[str, ...]  # Reasons why the result is not valid; empty if it is
 
 
 def camera_latency(
@@ -69,7 +66,8 @@ def camera_latency(
     kept = (middle_s >= middle_s[0] + LATEST_S) & (middle_s <= middle_s[-1] + EARLIEST_S)
     curve = CubicSpline(middle_s, twin)
     shifted = np.stack([curve(middle_s[kept] - shift) for shift in shifts])
-    moments = _moments(shifted, measured[kept])
+    one, other = measured[kept] - measured[kept].mean(0), shifted - shifted.mean(1, keepdims=True)
+    moments = _Moments((other * one).sum(2), (other**2).sum(2), (one**2).sum(1))
     agree = _correlation(moments, np.ones(int(kept.sum())))
     best = int(np.argmax(agree))
     drawn = _bootstrap(moments, max(1, round(_BLOCK_S / period_s)), shifts)
@@ -94,9 +92,8 @@ def _changes(
             if view is None:
                 view = TwinView(config, camera, (int(picture.shape[0]), int(picture.shape[1])))
             now = [_small(image) for image in (view.inside(picture[None])[0], view.picture(row, view.start))]
-            if before:
-                for changes, new, old in zip((measured, twin), now, before, strict=True):
-                    changes.append(_cells(np.abs(new - old)))
+            for changes, new, old in zip((measured, twin), now, before, strict=False):
+                changes.append(_cells(np.abs(new - old)))
             before = now
     finally:
         if view is not None:
@@ -120,17 +117,9 @@ def _cells(change: np.ndarray) -> np.ndarray:
 class _Moments(NamedTuple):
     """What a correlation over any draw of pictures is made of, for each of them, summed over cells after centring."""
 
-    both: np.ndarray
-    """(S, T) twin at a shift times measured."""
-    twin: np.ndarray
-    """(S, T) twin at a shift, squared."""
-    measured: np.ndarray
-    """(T,) squared."""
-
-
-def _moments(shifted: np.ndarray, measured: np.ndarray) -> _Moments:
-    one, other = measured - measured.mean(0), shifted - shifted.mean(1, keepdims=True)
-    return _Moments((other * one).sum(2), (other**2).sum(2), (one**2).sum(1))
+    both: np.ndarray  # (S, T) twin at a shift times measured
+    twin: np.ndarray  # (S, T) twin at a shift, squared
+    measured: np.ndarray  # (T,) squared
 
 
 def _correlation(moments: _Moments, weights: np.ndarray) -> np.ndarray:

@@ -78,16 +78,9 @@ class TwinView:
         mujoco.mj_comPos(self.model, self.data)
 
     def labels(self, joints: np.ndarray, offset: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Body and depth of each pixel of a rendered picture.
-
-        Args:
-            joints: (14,) joint angles and gripper openings [rad, m].
-            offset: (6,) camera pose [rad, m].
-
-        Returns:
-            (rows, columns) int, index of the body that the pixel shows, 0 if it shows no arm; and (rows, columns), depth along
-            the optical axis [m], infinite where nothing is shown.
-        """
+        """Body and depth of each pixel of a rendered picture. ``joints``: (14,) joint angles and gripper openings [rad, m].
+        ``offset``: (6,) camera pose [rad, m]. Returns (rows, columns) int, index of the body that the pixel shows, 0 if it shows
+        no arm; and (rows, columns), depth along the optical axis [m], infinite where nothing is shown."""
         self._turn(joints, offset)
         geoms, depth_m = self._renderer(rows, columns).labels(self.data)[0]
         bodies = np.where(geoms >= 0, self.model.geom_bodyid[geoms], 0)
@@ -151,5 +144,4 @@ class TwinView:
 
 def as_offset(offset: np.ndarray) -> CameraOffset:
     """The pose ``offset`` (6,) = (ω, t) [rad, m] as the ``CameraOffset`` of a ``CameraConfig``."""
-    x, y, z, right, up, back = offset.tolist()
-    return CameraOffset(rotation_rad=(x, y, z), translation_m=(right, up, back))
+    return CameraOffset(rotation_rad=tuple(offset[:3].tolist()), translation_m=tuple(offset[3:].tolist()))

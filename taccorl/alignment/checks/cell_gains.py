@@ -21,25 +21,21 @@ EXCHANGED = 4.0
 """Cells are exchanged if the load of another cell leaves less than one part in so many of a reading's variance that the own load
 leaves. A choice: with columns in order the own load left less than every other in all simulated arrays, also with crosstalk of
 0.15, hysteresis, saturation, and a contact 1 mm off its stated place."""
-FACTOR = 3.0
-"""Ratio of the gains of two recordings from which on one of them has another unit."""
+FACTOR = 3.0  # Ratio of the gains of two recordings from which on one of them has another unit
 SAME_WAY = 1.2
 """Both in rows up to the same load and up to the same reading the gains must differ by this factor, in the same direction."""
 LINEAR = 0.7
 """Correlation of load and reading from which on a recording's gain is known well enough for ``FACTOR``: noise of the load lowers
 a gain by the square of this at most."""
-PRESSED, REST = 0.3, 0.05
-"""Shares of a recording's largest load above which it is pressed, and below which it rests."""
-PIECES = 8
-"""Number of pieces into which the pressed rows of a recording are divided."""
+PRESSED, REST = 0.3, 0.05  # Shares of a recording's largest load above which it is pressed, and below which it rests
+PIECES = 8  # Number of pieces into which the pressed rows of a recording are divided
 UNEVEN = 0.3
 """Change of the cells' shares of the load, RMS over cells in units of the mean share, from which on a load is not shared alike.
 A choice: simulated arrays whose cells saturate at limits that differ by 40 % change their shares by 0.07 at most."""
-ABOVE_NOISE = 5.0
-"""The change of shares must be so many times that which the readings' variation at rest explains."""
+ABOVE_NOISE = 5.0  # The change of shares must be so many times that which the readings' variation at rest explains
 
 
-@check("dead_cells", "warning")
+@check("warning", "dead_cells")
 def dead_finding(s: CellSet) -> Iterator[Finding]:
     """Cells that hardly respond to a load that others respond to."""
     if not s.dead.any():
@@ -56,14 +52,10 @@ def dead_finding(s: CellSet) -> Iterator[Finding]:
 class Exchanged(NamedTuple):
     """A cell whose reading follows the load of another cell."""
 
-    cell: int
-    """Number of the cell."""
-    load_of: int
-    """Number of the cell whose load its reading follows."""
-    own: float
-    """Share of the reading's variance that a fit to its own load leaves."""
-    other: float
-    """The same of the load of ``load_of``."""
+    cell: int  # Number of the cell
+    load_of: int  # Number of the cell whose load its reading follows
+    own: float  # Share of the reading's variance that a fit to its own load leaves
+    other: float  # The same of the load of ``load_of``
 
 
 def exchanged_cells(s: CellSet) -> list[Exchanged]:
@@ -103,7 +95,7 @@ def _remains(s: CellSet) -> np.ndarray:
     return np.maximum(1.0 - explained, 1e-9)
 
 
-@check("exchanged_cells", "error", explains=("shifted_loads",))
+@check("error", "exchanged_cells", explains=("shifted_loads",))
 def exchanged_finding(s: CellSet) -> Iterator[Finding]:
     """Cells whose readings follow the load of another cell, so that columns are exchanged."""
     exchanged = exchanged_cells(s)
@@ -124,7 +116,7 @@ def exchanged_finding(s: CellSet) -> Iterator[Finding]:
     yield find("exchanged_cells", "reading", text)
 
 
-@check("other_gain", "error")
+@check("error", "other_gain")
 def other_gains(s: CellSet) -> Iterator[tuple[str, Finding]]:
     """Recordings whose gain is ``FACTOR`` times that of the others or more, or as much less: name, and error.
 
@@ -184,7 +176,7 @@ def _ratios(one: tuple, other: tuple) -> list[float]:
     return [r for r in found if np.isfinite(r)]
 
 
-@check("uneven_load", "warning", needs="cells")
+@check("warning", "uneven_load", needs="cells")
 def uneven_load(s: CellSet) -> Iterator[Finding]:
     """Cells' shares of a shared load that differ between recordings or within one; not where each cell has its own load."""
     if not s.config.load.shared or s.config.num_cells < 2 or s.config.same_place_mm is not None:

@@ -14,10 +14,8 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import listed
 
-DEAD = 0.05
-"""Share of the usual gain, that of the median cell which responds, below which a cell hardly responds."""
-RESPONDS = 0.5
-"""Correlation of load and reading from which on a cell responds."""
+DEAD = 0.05  # Share of the usual gain, that of the median cell which responds, below which a cell hardly responds
+RESPONDS = 0.5  # Correlation of load and reading from which on a cell responds
 AS_LOADED = 0.5
 """A cell is judged only if its load reaches this share of the largest load of any cell: a cell with less may have a threshold."""
 CLEAR = 3.0

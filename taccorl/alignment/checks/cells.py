@@ -20,18 +20,12 @@ from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import Finding
 from taccorl.data.timing import runs
 
-LOADED = 0.05
-"""Share of the rated load above which a cell counts as loaded."""
-REST_S = 0.5
-"""Time without load that a set of recordings must have, for the offsets."""
-CONSTANT = 0.05
-"""A load whose variation is below this share of the rated load does not determine gain and law."""
-MOST_CUT = 0.9
-"""Share of the loaded rows at an end of the converter from which on a cell counts as always saturated."""
-WRONG_WAY = -0.5
-"""Correlation of load and reading, with the file's sign, below which the file's sign is wrong."""
-RATE = 0.05
-"""Largest share by which a recording's rate may differ from the file's."""
+LOADED = 0.05  # Share of the rated load above which a cell counts as loaded
+REST_S = 0.5  # Time without load that a set of recordings must have, for the offsets
+CONSTANT = 0.05  # A load whose variation is below this share of the rated load does not determine gain and law
+MOST_CUT = 0.9  # Share of the loaded rows at an end of the converter from which on a cell counts as always saturated
+WRONG_WAY = -0.5  # Correlation of load and reading, with the file's sign, below which the file's sign is wrong
+RATE = 0.05  # Largest share by which a recording's rate may differ from the file's
 FEWEST_HELD, HELD = 3, 0.9
 """Load changes that lie at multiples of at least so many rows, in this share of cases, show that the load was recorded at a
 lower rate and held."""
@@ -52,10 +46,9 @@ def check_cells(
     exchanged = list(exchanged_finding(every))
     wrong = list(_together(CellSet(config, fit), {e.cell for e in exchanged_cells(every)}))
     found[first] += wrong
+    together = f"all fit recordings together, see {first}"
     for name in others:
-        found[name] += [
-            dataclasses.replace(f, text=f"{f.feature}: all fit recordings together, see {first}") for f in wrong
-        ]
+        found[name] += [dataclasses.replace(f, text=f"{f.feature}: {together}") for f in wrong]
     for name, finding in other_gains(every):
         found[name].append(finding)
     explained = {name for f in exchanged for name in CHECKS[f.check].explains}
@@ -70,10 +63,7 @@ def warnings_of_all(
     return [*dead_finding(CellSet(config, fit)), *run("cells", CellSet(config, measurements))]
 
 
-@check("other_rate", "error")
-@check("load_held", "error")
-@check("load_unit", "error")
-@check("beyond_ends", "error")
+@check("error", "other_rate", "load_held", "load_unit", "beyond_ends")
 def _of_recording(config: CellsConfig, m: CellMeasurement) -> Iterator[Finding]:
     if config.rate_hz is not None and abs(m.rate_hz / config.rate_hz - 1) > RATE:
         text = f"{m.rate_hz:g} rows a second; write `rate_hz: {m.rate_hz:g}` in the cells file, or check the unit of the time"
@@ -103,11 +93,7 @@ def _of_recording(config: CellsConfig, m: CellMeasurement) -> Iterator[Finding]:
         yield find("beyond_ends", name, text)
 
 
-@check("constant_load", "error")
-@check("no_rest", "error")
-@check("saturated", "error")
-@check("no_reading", "error")
-@check("wrong_sign", "error")
+@check("error", "constant_load", "no_rest", "saturated", "no_reading", "wrong_sign")
 def _together(s: CellSet, exchanged: set[int]) -> Iterator[Finding]:
     """What all fit recordings together lack.
     ``exchanged``: cells whose columns are exchanged; the sign of their gain is not judged."""
@@ -170,8 +156,7 @@ def _held_rows(m: CellMeasurement) -> int:
 FIRST_S, LEAST_S = 1.0, 0.3
 """The offset of a recording is that of its rows without load in the first so many seconds, and of at least the second number: at
 the same time in all recordings, so that a drift within them makes no difference, and before any press, so that none creeps on."""
-UNLOADED = 0.02
-"""Share of the rated load below which a cell counts as unloaded."""
+UNLOADED = 0.02  # Share of the rated load below which a cell counts as unloaded
 OTHER_OFFSET = 5.0
 """Offsets differ from this number of standard deviations of the unloaded readings on. A choice: those of clean simulated
 recordings differ by 0.7 at most."""
@@ -182,8 +167,7 @@ RETURNS = 0.3
 LEAST_ROWS, TOP = 20, 0.005
 """Share of a cell's rows, and least number of rows, whose readings are above what is taken as its highest reading, so that single
 outliers do not count."""
-WIDTH = 4.0
-"""Rows within so many standard deviations of the noise of the highest reading may be on a plateau."""
+WIDTH = 4.0  # Rows within so many standard deviations of the noise of the highest reading may be on a plateau
 LONG = 10.0
 """A plateau is so many of its own widths long: by as much the reading would have risen with the load, at the gain below it. The
 smooth law f / (1 + f / f_s) has one only if pressed with more than ten times f_s."""
@@ -195,7 +179,7 @@ does. A choice: in simulated arrays a contact 1 mm off, at a pitch of 3 mm, expl
 neither 0."""
 
 
-@check("other_offset", "warning", needs="cells")
+@check("warning", "other_offset", needs="cells")
 def other_offsets(s: CellSet) -> Iterator[Finding]:
     """Offsets of cells that differ between recordings without a temperature.
 
@@ -223,7 +207,7 @@ def other_offsets(s: CellSet) -> Iterator[Finding]:
     yield find("other_offset", "reading", text)
 
 
-@check("falls_below_rest", "warning", needs="cells")
+@check("warning", "falls_below_rest", needs="cells")
 def falls_below_rest(s: CellSet) -> Iterator[Finding]:
     """Readings that fall below their level before the first press when a load is released, and return: the model of creep must
     then act below rest. Not where the cells file says so (``below_rest``)."""
@@ -272,7 +256,7 @@ def _first_unloaded(s: CellSet, m: CellMeasurement) -> np.ndarray:
     return np.flatnonzero(m.time_s - m.time_s[0] < end_s) if end_s >= LEAST_S else np.empty(0, dtype=int)
 
 
-@check("plateau", "warning", needs="cells")
+@check("warning", "plateau", needs="cells")
 def plateaus(s: CellSet) -> Iterator[Finding]:
     """Readings of cells that stop rising, but for their noise, while the load still rises, at a level that is not an end of the
     converter's range: the end of an amplifier or of a divider. Not with ``same_place_mm``, where a cell's load depends on the
@@ -316,7 +300,7 @@ def plateaus(s: CellSet) -> Iterator[Finding]:
     yield find("plateau", "reading", text)
 
 
-@check("shifted_loads", "warning", needs="cells")
+@check("warning", "shifted_loads", needs="cells")
 def shifted_loads(s: CellSet) -> Iterator[Finding]:
     """Loads of a grid of 3 × 3 cells or more that act at another place than stated; not where cells share one load.
 

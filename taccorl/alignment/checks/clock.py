@@ -16,15 +16,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from taccorl.alignment.checks.first_order import (
-    Shift,
-    delay_between,
-    far_delay,
-    fit_first_order,
-    left_by_change,
-    onset_delay,
-    pure_shift,
-)
+from taccorl.alignment.checks import first_order
+from taccorl.alignment.checks.first_order import REST_S, Shift, delay_between, fit_first_order
 from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
@@ -37,22 +30,17 @@ from taccorl.data.joint_checks import LAG_SURE, find_lag
 from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
-CLOCK = "clock"
-"""Topic of findings that the clock of a joint could not be judged, or was judged by the onsets of steps."""
-FAR = "late"
-"""Topic of late answers beyond ``DELAY_S``."""
+CLOCK = "clock"  # Topic of findings that the clock of a joint could not be judged, or was judged by the onsets of steps
+FAR = "late"  # Topic of late answers beyond ``DELAY_S``
 SHIFTED = "shifted_from_twin"
 """Check whose findings state that a measurement leads the twin's replay, or comes after it."""
 UNDECIDED = "clock_or_effect"
 """Check whose findings state that a measurement leads the twin's replay, which an effect of the drive explains as well."""
 EXCHANGED_COLUMNS = "exchanged_target"
 """Check whose findings state that the columns of target and position are exchanged."""
-SURE = 4.0
-"""Number of standard deviations above which an offset is significant."""
-HALF_ROW_MOST = 0.75
-"""A lead below this [rows] can arise because the replay holds targets that the drive interpolated."""
-LEAD_ROWS = 0.3
-"""Least lead that is reported [rows]; a smaller one can be an error of the fit."""
+SURE = 4.0  # Number of standard deviations above which an offset is significant
+HALF_ROW_MOST = 0.75  # A lead below this [rows] can arise because the replay holds targets that the drive interpolated
+LEAD_ROWS = 0.3  # Least lead that is reported [rows]; a smaller one can be an error of the fit
 HIDDEN = 3.0
 """A shift is ignored if it alone would leave so many times what measurement and replay differ by: other numbers would have to
 hide it. A choice."""
@@ -74,10 +62,7 @@ FITTING = 3.0
 FITTING_ROWS = 0.05
 """A first-order lag also describes a joint if its residual is below this share of that of an offset of one row; the delay is
 then wrong by a sixth of a row at most."""
-STEP_FLOORS = 8.0
-"""Least motion in the first row after a step for judging it [noise floors]."""
-REST_S = 0.25
-"""Time for which all commands must have rested before a step [s]."""
+STEP_FLOORS = 8.0  # Least motion in the first row after a step for judging it [noise floors]
 EXCHANGED = 0.7
 """Columns of target and position are exchanged if the residual of a lag fitted from position to target is below this share of
 that from target to position."""
@@ -91,9 +76,9 @@ USUAL_TAU_S = 0.12
 least step · period / τ."""
 
 
-@check("measured_before_command", "error", explains=("effort_time",))
-@check(EXCHANGED_COLUMNS, "error", explains=FOLLOWS_FROM)
-@check("late_answer", "note", needs="clock")
+@check("error", "measured_before_command", explains=("effort_time",))
+@check("error", EXCHANGED_COLUMNS, explains=FOLLOWS_FROM)
+@check("note", "late_answer", needs="clock")
 def check_clock(t: Trial) -> Iterator[Finding]:
     """Leads, late answers, exchanged columns, and signals that could not be judged."""
     m, even = t.m, t.even
@@ -123,7 +108,7 @@ def check_clock(t: Trial) -> Iterator[Finding]:
                 yield _exchange(name, -lag.lag_s, m)
             else:
                 yield _lead(name, -lag.lag_s, m, "its movement correlates best with a later command")
-        elif far := far_delay(even.target[:, j], measured, even.period_s):
+        elif far := first_order.far_delay(even.target[:, j], measured, even.period_s):
             text = (
                 f"{name} answers its target {far.delay_s:.2f} s late ({far.delay_s / row_s:.0f} rows, then a lag of "
                 f"{far.time_constant_s * 1e3:.0f} ms): positions are stamped or paired late, commands early, or a driver "
@@ -148,7 +133,7 @@ def check_clock(t: Trial) -> Iterator[Finding]:
         yield not_judged("", "clock of command and measurement", "no joint moves enough to tell")
 
 
-@check("late_recording", "error")
+@check("error", "late_recording")
 def check_late_recordings(recordings: Sequence[Measurement], found: dict[str, list[Finding]]) -> None:
     """Turn far delays of signals that answer at once in at least as many other recordings into errors: a robot's own delay is in
     all of them. Changes ``found``, name of a recording → its findings."""
@@ -291,8 +276,8 @@ def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> s
 # beside a replay ---------------------------------------------------------------------------------------------------------
 
 
-@check(SHIFTED, "error")
-@check(UNDECIDED, "warning")
+@check("error", SHIFTED)
+@check("warning", UNDECIDED)
 def check_against_twin(
     m: Measurement,
     reported: np.ndarray,
@@ -323,7 +308,7 @@ def check_against_twin(
             shift = delay_between(*rows, period_s)
             if _leads(shift, period_s):
                 shift = delay_between(*rows, period_s, changed(name))
-            plain = pure_shift(*rows[1:], period_s)
+            plain = first_order.pure_shift(*rows[1:], period_s)
         except TaccorlError as error:
             findings.append(not_judged(name, "its offset in time from the twin", str(error), CLOCK))
             continue
@@ -392,12 +377,9 @@ def _led(m: Measurement, name: str, shift: Shift, rival: str, uncertain: bool) -
             "tell them apart; if the search does not add it, compare the clocks"
         )
         return find(UNDECIDED, name, text)
-    text += (
-        ": "
-        + "the drive's numbers in the file are off (diagnose fits them), or " * uncertain
-        + "positions stamped too early or "
-        f"commands too late, or paired one row off. {_earlier_targets(m, -shift.delay_s, whole=True)}"
-    )
+    numbers = "the drive's numbers in the file are off (diagnose fits them), or " * uncertain
+    text += f": {numbers}positions stamped too early or commands too late, or paired one row off. "
+    text += _earlier_targets(m, -shift.delay_s, whole=True)
     if uncertain:
         text += " only if the lead remains with the numbers that were fitted"
     elif -shift.delay_s < HALF_ROW_MOST * m.period_s:
@@ -421,17 +403,18 @@ def _with_common_delay(
         f" {len(late)} joints are late alike, by {delays_s.min() * 1e3:.1f} … {delays_s.max() * 1e3:.1f} ms: one cause for all, "
         "such as the way of commands or of readings, or a clock"
     )
-    is_late = [f.check == SHIFTED and f.feature in late for f in findings]
     return [
-        dataclasses.replace(f, text=f"{f.text}.{common}", topic="late") if of_all else f
-        for f, of_all in zip(findings, is_late, strict=True)
+        dataclasses.replace(f, text=f"{f.text}.{common}", topic="late")
+        if f.check == SHIFTED and f.feature in late
+        else f
+        for f in findings
     ]
 
 
-@check("same_onset", "note")
+@check("note", "same_onset")
 def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -> Finding | None:
     """Finding on the onsets after steps, where effects are missing; None if the recording has no steps that show them."""
-    onset = onset_delay(m, signal, reported, floor)
+    onset = first_order.onset_delay(m, signal, reported, floor)
     if onset is None:
         return None
     rows = abs(onset.delay_s) / m.period_s
@@ -456,7 +439,7 @@ def _rival(measured: np.ndarray, replay: np.ndarray, plain: Shift, rivals: Mappi
     """Name of the effect with which the replay comes as near to the measurement as by a shift alone; empty if none does. No other
     number is adjusted: with another K_d and inertia, too, velocity feedforward and a lead are alike.
     ``rivals``: name of an effect → the replay (T,) with a little of it."""
-    left = {name: left_by_change(measured, replay, changed) for name, changed in rivals.items()}
+    left = {name: first_order.left_by_change(measured, replay, changed) for name, changed in rivals.items()}
     best = min(left, key=lambda name: left[name], default="")
     return best if best and plain.rms >= BETTER * left[best] else ""
 

@@ -28,8 +28,7 @@ from taccorl.data.finding import Finding
 
 FAR, NEAR = 10.0, 3.0
 """A replay is far off above the first multiple of the noise, and right below the second one. Choices."""
-INEXACT = 0.01
-"""Share of the tracking error that counts as noise: equations and times are no better. A choice."""
+INEXACT = 0.01  # Share of the tracking error that counts as noise: equations and times are no better. A choice.
 BETTER = 1 / 3
 """Columns are exchanged, beside another fault that ``NEAR`` would not forgive, if the exchange leaves less than this share of the
 error, by the geometric mean of both joints. A choice."""
@@ -43,15 +42,11 @@ SURELY = 0.2
 can look like it. A choice."""
 AS_GOOD = 1.2
 """Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
-SMOOTH_S = 0.1
-"""Window of the quadratics whose slopes are velocity and acceleration [s]."""
-MOST_ROWS = 400
-"""Rows of one recording at which the model is evaluated."""
+SMOOTH_S = 0.1  # Window of the quadratics whose slopes are velocity and acceleration [s]
+MOST_ROWS = 400  # Rows of one recording at which the model is evaluated
 FREE = "a weight or spring"  # key of what is left beside the free numbers of such effects
-COLUMNS = ("measured", "target", "velocity", "effort")
-"""Arrays (T, J) of a measurement."""
-_Moved = Mapping[str, Sequence[Measurement]]
-"""Joint → recordings that move it, with all signals."""
+COLUMNS = ("measured", "target", "velocity", "effort")  # Arrays (T, J) of a measurement
+_Moved = Mapping[str, Sequence[Measurement]]  # Joint → recordings that move it, with all signals
 
 
 def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
@@ -77,10 +72,9 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
             old, new = _replay_error(robot, m, name), _replay_error(robot, swapped, other[name])
             rows.append((name, m.name, _noise(m, name), old, new))
     deciding = [row for row in rows if row[3] >= FAR * row[2]]  # a slow motion may not: any joint follows its target
-    right = all(
-        new <= (NEAR * noise if old >= FAR * noise else max(old, NEAR * noise)) for _, _, noise, old, new in rows
-    )
-    right = right and bool(deciding) and all(any(row[0] == n for row in deciding) or not recordings[n] for n in pair)
+    near = [max(0.0 if old >= FAR * noise else old, NEAR * noise) >= new for _, _, noise, old, new in rows]
+    right = bool(deciding) and all(any(row[0] == n for row in deciding) or not recordings[n] for n in pair)
+    right = right and all(near)
     # Also a motion that only the exchange leaves far off decides: against it.
     far = [(row[0], *np.maximum(row[3:], row[2])) for row in rows if max(row[3:]) >= FAR * row[2]]
     logs = [[math.log(new / old) for name, old, new in far if name == n] for n in pair]
@@ -128,18 +122,17 @@ def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tupl
     """(2,) what the law of the other joint leaves of each one's efforts over what its own leaves, whatever friction or load there
     is; NaN where they are not known, or near their own law. A text on both, and whether efforts are exchanged, too."""
     joints = robot.config.joints
-    used = [
-        [m for m in recordings[n] if all(p in getattr(m, k) for p in pair for k in joints[p].gain_names)] for n in pair
-    ]
+    gains = [(k, p) for p in pair for k in joints[p].gain_names]
+    used = [[m for m in recordings[n] if all(p in getattr(m, k) for k, p in gains)] for n in pair]
 
     def shares(names: tuple[str, ...], columns: Sequence[str]) -> np.ndarray:
         """(2,) shares of the efforts that the laws of ``names`` leave; NaN if they are not known."""
-        left = [
-            [law_left(joints[n], _swapped(m, *pair, columns), n) for m in own]
-            for n, own in zip(names, used, strict=True)
-        ]
-        squares = [np.sum(np.square([x for x in own if x] or [(math.nan, 1.0)]), axis=0) for own in left]
-        return np.array([math.sqrt(error / max(effort, 1e-300)) for error, effort in squares])
+        found = []
+        for name, own in zip(names, used, strict=True):
+            left = [law_left(joints[name], _swapped(m, *pair, columns), name) for m in own]
+            error, effort = np.square([x for x in left if x] or [(math.nan, 1.0)]).sum(axis=0)
+            found.append(math.sqrt(error / max(effort, 1e-300)))
+        return np.array(found)
 
     as_is = shares(pair, ())
     as_is[as_is <= LAW_OFF] = math.nan
@@ -190,18 +183,16 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
             effort, others = np.concatenate([p.effort for p in own]), np.concatenate([p.others for p in own])
             asked = {k: np.concatenate([p.asked[k] for p in own]) for k in keys}
             left[name] = {k: _left(effort, torque, others) for k, torque in asked.items()}
-            left[name][FREE] = _left(
-                effort, asked[""], np.column_stack([others, np.concatenate([p.place for p in own])])
-            )
+            free = np.column_stack([others, np.concatenate([p.place for p in own])])
+            left[name][FREE] = _left(effort, asked[""], free)
 
     def explains(k: str) -> bool:
         with_it = [(errors[k], errors[""], errors[FREE]) for errors in left.values() if k in errors]
         clear = any(other < TURNED * as_it_is and other < AS_GOOD * free for other, as_it_is, free in with_it)
         return clear and all(other < AS_GOOD * as_it_is for other, as_it_is, _ in with_it)
 
-    total = {
-        k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e) for k in robot.config.joints if explains(k)
-    }
+    better = [k for k in robot.config.joints if explains(k)]
+    total = {k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e) for k in better}
     k = min(total, key=lambda k: total[k], default="")
     if k:
         turned = [k, *(other for other in total if other != k and total[other] < AS_GOOD * total[k])]
@@ -216,10 +207,9 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
             f"{'' if sure else '. Another centre of mass of a link or another payload may look like this'}"
             f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
         )
+        severity = "error" if sure else "warning"
         for m in recordings[name]:
-            found[m.name].append(
-                find("wrong_sign", name, text, severity="error" if sure else "warning", topic=f"sign of {k}")
-            )
+            found[m.name].append(find("wrong_sign", name, text, severity=severity, topic=f"sign of {k}"))
 
 
 def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:
@@ -235,14 +225,10 @@ def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:
 class _Torques(NamedTuple):
     """One joint in one recording, at every few rows."""
 
-    effort: np.ndarray
-    """(T,)."""
-    asked: dict[str, np.ndarray]
-    """Turned joint, "" for none → (T,) torque that the rigid model asks of this one."""
-    others: np.ndarray
-    """(T, 3) speed, its sign, 1."""
-    place: np.ndarray
-    """(T, 3) position, its sine and cosine."""
+    effort: np.ndarray  # (T,)
+    asked: dict[str, np.ndarray]  # Turned joint, "" for none → (T,) torque that the rigid model asks of this one
+    others: np.ndarray  # (T, 3) speed, its sign, 1
+    place: np.ndarray  # (T, 3) position, its sine and cosine
 
 
 def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:

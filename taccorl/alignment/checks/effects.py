@@ -21,8 +21,7 @@ from taccorl.sim.effects.effect import NEEDS, Effect, TouchEffect
 NEARLY, MOST = 0.01, 0.1
 """An effect at the first share of the way from absent to typical values may change the result by at most the second share of
 what the typical values change."""
-SCAN_S = 0.01
-"""Time between two scans of the pad in these checks [s]."""
+SCAN_S = 0.01  # Time between two scans of the pad in these checks [s]
 
 
 def check_effect(cls: type[Effect]) -> None:
@@ -96,15 +95,12 @@ def _pad(effect: Effect | None) -> np.ndarray | None:
     if effect is not None and (not isinstance(effect, TouchEffect) or type(effect).reading is Effect.reading):
         return None
     force = np.interp(np.arange(0, 4.0, SCAN_S), [0.5, 1.0, 2.5, 2.8], [0.0, 4.0, 4.0, 0.0])
-    bump = np.exp(
-        -np.square(np.linspace(-2, 2, ROBOT.pad.rows))[:, None] - np.square(np.linspace(-2, 2, ROBOT.pad.columns))
-    )
+    along, across = (np.square(np.linspace(-2, 2, n)) for n in ROBOT.pad.shape)
+    bump = np.exp(-along[:, None] - across)
     ideal = (force[:, None, None, None] * bump * np.ones((len(ROBOT.pads), 1, 1))).astype(np.float32)
     if effect is None:
         return ideal
     memory = copy.deepcopy(effect.memory(1, ROBOT.pad.shape))
-    seen = [
-        effect.reading(ideal[k : k + 1], memory, np.array([k * SCAN_S]), np.array([SCAN_S if k else 0.0]))
-        for k in range(len(ideal))
-    ]
-    return np.concatenate(seen)
+    times_s = np.arange(len(ideal)) * SCAN_S
+    steps_s, rows = np.diff(times_s, prepend=0.0), [slice(k, k + 1) for k in range(len(ideal))]
+    return np.concatenate([effect.reading(ideal[k], memory, times_s[k], steps_s[k]) for k in rows])

@@ -25,15 +25,12 @@ from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding, Severity, listed
 
-NEAR = 0.3
-"""Largest distance of r from 0 or 1 for a decision."""
+NEAR = 0.3  # Largest distance of r from 0 or 1 for a decision
 SURE = 0.1
 """Largest standard error of r for a decision; otherwise there is no finding. A drive that receives targets faster than they
 are logged lies in between."""
-CLIPPED = 0.98
-"""Rows with an effort above this share of the effort limit are not used."""
-SMOOTH_S = 0.05
-"""Window of the quadratic whose slope is the velocity [s]."""
+CLIPPED = 0.98  # Rows with an effort above this share of the effort limit are not used
+SMOOTH_S = 0.05  # Window of the quadratic whose slope is the velocity [s]
 SIGN_SURE, MOST_SHARE = 0.5, 4.0
 """Sign and size of the gain are believed if a fit of the drive's law leaves at most this share of the RMS effort, and r is at
 most 4. The effort of a well damped drive is a small difference of large terms: fits with r above 30 left as little with wrong
@@ -51,17 +48,14 @@ ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
 """Choices for gains that are fitted to each recording alone: largest residual of such a fit, as a share of the RMS effort; ratio
 of the gains of two recordings from which on they are of two machines (one of 7 effects made at most 1.34); and, where efforts are
 computed from accelerations, least ratio of the fitted K_p to the stated one that is reported."""
-LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)
-"""Lags and delays of targets that are tried."""
+LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)  # Lags and delays of targets that are tried
 ALIKE = 1e-3
 """Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
-BLOCK_S = 0.5
-"""Length of stretches that count as independent [s]."""
+BLOCK_S = 0.5  # Length of stretches that count as independent [s]
 
 
-@check("effort_time", "error")
-@check("other_gains", "error")
-@check("other_scale", "warning")
+@check("error", "effort_time", "other_gains")
+@check("warning", "other_scale")
 def check_effort_time(
     law: DriveLaw,
     recordings: Sequence[Measurement],
@@ -116,10 +110,9 @@ def check_effort_time(
 
 def _moved(m: Measurement, signal: str, inertia: float) -> Measurement:
     """``m`` with the torque that accelerates the joint in place of its effort."""
-    torque = inertia * np.gradient(np.gradient(m.measured[:, m.column(signal)], m.period_s), m.period_s)
-    return dataclasses.replace(
-        m, effort=np.where(np.arange(len(m.signals)) == m.column(signal), torque[:, None], np.nan)
-    )
+    effort, j = np.full_like(m.measured, np.nan), m.column(signal)
+    effort[:, j] = inertia * np.gradient(np.gradient(m.measured[:, j], m.period_s), m.period_s)
+    return dataclasses.replace(m, effort=effort)
 
 
 def _two_machines(law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool = False) -> str:
@@ -282,14 +275,10 @@ class LawFit(NamedTuple):
 
     kp: float
     """Ratio of the fitted gain of the position error to the stated one (impedance: K_p; cascade: K_p times K_d)."""
-    kd: float
-    """Ratio of the fitted K_d to the stated one."""
-    sd: tuple[float, float]
-    """Standard errors of both."""
-    left: float
-    """RMS of the residual of the fitted law over the RMS of the effort, both smoothed."""
-    share: float
-    """r times ``kp``, for efforts in another unit."""
+    kd: float  # Ratio of the fitted K_d to the stated one
+    sd: tuple[float, float]  # Standard errors of both
+    left: float  # RMS of the residual of the fitted law over the RMS of the effort, both smoothed
+    share: float  # r times ``kp``, for efforts in another unit
 
     @property
     def sign(self) -> int:

@@ -24,14 +24,10 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.joint_checks import find_lag
 from taccorl.errors import TaccorlError
 
-COMMAND_HZ = 150.0
-"""Row rate below which the command is interpolated between rows, as in ``taccorl.sim.replay`` [Hz]."""
-TAU_S = (1e-3, 2.0)
-"""Range of time constants that are searched [s]."""
-LEAST_ROWS = 20
-"""Least number of measured rows for a fit."""
-MOST_ROWS = 5000
-"""If there are more rows, an even selection of so many is used for the start of the fit."""
+COMMAND_HZ = 150.0  # Row rate below which the command is interpolated between rows, as in ``taccorl.sim.replay`` [Hz]
+TAU_S = (1e-3, 2.0)  # Range of time constants that are searched [s]
+LEAST_ROWS = 20  # Least number of measured rows for a fit
+MOST_ROWS = 5000  # If there are more rows, an even selection of so many is used for the start of the fit
 DELAY_ROWS, DELAY_S, FAR_S = 8.0, 0.15, 2.0
 """Range of delays that are searched: from so many rows too early to so many seconds late; and by ``far_delay``."""
 FAR_LEAVES = 0.3
@@ -42,24 +38,19 @@ FAR_LEAVES = 0.3
 class Shift:
     """Delay of one response to a command relative to another, with differences of gains removed."""
 
-    delay_s: float
-    """Delay [s]; negative if the response leads the other, or its command."""
+    delay_s: float  # Delay [s]; negative if the response leads the other, or its command
     delay_sd_s: float
     """Standard deviation of the delay [s], with the autocorrelation of the residual taken into account."""
-    rms: float
-    """RMS of the residual of the fit [rad, m]."""
-    row_rms: float
-    """RMS residual that an offset of one row would cause [rad, m]."""
+    rms: float  # RMS of the residual of the fit [rad, m]
+    row_rms: float  # RMS residual that an offset of one row would cause [rad, m]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirstOrder(Shift):
     """Fitted first-order lag and delay of one joint behind its command."""
 
-    time_constant_s: float
-    """τ of the lag [s]."""
-    gain: float
-    """g: change of the position per change of the command; nearly 1."""
+    time_constant_s: float  # τ of the lag [s]
+    gain: float  # g: change of the position per change of the command; nearly 1
 
     def response(self, target: np.ndarray, period_s: float) -> np.ndarray:
         """(T,) g f(t − d) to ``target`` (T,), from its first row on [rad, m]."""
@@ -68,14 +59,9 @@ class FirstOrder(Shift):
 
 
 def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder:
-    """Fit the lag τ, delay d, gain g and offset b of the module's equation by least squares.
-
-    Args:
-        target: (T,) commands [rad, m], in force from row k on.
-        measured: (T,) positions at row k [rad, m]; rows with NaN are left out.
-        period_s: time between two rows [s].
-
-    Raises TaccorlError: there are too few rows."""
+    """Fit the lag τ, delay d, gain g and offset b of the module's equation by least squares. ``target``: (T,) commands [rad, m],
+    in force from row k on. ``measured``: (T,) positions at row k [rad, m]; rows with NaN are left out. ``period_s``: time between
+    two rows [s]. Raises TaccorlError: there are too few rows."""
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
 
@@ -107,9 +93,8 @@ def far_delay(target: np.ndarray, measured: np.ndarray, period_s: float) -> Firs
     fit = fit_first_order(target[:-rows], measured[rows:], period_s)
     fit = dataclasses.replace(fit, delay_s=fit.delay_s + rows * period_s)
     lost = np.ptp(target) - np.nanmax(measured) + np.nanmin(measured)
-    real = fit.delay_s - 4.0 * fit.delay_sd_s > DELAY_S and lost < float(
-        np.sqrt(np.nanmean(np.square(target - measured)))
-    )
+    error = np.sqrt(np.nanmean(np.square(target - measured)))
+    real = fit.delay_s - 4.0 * fit.delay_sd_s > DELAY_S and lost < error
     return fit if real and fit.rms < FAR_LEAVES * fit_first_order(target, measured, period_s).rms else None
 
 
@@ -224,36 +209,26 @@ class _Answer:
 # whole step: the joint moves as the replay does times a factor, and begins at the same time. Another inertia, too, changes the
 # first motion by a factor. So q(t) − q₀ = s · r(t − d) with the replay's motion r gives the delay d, whatever is missing.
 
-REST_S = 0.25
-"""Time for which all targets must have rested before a step [s]."""
-HELD_S = 0.04
-"""Time for which the target must rest after a step [s]."""
-WINDOW_S = 0.12
-"""Time after a step of the target within which the joint must have moved by ``SHARE`` of the step [s]."""
-SHARE = 0.25
-"""Share of the step up to which the motion is compared. A choice."""
-SEEN_FLOORS, SEEN_ROWS = 6.0, 3
-"""Least number of rows in which the motion is above so many noise floors."""
-ONSET_ROWS = -8.0, 20.0
-"""Range of delays that are tried."""
-FINE_ROWS = 0.05
-"""Step between them."""
+REST_S = 0.25  # Time for which all targets must have rested before a step [s]
+HELD_S = 0.04  # Time for which the target must rest after a step [s]
+WINDOW_S = 0.12  # Time after a step of the target within which the joint must have moved by ``SHARE`` of the step [s]
+SHARE = 0.25  # Share of the step up to which the motion is compared. A choice.
+SEEN_FLOORS, SEEN_ROWS = 6.0, 3  # Least number of rows in which the motion is above so many noise floors
+ONSET_ROWS = -8.0, 20.0  # Range of delays that are tried
+FINE_ROWS = 0.05  # Step between them
 ALIKE = 0.04
 """Largest residual of the comparison, as a share of what an offset of one row would leave. A torque at its limit, play and a
 wrong scale of torques change the motion's shape. On simulated joints delays were right within 1.9 ms below this share, and up to
 9 ms off above it."""
-LEAST_STEPS = 2
-"""Least number of steps by which a delay is judged."""
+LEAST_STEPS = 2  # Least number of steps by which a delay is judged
 
 
 @dataclass(frozen=True)
 class Onset:
     """Delay of a joint's measured motion after steps, compared with a replay."""
 
-    delay_s: float
-    """Median over the steps [s]; negative if the measurement leads."""
-    sd_s: float
-    """Standard error of the median, from the scatter of the steps [s]."""
+    delay_s: float  # Median over the steps [s]; negative if the measurement leads
+    sd_s: float  # Standard error of the median, from the scatter of the steps [s]
     num_steps: int
 
 

@@ -27,26 +27,17 @@ from scipy.signal import lfilter
 from taccorl.alignment.checks.first_order import beside
 from taccorl.alignment.measurements.measurement import Measurement
 
-HOLDS = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Lengths of a hold that are searched [command periods]."""
-AR_ORDER = 6
-"""Order of the whitening filter A(q)."""
-PASSES = 4
-"""Number of fits of response and noise, each without the events found so far: events bend both."""
-LEAD_ROWS = 4
-"""Rows of the response before the impulse: a delay of part of a row spreads it to both sides."""
-RESPONSE_S = 0.4
-"""Length of the response that is used [s]."""
-LEAST_GAIN = 12.0
-"""Least score of an event: noise alone causes one in about 10⁵ rows."""
-LOCAL_S = 0.5
-"""Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only."""
+HOLDS = (1, 2, 3, 4, 6, 8, 12, 16)  # Lengths of a hold that are searched [command periods]
+AR_ORDER = 6  # Order of the whitening filter A(q)
+PASSES = 4  # Number of fits of response and noise, each without the events found so far: events bend both
+LEAD_ROWS = 4  # Rows of the response before the impulse: a delay of part of a row spreads it to both sides
+RESPONSE_S = 0.4  # Length of the response that is used [s]
+LEAST_GAIN = 12.0  # Least score of an event: noise alone causes one in about 10⁵ rows
+LOCAL_S = 0.5  # Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
 """Ranges of the parameters of the fitted response: natural frequency [rad/s], damping ratio, delay [rows]."""
-STOOD_S = 0.075
-"""A target that begins to move after it stood for so long turns there [s]."""
-MOVES = 2e-3
-"""Least motion of a target that can show a dropped command [rad, m]."""
+STOOD_S = 0.075  # A target that begins to move after it stood for so long turns there [s]
+MOVES = 2e-3  # Least motion of a target that can show a dropped command [rad, m]
 LEAST_EVENTS, MIRRORED = 6, 4
 """Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
 that makes the joint lag (a torque limit) leaves up to four that are none."""
@@ -64,12 +55,9 @@ class Dropped:
 
     times_s: dict[str, tuple[float, ...]]
     """Recording → times at which a previous target stayed in force; recordings without one are left out."""
-    commands: int
-    """Number of changes of the command that were searched."""
-    held: float
-    """Number of commands during which a previous target was in force."""
-    mirrored: int
-    """Number of events of the opposite sign, which estimates that of false events."""
+    commands: int  # Number of changes of the command that were searched
+    held: float  # Number of commands during which a previous target was in force
+    mirrored: int  # Number of events of the opposite sign, which estimates that of false events
     ranks: tuple[float, ...]
     """For each event the share of commands whose loss could be seen that lie before it between two turns of the target; uniform
     if commands are dropped at random times."""
@@ -140,12 +128,8 @@ def _events(
     target: np.ndarray, measured: np.ndarray, changed: np.ndarray, period_s: float
 ) -> tuple[Events, Events, dict[int, np.ndarray]]:
     """Dropped commands, events of the opposite sign, and rows of a hold → (R,) bool: it could be seen if it began there.
-
-    Args:
-        target: (T,) commanded targets [rad, m], in force from row k on.
-        measured: (T,) positions at row k [rad, m]; NaN where not measured.
-        changed: (R,) rows in which the target changes.
-    """
+    ``target``: (T,) commanded targets [rad, m], in force from row k on. ``measured``: (T,) positions at row k [rad, m]; NaN where
+    not measured. ``changed``: (R,) rows in which the target changes."""
     found: Events = []
     others: Events = []
     visible: dict[int, np.ndarray] = {}

@@ -21,12 +21,9 @@ WRAPPED = 0.5
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
 10 s."""
-DEAD_SHARE = 0.05
-"""A joint does not answer if its range is below this share of its command's range."""
-FROZEN_S = 0.3
-"""Least time of bit-identical readings of a frozen channel [s]."""
-FROZEN_MOVE = 0.05
-"""Least motion of the command in that time [rad; a tenth of it in m]."""
+DEAD_SHARE = 0.05  # A joint does not answer if its range is below this share of its command's range
+FROZEN_S = 0.3  # Least time of bit-identical readings of a frozen channel [s]
+FROZEN_MOVE = 0.05  # Least motion of the command in that time [rad; a tenth of it in m]
 FROZEN_EFFORT_S = 1.0
 """Least time of bit-identical efforts of a frozen effort channel [s]; the joint must move to and fro by ``FROZEN_MOVE`` in it,
 which friction and inertia do not allow at one effort. A choice."""
@@ -38,19 +35,16 @@ REST_SHARE = 0.1
 ``ANSWER_S``, it counts as standing still until then."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
 """Time at the furthest reading [s], and distance of the command beyond it [rad; a tenth of it in m], for a blocked joint."""
-START_S, START_ROWS = 0.15, (8, 30)
-"""Time and number of rows from which the speed at row 0 is estimated."""
+START_S, START_ROWS = 0.15, (8, 30)  # Time and number of rows from which the speed at row 0 is estimated
 START_SPEED = {"rad": 0.03, "m": 0.003}
 """Largest speed at row 0 [rad/s]: a twin that starts at rest then errs by 0.1 s times it, 3 mrad."""
 START_OFFSET_RAD = 0.1
 """Largest distance of a joint from its resting command at the start [rad]. The paper's feed-forward torque causes 11 mrad at
 most."""
-AT_LIMIT_SHARE = 0.01
-"""Share of the rows with exactly the largest effort from which on the effort counts as limited."""
+AT_LIMIT_SHARE = 0.01  # Share of the rows with exactly the largest effort from which on the effort counts as limited
 PLATEAU_ROWS, PLATEAU_FROM = 10, 0.9
 """Least number of rows, and share of the effort in them below which rows show the law, for an effort at a limit with noise."""
-STATED_LIMIT = 0.02
-"""A plateau of efforts is at the stated limit if it is within this share of it. A choice."""
+STATED_LIMIT = 0.02  # A plateau of efforts is at the stated limit if it is within this share of it. A choice.
 STICK_STEPS = 4.0
 """Most steps (usual ones between rows, or the encoder's) by which a sticking joint moves on; a driver that repeated old values
 jumps to the joint's present position instead."""
@@ -81,8 +75,7 @@ def _filled(values: np.ndarray, target: np.ndarray) -> int | None:
     return row if apart > max(FILLER * others, FILLER_LEAST, 2.0 * moved) else None
 
 
-@check("not_finite", "error")
-@check("lost_samples", "error", needs="rows")
+@check("error", "not_finite", "lost_samples", needs="rows")
 def check_values(t: Trial) -> Iterator[Finding]:
     """Find targets that are no numbers, angles that jump by a full turn, values that fill a row (a logger's zeros), and rows
     without a measurement."""
@@ -128,8 +121,8 @@ def check_values(t: Trial) -> Iterator[Finding]:
     yield find("lost_samples", names[0], text, (first, end))
 
 
-@check("too_short", "error")
-@check("short", "warning", needs="rows")
+@check("error", "too_short")
+@check("warning", "short", needs="rows")
 def check_length(t: Trial) -> Iterator[Finding]:
     """Motion, from the first change of a command to the last, that is too short for a fit."""
     changed = np.flatnonzero(np.any(np.diff(t.m.target, axis=0) != 0, axis=1))
@@ -151,8 +144,7 @@ def _comes_to_rest(m: Measurement) -> bool:
     return bool(known.any() and (last[0] == 0.0).all() and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all())
 
 
-@check("no_motion", "error")
-@check("dead_channel", "error", needs="position")
+@check("error", "no_motion", "dead_channel", needs="position")
 def check_motion(t: Trial) -> Iterator[Finding]:
     """Joints that do not move, do not answer, or stop answering."""
     m = t.m
@@ -181,10 +173,8 @@ def check_motion(t: Trial) -> Iterator[Finding]:
             yield from _stuck(m, int(j))
 
 
-@check("frozen_channel", "error")
-@check("saturated_channel", "error")
-@check("sticking_joint", "warning")
-@check("blocked", "warning")
+@check("error", "frozen_channel", "saturated_channel")
+@check("warning", "sticking_joint", "blocked")
 def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
     """A joint that stands still while its command moves: a driver that repeats old values, the end of its range, or a joint that
     sticks or is stopped. One finding."""
@@ -300,8 +290,7 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
     return f"goes on from there ({jump:.2g} {m.units[j]} to the next row)"
 
 
-@check("not_at_rest", "warning")
-@check("start_offset", "warning", needs="position")
+@check("warning", "not_at_rest", "start_offset", needs="position")
 def check_start(t: Trial) -> Iterator[Finding]:
     """Signals that were not at rest near their command at the start, as the twin is."""
     m = t.m
@@ -345,8 +334,8 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
     return abs(float(solution[1])), float(sd[1])
 
 
-@check("dead_effort", "warning")
-@check("effort_limit", "note", needs="effort")
+@check("warning", "dead_effort")
+@check("note", "effort_limit", needs="effort")
 def check_effort(t: Trial) -> Iterator[Finding]:
     """Efforts that are constant while the joint moves, or stop at a limit that is not the one stated in ``limits``."""
     m = t.m
@@ -374,7 +363,7 @@ def check_effort(t: Trial) -> Iterator[Finding]:
             yield find("effort_limit", name, text, (int(at[0]), int(at[-1]) + 1))
 
 
-@check("frozen_effort", "error")
+@check("error", "frozen_effort")
 def _frozen_effort(m: Measurement, j: int) -> Iterator[Finding]:
     """An effort that stays the same to the last bit for ``FROZEN_EFFORT_S`` while the joint goes to and fro, though it changes
     from row to row elsewhere; efforts at their largest value are left to the limit of the drive."""
@@ -485,11 +474,5 @@ def stood_at_stop(
     for k in range(first, len(up) - 1):
         stopped[k + 1] = min(held, command[k] + (stopped[k] - command[k]) * keep)
     beyond = first + int(np.argmax(command[first:end]))  # both come back after this row
-    back = [_first(answer < below, beyond), _first(stopped < below, beyond)]
-    return abs(back[1] - end) < abs(back[0] - end)
-
-
-def _first(reached: np.ndarray, after: int) -> int:
-    """The first row from ``after`` on where ``reached`` is true; the number of rows if there is none."""
-    found = np.flatnonzero(reached[after:])
-    return after + int(found[0]) if len(found) else len(reached)
+    back = [np.append(np.flatnonzero(own[beyond:] < below) + beyond, len(up))[0] for own in (answer, stopped)]
+    return bool(abs(back[1] - end) < abs(back[0] - end))

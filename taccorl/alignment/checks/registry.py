@@ -1,6 +1,6 @@
 """The list of checks of measurements. A check is a function that yields findings; the decorator puts it into the list.
 
-    @check("reversed", "error", needs="position", explains=("measured_before_command", "blocked"))
+    @check("error", "reversed", needs="position", explains=("measured_before_command", "blocked"))
     def reversed_sign(t: Trial) -> Iterator[Finding]: ...
 
 ``telemetry`` runs the functions of one need after the other, in the order of the list. ``--accept`` takes the names that can
@@ -20,23 +20,20 @@ from taccorl.errors import TaccorlError, nearest
 class Check:
     """A name in the list."""
 
-    severity: Severity
-    """Severity of its findings, unless one states another."""
-    explains: tuple[str, ...] = ()
-    """Checks whose findings about the same signal may follow from this one."""
+    severity: Severity  # Severity of its findings, unless one states another
+    explains: tuple[str, ...] = ()  # Checks whose findings about the same signal may follow from this one
 
 
-CHECKS: dict[str, Check] = {}
-"""Name of every check of measurements. Thresholds stand beside the functions."""
+CHECKS: dict[str, Check] = {}  # Name of every check of measurements. Thresholds stand beside the functions.
 _FUNCTIONS: dict[str, list[Callable[..., Any]]] = {}
 
 
 def check[F: Callable[..., Any]](
-    name: str, severity: Severity, *, needs: str = "", explains: tuple[str, ...] = ()
+    severity: Severity, *names: str, needs: str = "", explains: tuple[str, ...] = ()
 ) -> Callable[[F], F]:
-    """Decorator that puts a check into the list. ``needs``: what a trial needs for the function to run (see ``run``); "": the
-    function stands in the list under another of its names, or is called by other code. ``explains``: as in ``Check``."""
-    CHECKS[name] = Check(severity, explains)
+    """Decorator that puts checks into the list, in this order. ``needs``: what a trial needs for the function to run (see
+    ``run``); "": another decorator of the function says so, or other code calls it. ``explains``: as in ``Check``."""
+    CHECKS.update(dict.fromkeys(names, Check(severity, explains)))
 
     def listed(function: F) -> F:
         if needs:

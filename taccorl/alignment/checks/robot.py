@@ -17,23 +17,19 @@ from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.data.finding import Finding, listed
 
-BEYOND = 0.02
-"""Share of a joint's range by which a measured position may exceed its limits."""
+BEYOND = 0.02  # Share of a joint's range by which a measured position may exceed its limits
 DEGREES, NEAR_DEGREES = math.pi / 180, 0.3
 """Radians in a degree. Where the fitted inertia over the stated one is this number, within a factor of exp(0.3) (a choice), the
 positions are in degrees."""
-EFFORT_BEYOND = 1.5
-"""Multiple of the effort limit above which a reported effort is probably in another unit."""
-INERTIA_OFF = 5.0
-"""Ratio of the model's inertia to that in the recording from which on they do not match."""
+EFFORT_BEYOND = 1.5  # Multiple of the effort limit above which a reported effort is probably in another unit
+INERTIA_OFF = 5.0  # Ratio of the model's inertia to that in the recording from which on they do not match
 INERTIA_SURE = 0.6
 """Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known, and by
 which a reversed effort must be explained better than the effort as it is."""
 REVERSED_LEFT = 0.2
 """Share that a reversed effort leaves at most of what the effort as it is leaves, where no law shows its sign: a centre of mass
 on the other side of the axis leaves more. A choice."""
-SMOOTH_S = 0.05
-"""Window of the quadratic whose second derivative is the acceleration [s]."""
+SMOOTH_S = 0.05  # Window of the quadratic whose second derivative is the acceleration [s]
 
 
 def check_robot(
@@ -43,13 +39,9 @@ def check_robot(
     moved: Sequence[str],
     fits: Mapping[str, LawFit | None] | None = None,
 ) -> list[Finding]:
-    """Check one recording of a machine with a robot file; returns its findings.
-
-    Args:
-        whole: the measurement ``m`` extended to all signals of the robot.
-        moved: joints of the robot file that the recording moves.
-        fits: joint → law of its efforts in all recordings; by default in this one.
-    """
+    """Check one recording of a machine with a robot file; returns its findings. ``whole``: the measurement ``m`` extended to all
+    signals of the robot. ``moved``: joints of the robot file that the recording moves. ``fits``: joint → law of its efforts in
+    all recordings; by default in this one."""
     if fits is None:
         fits = {name: law_fit(robot.config.joints[name], [whole], name) for name in moved if name in m.signals}
     found = _missing(robot, m)
@@ -73,7 +65,7 @@ def check_robot(
     return [*found, *_effort_unit(m, factors), *of_efforts]
 
 
-@check("effort_unit", "error")
+@check("error", "effort_unit")
 def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
     """One finding for all joints whose reported efforts are ``factors`` times those of their laws."""
     if not factors:
@@ -82,9 +74,8 @@ def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
     times = f"{low:.3g} times" if len(factors) == 1 else f"{low:.3g} … {high:.3g} times"
     unit = "another unit: mA, or the torque before the gear?" if low > 1 else "another unit, such as A?"
     numbers = ", ".join(f"{name}: {1 / factor:.3g}" for name, factor in factors.items())
-    where = write(
-        m, "as `factor:` of their .tau in a columns file", "as `effort_scale:` of the recording in measurements.yaml"
-    )
+    scales = "as `effort_scale:` of the recording in measurements.yaml"
+    where = write(m, "as `factor:` of their .tau in a columns file", scales)
     text = (
         f"efforts of {listed(list(factors))} are {times} what kp and kd of the file command: in {unit} With these gains one unit "
         f"is so many N·m (N) at the joint: {{{numbers}}}. Write these {where}, or the torque constants that you know; or correct "
@@ -104,7 +95,7 @@ def _factor(law: DriveLaw, m: Measurement, name: str, fit: LawFit | None) -> flo
     return fit.kp if fit is not None and stated and fit.sign > 0 else None
 
 
-@check("pose_unknown", "warning")
+@check("warning", "pose_unknown")
 def _missing(robot: Robot, m: Measurement) -> list[Finding]:
     lacking = [name for name in robot.units if name not in m.signals]
     if not lacking:
@@ -116,7 +107,7 @@ def _missing(robot: Robot, m: Measurement) -> list[Finding]:
     return [find("pose_unknown", "", text)]
 
 
-@check("beyond_limits", "error")
+@check("error", "beyond_limits")
 def beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     facts, j = robot.rigid.joints[name], m.column(name)
     if facts.limits is None:
@@ -140,7 +131,7 @@ def beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     return [find("beyond_limits", name, text, (row, row + 1))]
 
 
-@check("beyond_effort", "error")
+@check("error", "beyond_effort")
 def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[Finding]:
     """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none. ``law``:
     the drive of signal ``name``. ``file``: name of its file, for the message."""
@@ -165,7 +156,7 @@ def _line(m: Measurement, name: str, factor: str = "…") -> str:
     return write(m, f"`factor: {factor}` for {name}.tau in a columns file", scale)
 
 
-@check("reversed_effort", "error")
+@check("error", "reversed_effort")
 def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) -> list[Finding]:
     """Finding on an effort with the wrong sign: by its law, which no mass changes, or where no law shows the sign by inertia.
     ``left``: share that the effort with the opposite sign leaves of what it leaves as it is."""
@@ -191,7 +182,7 @@ def in_degrees(ratio: float, signal: str, unit: str) -> str:
     return f" Positions in degrees make it 0.0175 times: then write {line}."
 
 
-@check("wrong_inertia", "error")
+@check("error", "wrong_inertia")
 def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: LawFit | None) -> list[Finding]:
     """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
     j = m.column(name)

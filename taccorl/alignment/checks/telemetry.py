@@ -32,8 +32,7 @@ LISTED = cells, clock, effort_time, robot, time_stamps, wiring
 DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
 ORDER = ("error", "warning", "note")
-NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
-"""With these nothing else can be judged."""
+NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")  # With these nothing else can be judged
 
 
 def check_measurement(
@@ -92,9 +91,7 @@ def check_measurements(
     for a, b in itertools.combinations(sound, 2):
         if not moves[a.name] & moves[b.name]:
             continue  # other joints: of a hundred recordings most pairs
-        if np.array_equal(a.measured, b.measured, equal_nan=True) and np.array_equal(
-            a.target, b.target, equal_nan=True
-        ):
+        if all(np.array_equal(getattr(a, k), getattr(b, k), equal_nan=True) for k in ("measured", "target")):
             text = f"{b.name} is {a.name}, number for number: no repeat, whose noise tells the floor, and nothing new. Remove it"
             found[b.name].append(find("copied_recording", "", f"{text} (a simulation without noise repeats so, too)"))
             continue
@@ -125,7 +122,7 @@ def _held_and_exchanged(m: Measurement, f: Finding, findings: Sequence[Finding])
     return find(clock.EXCHANGED_COLUMNS, f.feature, text)
 
 
-@check("slower_rows", "warning")
+@check("warning", "slower_rows")
 def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> Iterator[tuple[str, Finding]]:
     """Find recordings with fewer rows a second than targets changed in another one; ``rates``: joint → stated command_hz or 0."""
     trials = [Trial(m) for m in sound]
@@ -143,9 +140,9 @@ def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> It
             yield m.name, find("slower_rows", signal, text, topic="rows")
 
 
-@check("copied_recording", "warning")
-@check("same_motion", "note")
-@check("same_commands", "warning")
+@check("warning", "copied_recording")
+@check("note", "same_motion")
+@check("warning", "same_commands")
 def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
     """What to write into the index of two recordings that were given the same commands."""
     floors = [Trial(a).floor, Trial(b).floor]
@@ -182,10 +179,8 @@ def _turned(m: Measurement, f: Finding) -> Measurement:
 
 
 def _exchanged(m: Measurement, f: Finding) -> Measurement:
-    own = np.array(m.signals) == f.feature
-    return dataclasses.replace(
-        m, measured=np.where(own, m.target, m.measured), target=np.where(own, m.measured, m.target)
-    )
+    own, q, target = np.array(m.signals) == f.feature, m.measured, m.target
+    return dataclasses.replace(m, measured=np.where(own, target, q), target=np.where(own, q, target))
 
 
 def _of_other(m: Measurement, f: Finding) -> Measurement:
@@ -219,9 +214,8 @@ def one_cause(
     result = {name: [f for f in own if (f.check, f.feature) not in explained] for name, own in found.items()}
     wrong = {f.feature for own in result.values() for f in own if f.check in CORRECTED and f.severity == "error"}
     for signal in sorted(wrong):
-        errors = {
-            n: {f.check: f for f in own if f.feature == signal and f.severity == "error"} for n, own in result.items()
-        }
+        of_signal = {n: [f for f in own if f.feature == signal and f.severity == "error"] for n, own in result.items()}
+        errors = {n: {f.check: f for f in own} for n, own in of_signal.items()}
         of = {cause: [name for name, own in errors.items() if cause in own] for cause in CORRECTED}
         cause = max(of, key=lambda c: len(of[c]))
         follow = {*CORRECTED, *CHECKS[cause].explains}

@@ -10,17 +10,14 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding
 
-RATE_HZ = (5.0, 5000.0)
-"""Range of plausible row rates [Hz]; outside it the times are probably in another unit."""
+RATE_HZ = (5.0, 5000.0)  # Range of plausible row rates [Hz]; outside it the times are probably in another unit
 GAP, JITTER = 1.5, 0.1
 """Steps above the first [median periods] are lost rows; at most a twentieth of the steps may deviate by more than the second."""
-RATE_SHARE = 0.8
-"""Least rate, as a share of the rate that the spec states."""
+RATE_SHARE = 0.8  # Least rate, as a share of the rate that the spec states
 
 
-@check("time_backwards", "error")
-@check("time_unit", "error")
-@check("row_times", "warning", needs="rows")
+@check("error", "time_backwards", "time_unit")
+@check("warning", "row_times", needs="rows")
 def check_time(t: Trial) -> Iterator[Finding]:
     """Time stamps that do not increase, are uneven, or have gaps."""
     m = t.m
@@ -54,8 +51,7 @@ def check_time(t: Trial) -> Iterator[Finding]:
         yield find("row_times", "time", text)
 
 
-@check("dropped_rows", "error")
-@check("jitter", "error")
+@check("error", "dropped_rows", "jitter")
 def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
     """Errors of tables: reading made these even where that is possible, and no replay takes the others."""
     period, severity = m.period_s, "error" if is_table(m) else "warning"
@@ -81,9 +77,8 @@ def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
         yield find("jitter", "time", text, (worst, worst + 2), severity=severity)
 
 
-@check("low_rate", "warning")
-@check("out_of_order", "warning")
-@check("duplicates", "note")
+@check("warning", "low_rate", "out_of_order")
+@check("note", "duplicates")
 def _channels(m: Measurement) -> Iterator[Finding]:
     for t in m.timing:
         if t.nominal_hz and t.rate_hz < RATE_SHARE * t.nominal_hz:

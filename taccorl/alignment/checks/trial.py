@@ -15,8 +15,7 @@ from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.robots import ROBOT
 
-MOVED = {"rad": 0.02, "m": 0.002}
-"""Least range of a command that counts as motion [rad; a tenth of it in m]."""
+MOVED = {"rad": 0.02, "m": 0.002}  # Least range of a command that counts as motion [rad; a tenth of it in m]
 MOVED_STEPS = 100.0
 """A command of a machine other than the PiPER also counts as motion if its range is so many encoder steps (± 1 mm on a stage)."""
 
@@ -55,10 +54,8 @@ def write(m: Measurement, columns_file: str, otherwise: str) -> str:
 
 def without(m: Measurement, first: int) -> str:
     """The way to leave out row ``first`` and those after it: a command for a CSV file whose rows are as they were written."""
-    is_whole = (
-        m.source.suffix == ".csv" and m.source.is_file() and {f.check for f in m.findings}.isdisjoint({"resampled"})
-    )
-    if not is_whole or first * m.period_s < 1.0:
+    is_changed = any(f.check == "resampled" for f in m.findings)
+    if is_changed or not (m.source.suffix == ".csv" and m.source.is_file()) or first * m.period_s < 1.0:
         return "leave this recording out"
     with m.source.open(encoding="utf-8", errors="replace") as file:
         head = 1 + sum(1 for _ in itertools.takewhile(lambda line: line.startswith("#"), file))

@@ -32,24 +32,18 @@ from taccorl.alignment.measurements.noise_floor import (
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
 
-BLOCK_S = 0.5
-"""Length of a block in which the difference of two repeats is measured [s]."""
-MOST_TIMES = 5
-"""Most times that a text lists."""
+BLOCK_S = 0.5  # Length of a block in which the difference of two repeats is measured [s]
+MOST_TIMES = 5  # Most times that a text lists
 
 
 class Block(NamedTuple):
     """Difference of two recordings of one motion within ``BLOCK_S``."""
 
-    rms: float
-    """RMS of the difference / √2 [rad, m]."""
+    rms: float  # RMS of the difference / √2 [rad, m]
     first: str
-    second: str
-    """Name of the recording that repeats it."""
-    begin_s: float
-    """Start of the block in the first recording [s]."""
-    end_s: float
-    """End of the block in the first recording [s]."""
+    second: str  # Name of the recording that repeats it
+    begin_s: float  # Start of the block in the first recording [s]
+    end_s: float  # End of the block in the first recording [s]
 
 
 class Pair(NamedTuple):
@@ -69,9 +63,8 @@ class Pair(NamedTuple):
             yield Block(rms, self.first, self.second, float(self.time_s[k]), float(self.time_s[k + rows - 1]))
 
 
-@check("dropped_commands", "warning")
-@check("does_not_repeat", "warning")
-@check("not_judged", "note")
+@check("warning", "dropped_commands", "does_not_repeat")
+@check("note", "not_judged")
 def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[str, Finding]]:
     """Recordings with dropped commands, and those that differ by far more than their noise from one that they repeat: name, and
     finding; each signal's under the recording that shows it most. A note under the first one if there are no repeats."""
@@ -88,14 +81,11 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
         # Without logged targets the measured position is the input: repeats with other positions were another motion.
         moved = [s for s in floors if any(np.ptp(m.target[:, m.column(s)]) > 0 for m in group)]
         moved = [s for s in moved if group[0].target_kind(s) != "effort"]
-        later = [without_beginning(laid.difference["position"], a.rate_hz) for a, _, laid in pairs]
-        differences = {
-            s: [
-                Pair(a.name, b.name, laid.time_s, own[:, a.column(s)])
-                for (a, b, laid), own in zip(pairs, later, strict=True)
-            ]
-            for s in moved
-        }
+        differences: dict[str, list[Pair]] = {signal: [] for signal in moved}
+        for a, b, laid in pairs:
+            later = without_beginning(laid.difference["position"], a.rate_hz)
+            for signal, own in differences.items():
+                own.append(Pair(a.name, b.name, laid.time_s, later[:, a.column(signal)]))
         if moved and not any(np.isfinite(pair.difference).any() for own in differences.values() for pair in own):
             yield name, not_judged("", what, "no recording repeats another (repeat_of). Record one motion twice")
         for signal, own in differences.items():

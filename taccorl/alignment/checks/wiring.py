@@ -19,23 +19,16 @@ from taccorl.alignment.measurements.measurement import Measurement, other_arm
 from taccorl.data.finding import Finding, listed
 from taccorl.robots import ROBOT
 
-USUAL_LAG_S = 0.1
-"""Lag of a joint behind its command that is assumed here [s]."""
-FOLLOWS, FOLLOWS_NOT = 0.8, 0.5
-"""Correlation above which a joint follows a command, and below which it does not."""
-REVERSED = -0.6
-"""Correlation below which a joint moves against its command."""
-ALIKE = 0.02
-"""Least difference of correlations for choosing between two joints."""
-GAIN = (0.2, 5.0)
-"""Gain above which neither controller nor physics can explain the motion."""
+USUAL_LAG_S = 0.1  # Lag of a joint behind its command that is assumed here [s]
+FOLLOWS, FOLLOWS_NOT = 0.8, 0.5  # Correlation above which a joint follows a command, and below which it does not
+REVERSED = -0.6  # Correlation below which a joint moves against its command
+ALIKE = 0.02  # Least difference of correlations for choosing between two joints
+GAIN = (0.2, 5.0)  # Gain above which neither controller nor physics can explain the motion
 SAME_FACTOR = 1.5
 """A joint that hardly moves is in another unit if it follows its command and its gain is a known factor, within so many times of
 it either way: a lag other than ``USUAL_LAG_S`` changes gains. A choice."""
-BEYOND = {"rad": 0.5, "m": 0.05}
-"""Distance beyond the robot's limits above which a position is impossible."""
-SMOOTH_S = 0.03
-"""Window over which velocities are averaged [s]."""
+BEYOND = {"rad": 0.5, "m": 0.05}  # Distance beyond the robot's limits above which a position is impossible
+SMOOTH_S = 0.03  # Window over which velocities are averaged [s]
 KNOWN_FACTORS = {
     57.2958: "in degrees where it should be in rad",
     1 / 57.2958: "in rad where the command is in degrees",
@@ -51,8 +44,7 @@ VELOCITY_FACTORS = {
     -1.0: "the other sign",
 }
 """Ratio of reported velocity to the slope of the position → unit in which the velocity probably is."""
-VELOCITY_GAIN = (0.8, 1.25)
-"""Range of that ratio that is accepted."""
+VELOCITY_GAIN = (0.8, 1.25)  # Range of that ratio that is accepted
 
 
 FOLLOWS_FROM = (
@@ -67,8 +59,8 @@ OF_ANOTHER_JOINT = (
 """Checks whose findings about a signal may also follow from a column that is another joint's."""
 
 
-@check("reversed", "error", explains=FOLLOWS_FROM)
-@check("swapped_joints", "error", needs="position", explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT))
+@check("error", "reversed", explains=FOLLOWS_FROM)
+@check("error", "swapped_joints", needs="position", explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT))
 def check_wiring(t: Trial) -> Iterator[Finding]:
     """Swapped joints and arms, reversed signs, and wrong units."""
     m, even = t.m, t.even
@@ -103,9 +95,8 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             yield find("reversed", name, text)
     yield from _swaps(m, swapped)
     for j in t.moving:
-        if m.signals[j] not in {*(f.feature for f in beyond), *swapped} and (
-            follows[j, j] > FOLLOWS_NOT or in_other_unit(t, j)
-        ):
+        is_named = m.signals[j] in {*(f.feature for f in beyond), *swapped}
+        if not is_named and (follows[j, j] > FOLLOWS_NOT or in_other_unit(t, j)):
             yield from _gain(m, even, lagged, j)
             yield from _velocity_unit(m, even, j)
 
@@ -152,7 +143,7 @@ def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
     return ([i for i in alike if m.signals[i] == other_arm(m.signals[j])] or alike)[0]
 
 
-@check("swapped_arms", "error")
+@check("error", "swapped_arms")
 def _swaps(m: Measurement, swapped: dict[str, str]) -> Iterator[Finding]:
     across = [name for name, other in swapped.items() if other == other_arm(name)]
     if len(across) == len(swapped) and len(across) > 1:
@@ -183,7 +174,7 @@ def _unit_way_out(m: Measurement, *columns: str) -> str:
     return f"{where}; if other recordings are right, convert this one"
 
 
-@check("unit", "error")
+@check("error", "unit")
 def _beyond_range(m: Measurement) -> Iterator[Finding]:
     """Positions where the robot cannot be: another unit."""
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
@@ -218,7 +209,7 @@ def _gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -> Iter
     yield find("unit", name, text)
 
 
-@check("velocity_unit", "warning")
+@check("warning", "velocity_unit")
 def _velocity_unit(m: Measurement, even: Measurement, j: int) -> Iterator[Finding]:
     """The reported velocity against the slope of the position."""
     gain = velocity_gain(even, j, j)

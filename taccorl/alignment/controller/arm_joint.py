@@ -66,13 +66,9 @@ def arm_spec(
     payload_kg: float = 0.0,
     payload_at_m: Position = AT_TCP,
 ) -> mujoco.MjSpec:
-    """One arm whose joints ``free`` have motors and encoders, and whose other joints and gripper are held at ``pose``.
-
-    Args:
-        pose: (7,) angles of the arm's six joints [rad] and its opening [m].
-        free: names of joints without the arm, such as ``joint5``.
-        payload_at_m: centre of mass of the known payload, in link 6's frame.
-    """
+    """One arm whose joints ``free`` have motors and encoders, and whose other joints and gripper are held at ``pose``. ``pose``:
+    (7,) angles of the arm's six joints [rad] and its opening [m]. ``free``: names of joints without the arm, such as ``joint5``.
+    ``payload_at_m``: centre of mass of the known payload, in link 6's frame."""
     spec = empty_bench(config)
     for other in ROBOT.arms:
         if other != arm:
@@ -99,10 +95,9 @@ def arm_spec(
             spec.delete(joint)
     for joint in spec.joints:
         joint.limited = False
+    position, of_joint = mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtObj.mjOBJ_JOINT
     for name in names:
-        spec.add_sensor(
-            name=f"{name}_pos", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=name
-        )
+        spec.add_sensor(name=f"{name}_pos", type=position, objtype=of_joint, objname=name)
     if payload_kg > 0:
         held_payload(arm, payload_kg, payload_at_m).edit(spec, config)
         spec.body(f"{arm}_payload").name = f"{arm}_held"  # so that the arm may have another, hidden one

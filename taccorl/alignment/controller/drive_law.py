@@ -37,8 +37,7 @@ NEEDED: Mapping[Law, tuple[str, ...]] = {
     "pwm": ("kp", *WINDING[:3]),
 }
 """Law → fields of ``DriveLaw`` that it requires."""
-LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
-"""Range of the physics step [s]."""
+LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4  # Range of the physics step [s]
 STEP_SHARE = 0.05
 """Physics step as a share of inertia / K_d. Steps are of second order: the error of a PWM servo's step of 0.8 rad is then 0.1
 mrad."""
@@ -71,28 +70,19 @@ _OF_LOOPS: Mapping[str, tuple[TargetKind, ...]] = {
 class DriveLaw:
     """Control law and numbers of one drive. Units are for a hinge; for a sliding joint read N for N·m and m for rad."""
 
-    law: Law = "impedance"
-    """Control law, a row of the table in ``docs/your_robot.md``."""
-    kp: float | None = None
-    """Gain in the law's unit divided by ``kp_factor``; None for laws without it."""
-    kd: float | None = None
-    """Gain in the law's unit divided by ``kd_factor``; None for laws without it."""
+    law: Law = "impedance"  # Control law, a row of the table in ``docs/your_robot.md``
+    kp: float | None = None  # Gain in the law's unit divided by ``kp_factor``; None for laws without it
+    kd: float | None = None  # Gain in the law's unit divided by ``kd_factor``; None for laws without it
     kp_factor: float = 1.0
     """Factor from ``kp``, here and in measurements.yaml, to the law's unit: the value of one step of a gain's register."""
-    kd_factor: float = 1.0
-    """The same for ``kd``."""
-    torque_ff: float = 0.0
-    """Constant torque of the controller [N·m]."""
-    supply_v: float | None = None
-    """Voltage of the motor's supply [V]; law pwm."""
-    resistance_ohm: float | None = None
-    """Resistance of the winding [Ω]; law pwm."""
-    torque_nm_per_a: float | None = None
-    """k_t at the axis or joint, gear included [N·m/A], law pwm."""
+    kd_factor: float = 1.0  # The same for ``kd``
+    torque_ff: float = 0.0  # Constant torque of the controller [N·m]
+    supply_v: float | None = None  # Voltage of the motor's supply [V]; law pwm
+    resistance_ohm: float | None = None  # Resistance of the winding [Ω]; law pwm
+    torque_nm_per_a: float | None = None  # k_t at the axis or joint, gear included [N·m/A], law pwm
     emf_v_s_per_rad: float | None = None
     """k_e at the axis or joint [V·s/rad], law pwm; k_t if not given (both are equal in SI units)."""
-    effort_limit: float | None = None
-    """Torque at which the drive's output is clipped [N·m]; None: not clipped."""
+    effort_limit: float | None = None  # Torque at which the drive's output is clipped [N·m]; None: not clipped
     effort_after_target: bool = False
     """True: the logged effort of a row already responds to the row's target. False: it was measured before that target acts."""
     known: tuple[str, ...] = ()
@@ -106,15 +96,11 @@ class DriveLaw:
         for the law, or is not used by it."""
         check_numbers(owner, self, positive=("kp_factor", "kd_factor"), finite=("torque_ff",))
         stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
-        foreign = () if self.law == "pwm" else WINDING
-        foreign += {"velocity": ("kp",), "torque": ("kp", "kd"), "effort": ("kp", "kd", "effort_limit")}.get(
-            self.law, ()
-        )
-        for name in foreign:
-            if name in stated:
-                raise TaccorlError(
-                    f"{owner}.{name}: law {self.law} does not use this number; remove it, or correct the law"
-                )
+        unused = {"velocity": ("kp",), "torque": ("kp", "kd"), "effort": ("kp", "kd", "effort_limit")}
+        foreign = (() if self.law == "pwm" else WINDING) + unused.get(self.law, ())
+        for name in (name for name in foreign if name in stated):
+            text = f"law {self.law} does not use this number; remove it, or correct the law"
+            raise TaccorlError(f"{owner}.{name}: {text}")
         check_numbers(owner, self, not_negative=[name for name in stated if name == "kd"])
         check_numbers(owner, self, positive=[name for name in stated if name != "kd"])
         for name in NEEDED[self.law]:
@@ -217,15 +203,9 @@ class DriveLaw:
         return {name: (getattr(self, name), unit) for name, unit in units.items() if getattr(self, name) is not None}
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
-        """Convert fitted values, by parameter name, into values of this class's fields.
-
-        Args:
-            base: those of ``torque_ff`` [N·m], ``kp`` and ``kd`` (as in ``loop_gains``), ``stall_nm`` and ``back_emf`` that were
-                fitted.
-
-        Returns:
-            Field → value in the unit of the file; only fields that follow from ``base``.
-        """
+        """Convert fitted values, by parameter name, into values of this class's fields. ``base``: those of ``torque_ff`` [N·m],
+        ``kp`` and ``kd`` (as in ``loop_gains``), ``stall_nm`` and ``back_emf`` that were fitted. Returns field → value in the
+        unit of the file; only fields that follow from ``base``."""
         new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
         if self.law == "pwm" and {"stall_nm", "back_emf"} & {*base}:
             volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0

@@ -8,8 +8,7 @@ from taccorl.alignment.controller.rigid_joint import Gains, Rigid
 from taccorl.sim.effects import command, drive, encoder, friction, gear, load
 from taccorl.sim.effects.effect import JOINT_SLOTS, ArmEffect
 
-FAMILIES = (command, drive, encoder, friction, gear, load)
-"""Modules of the effects that the model has."""
+FAMILIES = (command, drive, encoder, friction, gear, load)  # Modules of the effects that the model has
 POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
 """Values of ``Drive.command``: which quantity of the joint commands set, its position, velocity or torque."""
 
@@ -25,8 +24,7 @@ class _Own(NamedTuple):
     duty_torque: float = math.inf
     """Torque of the whole supply voltage at rest [N·m], V k_t / R, to which the controller's torque is clipped
     before the back-EMF is subtracted."""
-    back_emf: float = 0.0
-    """Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]."""
+    back_emf: float = 0.0  # Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]
     effort_after: float = 0.0
     """1: the reported effort of a row was measured after the row's command acted; 1 + n: after a command that acts n parts of the
     row late; 0: before."""
@@ -39,8 +37,7 @@ class _Own(NamedTuple):
     age, except while the motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""
     midpoint: float = 0.0
     """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
-    dropped_commands__seed: float = 0.0
-    """Seed of the commands that are lost."""
+    dropped_commands__seed: float = 0.0  # Seed of the commands that are lost
 
 
 def _numbers() -> dict[str, float]:

@@ -24,8 +24,7 @@ from taccorl.errors import TaccorlError
 
 PAPER_BOUNDS = {"kp": (10.0, 1e5), "kd": (1.0, 1e3), "torque_ff": (-8.0, 8.0)}
 """Bounds of K_p, K_d and T_ref [N·m/rad, N·m·s/rad, N·m] (App. B.1)."""
-REFERENCE = Gains(500.0, 50.0, 0.0)
-"""Gains of the paper's reference simulator, at which a search starts."""
+REFERENCE = Gains(500.0, 50.0, 0.0)  # Gains of the paper's reference simulator, at which a search starts
 _NORMAL_95 = 1.96
 _AT_BOUND = 1e-3  # so near to a bound, as a share of the value or of the span, is at it
 _LEAST_MOTION = 5e-3  # rad, m
@@ -44,12 +43,9 @@ class Estimate:
     value: float
     low: float
     high: float
-    unit: str
-    """Unit of all three, such as ``N·m/rad``."""
-    fixed: bool = False
-    """True if the number was not fitted, because it was commanded and known, or not requested."""
-    at_bound: bool = False
-    """True if the fit ended at one of the bounds of the search."""
+    unit: str  # Unit of all three, such as ``N·m/rad``
+    fixed: bool = False  # True if the number was not fitted, because it was commanded and known, or not requested
+    at_bound: bool = False  # True if the fit ended at one of the bounds of the search
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,29 +53,22 @@ class MotionError:
     """Error of the model on one recording, before (gains of the twin's configuration) and after the fit."""
 
     name: str
-    use: Literal["fit", "validation"]
-    """Whether the gains were fitted to the recording, or not (validation)."""
-    rmse_before: float
-    """RMS error before the fit [rad]."""
-    rmse_after: float
-    """RMS error after the fit [rad]."""
+    use: Literal["fit", "validation"]  # Whether the gains were fitted to the recording, or not (validation)
+    rmse_before: float  # RMS error before the fit [rad]
+    rmse_after: float  # RMS error after the fit [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerFit:
     """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
-    gains: Gains
-    """Gains in force in the first recording."""
+    gains: Gains  # Gains in force in the first recording
     estimates: dict[str, Estimate]
     """Always all six: ``kp``, ``kd``, ``torque_ff``; ``lag`` = K_d / K_p [s] and ``offset`` = T_ref / K_p, which positions alone
     determine; ``late``: delay of the measured rows [s], from a second fit that has it as a further unknown."""
-    ridge: float
-    """Correlation of log K_p and log K_d; 1 means that only their ratio is known. NaN if one is fixed."""
-    errors: tuple[MotionError, ...]
-    """One item per recording, those of the fit first."""
-    converged: bool
-    """True if the search ended at a minimum."""
+    ridge: float  # Correlation of log K_p and log K_d; 1 means that only their ratio is known. NaN if one is fixed.
+    errors: tuple[MotionError, ...]  # One item per recording, those of the fit first
+    converged: bool  # True if the search ended at a minimum
     remarks: tuple[str, ...]
     """Remarks: reasons why it did not converge, numbers that cannot be determined, suspicious values."""
 
@@ -218,17 +207,9 @@ def _errors(
 ) -> list[MotionError]:
     errors = []
     for motion in motions:
-        before, after = (
-            search.simulate(search.scaled(motion), gains)[0] for gains in (search.model.gains, search.gains(x))
-        )
-        errors.append(
-            MotionError(
-                name=motion.name,
-                use=use,
-                rmse_before=float(np.sqrt(np.nanmean((before - motion.measured) ** 2))),
-                rmse_after=float(np.sqrt(np.nanmean((after - motion.measured) ** 2))),
-            )
-        )
+        both = [search.simulate(search.scaled(motion), g)[0] for g in (search.model.gains, search.gains(x))]
+        before, after = (float(np.sqrt(np.nanmean((q - motion.measured) ** 2))) for q in both)
+        errors.append(MotionError(name=motion.name, use=use, rmse_before=before, rmse_after=after))
     return errors
 
 

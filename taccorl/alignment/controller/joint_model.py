@@ -54,33 +54,26 @@ class PayloadLever(NamedTuple):
     """Correction of the weight of a payload whose position no recording states: m g (s sin q + c cos q), relative to the
     position in the twin."""
 
-    sin_m: float = 0.0
-    """Coefficient s [m]."""
-    cos_m: float = 0.0
-    """Coefficient c [m]."""
+    sin_m: float = 0.0  # Coefficient s [m]
+    cos_m: float = 0.0  # Coefficient c [m]
 
 
-AT_ITS_PLACE = PayloadLever()
-"""No correction: the payload is where the twin has it."""
+AT_ITS_PLACE = PayloadLever()  # No correction: the payload is where the twin has it
 
 
 class Numbers(NamedTuple):
     """Gains, effects and corrections of one simulation."""
 
-    gains: Gains
-    """Gains of a recording with ``kp_scale`` = 1."""
+    gains: Gains  # Gains of a recording with ``kp_scale`` = 1
     effects: Sequence[Effect] = ()
     """Effects in addition to those of the machine file; one with the name of an effect of the file replaces it."""
-    lever: PayloadLever = AT_ITS_PLACE
-    """Correction of the payload's weight."""
-    age_s: float = 0.0
-    """Additional age of the measured position when the drive's torque acts."""
+    lever: PayloadLever = AT_ITS_PLACE  # Correction of the payload's weight
+    age_s: float = 0.0  # Additional age of the measured position when the drive's torque acts
     facts: Mapping[str, float] | None = None
     """Overrides: name of a field of ``drive_numbers.Drive`` → value that is used instead of the joint's own."""
     waits_s: float = 0.0
     """Time for which a row's target waits until the drive's loop reads it [s]; the row's effort is newer by the same time."""
-    effort_scale: float = 1.0
-    """Ratio of the recorded effort to the torque that drives a model of law effort."""
+    effort_scale: float = 1.0  # Ratio of the recorded effort to the torque that drives a model of law effort
 
 
 class _Prepared(NamedTuple):
@@ -111,8 +104,7 @@ Answers = dict[JointMotion, dict[tuple, tuple[np.ndarray, np.ndarray]]]
 class JointResponse:
     """Simulated position and motor torque of the joint, one value for each row of the recording."""
 
-    reported: np.ndarray
-    """(T,) reported positions [rad]."""
+    reported: np.ndarray  # (T,) reported positions [rad]
     effort: np.ndarray
     """(T,) torque of the motor at the time of each row, before the row's command acts, within the motor's limits [N·m]; with or
     without the gravity compensation as ``RigidJoint.effort_holds_weight`` states. ``Replay.effort`` has the same value one row
@@ -335,10 +327,8 @@ def _in_time(motion: JointMotion, late_s: float, received: int, parts: int, held
         return np.diff(before[last] + values[last] * since) * parts
 
     on = mean(sent.on)
-    target, supply = (
-        np.where(on > 1e-9, mean(values * sent.on) / np.maximum(on, 1e-9), values[0])
-        for values in (sent.target, sent.supply)
-    )
+    of_on = ((mean(values * sent.on) / np.maximum(on, 1e-9), values[0]) for values in (sent.target, sent.supply))
+    target, supply = (np.where(on > 1e-9, own, first) for own, first in of_on)
     found = _Sent(target, supply, on, np.repeat(sent.added, parts))
     if received > 1:
         middle = 0.5 * (edges[1:] + edges[:-1]) - held
@@ -346,17 +336,12 @@ def _in_time(motion: JointMotion, late_s: float, received: int, parts: int, held
     return found
 
 
-OTHER = 0.05
-"""Share by which numbers are changed to see what they do to a response."""
+OTHER = 0.05  # Share by which numbers are changed to see what they do to a response
 
 
 def with_other_numbers(model: JointModel, motion: JointMotion) -> list[np.ndarray]:
-    """Reported positions with 5 % more of K_p, of K_d, and of the inertia, one at a time: what numbers that are not quite
-    right change in a response.
-
-    Returns:
-        (T,) [rad] for each number, in this order; gains that are 0 are left out.
-    """
+    """Reported positions with 5 % more of K_p, of K_d, and of the inertia, one at a time: what numbers that are not quite right
+    change in a response. Returns (T,) [rad] for each number, in this order; gains that are 0 are left out."""
     kp, kd, torque_ff = model.gains
     more = 1.0 + OTHER
     gains = [Gains(more * kp, kd, torque_ff)] * (kp > 0.0) + [Gains(kp, more * kd, torque_ff)] * (kd > 0.0)
@@ -370,19 +355,15 @@ LOOK_LIKE_LEADS = {"velocity_feedforward": ("share", 0.1), "integral_action": ("
 
 
 def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarray]:
-    """Reported positions with a little more, or less, of each effect that makes a response lead as a clock offset does.
-
-    Returns:
-        Effect → (T,) [rad]."""
+    """Reported positions with a little more, or less, of each effect that makes a response lead as a clock offset does. Returns
+    effect → (T,) [rad]."""
     found = {}
     for name, (parameter, more) in LOOK_LIKE_LEADS.items():
-        own = [e for e in model.joint.effects(()) if e.name == name]
-        values = [getattr(e, parameter) for e in own]
-        stronger = [
-            dataclasses.replace(e, **{parameter: value + (more if value <= 1.0 else -more)})
-            for e, value in zip(own, values, strict=True)
-        ]
-        facts = {} if own else {f"{name}__{parameter}": more}
+        stronger = []
+        for own in (e for e in model.joint.effects(()) if e.name == name):
+            value = getattr(own, parameter)
+            stronger.append(dataclasses.replace(own, **{parameter: value + (more if value <= 1.0 else -more)}))
+        facts = {} if stronger else {f"{name}__{parameter}": more}
         found[name] = model.simulate(motion, model.gains, stronger, facts=facts).reported
     return found
 

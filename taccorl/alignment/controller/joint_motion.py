@@ -18,8 +18,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 
 _START_S = 0.1  # of a rest at the start is averaged
-STILL = 0.01
-"""Another joint counts as held if it moves by less than this [rad, m]."""
+STILL = 0.01  # Another joint counts as held if it moves by less than this [rad, m]
 _BANDS_HZ = (20.0, 60.0)
 """Of the other joints' measured motion. Seven clean robots of ``docs/robot_study.jsonl`` ended at up to 1.45 noise floors with
 10 Hz, which loses what steps do to other joints, at 1.16 with 20 Hz, and at 1.18 with 30 Hz, which lets in noise."""
@@ -31,8 +30,7 @@ that of white noise, whose level is the median of the fastest band, because step
 STEP_FROM_START = 0.05
 """Least share of the way to a target that never changes by which a joint moves in the first tenth of a second if it started away
 from it. A choice."""
-Position = tuple[float, float, float]
-"""x, y, z [m]."""
+Position = tuple[float, float, float]  # x, y, z [m]
 AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """Position in link 6's frame [m]: the middle between the pads, where the PiPER's gripper holds its payload."""
 
@@ -47,27 +45,20 @@ class Surroundings:
     still. Where ``carrying_nm`` is given, all weight is included."""
     carrying_nm: np.ndarray | None = None
     """(T · F,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
-    torque_ff_nm: np.ndarray | None = None
-    """(T,) known torque that the controller adds to its law [N·m]; None: none."""
-    supply: np.ndarray | None = None
-    """(T,) supply voltage of the motor divided by that of its file; None: 1."""
-    on: np.ndarray | None = None
-    """(T,) 0 while the motor is off, else 1; None: always 1."""
+    torque_ff_nm: np.ndarray | None = None  # (T,) known torque that the controller adds to its law [N·m]; None: none
+    supply: np.ndarray | None = None  # (T,) supply voltage of the motor divided by that of its file; None: 1
+    on: np.ndarray | None = None  # (T,) 0 while the motor is off, else 1; None: always 1
     moment_kgm: float = 0.0
     """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m]."""
-    mounted_kgm2: float = 0.0
-    """Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]."""
+    mounted_kgm2: float = 0.0  # Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]
     pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(N,) positions at which the other joints are held [rad, m] (for the PiPER its arm's joints and gripper); the entry of the
     free joint is not used."""
     positions: np.ndarray | None = None
     """(T · F, N) positions of all joints [rad, m]; None: the others are held, or no mass depends on them."""
-    payload_kg: float = 0.0
-    """Mass of the payload in the gripper, as the recording states it [kg]; 0: none."""
-    payload_at_m: Position = AT_TCP
-    """Centre of mass of the payload in link 6's frame [m]."""
-    payload_at_known: bool = False
-    """True if the recording states that position."""
+    payload_kg: float = 0.0  # Mass of the payload in the gripper, as the recording states it [kg]; 0: none
+    payload_at_m: Position = AT_TCP  # Centre of mass of the payload in link 6's frame [m]
+    payload_at_known: bool = False  # True if the recording states that position
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,29 +67,19 @@ class JointMotion(Surroundings):
     acts."""
 
     name: str
-    time_s: np.ndarray
-    """(T,) times [s]."""
-    rate_hz: float
-    """Row rate [Hz]."""
-    target: np.ndarray
-    """(T,) targets in the unit that ``target_kind`` of the joint implies [rad, rad/s or N·m]."""
-    measured: np.ndarray
-    """(T,) measured positions [rad]; NaN where not measured."""
-    effort: np.ndarray
-    """(T,) efforts [N·m]; NaN where not recorded."""
-    start: float
-    """Position reported at rest before the first command [rad]."""
-    start_speed: float = 0.0
-    """Speed at the first row of a recording that begins in motion [rad/s]."""
+    time_s: np.ndarray  # (T,) times [s]
+    rate_hz: float  # Row rate [Hz]
+    target: np.ndarray  # (T,) targets in the unit that ``target_kind`` of the joint implies [rad, rad/s or N·m]
+    measured: np.ndarray  # (T,) measured positions [rad]; NaN where not measured
+    effort: np.ndarray  # (T,) efforts [N·m]; NaN where not recorded
+    start: float  # Position reported at rest before the first command [rad]
+    start_speed: float = 0.0  # Speed at the first row of a recording that begins in motion [rad/s]
     kp_scale: float = 1.0
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other
     recordings (``Measurement.gain_scale``)."""
-    kd_scale: float = 1.0
-    """The same for K_d."""
-    kp_known: bool = False
-    """True if the recording states the commanded K_p."""
-    kd_known: bool = False
-    """True if the recording states the commanded K_d."""
+    kd_scale: float = 1.0  # The same for K_d
+    kp_known: bool = False  # True if the recording states the commanded K_p
+    kd_known: bool = False  # True if the recording states the commanded K_d
     command_s: np.ndarray | None = None
     """(T,) arrival time of each target [s], on the clock of ``time_s``; None: the time of its row."""
 
@@ -129,9 +110,8 @@ def resting(m: Measurement, j: int) -> float:
     if np.isfinite(rows).any():
         return float(np.nanmean(rows))
     if np.isfinite(m.measured[:, j]).any():
-        raise TaccorlError(
-            f"{m.name}: {m.signals[j]} was not measured in its first {rest} rows; cut the recording there"
-        )
+        name = f"{m.name}: {m.signals[j]}"
+        raise TaccorlError(f"{name} was not measured in its first {rest} rows; cut the recording there")
     return float(_planned(m, j)[0])
 
 
@@ -146,12 +126,9 @@ def steps_at_once(m: Measurement, j: int) -> bool:
 
 def _planned(m: Measurement, j: int) -> np.ndarray:
     """(T,) targets of a signal that was not measured. Raises TaccorlError: they are no positions."""
-    kind = m.target_kind(m.signals[j])
-    if kind != "position":
-        raise TaccorlError(
-            f"{m.name}: {m.signals[j]} is commanded by {kind}, and its position was not measured; log the position, or remove "
-            "the signal"
-        )
+    if (kind := m.target_kind(m.signals[j])) != "position":
+        why = f"{m.signals[j]} is commanded by {kind}, and its position was not measured"
+        raise TaccorlError(f"{m.name}: {why}; log the position, or remove the signal")
     return m.target[:, j]
 
 

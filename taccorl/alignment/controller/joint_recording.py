@@ -24,8 +24,7 @@ _TARGET_COLUMNS = {
     "torque": "tau_target",
     "effort": "tau, and no target",
 }
-START_ROWS = 8
-"""Rows from which the speed at the start is computed. A choice."""
+START_ROWS = 8  # Rows from which the speed at the start is computed. A choice.
 SMOOTH_S = 0.05
 """Window of the quadratic that is the measured position at which a model of law effort is held [s]: half of 1 / ``FOLLOW_HZ``."""
 MOST_YIELD = 0.05

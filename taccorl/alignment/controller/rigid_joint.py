@@ -17,36 +17,26 @@ from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.sim.effects.effect import Effect
 
-NEED_ROTOR = ("backlash", "joint_compliance")
-"""Effects in a gear, which need the inertia on the motor's side."""
+NEED_ROTOR = ("backlash", "joint_compliance")  # Effects in a gear, which need the inertia on the motor's side
 
 
 class Gains(NamedTuple):
     """Gains of τ = K_p (q* − q) − K_d q̇ + T_ref. For a sliding joint N/m, N·s/m, N."""
 
-    kp: float
-    """K_p [N·m/rad]."""
-    kd: float
-    """K_d [N·m·s/rad]."""
-    torque_ff: float
-    """T_ref [N·m]."""
+    kp: float  # K_p [N·m/rad]
+    kd: float  # K_d [N·m·s/rad]
+    torque_ff: float  # T_ref [N·m]
 
 
 class Rigid(NamedTuple):
     """Inertia and weight of one joint with the others held, in N·m and rad (for a sliding joint N and m)."""
 
-    inertia: float
-    """Inertia about the joint, with the rotor [kg·m²]."""
-    rotor_inertia: float = 0.0
-    """Part of ``inertia`` that is on the motor's side of the gear [kg·m²]."""
-    gravity_sin: float = 0.0
-    """S [N·m] in S sin q + C cos q, the torque that holds the weight at position q."""
-    gravity_cos: float = 0.0
-    """C [N·m] in the same torque."""
-    compensation_sin: float = 0.0
-    """S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity."""
-    compensation_cos: float = 0.0
-    """C [N·m] in the same torque."""
+    inertia: float  # Inertia about the joint, with the rotor [kg·m²]
+    rotor_inertia: float = 0.0  # Part of ``inertia`` that is on the motor's side of the gear [kg·m²]
+    gravity_sin: float = 0.0  # S [N·m] in S sin q + C cos q, the torque that holds the weight at position q
+    gravity_cos: float = 0.0  # C [N·m] in the same torque
+    compensation_sin: float = 0.0  # S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity
+    compensation_cos: float = 0.0  # C [N·m] in the same torque
     weight_n: float = 0.0
     """Force that holds the weight of masses besides the model's at a slide [N], which does not change as it slides."""
 
@@ -55,10 +45,8 @@ class PointMass(NamedTuple):
     """A mass without extent that is fixed to a body of a model, and that no controller compensates."""
 
     mass_kg: float
-    body: int
-    """Id of the body."""
-    place_m: tuple[float, float, float]
-    """Place in the body's frame [m]."""
+    body: int  # Id of the body
+    place_m: tuple[float, float, float]  # Place in the body's frame [m]
 
 
 class MassTorque(NamedTuple):
@@ -66,12 +54,9 @@ class MassTorque(NamedTuple):
     row: k + l·c + cᵀ M c, where c (3,) is the place of the mass in the body's frame [m]. From Newton's law and the joint's
     Jacobian (``mass_torque_along``)."""
 
-    constant: np.ndarray
-    """(T,) k [N·m/kg]."""
-    linear: np.ndarray
-    """(T, 3) l [N/kg]."""
-    square: np.ndarray
-    """(T, 3, 3) M [1/s²]."""
+    constant: np.ndarray  # (T,) k [N·m/kg]
+    linear: np.ndarray  # (T, 3) l [N/kg]
+    square: np.ndarray  # (T, 3, 3) M [1/s²]
 
     def of(self, one: PointMass) -> np.ndarray:
         """(T,) torque [N·m] for one mass in that body."""
@@ -84,24 +69,20 @@ class RigidJoint(ABC):
     influences; subclasses override its methods."""
 
     signal: str
-    unit: Literal["rad", "m"] = "rad"
-    """Unit of its position: a hinge has rad, a slide m."""
-    gains: Gains
-    """Gains for recordings that state none."""
+    unit: Literal["rad", "m"] = "rad"  # Unit of its position: a hinge has rad, a slide m
+    gains: Gains  # Gains for recordings that state none
     command_hz: float = 150.0
     """Rate at which its drive receives targets [Hz]. Rows at a lower rate are interpolated linearly at this rate; at a higher
     rate a target is held until the next row."""
     effort_holds_weight: ClassVar[bool] = False
     """Whether the reported effort includes the torque of the gravity compensation."""
 
-    target_kind: TargetKind = "position"
-    """Quantity that its controller takes as target."""
+    target_kind: TargetKind = "position"  # Quantity that its controller takes as target
     facts: Mapping[str, float] = {}
     """Known fields of ``drive_numbers.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
-    speed_delay_s: float = 0.0
-    """Delay of the measured velocity in the controller [s]."""
+    speed_delay_s: float = 0.0  # Delay of the measured velocity in the controller [s]
     exact_timing: ClassVar[bool] = False
     """Whether the age of the position is fitted if gains are commanded: at 3.7 rad/s half a millisecond makes 18 noise floors of
     0.1 mrad."""
@@ -114,12 +95,9 @@ class RigidJoint(ABC):
     target_late_s: float = 0.0
     """Delay from a target's arrival (see ``keeps_times``) until it acts in the controller [s]."""
 
-    gain_names: tuple[str, ...] = ("kp", "kd")
-    """Gains that a recording can state and a fit can determine."""
-    holds_torque_ff: bool = False
-    """True: ``torque_ff`` stays as the file states it. False: it is always fitted."""
-    known_names: tuple[str, ...] = ()
-    """Numbers and effects that the file marks as known (``DriveLaw.known``)."""
+    gain_names: tuple[str, ...] = ("kp", "kd")  # Gains that a recording can state and a fit can determine
+    holds_torque_ff: bool = False  # True: ``torque_ff`` stays as the file states it. False: it is always fitted.
+    known_names: tuple[str, ...] = ()  # Numbers and effects that the file marks as known (``DriveLaw.known``)
 
     @property
     def winding(self) -> Mapping[str, float]:
@@ -128,23 +106,15 @@ class RigidJoint(ABC):
         return {}
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
-        """Convert fitted values, by parameter name.
-
-        Returns:
-            Gains, with those of ``gains`` where ``values`` has none; and field → value of ``drive_numbers.Drive`` that replace
-            ``facts``.
-        """
+        """Convert fitted values, by parameter name. Returns gains, with those of ``gains`` where ``values`` has none; and field →
+        value of ``drive_numbers.Drive`` that replace ``facts``."""
         return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         """Ratios of a recording's gains to ``gains``: (for the position error, for the velocity); 1 if the recording states
         none."""
-        own = (self.gains.kp, max(self.gains.kd, 1e-9))
-        factor = m.gain_scale.get(self.signal, 1.0)
-        kp, kd = (
-            stated[self.signal] / one if self.signal in stated else factor
-            for stated, one in zip((m.kp, m.kd), own, strict=True)
-        )
+        factor, both = m.gain_scale.get(self.signal, 1.0), ((m.kp, self.gains.kp), (m.kd, max(self.gains.kd, 1e-9)))
+        kp, kd = (stated[self.signal] / own if self.signal in stated else factor for stated, own in both)
         return kp, kd
 
     def timestep_s(self, motion: JointMotion) -> float:
@@ -153,11 +123,8 @@ class RigidJoint(ABC):
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         """Inertia of the joint, and its weight as a function of its position, with the other joints held where they were.
-
-        Args:
-            motion: recording, of which the pose of the other joints and the mounted masses are used.
-            bodies: effects that act on the joint; those that change masses, such as ``payload``, are included, others ignored.
-        """
+        ``motion``: recording, of which the pose of the other joints and the mounted masses are used. ``bodies``: effects that act
+        on the joint; those that change masses, such as ``payload``, are included, others ignored."""
         raise NotImplementedError
 
     def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
@@ -231,7 +198,8 @@ def with_masses(
             data.qpos[address] = angle
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
-            mujoco.mj_jac(model, data, lever, None, _place(data, one), one.body)
+            at = data.xpos[one.body] + data.xmat[one.body].reshape(3, 3) @ one.place_m
+            mujoco.mj_jac(model, data, lever, None, at, one.body)
             weight.append(float(-one.mass_kg * model.opt.gravity @ lever[:, dof]))
         terms = terms._replace(inertia=terms.inertia + one.mass_kg * float(lever[:, dof] @ lever[:, dof]))
         if hinge:
@@ -241,21 +209,12 @@ def with_masses(
     return terms
 
 
-def _place(data: mujoco.MjData, one: PointMass) -> np.ndarray:
-    """(3,) place of a mass in the world [m]."""
-    return data.xpos[one.body] + data.xmat[one.body].reshape(3, 3) @ one.place_m
-
-
 def torque_along(
     model: mujoco.MjModel, positions: np.ndarray, period_s: float, still: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Inverse dynamics without armature for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart, at rest at both
-    ends (``still``: everywhere).
-
-    Returns:
-        (T, nv) torques [N·m] at all joints, (T, nv) the part of them that the gravity compensation supplies, and (T, nv, nv) the
-        mass matrix [kg·m²].
-    """
+    ends (``still``: everywhere). Returns (T, nv) torques [N·m] at all joints, (T, nv) the part of them that the gravity
+    compensation supplies, and (T, nv, nv) the mass matrix [kg·m²]."""
     data, (velocities, accelerations) = mujoco.MjData(model), rates(positions, np.inf if still else period_s)
     torque, carried = np.empty((2, len(positions), model.nv))
     masses, mass = np.empty((len(positions), model.nv, model.nv), np.float32), np.empty((model.nv, model.nv))
@@ -275,13 +234,9 @@ def mass_torque_along(
 ) -> MassTorque:
     """Torque at one joint for a mass in one body, along a motion as that of ``torque_along``.
 
-    A mass at c requires J_c · (a_c − g), its lever J_c = j + w × R c and acceleration a_c = a₀ + A R c with A = [ω̇]× + [ω]×², for
-    the Jacobian's columns j and w of the joint at the body's origin, the origin's acceleration a₀ and the body's rotation R.
-
-    Args:
-        body: id of the body.
-        gravity_mps2: (3,) gravity in the model's frame [m/s²].
-    """
+    A mass at c requires J_c · (a_c − g), its lever J_c = j + w × R c and acceleration a_c = a₀ + A R c with A = [ω̇]× + [ω]×²,
+    for the Jacobian's columns j and w of the joint at the body's origin, the origin's acceleration a₀ and the body's rotation R.
+    ``body``: id of the body. ``gravity_mps2``: (3,) gravity in the model's frame [m/s²]."""
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
     jac, dot = np.zeros((2, len(positions), 2, 3, model.nv))
     rotation = np.empty((len(positions), 3, 3))

@@ -36,8 +36,7 @@ class EffectEntry:
     """An effect as in the file, in the units of the axis."""
 
     name: str
-    values: Mapping[str, Any]
-    """Parameter → value."""
+    values: Mapping[str, Any]  # Parameter → value
 
 
 @dataclass(kw_only=True)
@@ -47,18 +46,15 @@ class AxisConfig(DriveLaw):
 
     kind: Literal["axis"] = "axis"
     name: str
-    unit: Literal["rad", "m"]
-    """Unit of its position: rad of a turning axis, m of a slide."""
-    inertia: float
-    """Inertia about the axis [kg·m²], at which a fit starts."""
+    unit: Literal["rad", "m"]  # Unit of its position: rad of a turning axis, m of a slide
+    inertia: float  # Inertia about the axis [kg·m²], at which a fit starts
     gains: Literal["commanded", "fitted"] = "commanded"
     """``commanded``: the drive runs kp and kd. ``fitted``: nobody knows them, they are the start of a fit, which without efforts
     leaves ``inertia`` as it is, because positions determine ratios only. Not for law pwm, whose motor is fitted."""
     rotor_inertia: float = 0.0
     """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it the search does not consider play and
     compliance."""
-    weight_sin: float = 0.0
-    """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
+    weight_sin: float = 0.0  # S [N·m] in the torque S sin q + C cos q that holds the axis's own weight
     weight_cos: float = 0.0
     """C [N·m] in the torque S sin q + C cos q that holds the weight of a turning axis at angle q; of a slide, its weight [N]."""
     payload_kg: float = 0.0
@@ -67,8 +63,7 @@ class AxisConfig(DriveLaw):
     """Distance from the axis at which ``payload_kg`` is held, unless a recording states another one; not for slides."""
     arm_kg: float = 0.0
     """Mass of the arm that holds the payload [kg], unless a recording states another one: a uniform rod as long as the lever."""
-    hangs_at_rad: float = 0.0
-    """Angle at which the payload of ``lever_m`` hangs straight down [rad]."""
+    hangs_at_rad: float = 0.0  # Angle at which the payload of ``lever_m`` hangs straight down [rad]
     loop_hz: float | None = None
     """Rate of the drive's control loop [Hz], if known. The model then holds the loop's output for a period, and computes the
     speed as a difference of samples."""
@@ -81,15 +76,13 @@ class AxisConfig(DriveLaw):
     speed_late_s: float = 0.0
     """Delay of the speed in the drive's loop [s] beyond that of a difference of two samples: its filter. ``diagnose`` fits up to
     two periods of the loop; without efforts up to 3 ms, if those are more."""
-    limits: tuple[float, float] | None = None
-    """Lowest and highest position [rad]."""
+    limits: tuple[float, float] | None = None  # Lowest and highest position [rad]
     force_unit_n: float | None = None
     """Torque of this axis [N·m] that corresponds to 1 N·m at a joint of a small arm; the bounds of effects are multiplied by it.
     If not given: a tenth of effort_limit, or 1 without that."""
     length_unit_m: float | None = None
     """Position range [rad] that corresponds to 1 rad at a joint of a small arm. If not given: the stroke of a slide, or 1."""
-    effects: tuple[EffectEntry, ...] = ()
-    """Effects beyond inertia, weight and control law; empty if there are none."""
+    effects: tuple[EffectEntry, ...] = ()  # Effects beyond inertia, weight and control law; empty if there are none
     FITTED: ClassVar[tuple[str, ...]] = (
         *DriveLaw.FITTED,
         *("inertia", "weight_sin", "weight_cos", "target_late_s", "speed_late_s"),
@@ -147,19 +140,16 @@ class AxisConfig(DriveLaw):
         or has no such parameter."""
         found = []
         for entry in self.effects:
-            cls = self.effect_class(entry.name)
-            if cls is None and entry.name in NEED_ROTOR and not self.rotor_inertia:
-                raise TaccorlError(
-                    f"effects: {entry.name} needs the motor's share of inertia: write `rotor_inertia: …`"
-                )
+            name, values = entry.name, dict[str, Any](entry.values)
+            cls = self.effect_class(name)
+            if cls is None and name in NEED_ROTOR and not self.rotor_inertia:
+                raise TaccorlError(f"effects: {name} needs the motor's share of inertia: write `rotor_inertia: …`")
             if cls is None:
-                raise TaccorlError(f"effects: {entry.name} cannot act on an axis; remove it")
-            for key in entry.values:
-                if key not in _settings(cls):
-                    raise TaccorlError(
-                        f"effects: {entry.name} has no parameter {key!r}; {nearest(key, _settings(cls))}"
-                    )
-            values: dict[str, Any] = dict(entry.values)
+                raise TaccorlError(f"effects: {name} cannot act on an axis; remove it")
+            settings = [*(p.name for p in cls.parameters()), "interval", "evidence"]
+            for key in values:
+                if key not in settings:
+                    raise TaccorlError(f"effects: {name} has no parameter {key!r}; {nearest(key, settings)}")
             found.append(cls(**values))
         return found
 
@@ -183,10 +173,6 @@ class AxisConfig(DriveLaw):
         entries = [e for e in self.effects if e.name not in names]
         entries += [EffectEntry(e.name, _values(e)) for e in found if not e.is_absent]
         return dataclasses.replace(self, effects=tuple(entries))
-
-
-def _settings(cls: type[Effect]) -> list[str]:
-    return [*(p.name for p in cls.parameters()), "interval", "evidence"]
 
 
 def _values(effect: Effect) -> dict[str, Any]:

@@ -31,20 +31,15 @@ STEPS_OF_ROW = 4
 class Calibration(NamedTuple):
     """Gain and offset of each cell."""
 
-    gain: np.ndarray
-    """(K,) gains: the reading's unit per 1 of the unit ``reading``. With places (K, P)."""
-    offset: np.ndarray
-    """(K,) offsets in the reading's unit."""
+    gain: np.ndarray  # (K,) gains: the reading's unit per 1 of the unit ``reading``. With places (K, P).
+    offset: np.ndarray  # (K,) offsets in the reading's unit
 
 
 def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()) -> np.ndarray:
     """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``, which acts at its row's time and
     follows a straight line between rows. If ``m`` has places, (T, P): a column for each place, with the load while it is pressed.
-
-    Args:
-        effects: effects besides the config's; one of the same name replaces the config's.
-
-    Raises TaccorlError: an effect is given twice."""
+    ``effects``: effects besides the config's; one of the same name replaces the config's. Raises TaccorlError: an effect is given
+    twice."""
     acting = present([*(e for e in config.effects if e.name not in {effect.name for effect in effects}), *effects])
     if config.reading.below_rest:
         acting = [dataclasses.replace(e, below_rest=True) if isinstance(e, CreepingEffect) else e for e in acting]
@@ -134,9 +129,8 @@ def _calibrated_by_place(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Cali
         if np.sum(rows) and len(cells):
             own = given[rows]
             # Normal equations: (P + 1)² numbers in place of T (P + 1); a place without a row gets the gain 0.
-            solved[:, cells] = np.linalg.pinv(own.T @ own, rcond=1e-10, hermitian=True) @ (
-                own.T @ reading[rows][:, cells]
-            )
+            inverse = np.linalg.pinv(own.T @ own, rcond=1e-10, hermitian=True)
+            solved[:, cells] = inverse @ (own.T @ reading[rows][:, cells])
     return Calibration(solved[:-1].T, solved[-1])
 
 

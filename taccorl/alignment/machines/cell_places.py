@@ -21,10 +21,8 @@ from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
-PRESSED = 0.05
-"""Share of the rated load above which a row is part of a press."""
-MOST_PLACES = 200
-"""Most places of a sensor: each is a number a cell, and a column of every fit."""
+PRESSED = 0.05  # Share of the rated load above which a row is part of a press
+MOST_PLACES = 200  # Most places of a sensor: each is a number a cell, and a column of every fit
 
 
 def with_places(config: CellsConfig, measurements: Measurements) -> Measurements:

@@ -35,8 +35,7 @@ from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, nearest
 
 _PLACE = re.compile(r"\{(\w*)\}")
-PLACES = ({"row", "column"}, {"index"})
-"""Placeholders of a pattern: one of these sets."""
+PLACES = ({"row", "column"}, {"index"})  # Placeholders of a pattern: one of these sets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,28 +50,23 @@ class PositionColumns:
     """Columns with the position of the probe that presses the sensor: two coordinates in the plane of the cells. Origin and axes
     are free, but the same in all recordings."""
 
-    x: Column
-    """Column of the coordinate along the first axis, with its unit of length."""
-    y: Column
-    """Column of the coordinate along the second axis, at a right angle to the first."""
+    x: Column  # Column of the coordinate along the first axis, with its unit of length
+    y: Column  # Column of the coordinate along the second axis, at a right angle to the first
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellColumns:
     """Which columns of a table hold the reading of one cell and the load that acts on it."""
 
-    reading: Column
-    """Column of the reading."""
-    load: Column | None = None
-    """Column of the load, if the cell has its own."""
+    reading: Column  # Column of the reading
+    load: Column | None = None  # Column of the load, if the cell has its own
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayColumns(CellColumns):
     """Columns of all cells of an array; their names are patterns."""
 
-    first: int
-    """Number from which the column names count cells, rows and columns: 0 or 1, say."""
+    first: int  # Number from which the column names count cells, rows and columns: 0 or 1, say
     order: Literal["row by row", "column by column"] | None = None
     """Order in which ``{index}`` numbers the cells of a grid; None for other patterns."""
 
@@ -81,16 +75,11 @@ class ArrayColumns(CellColumns):
 class CellTableSpec(ColumnsFile):
     """Names and units of a table's columns."""
 
-    cells: dict[str, CellColumns] = field(default_factory=dict)
-    """Name of the cell → its columns; empty with ``array``."""
-    array: ArrayColumns | None = None
-    """Pattern of the column names of all cells; given instead of ``cells``."""
-    load: Column | None = None
-    """Column of the load of all cells; None if each cell has its own."""
-    temperature: TemperatureColumn | None = None
-    """None if the table has no temperature."""
-    position: PositionColumns | None = None
-    """Position of the probe; None if all presses are at one place."""
+    cells: dict[str, CellColumns] = field(default_factory=dict)  # Name of the cell → its columns; empty with ``array``
+    array: ArrayColumns | None = None  # Pattern of the column names of all cells; given instead of ``cells``
+    load: Column | None = None  # Column of the load of all cells; None if each cell has its own
+    temperature: TemperatureColumn | None = None  # None if the table has no temperature
+    position: PositionColumns | None = None  # Position of the probe; None if all presses are at one place
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
@@ -170,13 +159,9 @@ def _rules_of_array(array: ArrayColumns, config: CellsConfig) -> Rules:
 
 
 def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config: CellsConfig) -> CellTableSpec:
-    """``spec`` with the columns of each cell in place of the pattern of an array.
-
-    Args:
-        path: the table, for messages.
-        header: names of its columns.
-
-    Raises RecordingError: no column fits the pattern, a cell has none or two, or a column fits and has no cell."""
+    """``spec`` with the columns of each cell in place of the pattern of an array. ``path``: the table, for messages. ``header``:
+    names of its columns. Raises RecordingError: no column fits the pattern, a cell has none or two, or a column fits and has no
+    cell."""
     array = spec.array
     if array is None:
         return spec
@@ -234,12 +219,8 @@ def _matched(path: Path, header: list[str], pattern: Column, array: ArrayColumns
 
 
 def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
-    """Columns of a table with taccorl's own names.
-
-    Args:
-        header: names of its columns.
-
-    Raises RecordingError: a column is missing or unknown; the message names file, column and remedy."""
+    """Columns of a table with taccorl's own names. ``header``: names of its columns. Raises RecordingError: a column is missing
+    or unknown; the message names file, column and remedy."""
     load = LOADS[config.load.unit][0]
     known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
     place = ["x_mm", "y_mm"] if config.same_place_mm is not None else []
@@ -292,8 +273,7 @@ class CellMeasurement(Measurement):
     """(T, 2) position of the probe [mm]; empty if all presses are at one place."""
     place: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))
     """(T,) number of the place that is pressed, −1 in rows that are not used; empty if not known (``cell_places``)."""
-    num_places: int = 0
-    """Number P of places of the sensor; 0 while ``place`` is empty."""
+    num_places: int = 0  # Number P of places of the sensor; 0 while ``place`` is empty
 
 
 def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import yaml
 
+from taccorl.data.strict_yaml import Rules
 from taccorl.errors import TaccorlError, nearest, plain_name
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.added import present
@@ -44,34 +45,26 @@ READINGS_OF_RATED = 10.0
 _HEADER = "# A sensor of cells. taccorl/alignment/machines/cells_file.py says what may stand here.\n"
 
 
-MOST_CELLS = 100_000
-"""Most cells of a sensor."""
+MOST_CELLS = 100_000  # Most cells of a sensor
 
 
 @dataclass(kw_only=True)
 class Load:
     """Settings of the load on the cells in a cells file: unit, rated value, and whether all cells share it."""
 
-    unit: str
-    """Unit of the load, a key of ``LOADS``."""
-    rated: float
-    """Greatest load for which the sensor is made, in ``unit``."""
-    shared: bool = True
-    """True: all cells have the load of one column; false: each cell has its own column."""
+    unit: str  # Unit of the load, a key of ``LOADS``
+    rated: float  # Greatest load for which the sensor is made, in ``unit``
+    shared: bool = True  # True: all cells have the load of one column; false: each cell has its own column
 
 
 @dataclass(kw_only=True)
 class Reading:
     """Unit, converter range and direction of the readings, the same for all cells."""
 
-    unit: str
-    """Unit of the readings, a key of ``READINGS``."""
-    lowest: float | None = None
-    """Lower end of the converter, in ``unit``; none if not given."""
-    highest: float | None = None
-    """Upper end of the converter, in ``unit``; none if not given."""
-    falls: bool = False
-    """True if the reading decreases under load, like a resistance."""
+    unit: str  # Unit of the readings, a key of ``READINGS``
+    lowest: float | None = None  # Lower end of the converter, in ``unit``; none if not given
+    highest: float | None = None  # Upper end of the converter, in ``unit``; none if not given
+    falls: bool = False  # True if the reading decreases under load, like a resistance
     below_rest: bool = False
     """True if readings can be below the offset after a release, as where a soft layer relaxes: creep then acts there, too. With
     ``falls`` above it."""
@@ -82,73 +75,60 @@ class CellsConfig:
     """Content of a cells file."""
 
     kind: Literal["cells"] = "cells"
-    name: str = ""
-    """Name of the sensor in tables and reports; the file's stem if not given."""
-    cells: list[str] = field(default_factory=list)
-    """Names of cells that are not in a grid."""
-    rows: int | None = None
-    """Number of rows of a grid; None if the cells have names."""
-    columns: int | None = None
-    """Number of columns of a grid."""
+    name: str = ""  # Name of the sensor in tables and reports; the file's stem if not given
+    cells: list[str] = field(default_factory=list)  # Names of cells that are not in a grid
+    rows: int | None = None  # Number of rows of a grid; None if the cells have names
+    columns: int | None = None  # Number of columns of a grid
     load: Load
     reading: Reading
-    rate_hz: float | None = None
-    """Row rate of the recordings [Hz]; not checked if not given."""
+    rate_hz: float | None = None  # Row rate of the recordings [Hz]; not checked if not given
     same_place_mm: float | None = None
     """Largest distance of presses at one place [mm], for recordings with the position of a probe. Each cell then has a gain for
     each place. None: all presses are at one place, and recordings have no position."""
     gain: list[float] = field(default_factory=list)
     """Gain of each cell, row after row [unit of the reading per unit of the load]; fitted if not given."""
-    offset: list[float] = field(default_factory=list)
-    """Offset of each cell: reading without load."""
-    effects: list[Effect] = field(default_factory=list)
-    """Effects between load and reading; empty if there are none."""
+    offset: list[float] = field(default_factory=list)  # Offset of each cell: reading without load
+    effects: list[Effect] = field(default_factory=list)  # Effects between load and reading; empty if there are none
 
     def __post_init__(self) -> None:
-        if bool(self.cells) == (self.rows is not None or self.columns is not None):
-            raise TaccorlError("cells: give names, `cells: [thumb]`, or a grid, `rows: 4` and `columns: 6`")
-        if not self.cells and not (self.rows and self.columns and min(self.rows, self.columns) > 0):
-            raise TaccorlError(f"rows {self.rows} and columns {self.columns}: a grid needs both, 1 or more")
-        if self.rows and self.columns and self.rows * self.columns > MOST_CELLS:
-            raise TaccorlError(
-                f"rows {self.rows} and columns {self.columns}: more than {MOST_CELLS:,} cells; correct them"
-            )
-        for name in self.cells:
-            plain_name(name, "cells")
-        if len(set(self.cells)) < len(self.cells):
-            raise TaccorlError(f"cells: {self.cells}: each name must occur once")
-        if self.load.unit not in LOADS:
-            raise TaccorlError(
-                f"load: {self.load.unit!r} is not a unit of force, pressure or depth; {nearest(self.load.unit, LOADS)}"
-            )
-        if not 0 < self.load.rated < math.inf:
-            raise TaccorlError(f"load: rated {self.load.rated:g} {self.load.unit}; give the greatest load, above 0")
-        if self.reading.unit not in READINGS:
-            raise TaccorlError(
-                f"reading: {self.reading.unit!r} is not a unit of a reading; {nearest(self.reading.unit, READINGS)}"
-            )
-        if self.low >= self.high:
-            raise TaccorlError(f"reading: lowest {self.low:g} is not below highest {self.high:g}")
-        if self.rate_hz is not None and not 0 < self.rate_hz < math.inf:
-            raise TaccorlError(f"rate_hz: {self.rate_hz:g} is not above 0")
-        if self.same_place_mm is not None and not 0 < self.same_place_mm < math.inf:
-            raise TaccorlError(f"same_place_mm: {self.same_place_mm:g} is not above 0")
-        if self.same_place_mm is not None and not self.load.shared:
-            raise TaccorlError("same_place_mm: is for one load that all cells share; remove it, or `shared: false`")
-        if self.same_place_mm is not None and (self.gain or self.offset):
-            raise TaccorlError(
-                "gain and offset: remove both; with same_place_mm a cell has a gain for each place, and is fitted"
-            )
-        for key in ("gain", "offset"):
-            numbers = getattr(self, key)
-            if numbers and len(numbers) != self.num_cells:
-                raise TaccorlError(
-                    f"{key}: {len(numbers)} numbers for {self.num_cells} cells; give one for each cell, or none"
-                )
-        if bool(self.gain) != bool(self.offset):
-            raise TaccorlError("gain and offset: give both, or neither (they are then fitted)")
+        for wrong, key, text in self._rules():
+            if wrong:
+                raise TaccorlError(f"{key}: {text}")
         self.effects = [_of_cells(effect) for effect in self.effects]
         present(self.effects)
+
+    def _rules(self) -> Rules:
+        grid, load, reading = f"rows {self.rows} and columns {self.columns}", self.load.unit, self.reading.unit
+        has_grid, rows, columns = (self.rows, self.columns) != (None, None), self.rows or 0, self.columns or 0
+        yield (
+            bool(self.cells) == has_grid,
+            "cells",
+            "give names, `cells: [thumb]`, or a grid, `rows: 4` and `columns: 6`",
+        )
+        yield not self.cells and min(rows, columns) < 1, grid, "a grid needs both, 1 or more"
+        yield rows * columns > MOST_CELLS, grid, f"more than {MOST_CELLS:,} cells; correct them"
+        for name in self.cells:
+            plain_name(name, "cells")
+        yield len(set(self.cells)) < len(self.cells), "cells", f"{self.cells}: each name must occur once"
+        none = f"{load!r} is not a unit of force, pressure or depth; {nearest(load, LOADS)}"
+        yield load not in LOADS, "load", none
+        rated = f"rated {self.load.rated:g} {load}; give the greatest load, above 0"
+        yield not 0 < self.load.rated < math.inf, "load", rated
+        none = f"{reading!r} is not a unit of a reading; {nearest(reading, READINGS)}"
+        yield reading not in READINGS, "reading", none
+        yield self.low >= self.high, "reading", f"lowest {self.low:g} is not below highest {self.high:g}"
+        for key, value in (("rate_hz", self.rate_hz), ("same_place_mm", self.same_place_mm)):
+            if value is not None:
+                yield not 0 < value < math.inf, key, f"{value:g} is not above 0"
+        both, by_place = "gain and offset", self.same_place_mm is not None
+        shared = "is for one load that all cells share; remove it, or `shared: false`"
+        yield by_place and not self.load.shared, "same_place_mm", shared
+        fitted = "remove both; with same_place_mm a cell has a gain for each place, and is fitted"
+        yield by_place and (self.gain or self.offset), both, fitted
+        for key, numbers in (("gain", self.gain), ("offset", self.offset)):
+            each = f"{len(numbers)} numbers for {self.num_cells} cells; give one for each cell, or none"
+            yield numbers and len(numbers) != self.num_cells, key, each
+        yield bool(self.gain) != bool(self.offset), both, "give both, or neither (they are then fitted)"
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -222,11 +202,9 @@ def load_cells(path: Path) -> CellsConfig:
     document = EffectsDocument(CellsConfig, path)
     config: CellsConfig = document.value
     for k, effect in enumerate(config.effects):
-        lacking = [word for word in effect.needs if word not in (*config.known_facts, "temperature")]
-        if lacking:
-            raise document.error(
-                f"effects/{k}", f"{effect.name} needs {lacking[0]}; give rows and columns, not same_place_mm"
-            )
+        for word in effect.needs:
+            text = f"{effect.name} needs {word}; give rows and columns, not same_place_mm"
+            document.refuse([(word not in (*config.known_facts, "temperature"), f"effects/{k}", text)])
     config.name = config.name or path.stem
     return config
 

@@ -17,18 +17,13 @@ import numpy as np
 
 from taccorl.errors import TaccorlError, plain_name
 
-MOST_BYTES = 1 << 24
-"""Largest model file that is read."""
-MOST_DEEP = 200
-"""Most elements, or links of a chain, within one another."""
+MOST_BYTES = 1 << 24  # Largest model file that is read
+MOST_DEEP = 200  # Most elements, or links of a chain, within one another
 MOST_ELEMENTS = 200_000
 """Most elements of a file after ``<replicate>``, and most parts of a ``<composite>`` or ``<flexcomp>``."""
-MOST_JOINTS = 1000
-"""Most joints of a robot."""
-MOST_VALUES = 4_000_000
-"""Most values of a height field, a texture, or another array whose size an attribute states."""
-MOST_FILES = 20
-"""Most files that a model includes."""
+MOST_JOINTS = 1000  # Most joints of a robot
+MOST_VALUES = 4_000_000  # Most values of a height field, a texture, or another array whose size an attribute states
+MOST_FILES = 20  # Most files that a model includes
 BALANCE = '<mujoco><compiler balanceinertia="true"/></mujoco>'
 _SIZES = ("nrow", "ncol", "width", "height", "size", "dim")
 _BODIES = ("body", "worldbody")
@@ -41,15 +36,11 @@ class Element:
 
     tag: str
     attributes: dict[str, str]
-    path: Path
-    """File in which it is."""
-    line: int
-    """Line of that file, from 1."""
+    path: Path  # File in which it is
+    line: int  # Line of that file, from 1
     parent: "Element | None"
-    begin: int = 0
-    """Byte at which it begins."""
-    end: int = 0
-    """Byte at which its closing tag begins, or it itself if it has none."""
+    begin: int = 0  # Byte at which it begins
+    end: int = 0  # Byte at which its closing tag begins, or it itself if it has none
     children: "list[Element]" = field(default_factory=list)
 
     def iterate(self) -> Iterator["Element"]:
@@ -79,13 +70,9 @@ class Element:
 
 
 def read_model(path: Path) -> tuple[Element, bytes]:
-    """Read and check a model file, with all files that it includes.
-
-    Returns:
-        Its root, and its bytes.
-
-    Raises TaccorlError: it cannot be read, is not XML, is too large or nested too deeply, or two joints or links have one
-    name; the message names file and line."""
+    """Read and check a model file, with all files that it includes. Returns its root, and its bytes. Raises TaccorlError: it
+    cannot be read, is not XML, is too large or nested too deeply, or two joints or links have one name; the message names file
+    and line."""
     root, content = _parsed(path)
     if root.tag == "robot":
         _refuse_long_chains(root)
@@ -199,9 +186,8 @@ def _refuse_long_chains(root: Element) -> None:
         for k, one in enumerate(reversed(chain)):
             deep[one] = length + k
         if deep[link] > MOST_DEEP:
-            raise TaccorlError(
-                f"{root.path}: link {link} hangs on a chain of more than {MOST_DEEP} links; is it a robot?"
-            )
+            chain_of = f"{root.path}: link {link} hangs on a chain of more than {MOST_DEEP} links"
+            raise TaccorlError(f"{chain_of}; is it a robot?")
 
 
 def ends_of(joint: Element) -> tuple[str, str]:
@@ -275,10 +261,8 @@ def unbalanced(root: Element) -> str:
     none."""
     for inertia in root.all("inertia"):
         try:
-            xx, yy, zz, xy, xz, yz = (
-                float(inertia.get(f"i{key}", "0")) for key in ("xx", "yy", "zz", "xy", "xz", "yz")
-            )
-            moments = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+            full = [[float(inertia.get(f"i{min(a, b)}{max(a, b)}", "0")) for a in "xyz"] for b in "xyz"]
+            moments = np.linalg.eigvalsh(np.array(full))
         except (ValueError, np.linalg.LinAlgError):
             continue
         if moments[0] > 0.0 and moments[0] + moments[1] >= moments[2]:

@@ -31,15 +31,12 @@ class OmittedActuator:
     """An actuator that does not act on one joint alone."""
 
     name: str
-    transmission: str
-    """What it acts on, with its name in the file."""
+    transmission: str  # What it acts on, with its name in the file
     levers: dict[str, float | None]
     """Joint that it moves → change of its length per motion of the joint, gear included [rad/rad, m/rad, …]; None where this
     depends on the pose."""
-    kp: float
-    """Position gain at its own length; 0 for a motor."""
-    kd: float
-    """Velocity gain at its own length."""
+    kp: float  # Position gain at its own length; 0 for a motor
+    kd: float  # Velocity gain at its own length
 
     @property
     def text(self) -> str:

@@ -30,13 +30,9 @@ _HEADER = """\
 
 
 def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
-    """YAML text of a draft robot file for the path ``out``, and the model that it names.
-
-    Args:
-        model: MJCF or URDF file.
-        out: path of the robot file, which is not written here; the text names the model relative to it.
-
-    Raises TaccorlError: the model cannot be used (``load_robot_model``)."""
+    """YAML text of a draft robot file for the path ``out``, and the model that it names. ``model``: MJCF or URDF file. ``out``:
+    path of the robot file, which is not written here; the text names the model relative to it. Raises TaccorlError: the model
+    cannot be used (``load_robot_model``)."""
     robot = load_robot_model(model)
     relative = Path(os.path.relpath(Path(model).resolve(), Path(out).resolve().parent)).as_posix()
     lines = [_HEADER.format(model=Path(model).name, name=Path(out).name).rstrip()]

@@ -22,6 +22,7 @@ from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, PointMass
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT, RobotJoint, acts_on_joint
 from taccorl.alignment.machines.robot_model import RobotModel, load_robot_model
+from taccorl.data.strict_yaml import Rules
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
@@ -29,8 +30,7 @@ from taccorl.sim.effects.scaled import OF_A_TURN
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
-TODO = "TODO"
-"""Placeholder for a value that only the user knows; a file that contains it is rejected."""
+TODO = "TODO"  # Placeholder for a value that only the user knows; a file that contains it is rejected
 REMOVABLE = 0.95
 """Largest share of a body's mass that a ``payload`` below 0 may remove. A choice: what is left must be above 0."""
 _LEAST_REACH_M = 0.05
@@ -45,12 +45,9 @@ class JointConfig(DriveLaw):
     gains: Literal["commanded", "fitted"] = "commanded"
     """commanded: kp and kd are those of the controller. fitted: they are only the start of a fit. With law pwm they are always
     the servo's own, and stall torque and back-EMF are fitted."""
-    rotor_inertia: float = 0.0
-    """Inertia of the motor's rotor on the motor's side of the gear [kg·m²]."""
-    gear: float = 1.0
-    """Turns of the motor per turn of the joint; for a sliding joint [rad/m]."""
-    loop_hz: float | None = None
-    """Rate of the drive's control loop [Hz]."""
+    rotor_inertia: float = 0.0  # Inertia of the motor's rotor on the motor's side of the gear [kg·m²]
+    gear: float = 1.0  # Turns of the motor per turn of the joint; for a sliding joint [rad/m]
+    loop_hz: float | None = None  # Rate of the drive's control loop [Hz]
     command_hz: float | None = None
     """Rate at which the drive receives targets [Hz], if only some of them are logged: a replay interpolates rows linearly at this
     rate. Without it, a target holds until the next row."""
@@ -88,15 +85,12 @@ class RobotConfig:
     """Content of a robot file."""
 
     kind: Literal["robot"]
-    model: str
-    """Path of the MJCF or URDF file, relative to this file."""
-    gravity_compensation: float = 0.0
-    """Share of the weight that the controller compensates, 0 … 1."""
+    model: str  # Path of the MJCF or URDF file, relative to this file
+    gravity_compensation: float = 0.0  # Share of the weight that the controller compensates, 0 … 1
     gravity: list[float] = field(default_factory=list)
     """Direction of gravity (x, y, z) in the model's frame, of any length, where the base is not mounted as in the model, which
     the controller does not know. Empty: as the model has it."""
-    joints: dict[str, JointConfig]
-    """Name of the joint in the model → its drive."""
+    joints: dict[str, JointConfig]  # Name of the joint in the model → its drive
 
     def __post_init__(self) -> None:
         check_numbers("robot", self, not_negative=("gravity_compensation",))
@@ -108,12 +102,9 @@ class RobotConfig:
 class Robot:
     """Machine described by a robot file and its model. ``joint`` returns the data for the one-joint model."""
 
-    config: RobotConfig
-    """Content of the file."""
-    rigid: RobotModel
-    """The model that the file names."""
-    path: Path
-    """Path of the robot file."""
+    config: RobotConfig  # Content of the file
+    rigid: RobotModel  # The model that the file names
+    path: Path  # Path of the robot file
     assumed: Mapping[int, PointMass] = field(default_factory=dict)
     """Id of a body → payload of which a search assumes the place and fits the mass."""
 
@@ -287,13 +278,8 @@ def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
 
 
 def load_robot(path: Path) -> Robot:
-    """Load a robot file and its model.
-
-    Raises:
-        SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the model lacks; the message names file and
-            line.
-        TaccorlError: the model cannot be used (``load_robot_model``).
-    """
+    """Load a robot file and its model. Raises SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the model
+    lacks; the message names file and line; TaccorlError: the model cannot be used (``load_robot_model``)."""
     path = Path(path)
     _refuse_todo(path)
     document = EffectsDocument(RobotConfig, path)
@@ -304,36 +290,32 @@ def load_robot(path: Path) -> Robot:
     rigid = load_robot_model(model, config.gravity_compensation)
     if not config.joints:
         raise document.error("joints", f"the file names no joint; the model has {', '.join(rigid.joints)}")
-    bodies = {rigid.model.body(k).name: k for k in range(1, rigid.model.nbody)}
-    for name, joint in config.joints.items():
-        if name not in rigid.joints:
-            raise document.error(
-                f"joints/{name}", f"{config.model} has no joint {name!r}; {nearest(name, rigid.joints)}"
-            )
-        for k, effect in enumerate(joint.effects):
-            key = f"joints/{name}/effects/{k}"
-            if not acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
-                raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
-            if effect.name in OF_A_TURN and rigid.joints[name].unit == "m":
-                raise document.error(key, f"{effect.name} repeats with each turn, and {name} is a slide; remove it")
-            if not joint.allows_effect(effect.name):
-                raise document.error(
-                    key, f"{effect.name} acts in a control loop that law {joint.law} does not have; remove it"
-                )
-            if effect.name in NEED_ROTOR and joint.armature == 0.0:
-                raise document.error(
-                    key,
-                    f"{effect.name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of "
-                    f"{name}",
-                )
-            link = getattr(effect, "link", "")
-            if link and not (link in bodies and Robot(config, rigid, path).moves_body(name, bodies[link])):
-                raise document.error(key, f"link: {name} moves no body {link!r}; {nearest(link, bodies)}")
     robot = Robot(config, rigid, path)
-    name, why = robot.wrong_mass()
-    if name:
-        raise document.error(f"joints/{name}/effects", why)
+    document.refuse(_rules(robot))
     return robot
+
+
+def _rules(robot: Robot) -> Rules:
+    config, rigid = robot.config, robot.rigid
+    bodies = {rigid.model.body(k).name: k for k in range(1, rigid.model.nbody)}
+    for joint, drive in config.joints.items():
+        unknown = f"{config.model} has no joint {joint!r}; {nearest(joint, rigid.joints)}"
+        yield joint not in rigid.joints, f"joints/{joint}", unknown
+        for k, effect in enumerate(drive.effects):
+            key, name = f"joints/{joint}/effects/{k}", effect.name
+            can_act = acts_on_joint(type(effect), weight=True, rotor=True, payload=True)
+            yield not can_act, key, f"{name} cannot act on one joint of a robot file; remove it"
+            of_slide = name in OF_A_TURN and rigid.joints[joint].unit == "m"
+            yield of_slide, key, f"{name} repeats with each turn, and {joint} is a slide; remove it"
+            no_loop = f"{name} acts in a control loop that law {drive.law} does not have; remove it"
+            yield not drive.allows_effect(name), key, no_loop
+            rotor = f"{name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of {joint}"
+            yield name in NEED_ROTOR and drive.armature == 0.0, key, rotor
+            link = getattr(effect, "link", "")
+            is_moved = not link or (link in bodies and robot.moves_body(joint, bodies[link]))
+            yield not is_moved, key, f"link: {joint} moves no body {link!r}; {nearest(link, bodies)}"
+    joint, why = robot.wrong_mass()
+    yield joint, f"joints/{joint}/effects", why
 
 
 def _refuse_todo(path: Path) -> None:

@@ -52,8 +52,7 @@ _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swin
 LEAST_INERTIA = 0.01
 """Least inertia of a joint with a ``payload`` of negative mass, as a share of its inertia in the model. A choice: a search may
 try places of the mass that would make the inertia negative."""
-PAYLOAD_AT = ("x_m", "y_m", "z_m")
-"""Parameters of ``payload`` for its place along the axes of its body."""
+PAYLOAD_AT = ("x_m", "y_m", "z_m")  # Parameters of ``payload`` for its place along the axes of its body
 _SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
 
 
@@ -165,23 +164,15 @@ class RobotJoint(DriveJoint):
     def _mass_torque(self, motion: JointMotion, body: int) -> MassTorque:
         """Torque for masses in one body because other joints move; kept, since a search changes masses only."""
         if (motion, body) not in self._mass_torques:
-            assert motion.positions is not None
-            gravity = self._robot.rigid.model.opt.gravity + self._robot.more_gravity
-            whole, alone = (
-                mass_torque_along(
-                    self._robot.rigid.model, self.signal, body, q, len(motion.target) / len(q) / motion.rate_hz, gravity
-                )
-                for q in (motion.positions, self._alone(motion.positions, motion.pose))
-            )
+            model, q = self._robot.rigid.model, motion.positions
+            assert q is not None
+            gravity = model.opt.gravity + self._robot.more_gravity
+            period_s, alone = len(motion.target) / len(q) / motion.rate_hz, np.tile(motion.pose, (len(q), 1))
+            own = model.joint(self.signal).qposadr[0]
+            alone[:, own] = q[:, own]
+            whole, alone = (mass_torque_along(model, self.signal, body, at, period_s, gravity) for at in (q, alone))
             self._mass_torques[motion, body] = MassTorque(*(a - b for a, b in zip(whole, alone, strict=True)))
         return self._mass_torques[motion, body]
-
-    def _alone(self, positions: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """(T, nq) ``positions`` of this joint, with the others at ``pose`` (nq,)."""
-        address = self._robot.rigid.model.joint(self.signal).qposadr[0]
-        own = np.tile(pose, (len(positions), 1))
-        own[:, address] = positions[:, address]
-        return own
 
     def pose(self, m: Measurement) -> np.ndarray:
         """(nq,) positions of all joints at the beginning of a recording [rad, m]; where it has none, those of the model."""
@@ -298,14 +289,10 @@ class RobotJoint(DriveJoint):
 class Along(NamedTuple):
     """Motion of all joints in one recording."""
 
-    moving: frozenset[str]
-    """Joints that move."""
-    positions: np.ndarray
-    """(T · F, nq) positions [rad, m]."""
-    needed: np.ndarray
-    """(T · F, nv) torques that they need, without payloads and armature [N·m, N]."""
-    carried: np.ndarray
-    """(T · F, nv) the part of them that the gravity compensation supplies [N·m, N]."""
+    moving: frozenset[str]  # Joints that move
+    positions: np.ndarray  # (T · F, nq) positions [rad, m]
+    needed: np.ndarray  # (T · F, nv) torques that they need, without payloads and armature [N·m, N]
+    carried: np.ndarray  # (T · F, nv) the part of them that the gravity compensation supplies [N·m, N]
 
 
 def needed_along(robot: "Robot", positions: np.ndarray, period_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

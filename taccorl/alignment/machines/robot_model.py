@@ -13,7 +13,6 @@ removed.
 
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,20 +20,13 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from taccorl.alignment.machines import omitted_actuators as actuators
 from taccorl.alignment.machines.model_xml import Element, joints_of, read_model, unbalanced, without_shapes
-from taccorl.alignment.machines.omitted_actuators import (
-    OmittedActuator,
-    held_by,
-    omitted_actuators,
-    remarks_on,
-    without,
-)
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-MOST_TURNS = 3.0
-"""Turns to a side of a hinge beyond which its limits are probably in degrees."""
+MOST_TURNS = 3.0  # Turns to a side of a hinge beyond which its limits are probably in degrees
 _CLOSING = {mujoco.mjtEq.mjEQ_CONNECT: "connect", mujoco.mjtEq.mjEQ_WELD: "weld"}
 _REMOVED = ("sensors", "keys", "equalities", "tendons", "pairs", "excludes", "skins", "lights", "cameras")
 
@@ -44,12 +36,9 @@ class ActuatorFacts:
     """One actuator of a joint in MJCF: τ = gear · (gain · ctrl + bias0 + bias1 · gear q + bias2 · gear q̇)."""
 
     name: str
-    kp: float
-    """Position gain at the joint [N·m/rad or N/m]; 0 for a motor."""
-    kd: float
-    """Velocity gain at the joint [N·m·s/rad or N·s/m]."""
-    effort_limit: float | None
-    """Largest torque or force at the joint [N·m or N]; None if unlimited."""
+    kp: float  # Position gain at the joint [N·m/rad or N/m]; 0 for a motor
+    kd: float  # Velocity gain at the joint [N·m·s/rad or N·s/m]
+    effort_limit: float | None  # Largest torque or force at the joint [N·m or N]; None if unlimited
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,24 +46,16 @@ class JointFacts:
     """Facts about one joint in a model file: limits, inertia, passive forces, actuators."""
 
     name: str
-    unit: Literal["rad", "m"]
-    """Unit of its position: rad of a hinge, m of a slide."""
-    limits: tuple[float, float] | None
-    """Lowest and highest position [rad or m]; None if unlimited."""
+    unit: Literal["rad", "m"]  # Unit of its position: rad of a hinge, m of a slide
+    limits: tuple[float, float] | None  # Lowest and highest position [rad or m]; None if unlimited
     inertia: float
     """Inertia of all bodies that the joint moves, with other joints at the model's zero pose [kg·m² or kg]; without armature."""
-    armature: float
-    """Rotor inertia at the joint [kg·m² or kg]."""
-    effort_limit: float | None
-    """Largest torque or force [N·m or N]; None if unlimited."""
-    damping: float
-    """Damping coefficient [N·m·s/rad or N·s/m]."""
-    friction: float
-    """Dry friction [N·m or N]."""
-    stiffness: float
-    """Stiffness of a spring at the joint [N·m/rad or N/m]."""
-    spring_rest: float
-    """Position at which the spring of ``stiffness`` is relaxed [rad or m]."""
+    armature: float  # Rotor inertia at the joint [kg·m² or kg]
+    effort_limit: float | None  # Largest torque or force [N·m or N]; None if unlimited
+    damping: float  # Damping coefficient [N·m·s/rad or N·s/m]
+    friction: float  # Dry friction [N·m or N]
+    stiffness: float  # Stiffness of a spring at the joint [N·m/rad or N/m]
+    spring_rest: float  # Position at which the spring of ``stiffness`` is relaxed [rad or m]
     actuators: tuple[ActuatorFacts, ...]
     """Actuators of the joint; one that stands for all those that hold it through tendons, if it has none of its own and they do
     not couple it with another joint; empty if it has none."""
@@ -84,40 +65,37 @@ class JointFacts:
 class RobotModel:
     """A compiled tree of rigid bodies without contact, passive forces and armature."""
 
-    path: Path
-    """Path of the MJCF or URDF file."""
+    path: Path  # Path of the MJCF or URDF file
     model: mujoco.MjModel
-    joints: dict[str, JointFacts]
-    """Name → facts of the hinge and slide joints, in the order of the tree."""
-    remarks: tuple[str, ...]
-    """Parts of the file that were left out, and what that means for the robot file."""
+    joints: dict[str, JointFacts]  # Name → facts of the hinge and slide joints, in the order of the tree
+    remarks: tuple[str, ...]  # Parts of the file that were left out, and what that means for the robot file
 
 
 def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotModel:
-    """Read an MJCF or URDF file.
-
-    Args:
-        gravity_compensation: share of the weight that the controller compensates.
-
-    Raises TaccorlError: the file cannot be read; a moving link has no inertia, or one that requires a mesh; there is a
-    closed chain, a joint without a name, or no joint."""
+    """Read an MJCF or URDF file. ``gravity_compensation``: share of the weight that the controller compensates. Raises
+    TaccorlError: the file cannot be read; a moving link has no inertia, or one that requires a mesh; there is a closed chain, a
+    joint without a name, or no joint."""
     path = Path(path)
     spec, root, remarks, mimics = _spec(path)
     spec.memory = -1  # of contacts, which are not computed
     _refuse_closed_chains(path, spec)
     try:
-        omitted = omitted_actuators(spec)
+        omitted = actuators.omitted_actuators(spec)
     except TaccorlError as error:
         raise TaccorlError(f"{path}: {error}") from error
-    remarks += remarks_on(omitted)
-    without(spec, omitted)
+    remarks += actuators.remarks_on(omitted)
+    actuators.without(spec, omitted)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
     for body in spec.bodies:
         body.gravcomp = gravity_compensation
     model = _compiled(path, spec, root)
+    names = [model.joint(k).name for k in range(model.njnt)]
+    if "" in names:
+        body = model.body(model.jnt_bodyid[names.index("")]).name
+        raise TaccorlError(f"{path}: a joint of body {body} has no name; give it one")
     inertias = _inertias(model)
-    joints = {name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(_joint_names(path, model))}
+    joints = {name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(names)}
     remarks += [remark for facts in joints.values() for remark in _of_limits(root, facts)]
     remarks += [_of_mimic(joints[name], *mimic) for name, mimic in mimics.items() if name in joints]
     if not joints:
@@ -191,14 +169,12 @@ def _of_mimic(facts: JointFacts, follows: str, multiplier: float) -> str:
 
 
 def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:
-    closing = [e for e in spec.equalities if e.type in _CLOSING and e.active]
+    closing = {e: _CLOSING[e.type] for e in spec.equalities if e.type in _CLOSING and e.active}
     if closing:
-        names = listed(
-            [f"{_CLOSING[e.type]} {e.name or '(no name)'} between {e.name1} and {e.name2 or 'world'}" for e in closing]
-        )
+        names = [f"{t} {e.name or '(no name)'} between {e.name1} and {e.name2 or 'world'}" for e, t in closing.items()]
         raise TaccorlError(
-            f"{path}: closed chain: {names}. Only trees are supported: remove <{_CLOSING[closing[0].type]}> and the links that "
-            "close the loop, and add the inertia of the removed links to those that remain"
+            f"{path}: closed chain: {listed(names)}. Only trees are supported: remove <{next(iter(closing.values()))}> and the "
+            "links that close the loop, and add the inertia of the removed links to those that remain"
         )
 
 
@@ -237,17 +213,8 @@ def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
 
 def _moving(spec: mujoco.MjSpec) -> set[str]:
     """Bodies that a hinge, slide or ball joint moves."""
-    moving: set[str] = set()
-
-    def visit(body: mujoco.MjsBody, moved: bool) -> None:
-        moved = moved or any(j.type != mujoco.mjtJoint.mjJNT_FREE for j in body.joints)
-        if moved:
-            moving.add(body.name)
-        for child in body.bodies:
-            visit(child, moved)
-
-    visit(spec.worldbody, False)
-    return moving
+    own = [joint.parent for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    return {body.name for first in own for body in (first, *first.find_all("body"))}
 
 
 def _held_base(spec: mujoco.MjSpec) -> list[str]:
@@ -282,16 +249,6 @@ def _compiled(path: Path, spec: mujoco.MjSpec, root: Element) -> mujoco.MjModel:
         raise TaccorlError(f"{_placed(path, error)}: MuJoCo cannot compile it: {text}") from error
 
 
-def _joint_names(path: Path, model: mujoco.MjModel) -> Iterator[str]:
-    for k in range(model.njnt):
-        name = model.joint(k).name
-        if not name:
-            raise TaccorlError(
-                f"{path}: a joint of body {model.body(model.jnt_bodyid[k]).name} has no name; give it one"
-            )
-        yield name
-
-
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
@@ -309,11 +266,11 @@ def _inertias(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _facts(
-    model: mujoco.MjModel, name: str, k: int, omitted: list[OmittedActuator], inertias: np.ndarray
+    model: mujoco.MjModel, name: str, k: int, omitted: list[actuators.OmittedActuator], inertias: np.ndarray
 ) -> JointFacts:
     dof = model.jnt_dofadr[k]
     own = [_actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
-    if not own and (held := held_by(omitted, name)):
+    if not own and (held := actuators.held_by(omitted, name)):
         own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None)]
     effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
     return JointFacts(

@@ -32,19 +32,14 @@ from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 
-TIME = "timestamp"
-"""Column of a LeRobot dataset with the time of a row in its episode [s]."""
+TIME = "timestamp"  # Column of a LeRobot dataset with the time of a row in its episode [s]
 
 
 def read_dataset(root: Path, columns: TableSpec | None = None, *, is_all: bool = False) -> list[Measurement]:
-    """One measurement per episode of a dataset, in their order, at the dataset's rate.
-
-    Args:
-        columns: names and units of the columns of a dataset that states none. A dataset that states its units is read by those.
-        is_all: nothing else is read, so that ``columns`` can be meant for this dataset only.
-
-    Raises TaccorlError: it is not a dataset, its numbers have no units, it does not state its action_time, it lacks a
-    column, or it states its units and ``columns`` would too."""
+    """One measurement per episode of a dataset, in their order, at the dataset's rate. ``columns``: names and units of the
+    columns of a dataset that states none. A dataset that states its units is read by those. ``is_all``: nothing else is read, so
+    that ``columns`` can be meant for this dataset only. Raises TaccorlError: it is not a dataset, its numbers have no units, it
+    does not state its action_time, it lacks a column, or it states its units and ``columns`` would too."""
     dataset = Dataset(root)
     try:
         names, units = signal_names(dataset.spec), signal_units(dataset.spec)
@@ -108,13 +103,8 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
 
     ``next_row``: the action of row t is reached, in a straight line, at row t + 1, so that row k of the measurement is row k + 1
     of the episode with the action of row k (T rows → T − 1). ``this_row``: the action of row t is in force from row t (T rows).
-
-    Args:
-        names, units: of the J signals, in the order of the columns of state and action.
-        root: folder of the dataset.
-        k: index of the episode.
-
-    Raises TaccorlError: there are too few rows, or the dataset does not state its action_time."""
+    ``names``, ``units``: of the J signals, in the order of the columns of state and action. ``root``: folder of the dataset.
+    ``k``: index of the episode. Raises TaccorlError: there are too few rows, or the dataset does not state its action_time."""
     episode.spec.require_action_time(episode.name)
     state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)
     first = 1 if episode.spec.action_time == "next_row" else 0

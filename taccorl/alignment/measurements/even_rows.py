@@ -22,20 +22,14 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding
 from taccorl.sim.twin import PhysicsConfig
 
-EVEN = 0.1
-"""Steps within this share of the period are even enough for a replay."""
-GAP = 1.5
-"""A step longer than this [periods] has lost rows."""
-MOST_JITTER = 0.5
-"""Largest jitter [periods] of 95 % of the steps that are no gaps."""
-LONGEST_GAP_S = 0.25
-"""Longest gap of a table that is resampled [s]."""
-MOST_LOST = 0.1
-"""Largest share of lost rows of a table that is resampled."""
+EVEN = 0.1  # Steps within this share of the period are even enough for a replay
+GAP = 1.5  # A step longer than this [periods] has lost rows
+MOST_JITTER = 0.5  # Largest jitter [periods] of 95 % of the steps that are no gaps
+LONGEST_GAP_S = 0.25  # Longest gap of a table that is resampled [s]
+MOST_LOST = 0.1  # Largest share of lost rows of a table that is resampled
 RATE_TOLERANCE = 0.02
 """Largest relative difference from a rate with a whole number of physics steps at which the rate is set to it."""
-AT_ROW = 0.1
-"""A row this near to a grid row beside a gap [periods] counts as being at it."""
+AT_ROW = 0.1  # A row this near to a grid row beside a gap [periods] counts as being at it
 
 
 def even_rows(m: Measurement) -> Measurement:

@@ -38,12 +38,11 @@ from taccorl.data.decode import natural_key
 from taccorl.data.origin import Domain
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
-from taccorl.data.strict_yaml import Document
+from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, TaccorlError, nearest, no_such_path
 from taccorl.robots import ROBOT
 
-INDEX = "measurements.yaml"
-"""Name of the file, in a folder of recordings, that states facts about them."""
+INDEX = "measurements.yaml"  # Name of the file, in a folder of recordings, that states facts about them
 TableReader = Callable[[Path, Any], Measurement]
 """Function that reads a table from its path and, if there is one, its columns file."""
 FARTHEST_PAYLOAD_M = 1.0
@@ -61,11 +60,9 @@ class PressedNote:
     """A known object between the fingers of one arm: the arguments of ``indenter``."""
 
     shape: Literal["sphere", "rod"]
-    radius_m: float
-    """Radius of the sphere or rod [m]."""
+    radius_m: float  # Radius of the sphere or rod [m]
     arm: ArmName
-    length_m: float | None = None
-    """Length of a rod, which has flat ends [m]; not for a sphere."""
+    length_m: float | None = None  # Length of a rod, which has flat ends [m]; not for a sphere
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of the object [m]: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y),
     or in the world's, as ``frame`` says."""
@@ -93,24 +90,19 @@ class RecordingNote(Stated):
     effort_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor from the recorded effort to N·m or N; 0: the effort is not used. PiPER's firmware 1.5 to 1.8 reports
     joints 1 to 3 four times too large (piper_sdk issue 73)."""
-    pressed: PressedNote | None = None
-    """Known object between the fingers of one arm; None if there is none."""
+    pressed: PressedNote | None = None  # Known object between the fingers of one arm; None if there is none
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementIndex:
     """Content of ``measurements.yaml``."""
 
-    spec: str | None = None
-    """Recording spec of the recordings: a shipped one's name, or a path; None if not needed."""
+    spec: str | None = None  # Recording spec of the recordings: a shipped one's name, or a path; None if not needed
     columns: str | None = None
     """Path of the columns file of tables and of datasets without units; None if they have taccorl's own names."""
-    domain: Domain | None = None
-    """Domain of all recordings that state none, such as ``real``."""
-    validation_every: int = 0
-    """Every k-th motion is for validation; 0: only recordings that are named."""
-    recordings: dict[str, RecordingNote] = field(default_factory=dict)
-    """File name of the recording → facts about it."""
+    domain: Domain | None = None  # Domain of all recordings that state none, such as ``real``
+    validation_every: int = 0  # Every k-th motion is for validation; 0: only recordings that are named
+    recordings: dict[str, RecordingNote] = field(default_factory=dict)  # File name of the recording → facts about it
 
 
 @dataclass(frozen=True)
@@ -120,10 +112,8 @@ class Measurements:
     fit: tuple[Measurement, ...]
     validation: tuple[Measurement, ...] = ()
     test: tuple[Measurement, ...] = ()
-    rule: str = ""
-    """Description of the rule of the division."""
-    skipped: tuple[str, ...] = ()
-    """Other entries of the folder that were not read, with the reason."""
+    rule: str = ""  # Description of the rule of the division
+    skipped: tuple[str, ...] = ()  # Other entries of the folder that were not read, with the reason
     unlisted: tuple[str, ...] = ()
     """Recordings for the fit that ``measurements.yaml`` does not list, although it states the use of others."""
 
@@ -181,8 +171,14 @@ def read_measurements(
         skipped,
     )
     found = sorted(found, key=lambda m: natural_key(m.name))
-    found = _noted(found, index, folder, whole=path.is_dir())
-    whole, uses = path.is_dir(), ("fit", "validation", "test")  # who asks for one file wants to fit it
+    whole, uses, names = path.is_dir(), ("fit", "validation", "test"), [m.name for m in found]
+    unknown = [name for name in index.recordings if name not in names]
+    if whole and unknown:
+        raise TaccorlError(
+            f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
+        )
+    found = [_with_note(m, index, folder, names if whole else None) for m in found]
+    # Who asks for one file wants to fit it.
     named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
     every = index.validation_every * whole if validation_every is None else validation_every
     divided = split(found, **named, validation_every=every, fit_needed=fit_needed)
@@ -206,10 +202,8 @@ def split(
     twice, a motion has different uses, or nothing remains for the fit although ``fit_needed``."""
     measurements = list(measurements)
     names = [m.name for m in measurements]
-    if len(set(names)) != len(names):
-        raise TaccorlError(
-            f"two measurements have the name {next(n for n in names if names.count(n) > 1)!r}; rename one file"
-        )
+    for name in (name for name in names if names.count(name) > 1):
+        raise TaccorlError(f"two measurements have the name {name!r}; rename one file")
     uses: dict[str, str] = {}
     for use, listed in (("fit", fit), ("validation", validation), ("test", test)):
         for name in listed:
@@ -260,69 +254,48 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
 
 
 def _load_index(folder: Path, holders: Sequence[str]) -> MeasurementIndex:
-    path = folder / INDEX
-    if not path.is_file():
+    if not (folder / INDEX).is_file():
         return MeasurementIndex()
-    document = Document(MeasurementIndex, path)
-    index = document.value
+    document = Document(MeasurementIndex, folder / INDEX)
+    document.refuse(_rules(document.value, folder, holders))
+    return document.value
+
+
+def _rules(index: MeasurementIndex, folder: Path, holders: Sequence[str]) -> Rules:
+    axes = [h for h in holders if h not in (*ROBOT.arms, *ROBOT.action_names)]
     for name, note in index.recordings.items():
+        place = f"recordings/{name}"
         for key in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "supply_v"):
-            bad = next((s for s, v in getattr(note, key).items() if v < 0), None)
-            if bad:
-                raise document.error(f"recordings/{name}/{key}/{bad}", f"{getattr(note, key)[bad]:g} is below 0")
-        axes = [h for h in holders if h not in (*ROBOT.arms, *ROBOT.action_names)]
+            for signal, value in getattr(note, key).items():
+                yield value < 0, f"{place}/{key}/{signal}", f"{value:g} is below 0"
         for key in ("payload_kg", "payload_position_m", "lever_m", "arm_kg", "supply_v"):
             known = {"payload_kg": holders, "payload_position_m": ROBOT.arms}.get(key, axes)
-            arm = next((a for a in getattr(note, key) if a not in known), None)
-            if arm:
-                others = [h for h in known if h not in ROBOT.action_names]
-                what = "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
-                raise document.error(
-                    f"recordings/{name}/{key}/{arm}", f"no {what} {arm!r}; {', '.join(others) or 'there is none'}"
-                )
-        _check_payload_positions(document, f"recordings/{name}/payload_position_m", note)
+            others = ", ".join(h for h in known if h not in ROBOT.action_names) or "there is none"
+            what = "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
+            for holder in getattr(note, key):
+                yield holder not in known, f"{place}/{key}/{holder}", f"no {what} {holder!r}; {others}"
+        for arm, at_m in note.payload_position_m.items():
+            is_near = all(math.isfinite(x) and abs(x) <= FARTHEST_PAYLOAD_M for x in at_m)
+            far = f"{list(at_m)} is further than {FARTHEST_PAYLOAD_M:g} m from the flange; is it in millimetres?"
+            yield not is_near, f"{place}/payload_position_m/{arm}", far
         if note.pressed is not None:
-            _check_pressed(document, f"recordings/{name}/pressed", note.pressed)
-    if index.columns and not (folder / index.columns).is_file():
-        raise document.error("columns", f"no file {index.columns!r} beside it")
-    return index
+            yield from _rules_of_pressed(f"{place}/pressed", note.pressed)
+    lacks_columns = index.columns and not (folder / index.columns).is_file()
+    yield lacks_columns, "columns", f"no file {index.columns!r} beside it"
 
 
-def _check_payload_positions(document: Document[MeasurementIndex], key: str, note: RecordingNote) -> None:
-    for arm, at_m in note.payload_position_m.items():
-        if not all(math.isfinite(x) and abs(x) <= FARTHEST_PAYLOAD_M for x in at_m):
-            text = f"{list(at_m)} is further than {FARTHEST_PAYLOAD_M:g} m from the flange; is it in millimetres?"
-            raise document.error(f"{key}/{arm}", text)
-
-
-def _check_pressed(document: Document[MeasurementIndex], key: str, pressed: PressedNote) -> None:
-    if (pressed.shape == "rod") != (pressed.length_m is not None):
-        need = "a rod needs its length_m" if pressed.shape == "rod" else "a sphere has no length_m; leave it out"
-        raise document.error(key if pressed.length_m is None else f"{key}/length_m", need)
-    for name in ("radius_m", "length_m"):
-        size = getattr(pressed, name)
-        if size is not None and not 0 < size < math.inf:
-            raise document.error(f"{key}/{name}", f"{size:g} is not above 0")
-    if 2 * pressed.radius_m > ROBOT.opening_max_m:
-        text = (
-            f"{pressed.radius_m:g} m does not fit between the fingers, which open {ROBOT.opening_max_m:g} m; "
-            "is it in millimetres?"
-        )
-        raise document.error(f"{key}/radius_m", text)
+def _rules_of_pressed(key: str, pressed: PressedNote) -> Rules:
+    is_rod, lengths = pressed.shape == "rod", {} if pressed.length_m is None else {"length_m": pressed.length_m}
+    need = "a rod needs its length_m" if is_rod else "a sphere has no length_m; leave it out"
+    yield is_rod != bool(lengths), f"{key}/length_m" if lengths else key, need
+    for name, size in {"radius_m": pressed.radius_m, **lengths}.items():
+        yield not 0 < size < math.inf, f"{key}/{name}", f"{size:g} is not above 0"
+    room = f"does not fit between the fingers, which open {ROBOT.opening_max_m:g} m; is it in millimetres?"
+    yield 2 * pressed.radius_m > ROBOT.opening_max_m, f"{key}/radius_m", f"{pressed.radius_m:g} m {room}"
 
 
 def _note(index: MeasurementIndex, measurement: Measurement) -> RecordingNote:
     return index.recordings.get(measurement.name, RecordingNote())
-
-
-def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, whole: bool) -> list[Measurement]:
-    names = [m.name for m in found]
-    unknown = [name for name in index.recordings if name not in names]
-    if whole and unknown:
-        raise TaccorlError(
-            f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
-        )
-    return [_with_note(m, index, folder, names if whole else None) for m in found]
 
 
 def _with_note(m: Measurement, index: MeasurementIndex, folder: Path, names: Sequence[str] | None) -> Measurement:
@@ -332,10 +305,9 @@ def _with_note(m: Measurement, index: MeasurementIndex, folder: Path, names: Seq
     def refuse(key: str, text: str) -> NoReturn:
         raise TaccorlError(f"{folder / INDEX}: recordings → {m.name} → {key}: {text}")
 
-    if names is not None and note.repeat_of is not None and note.repeat_of not in names:
-        refuse(
-            "repeat_of", f"there is no recording {note.repeat_of!r} in this folder; {nearest(note.repeat_of, names)}"
-        )
+    first = note.repeat_of
+    if names is not None and first is not None and first not in names:
+        refuse("repeat_of", f"there is no recording {first!r} in this folder; {nearest(first, names)}")
     for key in ("kp", "kd", "effort_scale", "supply_v"):
         for name in getattr(note, key):
             if name not in m.signals:

@@ -22,8 +22,7 @@ from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError, nearest, plain_name, printable
 from taccorl.robots import ROBOT
 
-UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
-"""Unit of a position → units of its velocity and effort."""
+UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}  # Unit of a position → units of its velocity and effort
 
 
 def unit_of(name: str) -> str:
@@ -43,20 +42,16 @@ class Touch:
 
     time_s: np.ndarray
     """(N, 4) times [s] of the ends of each pad's scans, on the measurement's clock, in the order of ``ROBOT.pads``."""
-    counts: np.ndarray
-    """(N, K) int16 counts above baseline, unclipped."""
-    baseline: np.ndarray
-    """(K,) counts that were subtracted."""
+    counts: np.ndarray  # (N, K) int16 counts above baseline, unclipped
+    baseline: np.ndarray  # (K,) counts that were subtracted
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stated:
     """Facts about one recording that its rows do not hold."""
 
-    kp: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_p [N·m/rad, N/m], if stated."""
-    kd: dict[str, float] = field(default_factory=dict)
-    """Signal → commanded K_d [N·m·s/rad, N·s/m], if stated."""
+    kp: dict[str, float] = field(default_factory=dict)  # Signal → commanded K_p [N·m/rad, N/m], if stated
+    kd: dict[str, float] = field(default_factory=dict)  # Signal → commanded K_d [N·m·s/rad, N·s/m], if stated
     gain_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
@@ -81,14 +76,11 @@ class Measurement(Stated):
     together."""
 
     known_units: ClassVar[tuple[str, ...]] = tuple(UNITS)
-    name: str
-    """Name of the recording: its file or folder name, or its dataset's name and episode."""
+    name: str  # Name of the recording: its file or folder name, or its dataset's name and episode
     time_s: np.ndarray
     """(T,) times since the first row [s]. They are even for recordings; a table keeps its own times, which are checked."""
-    target: np.ndarray
-    """(T, J) targets [rad, m], in force from ``time_s[k]`` on."""
-    measured: np.ndarray
-    """(T, J) positions [rad, m] at ``time_s[k]``; NaN in longer gaps of the measurement."""
+    target: np.ndarray  # (T, J) targets [rad, m], in force from ``time_s[k]`` on
+    measured: np.ndarray  # (T, J) positions [rad, m] at ``time_s[k]``; NaN in longer gaps of the measurement
     velocity: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) velocities [rad/s, m/s] as reported by the driver; NaN if it reports none."""
     effort: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -105,34 +97,23 @@ class Measurement(Stated):
     """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
     command_s: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T,) arrival times of each row's targets [s], on the clock of ``time_s``; empty if they equal the rows' times."""
-    signals: tuple[str, ...] = ROBOT.action_names
-    """(J,) names of the signals, in the order of the columns."""
-    units: tuple[str, ...] = ROBOT_UNITS
-    """Unit of each signal's position: rad or m."""
-    target_kinds: tuple[TargetKind, ...] = ()
-    """Quantity that ``target`` states for each signal; positions if not given."""
+    signals: tuple[str, ...] = ROBOT.action_names  # (J,) names of the signals, in the order of the columns
+    units: tuple[str, ...] = ROBOT_UNITS  # Unit of each signal's position: rad or m
+    target_kinds: tuple[TargetKind, ...] = ()  # Quantity that ``target`` states for each signal; positions if not given
     quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 if none is visible."""
-    touch: Touch | None = None
-    """Frames of the pads; None if there are none."""
-    source: Path = Path()
-    """File or dataset from which it was read."""
-    origin: Origin = UNSTATED
-    """Origin as the file states it."""
-    instruction: str = ""
-    """Task text of the recording; empty if it has none."""
-    start_ns: int = 0
-    """Time of row 0 on the recording's clock [ns]."""
-    repeat_of: str | None = None
-    """Name of the measurement whose commands this one repeats; None if it is no repeat."""
+    touch: Touch | None = None  # Frames of the pads; None if there are none
+    source: Path = Path()  # File or dataset from which it was read
+    origin: Origin = UNSTATED  # Origin as the file states it
+    instruction: str = ""  # Task text of the recording; empty if it has none
+    start_ns: int = 0  # Time of row 0 on the recording's clock [ns]
+    repeat_of: str | None = None  # Name of the measurement whose commands this one repeats; None if it is no repeat
     pressed: PressedObject | None = None
     """Known object between the fingers of one arm, if stated; the arm's pads are compared with the twin's for it."""
     time_error_s: float = 0.0
     """Largest time by which a row's position and target may differ from its time [s] (rows of a dataset show the last sample)."""
-    timing: tuple[ChannelTiming, ...] = ()
-    """Timing of each channel's samples; empty for tables."""
-    findings: tuple[Finding, ...] = ()
-    """Findings that were made while reading it."""
+    timing: tuple[ChannelTiming, ...] = ()  # Timing of each channel's samples; empty for tables
+    findings: tuple[Finding, ...] = ()  # Findings that were made while reading it
 
     def __post_init__(self) -> None:
         shape = (len(self.time_s), len(self.signals))
@@ -147,18 +128,12 @@ class Measurement(Stated):
             found = getattr(self, name).shape
             if found != shape:
                 raise TaccorlError(f"measurement {self.name}: {name} is {found}, but times and signals require {shape}")
-        if (
-            len(self.units) != shape[1]
-            or len(self.target_kinds) not in (0, shape[1])
-            or self.quantum.shape != shape[1:]
-            or len(set(self.signals)) != shape[1]
-        ):
-            raise TaccorlError(
-                f"measurement {self.name}: units, quantum and names have other lengths than signals {self.signals}"
-            )
-        wrong = [u for u in self.units if u not in self.known_units]
-        if wrong:
-            raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {wrong[0]!r}")
+        lengths = {len(self.units), len(self.target_kinds) or shape[1], len(set(self.signals))}
+        if lengths != {shape[1]} or self.quantum.shape != shape[1:]:
+            other = f"units, quantum and names have other lengths than signals {self.signals}"
+            raise TaccorlError(f"measurement {self.name}: {other}")
+        for unit in (unit for unit in self.units if unit not in self.known_units):
+            raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {unit!r}")
 
     @property
     def extra_columns(self) -> list[str]:
@@ -268,10 +243,8 @@ class Measurement(Stated):
                 raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
             if extra := self.twin_cannot_take(name):
                 raise TaccorlError(f"{self.name}: {name} has {extra}: the PiPER's twin cannot use this")
-        nothing = np.empty(0)
-        plain = dataclasses.replace(
-            self, load=nothing, torque_ff=nothing, supply_v=nothing, enabled=nothing, target_kinds=()
-        )
+        extra = dict.fromkeys(self.extra_columns, np.empty(0))
+        plain = dataclasses.replace(self, **extra, target_kinds=())
         return plain.extended(dict(zip(ROBOT.action_names, ROBOT_UNITS, strict=True)), rest)
 
     def extended(self, units: Mapping[str, str], rest: Sequence[float] | np.ndarray) -> Self:

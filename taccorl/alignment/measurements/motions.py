@@ -21,31 +21,20 @@ import numpy as np
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
-RATE_HZ = 200
-"""Rate of the targets [Hz]."""
-SWEEP_S = 10.0
-"""Duration of the sweep with which joints are identified [s] (paper App. B.1)."""
-SWEEP_HZ = (0.1, 2.5)
-"""Frequencies of the sweep, from and to [Hz]. A choice: the paper gives none."""
-REST_S = 1.0
-"""Rest before and after each motion [s]."""
-SPEED_RAD_PER_S = 3.0
-"""Highest speed of targets [rad/s]; the arm's slowest joint is rated for 3.1 rad/s (PiPER manual)."""
+RATE_HZ = 200  # Rate of the targets [Hz]
+SWEEP_S = 10.0  # Duration of the sweep with which joints are identified [s] (paper App. B.1).
+SWEEP_HZ = (0.1, 2.5)  # Frequencies of the sweep, from and to [Hz]. A choice: the paper gives none.
+REST_S = 1.0  # Rest before and after each motion [s]
+SPEED_RAD_PER_S = 3.0  # Highest speed of targets [rad/s]; the arm's slowest joint is rated for 3.1 rad/s (PiPER manual)
 TORQUE_NM = (25.0, 25.0, 25.0, 10.0, 10.0, 10.0)
 """Largest torque of each joint, weight and motion together [N·m]: a choice, no rating is published."""
-MARGIN_RAD = 0.05
-"""Distance that is kept from the joint's limits [rad]."""
-SWEEP_RAD = 0.35
-"""Amplitude of the chirp, if speed and torque allow it [rad]."""
-SMALL_RAD = 0.02
-"""Amplitude of the small chirp, for play and dead bands [rad]."""
+MARGIN_RAD = 0.05  # Distance that is kept from the joint's limits [rad]
+SWEEP_RAD = 0.35  # Amplitude of the chirp, if speed and torque allow it [rad]
+SMALL_RAD = 0.02  # Amplitude of the small chirp, for play and dead bands [rad]
 SLOW_HZ, FAST_HZ = SWEEP_HZ
-KNOWN_KG = 0.3
-"""Mass of the weighed payload that is gripped in one recording [kg]."""
-OPENING_M = 0.02
-"""Opening of the gripper in all motions [m]."""
-REST_POSE = (0.0, 1.732, -0.883, 0.0, 0.2, 0.0)
-"""Joint angles of the arm that is not under test [rad]."""
+KNOWN_KG = 0.3  # Mass of the weighed payload that is gripped in one recording [kg]
+OPENING_M = 0.02  # Opening of the gripper in all motions [m]
+REST_POSE = (0.0, 1.732, -0.883, 0.0, 0.2, 0.0)  # Joint angles of the arm that is not under test [rad]
 
 POSES = (
     (0.0, 1.34, -2.3, 0.0, -0.6, 0.3),
@@ -57,8 +46,7 @@ POSES = (
 )
 """Joint angles of the arm while joint 1, 2, … is under test, in the middle of its range [rad]: over the wide range nothing is
 touched."""
-WIDE_RAD = (1.1, 0.9, 0.9, 1.1, 0.95, 1.2)
-"""Half of the range of the wide triangle [rad]."""
+WIDE_RAD = (1.1, 0.9, 0.9, 1.1, 0.95, 1.2)  # Half of the range of the wide triangle [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,30 +57,21 @@ class Motion:
     target: Callable[["Room"], np.ndarray]
     """Function of the joint's ``Room`` that returns the joint's targets (T,) [rad] at ``RATE_HZ``: absolute angles, with
     ``REST_S`` of rest at both ends."""
-    gain: float = 1.0
-    """Factor on K_p and K_d."""
-    payload_kg: float = 0.0
-    """Mass in the gripper [kg]."""
-    repeat_of: str | None = None
-    """Name of the motion that this one repeats; None if it is no repeat."""
-    aims: str = ""
-    """Effect at whose limit it is aimed; empty: none."""
+    gain: float = 1.0  # Factor on K_p and K_d
+    payload_kg: float = 0.0  # Mass in the gripper [kg]
+    repeat_of: str | None = None  # Name of the motion that this one repeats; None if it is no repeat
+    aims: str = ""  # Effect at whose limit it is aimed; empty: none
 
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
     """Range of motion of one joint: middle, widest reach and amplitude of the sweep [rad]; of a slide read m for rad."""
 
-    middle_rad: float
-    """Angle about which the motions go [rad]."""
-    wide_rad: float
-    """Half of the range of the wide triangle [rad]."""
-    sweep_rad: float
-    """Amplitude of the slow part of the chirp [rad]."""
-    speed_rad_per_s: float = SPEED_RAD_PER_S
-    """Highest speed of targets [rad/s]."""
-    small_rad: float = SMALL_RAD
-    """Amplitude of the small chirp [rad]."""
+    middle_rad: float  # Angle about which the motions go [rad]
+    wide_rad: float  # Half of the range of the wide triangle [rad]
+    sweep_rad: float  # Amplitude of the slow part of the chirp [rad]
+    speed_rad_per_s: float = SPEED_RAD_PER_S  # Highest speed of targets [rad/s]
+    small_rad: float = SMALL_RAD  # Amplitude of the small chirp [rad]
 
     @classmethod
     def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
@@ -156,72 +135,50 @@ def _fade(time_s: np.ndarray, seconds: float) -> np.ndarray:
     return share**2 * (3 - 2 * share)
 
 
-def _rested(motion: np.ndarray, middle_rad: float) -> np.ndarray:
+def _motion(name: str, moved: Callable[[Room], np.ndarray], off: float = 0.0) -> Motion:
+    """Motion about a middle that is off by ``off`` times the sweep's amplitude; ``moved``: room → (T,) [rad], without rests."""
     still = np.zeros(round(REST_S * RATE_HZ))
-    return middle_rad + np.concatenate([still, motion, still])
+
+    def target(room: Room) -> np.ndarray:
+        return room.middle_rad + off * room.sweep_rad + np.concatenate([still, moved(room), still])
+
+    return Motion(name=name, target=target)
 
 
-def _chirp(room: Room) -> np.ndarray:
-    return _rested(chirp(SWEEP_S, SLOW_HZ, FAST_HZ, room.sweep_rad, room.speed_rad_per_s), room.middle_rad)
+def _steps(levels: tuple[float, ...], hold_s: float = 1.0) -> Callable[[Room], np.ndarray]:
+    return lambda room: steps(np.array(levels) * room.sweep_rad, hold_s, room.speed_rad_per_s)
 
 
-def _steps(levels: tuple[float, ...], off: float, hold_s: float = 1.0) -> Callable[[Room], np.ndarray]:
-    return lambda room: _rested(
-        steps(np.array(levels) * room.sweep_rad, hold_s, room.speed_rad_per_s), room.middle_rad + off * room.sweep_rad
-    )
-
-
-CHIRP = Motion(name="chirp", target=_chirp)
-AGAIN = Motion(name="chirp_again", target=_chirp, repeat_of="chirp")
-WIDE_TRIANGLE = Motion(name="wide_triangle", target=lambda r: _rested(triangle(14.0, r.wide_rad), r.middle_rad))
-STIFFER_CHIRP = Motion(name="chirp_2x_gain", target=_chirp, gain=2.0)
-LOADED_CHIRP = Motion(name="chirp_payload", target=_chirp, payload_kg=KNOWN_KG)
-PACK = (
-    WIDE_TRIANGLE,
-    Motion(name="steps", target=_steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0), 0.0)),
-    Motion(
-        name="small_chirp", target=lambda r: _rested(chirp(6.0, 0.2, 4.0, r.small_rad, r.speed_rad_per_s), r.middle_rad)
-    ),
-    STIFFER_CHIRP,
-    LOADED_CHIRP,
-)
+CHIRP = _motion("chirp", lambda r: chirp(SWEEP_S, SLOW_HZ, FAST_HZ, r.sweep_rad, r.speed_rad_per_s))
+AGAIN = dataclasses.replace(CHIRP, name="chirp_again", repeat_of="chirp")
+WIDE_TRIANGLE = _motion("wide_triangle", lambda r: triangle(14.0, r.wide_rad))
+STIFFER_CHIRP = dataclasses.replace(CHIRP, name="chirp_2x_gain", gain=2.0)
+LOADED_CHIRP = dataclasses.replace(CHIRP, name="chirp_payload", payload_kg=KNOWN_KG)
+STEPS = _motion("steps", _steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0)))
+SMALL_CHIRP = _motion("small_chirp", lambda r: chirp(6.0, 0.2, 4.0, r.small_rad, r.speed_rad_per_s))
+PACK = (WIDE_TRIANGLE, STEPS, SMALL_CHIRP, STIFFER_CHIRP, LOADED_CHIRP)
 """Motions of the fit recordings besides the chirp and its repeat."""
-HELD_STEPS = Motion(name="held_steps", target=_steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0), -0.2))
+HELD_STEPS = _motion("held_steps", _steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0)), -0.2)
 """Motion that is recorded twice as well: with dry friction a robot repeats its steps worse than its chirp."""
 VALIDATION = (
-    Motion(
-        name="held_chirp",
-        target=lambda r: _rested(
-            chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad, r.speed_rad_per_s), r.middle_rad - 0.3 * r.sweep_rad
-        ),
-    ),
-    Motion(name="held_triangle", target=lambda r: _rested(triangle(12.0, 0.8 * r.wide_rad, 2), r.middle_rad)),
+    _motion("held_chirp", lambda r: chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad, r.speed_rad_per_s), -0.3),
+    _motion("held_triangle", lambda r: triangle(12.0, 0.8 * r.wide_rad, 2)),
     HELD_STEPS,
     dataclasses.replace(HELD_STEPS, name="held_steps_again", repeat_of="held_steps"),
 )
 """Motions of the validation recordings."""
 TEST = (
-    Motion(
-        name="test_multisine",
-        target=lambda r: _rested(multisine(10.0, 1.2 * r.sweep_rad, 5, r.speed_rad_per_s), r.middle_rad),
-    ),
-    Motion(
-        name="test_multisine_far",
-        target=lambda r: _rested(
-            multisine(8.0, 0.7 * r.sweep_rad, 9, r.speed_rad_per_s), r.middle_rad + 0.4 * r.sweep_rad
-        ),
-    ),
+    _motion("test_multisine", lambda r: multisine(10.0, 1.2 * r.sweep_rad, 5, r.speed_rad_per_s)),
+    _motion("test_multisine_far", lambda r: multisine(8.0, 0.7 * r.sweep_rad, 9, r.speed_rad_per_s), 0.4),
 )
 """Motions of the test recordings."""
 LIBRARY = (
     CHIRP,
     *PACK,
-    Motion(name="slow_triangle", target=lambda r: _rested(triangle(30.0, 0.5 * r.wide_rad), r.middle_rad)),
-    Motion(name="holds", target=_steps((0.3, -0.3, 0.8, -0.8, 0.0), 0.0, hold_s=4.0)),
-    Motion(name="steps_2x_gain", target=_steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0), 0.0), gain=2.0),
-    Motion(
-        name="triangle_payload", target=lambda r: _rested(triangle(14.0, r.wide_rad), r.middle_rad), payload_kg=KNOWN_KG
-    ),
+    _motion("slow_triangle", lambda r: triangle(30.0, 0.5 * r.wide_rad)),
+    _motion("holds", _steps((0.3, -0.3, 0.8, -0.8, 0.0), hold_s=4.0)),
+    dataclasses.replace(STEPS, name="steps_2x_gain", gain=2.0),
+    dataclasses.replace(WIDE_TRIANGLE, name="triangle_payload", payload_kg=KNOWN_KG),
 )
 """Motions from which ``taccorl excite`` chooses."""
 DESIGNS = {"chirp": (CHIRP, AGAIN), "pack": (CHIRP, AGAIN, *PACK)}
@@ -234,7 +191,6 @@ def joint_number(signal: str) -> int:
     """Number of a joint: ``left_joint5`` → 5. Raises TaccorlError: there is no such joint."""
     arm, _, joint = signal.partition("_")
     if arm not in ROBOT.arms or joint not in ROBOT.joints:
-        raise TaccorlError(
-            f"no joint {signal!r}; {nearest(signal, [f'{a}_{j}' for a in ROBOT.arms for j in ROBOT.joints])}"
-        )
+        known = [f"{a}_{j}" for a in ROBOT.arms for j in ROBOT.joints]
+        raise TaccorlError(f"no joint {signal!r}; {nearest(signal, known)}")
     return ROBOT.joints.index(joint) + 1

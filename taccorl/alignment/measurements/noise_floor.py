@@ -16,7 +16,6 @@ is a lower bound, or cycles if they differ by more. The floor is never below the
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
 """
 
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -32,39 +31,31 @@ from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.repeats import Overlay, cycles, overlay
 from taccorl.errors import TaccorlError
 
-Kind = Literal["position", "velocity", "effort"]
-"""Quantity of a signal whose noise is estimated."""
+Kind = Literal["position", "velocity", "effort"]  # Quantity of a signal whose noise is estimated
 Method = Literal["repeats", "cycles", "rest", "residue", "quantisation", "number"]
 """How the noise was estimated, a row of the table above; ``number``: the least floor allowed, ``NUMBER`` or ``EXACT``."""
-BLOCK_S = 0.25
-"""Duration of a block [s]. Estimates are made per block, and their scatter gives the interval."""
-BLOCK_ROWS = 24
-"""Least number of rows in a block: 0.8 s at 30 rows per second."""
+BLOCK_S = 0.25  # Duration of a block [s]. Estimates are made per block, and their scatter gives the interval.
+BLOCK_ROWS = 24  # Least number of rows in a block: 0.8 s at 30 rows per second
 SETTLE_S = 1.5
 """Time after the last command until a joint counts as at rest [s]: with time constants of about 0.1 s, exp(−15) of the motion
 remains."""
-REST_TARGET = 2e-5
-"""Range within which a command counts as resting [rad, m]: 0.001°, PiPER's resolution."""
+REST_TARGET = 2e-5  # Range within which a command counts as resting [rad, m]: 0.001°, PiPER's resolution
 WINDOW, ORDER = 9, 4
 """Window [rows] and order of the Savitzky–Golay smooth. It follows motion up to 0.61 of half the row rate (Schafer 2011, f_c =
 (ORDER + 1) / (3.2 M − 4.6), M = 4)."""
 BANDWIDTH_FACTOR = 5.0
 """Least ratio of the smooth's bandwidth to the motion's highest frequency: with 5 the smooth misses 2 · 10⁻⁵ of the motion."""
-MOTION_POWER = 0.99
-"""Share of the motion's power that defines its highest frequency."""
+MOTION_POWER = 0.99  # Share of the motion's power that defines its highest frequency
 OTHER_START = 5.0
 """Two recordings of one motion began at different positions if they differ by so many times their usual difference."""
-MOVING = 1e-3
-"""Range within which a command is no motion with a relevant bandwidth [rad, m]."""
+MOVING = 1e-3  # Range within which a command is no motion with a relevant bandwidth [rad, m]
 BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
 """Repeats differ in bursts if less than ``BURST_SHARE`` of the blocks hold ``BURST_POWER`` of the squared difference, and the
 RMS of all is ``BURST_RATIO`` times that of the typical block."""
 ODD = 5.0
 """A repeat is left out if the RMS of its typical block is more than this many times the others' median. A choice."""
-DISAGREE = 3.0
-"""Ratio of the floor from repeats to that from rest, residue or rounding above which they disagree."""
-NUMBER = 2.0**-24
-"""Last bit of a 32-bit number of size 1: no floor is smaller than this rounding."""
+DISAGREE = 3.0  # Ratio of the floor from repeats to that from rest, residue or rounding above which they disagree
+NUMBER = 2.0**-24  # Last bit of a 32-bit number of size 1: no floor is smaller than this rounding
 EXACT = 1e-3
 """Least noise floor of an effort, as a share of its standard deviation. A choice: simulated efforts have no noise at all."""
 
@@ -73,8 +64,7 @@ EXACT = 1e-3
 class Estimate:
     """One estimate of the noise of one signal, in the signal's unit."""
 
-    method: Method
-    """How it was estimated."""
+    method: Method  # How it was estimated
     value: float
     low: float
     high: float
@@ -84,8 +74,7 @@ class Estimate:
     computed from the median block instead of from all blocks."""
     left_out: tuple[tuple[str, float], ...] = ()
     """Repeats that were left out: name of the recording, its difference over that of the others."""
-    pairs: int = 0
-    """Number of pairs of repeats that were used."""
+    pairs: int = 0  # Number of pairs of repeats that were used
 
 
 @dataclass(frozen=True)
@@ -93,16 +82,11 @@ class SignalFloor:
     """The noise floor of one signal: the estimate that is used, and all others."""
 
     signal: str
-    kind: Kind
-    """Quantity: position, velocity or effort."""
-    unit: str
-    """Unit of the quantity, such as rad/s."""
-    used: Estimate
-    """Estimate that is the floor."""
-    estimates: tuple[Estimate, ...]
-    """All estimates that could be made."""
-    lower_bound: bool
-    """True without repeats and equal cycles: the robot's own variation is then not included."""
+    kind: Kind  # Quantity: position, velocity or effort
+    unit: str  # Unit of the quantity, such as rad/s
+    used: Estimate  # Estimate that is the floor
+    estimates: tuple[Estimate, ...]  # All estimates that could be made
+    lower_bound: bool  # True without repeats and equal cycles: the robot's own variation is then not included
 
     @property
     def value(self) -> float:
@@ -125,9 +109,8 @@ class SignalFloor:
         factor, prefix = (1e3, "m") if self.kind != "effort" else (1.0, "")
         a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
         bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
-        bound += (
-            f"; not known: two recordings differ {self.value / self.quiet:.0f} times as much as rows" * self.is_unknown
-        )
+        times = f"{self.value / self.quiet:.0f} times"
+        bound += f"; not known: two recordings differ {times} as much as rows" * self.is_unknown
         bursts = ", bursts left out" if self.used.without_bursts else ""
         bursts += "".join(f", without {name}" for name, _ in self.used.left_out)
         return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
@@ -136,31 +119,22 @@ class SignalFloor:
 def noise_floor(
     measurements: Sequence[Measurement], kind: Kind = "position", unexplained: Sequence[Measurement] = ()
 ) -> dict[str, SignalFloor]:
-    """Estimate the noise floor of every signal.
-
-    Args:
-        measurements: measurements of one robot. Those with ``repeat_of`` are aligned with the recording that they repeat.
-        kind: quantity whose noise is estimated.
-        unexplained: the same measurements, from whose efforts a share of a twin's is subtracted, for joints without a target:
-            repeats whose motions differ then differ less. The noise between rows is then the least that is returned.
-
-    Returns:
-        Signal → its floor; signals that were never recorded (effort, velocity) are left out.
-
-    Raises TaccorlError: there is no measurement, signals differ, or a repeat has other commands."""
+    """Estimate the noise floor of every signal. ``measurements``: measurements of one robot. Those with ``repeat_of`` are aligned
+    with the recording that they repeat. ``kind``: quantity whose noise is estimated. ``unexplained``: the same measurements, from
+    whose efforts a share of a twin's is subtracted, for joints without a target: repeats whose motions differ then differ less.
+    The noise between rows is then the least that is returned. Returns signal → its floor; signals that were never recorded
+    (effort, velocity) are left out. Raises TaccorlError: there is no measurement, signals differ, or a repeat has other
+    commands."""
     measurements = list(measurements)
     if not measurements:
         raise TaccorlError("noise floor: no measurement")
     signals, units = measurements[0].signals, measurements[0].units
-    other = next((m for m in measurements if m.signals != signals), None)
-    if other:
-        raise TaccorlError(
-            f"noise floor: {other.name} and {measurements[0].name} have different signals; read them separately"
-        )
+    for m in (m for m in measurements if m.signals != signals):
+        two = f"{m.name} and {measurements[0].name}"
+        raise TaccorlError(f"noise floor: {two} have different signals; read them separately")
+    pairs = laid_pairs(unexplained or measurements)
     blocks: dict[Method, list[_Blocks]] = {
-        "repeats": [
-            _repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in laid_pairs(unexplained or measurements)
-        ],
+        "repeats": [_repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in pairs],
         "cycles": [_cycle_blocks(m, kind) for m in measurements],
         "rest": [_rest_blocks(m, kind) for m in measurements],
         "residue": [_residue_blocks(m, kind) for m in measurements],
@@ -266,14 +240,10 @@ def _values(m: Measurement, kind: Kind) -> np.ndarray:
 class _Blocks:
     """Mean squares of blocks of one recording, scaled so that white noise of variance σ² gives σ² on average."""
 
-    mean_squares: np.ndarray
-    """(B, J); NaN where a block says nothing about a signal."""
-    rows: int
-    """Rows in a block."""
-    freedom: float
-    """Degrees of freedom of a block of white noise."""
-    name: str = ""
-    """Name of the recording that repeats another."""
+    mean_squares: np.ndarray  # (B, J); NaN where a block says nothing about a signal
+    rows: int  # Rows in a block
+    freedom: float  # Degrees of freedom of a block of white noise
+    name: str = ""  # Name of the recording that repeats another
 
 
 def _repeat_blocks(rate_hz: float, name: str, laid: Overlay, kind: Kind) -> _Blocks:
@@ -319,14 +289,9 @@ def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
 def rest_stretches(m: Measurement) -> list[tuple[int, int]]:
     """[first, end) rows of every interval in which all commands rest, from 1.5 s (``SETTLE_S``) after the last motion on."""
     changed = np.flatnonzero(np.any(np.abs(np.diff(m.target, axis=0)) > REST_TARGET, axis=1)) + 1
-    edges = [0, *changed.tolist(), m.num_rows]
     settle = round(SETTLE_S / m.period_s)
-    stretches = []
-    for first, end in itertools.pairwise(edges):
-        begin = first if first == 0 else first + settle
-        if end > begin:
-            stretches.append((begin, end))
-    return stretches
+    begins, ends = [0, *(changed + settle).tolist()], [*changed.tolist(), m.num_rows]
+    return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]
 
 
 def _residue_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -414,12 +379,9 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
 
 def _odd(squares: dict[str, float]) -> dict[str, float]:
     """Repeats that differ over ``ODD`` times as much as the others: name → ratio. ``squares``: name → typical difference²."""
-    found = {}
-    for name, own in squares.items():
-        others = float(np.median([square for other, square in squares.items() if other != name] or [math.inf]))
-        if own > ODD**2 * others > 0.0:
-            found[name] = math.sqrt(own / others)
-    return found
+    others = {name: [square for other, square in squares.items() if other != name] or [math.inf] for name in squares}
+    ratios = {name: (own, float(np.median(others[name]))) for name, own in squares.items()}
+    return {name: math.sqrt(own / usual) for name, (own, usual) in ratios.items() if own > ODD**2 * usual > 0.0}
 
 
 def _in_bursts(squares: np.ndarray, freedom: float) -> bool:
@@ -441,11 +403,9 @@ def _log_spread(squares: np.ndarray, freedom: float, *, robust: bool) -> float:
     count = len(squares)
     if count > 1 and (squares > 0).all():
         log = np.log(squares)
-        spread = (
-            1.4826 * float(np.median(np.abs(log - np.median(log)))) if robust else float(squares.std() / squares.mean())
-        )
+        spread = 1.4826 * np.median(np.abs(log - np.median(log))) if robust else squares.std() / squares.mean()
     else:
         spread = least
     # a median scatters √(π/2) times as much
-    error = max(spread, least) / math.sqrt(count) * (1.2533 if robust else 1.0)
+    error = float(max(spread, least)) / math.sqrt(count) * (1.2533 if robust else 1.0)
     return math.exp(0.5 * float(student.ppf(0.975, max(count - 1, 2))) * error)

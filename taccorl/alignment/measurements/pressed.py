@@ -18,10 +18,8 @@ class PressedObject:
     """Object that the fingers of one arm press, and its pose. TCP frame: middle between the pads, z = approach, fingers close
     along y; finger a is on the side of +y."""
 
-    solids: Sequence[Solid]
-    """Solids of the object in its own frame; ballast (``touches`` is false) is ignored."""
-    arm: str
-    """Name of the arm, ``left`` or ``right``."""
+    solids: Sequence[Solid]  # Solids of the object in its own frame; ballast (``touches`` is false) is ignored
+    arm: str  # Name of the arm, ``left`` or ``right``
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) pose of the object in the TCP's frame, or in the world's [m]."""
     frame: Literal["tcp", "world"] = "tcp"
@@ -60,9 +58,6 @@ def indenter(
         raise TaccorlError(f"indenter: radius_m {radius_m} and length_m {length_m} must be above 0")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", rpy_rad).as_matrix(), position_m
-    solid = (
-        Capsule(radius_m=radius_m, half_height_m=0.0)
-        if shape == "sphere"
-        else Cylinder(radius_m=radius_m, half_height_m=length_m / 2)
-    )
+    kind, half_height_m = (Capsule, 0.0) if shape == "sphere" else (Cylinder, length_m / 2)
+    solid = kind(radius_m=radius_m, half_height_m=half_height_m)
     return PressedObject(solids=[solid], arm=arm, pose=pose, frame=frame)

@@ -5,8 +5,7 @@ import numpy as np
 SAME = 0.05
 """A difference counts as a whole number of steps if it deviates from one by less than this share of a step. Readings stored as
 32-bit numbers deviate by up to 1 % of 0.001°."""
-MANY = 8
-"""Least number of differences that must be whole multiples; by chance it happens once in 10⁸ (0.1⁸)."""
+MANY = 8  # Least number of differences that must be whole multiples; by chance it happens once in 10⁸ (0.1⁸)
 REPEATS = 10.0
 """If there are fewer levels than that, each must occur so often: noise without steps never gives the same reading twice."""
 

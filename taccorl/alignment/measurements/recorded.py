@@ -21,7 +21,6 @@ from taccorl.data import decode
 from taccorl.data.cutting import Cutter, Unfit
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
-from taccorl.data.origin import Origin
 from taccorl.data.recording import Recording, Source, opened, readers
 from taccorl.data.spec import ACTION, STATE, DatasetSpec, EpisodesSpec, InstructionSpec, RecordingSpec
 from taccorl.data.timing import NS_PER_S
@@ -44,7 +43,7 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
         found: list[Finding] = []
         rows = _Rows(_cutter(recording, found), spans)
         found += [Finding("damaged", "warning", "file", f"{d}; copy it again") for d in recording.damage if d.lost]
-        return rows.measurement(_Notes.of(recording, spec), (*found, *rows.cut_short()))
+        return rows.measurement(_notes(recording, spec), (*found, *rows.cut_short()))
 
 
 def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
@@ -138,38 +137,29 @@ def _cutter(recording: Recording, found: list[Finding]) -> Cutter:
         return Cutter(dataclasses.replace(recording, spec=dataclasses.replace(recording.spec, features=features)))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Notes:
-    """What is written down in a recording besides its channels: metadata records of any name, with these keys."""
+def _notes(recording: Recording, spec: RecordingSpec) -> dict[str, Any]:
+    """Fields of ``Measurement`` that are written down in a recording besides its channels: its origin, and metadata records of
+    any name with their keys, numbers and places as JSON."""
+    written = {k: v for record in recording.reader.metadata.values() for k, v in record.items()}
+    texts = [text for topic in recording.texts.values() for _, text in topic]
+    if spec.episodes.by == "markers":
+        texts = [t.removeprefix("start:") for t in texts if t.startswith("start:")]
+    told = next((t.strip() for t in texts if t.strip()), written.get("instruction", spec.instruction.text or ""))
 
-    origin: Origin
-    instruction: str
-    repeat_of: str | None
-    numbers: dict[str, Any]
-    """``kp``, ``kd``, ``gain_scale`` (signal → number) and ``payload_kg`` (arm → number), each as JSON."""
-    payload_position_m: dict[str, tuple[float, float, float]]
-    """Arm → centre of mass in link 6's frame, as JSON."""
+    def stated(key: str, value: Callable[[Any], Any], example: str) -> dict[str, Any]:
+        try:
+            return {str(k): value(v) for k, v in json.loads(written.get(key, "{}")).items()}
+        except (ValueError, TypeError, AttributeError) as error:
+            text = f"metadata {key} is {written[key]!r}; expected a value such as {example}"
+            raise RecordingError(f"{recording.source.name}: {text}") from error
 
-    @classmethod
-    def of(cls, recording: Recording, spec: RecordingSpec) -> "_Notes":
-        written = {k: v for record in recording.reader.metadata.values() for k, v in record.items()}
-        texts = [text for topic in recording.texts.values() for _, text in topic]
-        if spec.episodes.by == "markers":
-            texts = [t.removeprefix("start:") for t in texts if t.startswith("start:")]
-        told = next((t.strip() for t in texts if t.strip()), written.get("instruction", spec.instruction.text or ""))
+    found = {key: stated(key, float, '{"left_joint5": 40.0}') for key in ("kp", "kd", "gain_scale", "payload_kg")}
 
-        def stated(key: str, value: Callable[[Any], Any], example: str) -> dict[str, Any]:
-            try:
-                return {str(k): value(v) for k, v in json.loads(written.get(key, "{}")).items()}
-            except (ValueError, TypeError, AttributeError) as error:
-                text = f"metadata {key} is {written[key]!r}; expected a value such as {example}"
-                raise RecordingError(f"{recording.source.name}: {text}") from error
+    def three(values: Any) -> tuple[float, ...]:
+        return tuple(np.reshape(values, 3).astype(float).tolist())
 
-        one = '{"left_joint5": 40.0}'
-        numbers = {key: stated(key, float, one) for key in ("kp", "kd", "gain_scale", "payload_kg")}
-        three = '{"left": [0, 0, 0.168]}'
-        places = stated("payload_position_m", lambda v: (*np.reshape(v, 3).astype(float).tolist(),), three)
-        return cls(recording.origin, told, written.get("repeat_of") or None, numbers, places)
+    found["payload_position_m"] = stated("payload_position_m", three, '{"left": [0, 0, 0.168]}')
+    return {"origin": recording.origin, "instruction": told, "repeat_of": written.get("repeat_of") or None, **found}
 
 
 class _Rows:
@@ -241,8 +231,7 @@ class _Rows:
         share = np.where(after == before, 0.0, share)
         return values[before] + share[:, None] * (values[after] - values[before])
 
-    def measurement(self, notes: _Notes, findings: tuple[Finding, ...]) -> Measurement:
-        """All of it."""
+    def measurement(self, notes: dict[str, Any], findings: tuple[Finding, ...]) -> Measurement:
         names = signal_names(self.spec.target)
         extra = {kind: np.full((len(self.grid_ns), len(names)), np.nan) for kind in _EXTRA}
         for channel, span in self.spans.items():
@@ -263,12 +252,8 @@ class _Rows:
             quantum=np.array([find_quantum(column) for part in raw for column in part.T]),
             touch=touch,
             source=source.path,
-            origin=notes.origin,
-            instruction=notes.instruction,
+            **notes,
             start_ns=int(self.grid_ns[0]),
-            repeat_of=notes.repeat_of,
-            **notes.numbers,
-            payload_position_m=notes.payload_position_m,
             time_error_s=self.period_ns / NS_PER_S if no_clock else 0.0,
             timing=tuple(self._timing(c, key) for key in (STATE, ACTION) for c in self.spec.features[key].channels),
             findings=findings,

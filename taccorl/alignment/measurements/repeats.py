@@ -9,28 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.alignment.measurements.measurement import Measurement, Stated
+from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
 SAME_SHARE = 0.01
 """Largest difference of the commands, after alignment, as a share of the motion, for recordings of one motion."""
-SAME_QUANTA = 1e-4
-"""Difference of commands that is always accepted [rad, m]: rounding."""
-COMMON_SHARE = 0.5
-"""Least common part of the motion, as a share of the shorter recording's motion."""
-AFTER_S = 0.5
-"""The motion lasts from its first command to so long after its last [s]."""
+SAME_QUANTA = 1e-4  # Difference of commands that is always accepted [rad, m]: rounding
+COMMON_SHARE = 0.5  # Least common part of the motion, as a share of the shorter recording's motion
+AFTER_S = 0.5  # The motion lasts from its first command to so long after its last [s]
 
 
 @dataclass(frozen=True)
 class Overlay:
     """The second recording aligned with the rows of the first."""
 
-    shift_s: float
-    """Time in the second recording − time in the first, at the same command [s]."""
+    shift_s: float  # Time in the second recording − time in the first, at the same command [s]
     difference: dict[str, np.ndarray]
     """position, velocity, effort → (M, J) second − first, during the motion, in the quantity's unit."""
-    time_s: np.ndarray
-    """(M,) time in the first recording [s]."""
+    time_s: np.ndarray  # (M,) time in the first recording [s]
     noise_gain: float
     """Variance of ``difference`` for noise of variance 1 in both recordings: 1 + Σ c², with the weights c of the interpolation
     between rows."""
@@ -38,28 +34,20 @@ class Overlay:
 
 def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SHARE) -> Overlay:
     """Align ``second`` with ``first``: the time shift is that of the best agreement of their commands, to a fraction of a row.
-
-    Args:
-        same_share: largest difference of the aligned commands, as a share of the motion; larger for loads, which are measured
-            and not commanded.
-
-    Raises TaccorlError: the signals or the commands differ."""
+    ``same_share``: largest difference of the aligned commands, as a share of the motion; larger for loads, which are measured and
+    not commanded. Raises TaccorlError: the signals or the commands differ."""
+    no_repeat = f"{second.name} does not repeat {first.name}"
     if first.signals != second.signals:
-        raise TaccorlError(
-            f"{second.name} and {first.name} have different signals, so that one cannot repeat the other"
-        )
+        two = f"{second.name} and {first.name}"
+        raise TaccorlError(f"{two} have different signals, so that one cannot repeat the other")
     for what in Stated.names():
         one, other = getattr(first, what), getattr(second, what)
         silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
         if one != other and not silent:
-            raise TaccorlError(
-                f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} in the latter and "
-                f"{one or 'as usual'} in the former; correct repeat_of"
-            )
+            values = f"{what} is {other or 'as usual'} in the latter and {one or 'as usual'} in the former"
+            raise TaccorlError(f"{no_repeat}: {values}; correct repeat_of")
     if [m.torque_ff.any() for m in (first, second)] in ([True, False], [False, True]):
-        raise TaccorlError(
-            f"{second.name} does not repeat {first.name}: only one of them commands a torque_ff; correct repeat_of"
-        )
+        raise TaccorlError(f"{no_repeat}: only one of them commands a torque_ff; correct repeat_of")
     a, b = (m.resampled(rate_hz := first.rate_hz) for m in (first, second))
     scale = np.maximum(np.ptp(a.target, axis=0), 1e-9)
     lag = _lag(a.target / scale, b.target / scale)
@@ -74,18 +62,13 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
     alike = max(same_share * motion, SAME_QUANTA, 2.0 * jitter_s * speed)
     if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > alike:
         raise TaccorlError(
-            f"{second.name} does not repeat {first.name}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
+            f"{no_repeat}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
             f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice"
         )
     weights = _weights(share)
-    difference = {
-        kind: (_shifted(y, start, share, len(rows)) - x[rows])[moving]
-        for kind, x, y in (
-            ("position", a.measured, b.measured),
-            ("velocity", a.velocity, b.velocity),
-            ("effort", a.effort, b.effort),
-        )
-    }
+    columns = {"position": "measured", "velocity": "velocity", "effort": "effort"}
+    both = {kind: (getattr(a, name), getattr(b, name)) for kind, name in columns.items()}
+    difference = {k: (_shifted(y, start, share, len(rows)) - x[rows])[moving] for k, (x, y) in both.items()}
     shift_s = (lag + share) / rate_hz - first.time_s[0] + second.time_s[0]
     return Overlay(shift_s, difference, a.time_s[rows][moving], 1.0 + float((weights**2).sum()))
 
@@ -123,15 +106,8 @@ def _common(num_a: int, num_b: int, lag: int) -> tuple[np.ndarray, int]:
 
 def _weights(share: float) -> np.ndarray:
     """(4,) Lagrange weights of rows −1, 0, 1, 2 for a point at ``share`` of the way from row 0 to row 1."""
-    w = share
-    return np.array(
-        [
-            -w * (w - 1) * (w - 2) / 6,
-            (w + 1) * (w - 1) * (w - 2) / 2,
-            -(w + 1) * w * (w - 2) / 2,
-            (w + 1) * w * (w - 1) / 6,
-        ]
-    )
+    a, b, c, d = share + 1, share, share - 1, share - 2  # from each of the rows
+    return np.array([-b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6])
 
 
 def _shifted(values: np.ndarray, start: int, share: float, count: int) -> np.ndarray:
@@ -151,15 +127,13 @@ def _moving(target: np.ndarray, after: int) -> np.ndarray:
     return inside
 
 
-SAME = 1e-6
-"""Largest difference of equal targets, as a share of their range: rounding of logged numbers. A choice."""
+SAME = 1e-6  # Largest difference of equal targets, as a share of their range: rounding of logged numbers. A choice.
 EVEN = 0.01
 """Largest difference of the rows' periods, as a share of the period: targets of rows that jitter act at other times in each
 cycle."""
 MOVES = 0.5
 """Least range of each target within the equal cycles, as a share of its range in the recording: a hold is equal at any period."""
-MOST_PERIODS = 20
-"""Number of periods that are tried, the shortest first. A choice."""
+MOST_PERIODS = 20  # Number of periods that are tried, the shortest first. A choice.
 
 
 @dataclass(frozen=True)
@@ -167,8 +141,7 @@ class Cycles:
     """The rows ``first`` to ``end`` (exclusive) of a recording have the same targets as those ``period_rows`` later."""
 
     period_rows: int
-    first: int
-    """First row of the second cycle: the first one begins from rest."""
+    first: int  # First row of the second cycle: the first one begins from rest
     end: int
 
     def difference(self, values: np.ndarray) -> np.ndarray:
@@ -199,16 +172,8 @@ def cycles(m: Measurement) -> Cycles | None:
     alike = np.flatnonzero(alike[:-1] & (np.abs(columns[1:] - columns[at + 1]) <= SAME).all(axis=1))
     periods = np.unique(np.abs(alike - at))
     for period in periods[(periods > 0) & (periods <= third)][:MOST_PERIODS].tolist():
-        first, end = _longest((np.abs(columns[period:] - columns[:-period]) <= SAME).all(axis=1))
+        same = np.asarray((np.abs(columns[period:] - columns[:-period]) <= SAME).all(axis=1))
+        first, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
         if end - first >= 2 * period and (np.ptp(columns[first:end], axis=0) >= MOVES).all():
             return Cycles(period, first + period, end)
     return None
-
-
-def _longest(same: np.ndarray) -> tuple[int, int]:
-    """[first, end) rows of the longest stretch of True in ``same`` (T,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
-    if len(edges) == 0:
-        return 0, 0
-    k = 2 * int(np.argmax(edges[1::2] - edges[::2]))
-    return int(edges[k]), int(edges[k + 1])

@@ -19,14 +19,12 @@ from taccorl.data.origin import Domain, Origin, labelled
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, TaccorlError, nearest
 
-SUFFIXES = (".csv", ".parquet", ".mat")
-"""Suffixes of the files that are read as tables."""
+SUFFIXES = (".csv", ".parquet", ".mat")  # Suffixes of the files that are read as tables
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 """Name of a separator in a columns file → the character in CSV files."""
 MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 """First bytes of a CSV file that state its encoding (byte order marks) → that encoding, for Python's codecs."""
-LONGEST_LINE = 1000
-"""Most characters of a line that states an origin."""
+LONGEST_LINE = 1000  # Most characters of a line that states an origin
 _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
 _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S:g} s of them follow each other"
 
@@ -46,16 +44,13 @@ class EmptyColumns(RecordingError):
 class FileForm:
     """Keys of a columns file: how the table files are written (separator, decimal sign, encoding), and what made them."""
 
-    separator: str = "comma"
-    """Separator of CSV files: comma, semicolon, tab or space; several spaces count as one."""
-    decimal: Literal["point", "comma"] = "point"
-    """Decimal sign of the numbers in CSV files."""
+    separator: str = "comma"  # Separator of CSV files: comma, semicolon, tab or space; several spaces count as one
+    decimal: Literal["point", "comma"] = "point"  # Decimal sign of the numbers in CSV files
     encoding: str = "utf-8"
     """Encoding of CSV files without a byte order mark, such as ``latin-1`` or ``utf-16-le``; a mark states its own."""
     domain: Domain | None = None
     """``real``: a robot or device made the file. ``surrogate``: a simulation in its place. None: not stated."""
-    origin: str = ""
-    """Description of what made the file."""
+    origin: str = ""  # Description of what made the file
 
     def check(self, document: Document[Any]) -> None:
         """Raises SpecError: the separator or the encoding is unknown. ``document``: the columns file, which messages name."""
@@ -237,8 +232,7 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
         if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
             hint = "; of a LeRobot dataset give the folder" if pa.types.is_fixed_size_list(column.type) else ""
             raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers{hint}")
-        values = np.asarray(column.to_numpy(), dtype=float)
-        columns[name] = values
+        columns[name] = np.asarray(column.to_numpy(), dtype=float)
     _check_numbers(path, columns)
     return header, columns
 

@@ -38,13 +38,12 @@ from taccorl.alignment.measurements.measurement import Measurement, TargetKind, 
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.table_files import SUFFIXES, FileForm, read_columns, table_origin
 from taccorl.data.origin import Origin
-from taccorl.data.strict_yaml import Document
+from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, nearest
 from taccorl.robots import ROBOT
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
-TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
-"""Unit of time → seconds."""
+TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}  # Unit of time → seconds
 POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
 POSITION |= {"rev": ("rad", _TURN), "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3)}
 POSITION |= {"um": ("m", 1e-6), "µm": ("m", 1e-6)}
@@ -59,13 +58,9 @@ constant is somebody's guess until it is written down as a column in N·m."""
 _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
 _CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
-_HINTS: dict[str, str] = dict.fromkeys(
-    ("ticks", "tick", "counts", "count"), "; write `unit: rad` with `factor:` in rad a tick"
-)
-_HINTS |= dict.fromkeys(
-    ("A", "mA"),
-    "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column",
-)
+_TICKS = "; write `unit: rad` with `factor:` in rad a tick"
+_CURRENT = "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column"
+_HINTS: dict[str, str] = {**dict.fromkeys(("ticks", "tick", "counts", "count"), _TICKS), "A": _CURRENT, "mA": _CURRENT}
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
 _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
@@ -76,14 +71,12 @@ class Column:
     """One column of the table, with its unit: quantity = (number − ``zero``) · ``factor`` [``unit``]."""
 
     column: str
-    unit: str
-    """Unit of the quantity, such as a key of ``TIME_S``, ``POSITION``, ``VELOCITY`` or ``EFFORT``."""
+    unit: str  # Unit of the quantity, such as a key of ``TIME_S``, ``POSITION``, ``VELOCITY`` or ``EFFORT``
     factor: float = 1.0
     """Factor from the column's numbers to ``unit``: turns per tick, N·m per mA, or −1 to reverse the sign."""
     zero: float = 0.0
     """The column's number at 0 of its quantity, such as 512 counts or a pulse of 1500 µs; subtracted before ``factor``."""
-    if_missing: float | None = None
-    """Value for files without the column; if not given, such a file is rejected."""
+    if_missing: float | None = None  # Value for files without the column; if not given, such a file is rejected
 
     def quantity(self, numbers: np.ndarray) -> np.ndarray:
         """(any shape) the quantity [``unit``] for the column's ``numbers``, of the same shape."""
@@ -104,34 +97,24 @@ class Change:
 class SignalColumns:
     """Columns of one signal; None for quantities that the table does not have."""
 
-    q: Column
-    """Measured position."""
-    q_target: Column | None = None
-    """Commanded position; one of the target columns is given, or none where ``tau`` is."""
-    qd_target: Column | None = None
-    """Commanded velocity."""
-    tau_target: Column | None = None
-    """Commanded torque; 0 while the motor is off."""
-    qd: Column | None = None
-    """Measured velocity."""
-    tau: Column | None = None
-    """Effort of the motor."""
-    load: Column | None = None
-    """Known external torque, positive if it drives the joint forwards."""
-    torque_ff: Column | None = None
-    """Torque that the controller adds to its law."""
+    q: Column  # Measured position
+    q_target: Column | None = None  # Commanded position; one of the target columns is given, or none where ``tau`` is
+    qd_target: Column | None = None  # Commanded velocity
+    tau_target: Column | None = None  # Commanded torque; 0 while the motor is off
+    qd: Column | None = None  # Measured velocity
+    tau: Column | None = None  # Effort of the motor
+    load: Column | None = None  # Known external torque, positive if it drives the joint forwards
+    torque_ff: Column | None = None  # Torque that the controller adds to its law
     supply: Column | None = None
     """Supply voltage of the motor (V or mV): it scales the motor's torque in law pwm; with another law it is an error."""
-    enabled: Column | None = None
-    """0 while the motor is off, else 1."""
+    enabled: Column | None = None  # 0 while the motor is off, else 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnsFile(FileForm):
     """Keys that every columns file may have."""
 
-    time: Column
-    """Column of the rows' times."""
+    time: Column  # Column of the rows' times
 
     def check(self, document: Document[Any]) -> None:
         """Raises SpecError: a separator, text encoding or unit of time that is not supported."""
@@ -152,8 +135,7 @@ class TableSpec(ColumnsFile):
     target_rows_late: int = 0
     """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
     −1 if it holds that of row k + 1."""
-    instruction: str = ""
-    """Task text of the recordings; empty if there is none."""
+    instruction: str = ""  # Task text of the recordings; empty if there is none
 
 
 def is_table(m: Measurement) -> bool:
@@ -164,50 +146,37 @@ def is_table(m: Measurement) -> bool:
 def load_table_spec(path: Path) -> TableSpec:
     """Load and check a columns file. Raises SpecError: it is invalid; the message names file, line, key and remedy."""
     document = Document(TableSpec, Path(path))
-    spec = document.value
-    spec.check(document)
-    if spec.signals and spec.changes:
-        both = "stands beside changes, which are to a table with taccorl's own names; keep one of the two"
-        raise document.error("signals", both)
+    document.value.check(document)
+    document.refuse(_rules(document.value))
+    return document.value
+
+
+def _rules(spec: TableSpec) -> Rules:
+    both = "stands beside changes, which are to a table with taccorl's own names; keep one of the two"
+    yield spec.signals and spec.changes, "signals", both
     for name, signal in spec.signals.items():
-        kinds: dict[str, str] = {}
+        place, kinds = f"signals/{name}", dict[str, str]()
         num = sum(getattr(signal, key) is not None for key in TARGETS)
-        if num > 1 or (num == 0 and signal.tau is None):
-            raise document.error(
-                f"signals/{name}",
-                "key 'q_target' is missing; or qd_target, tau_target, or tau alone for a file with law: effort"
-                if num == 0
-                else f"has {num} targets; one of {', '.join(TARGETS)} commands it",
-            )
+        yield num > 1, place, f"has {num} targets; one of {', '.join(TARGETS)} commands it"
+        none = "key 'q_target' is missing; or qd_target, tau_target, or tau alone for a file with law: effort"
+        yield num == 0 and signal.tau is None, place, none
         for key, column in _columns_of(signal):
-            known, where = _CONVERSIONS[key], f"signals/{name}/{key}/unit"
-            if column.unit not in known:
-                hint = _HINTS.get(column.unit, "")
-                raise document.error(
-                    where, f"{column.unit!r} is not a unit of {key}; {nearest(column.unit, known)}{hint}"
-                )
-            if not math.isfinite(column.zero):
-                raise document.error(f"signals/{name}/{key}/zero", f"{column.zero:g}; give a finite number")
-            if not math.isfinite(column.factor) or column.factor == 0.0:
-                raise document.error(where, f"factor {column.factor:g}; give a finite number other than 0")
+            known, where = _CONVERSIONS[key], f"{place}/{key}/unit"
+            alike = f"{nearest(column.unit, known)}{_HINTS.get(column.unit, '')}"
+            yield column.unit not in known, where, f"{column.unit!r} is not a unit of {key}; {alike}"
+            yield not math.isfinite(column.zero), f"{place}/{key}/zero", f"{column.zero:g}; give a finite number"
+            wrong = not math.isfinite(column.factor) or column.factor == 0.0
+            yield wrong, where, f"factor {column.factor:g}; give a finite number other than 0"
             if known[column.unit][0]:
                 kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
-        if len(kinds) > 1:
-            raise document.error(
-                f"signals/{name}",
-                f"{' and '.join(kinds.values())}: units of rotation and of translation are mixed; is the joint a hinge or a "
-                "slide?",
-            )
-        unit = POSITION[signal.q.unit][0]
-        if name in ROBOT.action_names and unit != unit_of(name):
-            raise document.error(
-                f"signals/{name}/q/unit",
-                f"{signal.q.unit!r}: the robot's signal {name} must be in {unit_of(name)} or a multiple of it, such as "
-                f"m{unit_of(name)}",
-            )
-    if twice := _used_twice(spec):
-        raise document.error("signals", twice)
-    return spec
+        mixed = "units of rotation and of translation are mixed; is the joint a hinge or a slide?"
+        yield len(kinds) > 1, place, f"{' and '.join(kinds.values())}: {mixed}"
+        if name in ROBOT.action_names:
+            unit = unit_of(name)
+            must = f"the robot's signal {name} must be in {unit} or a multiple of it, such as m{unit}"
+            yield POSITION[signal.q.unit][0] != unit, f"{place}/q/unit", f"{signal.q.unit!r}: {must}"
+    twice = _used_twice(spec)
+    yield twice, "signals", twice
 
 
 def _used_twice(spec: TableSpec) -> str:
@@ -307,9 +276,7 @@ def read_table(path: Path, spec: TableSpec | None = None, units: Mapping[str, st
     for a table without a spec; the PiPER's if not given. Raises RecordingError: a column is missing, or a cell is empty or not
     a number; the message names file, line and column."""
     path = Path(path)
-    header, columns = read_columns(
-        path, lambda header: wanted_columns(_resolved(path, header, spec, units), header), spec
-    )
+    header, columns = read_columns(path, lambda own: wanted_columns(_resolved(path, own, spec, units), own), spec)
     spec = _resolved(path, header, spec, units)
     return measurement_of_columns(path, columns, spec, name=path.name, origin=table_origin(path, spec))
 
@@ -334,9 +301,8 @@ def measurement_of_columns(
             if key in TARGETS:
                 kinds.append(_KINDS[key])
             read = columns[column.column] if column.column in columns else np.full(len(time_s), column.if_missing)
-            values["q_target" if key in TARGETS else key][:, j] = (
-                column.quantity(read) * _CONVERSIONS[key][column.unit][1]
-            )
+            numbers = column.quantity(read) * _CONVERSIONS[key][column.unit][1]
+            values["q_target" if key in TARGETS else key][:, j] = numbers
         if not any(getattr(signal, key) for key in TARGETS):  # the model is held where this was measured
             kinds.append("effort")
             values["q_target"][:, j] = values["q"][:, j]

@@ -16,18 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from taccorl.alignment.controller.identification import Estimate
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
-QUANTILE = 0.999
-"""Share of the readings without contact that lie below λ_noise."""
-MIN_FRAMES = 50
-"""Least number of frames without contact for a noise level: half a second."""
-BLOCK_S = 0.5
-"""Time after which residuals count as independent in the intervals [s]."""
+QUANTILE = 0.999  # Share of the readings without contact that lie below λ_noise
+MIN_FRAMES = 50  # Least number of frames without contact for a noise level: half a second
+BLOCK_S = 0.5  # Time after which residuals count as independent in the intervals [s]
 _NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
 _MIN_IN_CONTACT = 20  # frames
 _STIFFNESS_PER_M, _DAMPING_S_PER_M = (1.0, 1e6), (0.0, 1e4)
@@ -38,14 +36,10 @@ _STEP = 1e-3  # of finite differences, in shares of the numbers to start from
 class NoiseLevel:
     """Readings of pads without contact: mean, noise and threshold."""
 
-    pads: tuple[str, ...]
-    """Names of the pads, in the order of the arrays' first axis."""
-    mean_count: np.ndarray
-    """(P, R, C) mean counts above baseline."""
-    std_count: np.ndarray
-    """(P, R, C) standard deviation of each taxel's counts."""
-    threshold_count: float
-    """λ_noise common to all taxels [counts]: the 0.999 quantile of their readings."""
+    pads: tuple[str, ...]  # Names of the pads, in the order of the arrays' first axis
+    mean_count: np.ndarray  # (P, R, C) mean counts above baseline
+    std_count: np.ndarray  # (P, R, C) standard deviation of each taxel's counts
+    threshold_count: float  # λ_noise common to all taxels [counts]: the 0.999 quantile of their readings
 
     @property
     def pooled_std_count(self) -> float:
@@ -54,58 +48,35 @@ class NoiseLevel:
 
 
 @dataclass(frozen=True)
-class Number:
-    """An estimate with its 95 % interval."""
-
-    value: float
-    """Estimate."""
-    low: float
-    high: float
-    unit: str
-    """Unit of all three."""
-
-
-@dataclass(frozen=True)
 class TouchMatch:
     """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
 
-    rms_count: float
-    """RMS difference of counts [counts], over taxels that are ever active in either."""
-    mask_iou: float
-    """Masks of active taxels: intersection over union, all frames together."""
+    rms_count: float  # RMS difference of counts [counts], over taxels that are ever active in either
+    mask_iou: float  # Masks of active taxels: intersection over union, all frames together
 
 
 @dataclass(frozen=True)
 class TouchCalibration:
     """Result of ``calibrate_touch``: noise, k_n and k_d, and the match before and after."""
 
-    noise: NoiseLevel
-    """Readings without contact."""
-    stiffness: Number
-    """k_n [reading per metre]."""
-    damping: Number
-    """k_d [reading per m/s]."""
-    before: TouchMatch
-    """Match on the validation recordings with the twin's own k_n and k_d."""
-    after: TouchMatch
-    """Match on the same recordings with the fitted k_n and k_d."""
+    noise: NoiseLevel  # Readings without contact
+    stiffness: Estimate  # k_n [reading per metre]
+    damping: Estimate  # k_d [reading per m/s]
+    before: TouchMatch  # Match on the validation recordings with the twin's own k_n and k_d
+    after: TouchMatch  # Match on the same recordings with the fitted k_n and k_d
     fitted_to: tuple[str, ...]
     validation: tuple[str, ...]
-    trouble: str
-    """Reason why the result is not reliable; empty if there is none."""
+    trouble: str  # Reason why the result is not reliable; empty if there is none
 
 
 def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
     """Estimate λ_noise from the frames in which nothing is near a pad, nor was in the second before. Raises TaccorlError: such
     frames last less than half a second, or the recordings are of different pads."""
     pads = _pads(motions)
-    still = [
-        [motion.measured[:, p][motion.undisturbed()[:, p]].astype(float) for motion in motions]
-        for p in range(len(pads))
-    ]
+    quiet = [(motion.measured, motion.undisturbed()) for motion in motions]
+    still = [[counts[:, p][rows[:, p]].astype(float) for counts, rows in quiet] for p in range(len(pads))]
     frames = [np.concatenate(of_pad) for of_pad in still]
-    short = next((pad for pad, of_pad in zip(pads, frames, strict=True) if len(of_pad) < MIN_FRAMES), None)
-    if short:
+    for short in (pad for pad, of_pad in zip(pads, frames, strict=True) if len(of_pad) < MIN_FRAMES):
         raise TaccorlError(
             f"touch calibration: pad {short} has {min(map(len, frames))} frames without contact in {_names(motions)}; record "
             "some seconds before the first touch"
@@ -136,7 +107,8 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
             f"touch: no taxel ever has a reading above λ_noise = {threshold_count:g} counts in {_names(motions)}"
         )
     differences = [(x - y)[:, of] for (x, y), of in zip(both, ever, strict=True)]
-    return TouchMatch(rms_count=_rms(differences), mask_iou=sum(int((a & b).sum()) for a, b in masks) / union)
+    rms = math.sqrt(sum(float(np.square(x).sum()) for x in differences) / max(sum(x.size for x in differences), 1))
+    return TouchMatch(rms_count=rms, mask_iou=sum(int((a & b).sum()) for a, b in masks) / union)
 
 
 def calibrate_touch(
@@ -182,14 +154,12 @@ def calibrate_touch(
     value, std = solved.x * scale, np.sqrt(np.diag(covariance))
     low, high = value - 1.96 * std, value + 1.96 * std
     threshold = noise.threshold_count
-    matches = [
-        touch_match(validation, [model.counts(m, model.simulate(m, *numbers)) for m in validation], threshold)
-        for numbers in (start, value)
-    ]
+    simulated = [[model.counts(m, model.simulate(m, *numbers)) for m in validation] for numbers in (start, value)]
+    matches = [touch_match(validation, counts, threshold) for counts in simulated]
     return TouchCalibration(
         noise=noise,
-        stiffness=Number(float(value[0]), float(low[0]), float(high[0]), "1/m"),
-        damping=Number(float(value[1]), float(max(low[1], 0.0)), float(high[1]), "s/m"),
+        stiffness=Estimate(value=float(value[0]), low=float(low[0]), high=float(high[0]), unit="1/m"),
+        damping=Estimate(value=float(value[1]), low=float(max(low[1], 0.0)), high=float(high[1]), unit="s/m"),
         before=matches[0],
         after=matches[1],
         fitted_to=tuple(m.name for m in fit),
@@ -223,16 +193,11 @@ def _block_covariance(jacobian: np.ndarray, residuals: Sequence[np.ndarray], tim
     return curvature @ meat @ curvature
 
 
-def _rms(arrays: Sequence[np.ndarray]) -> float:
-    return math.sqrt(sum(float(np.square(a).sum()) for a in arrays) / max(sum(a.size for a in arrays), 1))
-
-
 def _pads(motions: Sequence[TouchMotion]) -> tuple[str, ...]:
     if not motions:
         raise TaccorlError("touch: no recording with contact")
     pads = motions[0].pads
-    other = next((m for m in motions if m.pads != pads), None)
-    if other:
+    for other in (m for m in motions if m.pads != pads):
         raise TaccorlError(
             f"touch: {motions[0].name} touches {', '.join(pads)} and {other.name} {', '.join(other.pads)}, of "
             f"{', '.join(ROBOT.pads)}; calibrate them separately"

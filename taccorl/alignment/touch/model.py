@@ -26,11 +26,7 @@ _TAXELS_AT_ONCE = 64 * ROBOT.num_taxels  # 0.4 MB: a core's cache holds what is 
 
 
 class TouchModel:
-    """The pads of a twin.
-
-    Args:
-        config: configuration of the twin, whose effects always act; those of ``simulate`` act in addition.
-
+    """The pads of a twin. ``config``: configuration of the twin, whose effects always act; those of ``simulate`` act in addition.
     Raises TaccorlError: the sensor is not FlexiTac."""
 
     def __init__(self, config: TwinConfig) -> None:
@@ -97,9 +93,8 @@ class TouchModel:
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
         """(T, P, R, C) counts above baseline for ``reading`` (T, P, R, C), without noise and rounding, limited to the ends of
         the converter."""
-        return np.clip(
-            self.sensor.gain_count * reading, -motion.baseline, self.spec.max_count - motion.baseline, dtype=np.float32
-        )
+        low, high = -motion.baseline, self.spec.max_count - motion.baseline
+        return np.clip(self.sensor.gain_count * reading, low, high, dtype=np.float32)
 
 
 def _reads(effect: Effect) -> bool:
@@ -130,25 +125,18 @@ def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[floa
     moving = [effect for effect in effects if isinstance(effect, PadFrameEffect)]
     if not moving:
         return ()
-    total = np.array(
-        [np.sum([e.offset_pad_m(pad) for e in moving if pad in e.pads], axis=0) * np.ones(3) for pad in pads]
-    )
-    return tuple((float(x), float(y), float(z)) for x, y, z in total)
+    own = ([e.offset_pad_m(pad) for e in moving if pad in e.pads] for pad in pads)
+    return tuple((float(x), float(y), float(z)) for x, y, z in (np.sum([np.zeros(3), *o], axis=0) for o in own))
 
 
 def through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
     """Apply an effect to frames ``reading`` (B, P, R, C) of all pads, and advance its memory. Returns the changed frames.
-
-    Args:
-        memory: state after the frames before; {} for an effect without memory. Changed in place.
-        time_s, dt_s: (B,) time since the first scan, and since the scan before [s].
-    """
+    ``memory``: state after the frames before; {} for an effect without memory. Changed in place. ``time_s``, ``dt_s``: (B,) time
+    since the first scan, and since the scan before [s]."""
     if not memory:
         return effect.reading(reading, memory, time_s, dt_s)
     if isinstance(effect, RememberingEffect):
         reading[:, effect.slots] = effect.scans(reading[:, effect.slots][:, None], memory, dt_s[:, None])[:, 0]
         return reading
-    scans = [
-        effect.reading(reading[k : k + 1], memory, time_s[k : k + 1], dt_s[k : k + 1]) for k in range(len(reading))
-    ]
-    return np.concatenate(scans)
+    rows = [slice(k, k + 1) for k in range(len(reading))]
+    return np.concatenate([effect.reading(reading[k], memory, time_s[k], dt_s[k]) for k in rows])

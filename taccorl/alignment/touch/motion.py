@@ -23,7 +23,7 @@ from scipy.signal import savgol_filter
 
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject
-from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
+from taccorl.data.sensor_spec import load_sensor_spec
 from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -50,28 +50,19 @@ class TouchMotion:
     """Matched contact replay: poses of the taxels in the object, frame by frame, and the measured counts. Made by
     ``touch_motion``."""
 
-    measurement: Measurement = field(repr=False)
-    """Measurement from which it was made."""
-    pads: tuple[str, ...]
-    """Names of the pads that the object came near, in the order of ``ROBOT.pads``."""
-    time_s: np.ndarray
-    """(T, P) time stamps on the measurement's clock: ends of scans [s]."""
-    measured: np.ndarray
-    """(T, P, R, C) int16 counts above baseline."""
-    baseline: np.ndarray
-    """(P, R, C) resting counts."""
+    measurement: Measurement = field(repr=False)  # Measurement from which it was made
+    pads: tuple[str, ...]  # Names of the pads that the object came near, in the order of ``ROBOT.pads``
+    time_s: np.ndarray  # (T, P) time stamps on the measurement's clock: ends of scans [s]
+    measured: np.ndarray  # (T, P, R, C) int16 counts above baseline
+    baseline: np.ndarray  # (P, R, C) resting counts
     object_from_pad: np.ndarray
     """(T, P, I, 3, 4) pose of each pad in the object's frame at the instants at which the taxels of ``groups`` were read."""
-    velocity: np.ndarray
-    """(T, P, I, 3, 4) time derivative of ``object_from_pad`` [1/s, m/s]."""
-    groups: np.ndarray
-    """(I, G) flat indices of the taxels that are read at each instant."""
-    shapes: ShapeTables
-    """Shapes of the object, in its own frame."""
+    velocity: np.ndarray  # (T, P, I, 3, 4) time derivative of ``object_from_pad`` [1/s, m/s]
+    groups: np.ndarray  # (I, G) flat indices of the taxels that are read at each instant
+    shapes: ShapeTables  # Shapes of the object, in its own frame
     clearance_m: np.ndarray
     """(T, P, I) lower bound of the distance from the taxels' plane to the object [m]; below 0 they may overlap."""
-    layout: PadLayout
-    """Arrangement of the taxels of a whole pad; ``window`` states which of them are simulated."""
+    layout: PadLayout  # Arrangement of the taxels of a whole pad; ``window`` states which of them are simulated
     window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns of the pads that are simulated; all of them unless the motion is a ``cut``."""
 
@@ -94,12 +85,8 @@ class TouchMotion:
         return self._known[offsets_m]
 
     def cut(self, frames: np.ndarray, window: tuple[slice, slice]) -> "TouchMotion":
-        """Copy with some frames, rows and columns only, to make the repeated simulations of a fit cheaper.
-
-        Args:
-            frames: (T,) bool, frames to keep.
-            window: rows and columns to keep.
-        """
+        """Copy with some frames, rows and columns only, to make the repeated simulations of a fit cheaper. ``frames``: (T,) bool,
+        frames to keep. ``window``: rows and columns to keep."""
         number = np.arange(self.layout.num_taxels).reshape(self.layout.shape)
         local = np.full(number.size, -1)
         local[number[window].ravel()] = np.arange(number[window].size)
@@ -107,9 +94,8 @@ class TouchMotion:
         instants, places = (groups >= 0).any(axis=1), (groups >= 0).any(axis=0)
         groups = groups[np.ix_(instants, places)]
         if (groups < 0).any():
-            raise TaccorlError(
-                f"touch motion: taxels {window} do not include all taxels that the board reads at the same instant"
-            )
+            less = f"taxels {window} do not include all taxels that the board reads at the same instant"
+            raise TaccorlError(f"touch motion: {less}")
         arrays = {
             name: np.ascontiguousarray(getattr(self, name)[frames][:, :, instants])
             for name in ("object_from_pad", "velocity", "clearance_m")
@@ -126,7 +112,7 @@ class TouchMotion:
 
     def _depth(self, offsets_m: tuple[tuple[float, float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
         offset = np.array(offsets_m or [(0.0, 0.0, 0.0)] * len(self.pads))
-        taxel_xy = _taxel_xy(self.layout)[self.window]
+        taxel_xy = np.stack(np.meshgrid(*self.layout.taxel_axes_m()), axis=2)[self.window]
         xyz = np.append(taxel_xy.reshape(-1, 2), np.zeros((taxel_xy.size // 2, 1)), axis=1)
         # Taxels of a group lie in a line: what is common to them goes into the position, what differs into the grid.
         first = xyz[self.groups[:, 0]]
@@ -163,19 +149,14 @@ def _moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
-    """Make the matched contact replay of a measurement, from its gripper openings and its pad frames.
-
-    Args:
-        config: configuration of the twin, for the robot's mounts and the sensor's scan.
-
-    Raises TaccorlError: there are no frames of the pads, openings or joints were not measured, or the object never came near
-    a pad."""
+    """Make the matched contact replay of a measurement, from its gripper openings and its pad frames. ``config``: configuration
+    of the twin, for the robot's mounts and the sensor's scan. Raises TaccorlError: there are no frames of the pads, openings or
+    joints were not measured, or the object never came near a pad."""
     if measurement.touch is None:
-        raise TaccorlError(
-            f"{measurement.name}: the recording has no frames of the pads; record them, or remove this recording"
-        )
+        none = "the recording has no frames of the pads; record them, or remove this recording"
+        raise TaccorlError(f"{measurement.name}: {none}")
     spec = load_sensor_spec(find_spec(config.sensor.spec if hasattr(config.sensor, "spec") else "flexitac_v2"))  # pyright: ignore[reportAttributeAccessIssue]
-    instants_s, groups = _scan_groups(spec)
+    instants_s, number = scan_instants_s(spec), np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
     slots = [ROBOT.pads.index(f"{pressed.arm}_{finger}") for finger in ROBOT.fingers]
     stamps = measurement.touch.time_s
     covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (stamps[:, slots] <= measurement.time_s[-1])
@@ -200,7 +181,7 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
         baseline=measurement.touch.baseline.reshape(whole)[0, slots],
         object_from_pad=pose,
         velocity=(later - earlier) / (2 * _STEP_S),
-        groups=groups,
+        groups=as_wire(number, spec).copy(),
         shapes=shapes,
         layout=layout,
         clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[..., 0].min(axis=-1),
@@ -223,19 +204,6 @@ def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
     }
     kept = tuple(motion.pads[p] for p in pads)
     return dataclasses.replace(motion, pads=kept, baseline=motion.baseline[pads], **arrays)
-
-
-def _taxel_xy(layout: PadLayout) -> np.ndarray:
-    """(R, C, 2) m in the pad's frame, as ``PadArray`` has them."""
-    x = (np.arange(layout.columns) + 0.5) * layout.pitch_m - layout.width_m / 2
-    y = (np.arange(layout.rows) + 0.5) * layout.pitch_m - layout.length_m / 2
-    return np.stack(np.broadcast_arrays(x[None], y[:, None]), axis=2)
-
-
-def _scan_groups(spec: SensorSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Instants (I,) before the stamp [s], and the taxels (I, G) that the board reads at each."""
-    number = np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
-    return scan_instants_s(spec), as_wire(number, spec).copy()
 
 
 class _Fingers:
@@ -286,11 +254,8 @@ def _compose(a_from_b: np.ndarray, b_from_c: np.ndarray) -> np.ndarray:
 
 
 def shapes_in_object(solids: Sequence[Solid]) -> tuple[ShapeTables, np.ndarray]:
-    """The G solids that touch (no ballast).
-
-    Returns:
-        The solids in double precision, for ``depth_in_body``; and the corners (8 G, 3) [m] of their bounding boxes.
-    """
+    """The G solids that touch (no ballast). Returns the solids in double precision, for ``depth_in_body``; and the corners (8 G,
+    3) [m] of their bounding boxes."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="pressed")
     for k, solid in enumerate(s for s in solids if s.touches):

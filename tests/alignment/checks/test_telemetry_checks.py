@@ -161,9 +161,8 @@ def test_a_recording_with_fewer_rows_than_targets_of_another_names_both_rates(hz
     said = check_measurements([fast, slow], rates={} if hz is None else {"table": hz})
     texts = [f.text for f in said["slow"] if f.check == "slower_rows"]
     assert len(texts) == told and not any(f.check == "slower_rows" for f in said["made"])
-    assert all(
-        word in text for text in texts for word in ("100 rows", "500 targets", "made", "`command_hz: 500`", "table")
-    )
+    words = ("100 rows", "500 targets", "made", "`command_hz: 500`", "table")
+    assert all(word in text for text in texts for word in words)
 
 
 def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_cannot_be_told(clean):
@@ -768,11 +767,10 @@ def test_a_wrapped_angle_is_named_and_a_fast_joint_is_not(clean):
 @pytest.mark.parametrize("row", [0, 700, -1])
 def test_a_row_that_a_logger_filled_with_zero_is_named_and_a_joint_that_breaks_free_is_not(clean, row):
     values = clean.measured[:, 4] - clean.measured[:, 4].mean() + 0.9  # the joint moves by less than that
-    filled = with_column(
-        clean, clean.signals[4], np.where(np.arange(clean.num_rows) == row % clean.num_rows, 0.0, values)
-    )
+    row %= clean.num_rows
+    filled = with_column(clean, clean.signals[4], np.where(np.arange(clean.num_rows) == row, 0.0, values))
     (finding,) = (f for f in check_measurement(filled) if f.severity == "error")
-    assert (finding.check, finding.rows) == ("not_finite", (row % clean.num_rows, row % clean.num_rows + 1))
+    assert (finding.check, finding.rows) == ("not_finite", (row, row + 1))
     free = with_column(clean, clean.signals[4], values + 0.5 * (np.arange(clean.num_rows) > 700))
     assert "not_finite" not in found(free)
 

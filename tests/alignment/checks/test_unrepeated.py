@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from made_rows import play
+from made_rows import of_signal, play
 
 from taccorl.alignment.checks.held_commands import find_dropped
 from taccorl.alignment.checks.telemetry import check_measurements
@@ -59,8 +59,7 @@ def joint(
 def recording(name: str, seed: int, *, drop=0.0, longest=1, rate_hz=200.0, repeat_of=None, **physics) -> Measurement:
     rng, target = np.random.default_rng(seed), sweep(rate_hz)
     measured = joint(held(target, drop, longest, rng), rate_hz, rng, **physics)
-    columns = {"time_s": np.arange(len(target)) / rate_hz, "target": target[:, None], "measured": measured[:, None]}
-    return Measurement(name=name, signals=("left_joint5",), units=("rad",), repeat_of=repeat_of, **columns)
+    return of_signal(name, rate_hz, target, measured, "left_joint5", repeat_of=repeat_of)
 
 
 def pair(seed: int, **how) -> list[Measurement]:
@@ -184,12 +183,10 @@ def test_a_joint_that_rests_elsewhere_until_it_is_moved_repeats():
 
 
 def test_positions_that_differ_without_a_target_are_another_motion():
-    first, second = (
-        {"measured": m.measured + 2e-3 * k * np.sin(20 * m.time_s)[:, None]} for k, m in enumerate(pair(3))
-    )
-    made = [
-        dataclasses.replace(m, **own, target=own["measured"]) for m, own in zip(pair(3), (first, second), strict=True)
-    ]
+    made = []
+    for k, m in enumerate(pair(3)):
+        at = m.measured + 2e-3 * k * np.sin(20 * m.time_s)[:, None]
+        made.append(dataclasses.replace(m, measured=at, target=at))
     assert said(made) == {"does_not_repeat"}  # as if these positions had been asked for
     assert said([dataclasses.replace(m, target_kinds=("effort",)) for m in made]) == set()
 

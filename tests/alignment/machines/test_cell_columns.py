@@ -68,9 +68,8 @@ def test_an_array_of_loads_is_read_by_its_own_pattern(tmp_path: Path) -> None:
 def test_the_columns_file_of_own_loads_in_the_documentation_reads_the_load_of_each_cell(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "your_robot.md").read_text(encoding="utf-8")
     (block,) = (part.split("```")[0] for part in text.split("```yaml\n")[1:] if "Fz3" in part.split("```")[0])
-    config = CellsConfig(
-        cells=["thumb", "index"], load=Load(unit="N", rated=3, shared=False), reading=Reading(unit="count")
-    )
+    load = Load(unit="N", rated=3, shared=False)
+    config = CellsConfig(cells=["thumb", "index"], load=load, reading=Reading(unit="count"))
     (tmp_path / "columns.yaml").write_text(block)
     (tmp_path / "press.csv").write_text("stamp,adc4,adc3,Fz3,Fz4\n0,10,20,30,40\n10,11,21,31,41\n")
     m = read_cell_table(tmp_path / "press.csv", config, load_cell_columns(tmp_path / "columns.yaml", config))

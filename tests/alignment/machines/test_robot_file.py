@@ -80,11 +80,11 @@ def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> Non
     # 2 · 0.3² + 1 · (0.5² + 0.2²): the lower link hangs straight down.
     assert shoulder.inertia_kgm2(seen) == pytest.approx(0.18 + 0.29, rel=1e-6)
     # About +y a positive angle lowers the mass: the joint must hold − g (2 · 0.3 + 1 · 0.5) at 0.
-    assert shoulder.weight_nm(seen, np.zeros(1))[0] == pytest.approx(-9.81 * 1.1, rel=1e-6)
+    assert shoulder.joint.rigid(seen, []).gravity_cos == pytest.approx(-9.81 * 1.1, rel=1e-6)
     bent_elbow = motion_of(bent, "elbow", elbow.joint)
     assert elbow.inertia_kgm2(bent_elbow) == pytest.approx(0.04 + 2e-5 * 50**2, rel=1e-6)  # with its rotor
-    assert elbow.weight_nm(bent_elbow, np.array([0.0]))[0] == pytest.approx(-9.81 * 0.2, rel=1e-6)
-    np.testing.assert_allclose(elbow.weight_nm(bent_elbow, np.array([np.pi / 2])), 0.0, atol=1e-6)
+    weight = elbow.joint.rigid(bent_elbow, [])
+    assert (weight.gravity_cos, weight.gravity_sin) == pytest.approx((-9.81 * 0.2, 0.0), rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("mass_kg", [0.5, -0.25])
@@ -112,9 +112,8 @@ def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_jo
     twice = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, {held}}}").replace("100.0}", f"100.0, {held}}}")
     with pytest.raises(SpecError, match=r"elbow.*payload.*shoulder.*lower"):
         robot(tmp_path, twice)
-    too_light = compensated.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}").replace(
-        f"{mass_kg}", "-0.96"
-    )
+    lighter = f"effort_limit: 100.0, {held.replace(f'{mass_kg}', '-0.96')}}}"
+    too_light = compensated.replace("effort_limit: 100.0}", lighter)
     with pytest.raises(SpecError, match=r"elbow.*-0\.96 kg, and body lower.*-0\.95 kg or more"):  # of its 1 kg
         robot(tmp_path, too_light)
     upright = robot(tmp_path, model=TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'))

@@ -69,11 +69,8 @@ def test_an_index_says_what_files_cannot(folder):
         "  sweep_10.csv: {use: test}\n"
     )
     found = read_measurements(folder)
-    assert (names(found.fit), names(found.validation), names(found.test)) == (
-        ["sweep_1.csv", "sweep_2.csv"],
-        ["sweep_3.csv"],
-        ["sweep_10.csv"],
-    )
+    assert names(found.fit) == ["sweep_1.csv", "sweep_2.csv"]
+    assert (names(found.validation), names(found.test)) == (["sweep_3.csv"], ["sweep_10.csv"])
     assert found.fit[1].repeat_of == "sweep_1.csv"
     assert found.unlisted == ("sweep_1.csv",)
     (held,) = found.validation
@@ -83,9 +80,8 @@ def test_an_index_says_what_files_cannot(folder):
     (alone,) = read_measurements(folder / "sweep_3.csv").fit  # asked for by itself
     assert alone.kp == {"left_joint5": 40.0}
     (folder / "measurements.yaml").write_text("recordings: {sweep_1.csv: {effort_scale: {left_joint5: 0}}}")
-    assert np.isnan(
-        next(m for m in read_measurements(folder).all if m.name == "sweep_1.csv").effort
-    ).all()  # not measured
+    (first,) = (m for m in read_measurements(folder).all if m.name == "sweep_1.csv")
+    assert np.isnan(first.effort).all()  # not measured
 
 
 @pytest.mark.parametrize(
@@ -211,8 +207,8 @@ def test_a_recording_of_one_joint_becomes_one_of_the_robot():
     wrong = dataclasses.replace(m, units=("m",))
     with pytest.raises(TaccorlError, match="left_joint5 is in m, the robot's is in rad"):
         wrong.on_robot(rest)
-    assert (other_arm("left_joint5"), other_arm("right_gripper"), other_arm("drive")) == (
+    assert [other_arm(n) for n in ("left_joint5", "right_gripper", "drive")] == [
         "right_joint5",
         "left_gripper",
         "drive",
-    )
+    ]

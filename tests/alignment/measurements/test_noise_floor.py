@@ -197,12 +197,9 @@ def test_repeats_of_unlike_motions_count_by_what_a_twin_leaves_of_their_efforts(
     for k in range(2):
         q = 0.4 * np.sin(2.0 * time_s) + 3e-4 * k * np.sin(30.0 * time_s)
         torque = -2.0 * (1.6 * np.sin(2.0 * time_s) + 0.27 * k * np.sin(30.0 * time_s))
-        columns = {"target": q, "measured": q, "effort": torque + 0.1 * rng.standard_normal(4000)}
-        columns = {name: own[:, None] for name, own in columns.items()}
-        m = Measurement(
-            name=f"m{k}", time_s=time_s, signals=("hip",), units=("rad",), target_kinds=("effort",), **columns
-        )
-        made.append((dataclasses.replace(m, repeat_of="m0" * k or None), torque[:, None]))
+        effort = torque + 0.1 * rng.standard_normal(4000)
+        m = of_signal(f"m{k}", 200.0, q, q, "hip", target_kinds=("effort",), effort=effort, repeat_of="m0" * k or None)
+        made.append((m, torque[:, None]))
     every = [m for m, _ in made]
     assert noise_floor(every, "effort")["hip"].value == pytest.approx(np.hypot(0.27, 0.1), rel=0.05)
     for share in (0.0, 1.0):  # of the noise that is left

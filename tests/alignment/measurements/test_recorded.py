@@ -53,10 +53,8 @@ class Moved:
 
 def write(moved: Moved, path: Path, config: StandInConfig, **label: str) -> Path:
     """``moved`` as the drivers would have recorded it."""
-    story = TwinStory(moved.sim, moved.trajectory, "success")
-    publish(
-        path, StandInStreams(config, story, Dark()), {"origin": "surrogate recording", "instruction": "move"} | label
-    )
+    streams = StandInStreams(config, TwinStory(moved.sim, moved.trajectory, "success"), Dark())
+    publish(path, streams, {"origin": "surrogate recording", "instruction": "move"} | label)
     return path
 
 
@@ -203,9 +201,8 @@ def test_lost_and_repeated_samples_are_bridged_and_counted(moved, recorded):
 
 
 def test_a_long_silence_is_a_hole_of_positions_and_holds_commands(moved):
-    config = dataclasses.replace(
-        NO_LOSS, gap=[("/joint_states_left", 2.0, 2.1), ("/joint_states_ctrl_right", 2.5, 2.6)]
-    )
+    gaps = [("/joint_states_left", 2.0, 2.1), ("/joint_states_ctrl_right", 2.5, 2.6)]
+    config = dataclasses.replace(NO_LOSS, gap=gaps)
     m = read_measurements(write(moved, moved.folder / "gap.mcap", config)).fit[0]
     begins = m.start_ns - START_UNIX_NS
     hole = np.flatnonzero(np.isnan(m.measured[:, 0])) * 0.005 + begins * 1e-9
@@ -381,7 +378,7 @@ def test_hdf5_of_cobot_magic_has_effort_and_owns_that_it_has_no_clock(tmp_path):
     # Row k of the file's action is the command of frame k + 1: in force at row k is the one before.
     time_s = 1 / 30 + m.time_s
     # piper_ros's factor makes angles 0.053 % short
-    np.testing.assert_allclose(m.target, truth.story.command(time_s), rtol=6e-4, atol=1e-4)
-    np.testing.assert_allclose(m.measured, truth.story.state(time_s), rtol=6e-4, atol=1e-4)
-    np.testing.assert_allclose(m.effort, truth.story.effort(time_s), atol=1e-4)
+    np.testing.assert_allclose(m.target, truth.story.at("command", time_s), rtol=6e-4, atol=1e-4)
+    np.testing.assert_allclose(m.measured, truth.story.at("state", time_s), rtol=6e-4, atol=1e-4)
+    np.testing.assert_allclose(m.effort, truth.story.at("effort", time_s), atol=1e-4)
     assert np.isfinite(m.velocity).all()

@@ -69,9 +69,7 @@ def test_targets_that_the_file_shows_rows_late_are_put_in_their_place(tmp_path, 
     m = read_table(path, load_table_spec(columns))
     assert m.num_rows == rows
     np.testing.assert_allclose(np.degrees(m.target[:, 0]), targets)
-    np.testing.assert_allclose(
-        np.degrees(m.measured[:, 0]), [10, 11, 12, 13][:3] if late == 1 else [10, 11, 12, 13][-rows:]
-    )
+    np.testing.assert_allclose(np.degrees(m.measured[:, 0]), [10, 11, 12] if late == 1 else [10, 11, 12, 13][-rows:])
     assert m.time_s[0] == 0
 
 
@@ -127,13 +125,12 @@ def test_wrong_cells_are_named_by_line_and_column(tmp_path, change, message):
 def test_a_column_without_any_number_is_to_be_left_out_and_no_row(tmp_path: Path, cell: str) -> None:
     path, rows = tmp_path / "run.csv", [f"{0.01 * k:.2f},0.1,0.2,{cell}" for k in range(5)]
     path.write_text("\n".join(["t,left_joint5.q,left_joint5.q_target,left_joint5.tau", *rows]))
-    with pytest.raises(
-        RecordingError, match=r"run.csv: column 'left_joint5.tau': no row holds a number: leave the column out"
-    ):
+    said = "column 'left_joint5.tau': no row holds a number"
+    with pytest.raises(RecordingError, match=f"run.csv: {said}: leave the column out"):
         read_table(path)
     values = {"t": np.arange(5) / 100, "left_joint5.q": np.ones(5), "left_joint5.q_target": np.ones(5)}
     pq.write_table(pa.table(values | {"left_joint5.tau": np.full(5, np.nan)}), tmp_path / "run.parquet")
-    with pytest.raises(RecordingError, match=r"run.parquet: column 'left_joint5.tau': no row holds a number"):
+    with pytest.raises(RecordingError, match=f"run.parquet: {said}"):
         read_table(tmp_path / "run.parquet")
     (tmp_path / "two.csv").write_text(path.read_text().replace(",0.2,", f",{cell},"))
     with pytest.raises(RecordingError) as every:
@@ -195,9 +192,8 @@ def test_other_names_get_a_draft_of_a_columns_file(tmp_path: Path, header: str, 
 
 
 def test_a_signal_of_another_machine_needs_no_robot_name(tmp_path):
-    columns = (
-        "time: {column: t, unit: s}\nsignals: {drive: {q: {column: a, unit: m}, q_target: {column: b, unit: m}}}\n"
-    )
+    drive = "{q: {column: a, unit: m}, q_target: {column: b, unit: m}}"
+    columns = f"time: {{column: t, unit: s}}\nsignals: {{drive: {drive}}}\n"
     path, spec = written(tmp_path, "t,a,b\n0,1,2\n0.001,1,2\n", columns)
     m = read_table(path, load_table_spec(spec))
     assert (m.signals, m.units) == (("drive",), ("m",))
