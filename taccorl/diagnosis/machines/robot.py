@@ -274,7 +274,7 @@ class RobotMachine(Machine):
         stands_for = {part: names for part, f in group.items() if (names := standing_in(f.diagnosis, "unbalance"))}
         if len(group) < 2 or not stands_for:
             return list(findings)
-        problems = {part: self.motion_problem(part, measurements, gains) for part in group}
+        problems = {part: self._problem_of(f, measurements, gains) for part, f in group.items()}
         found = one_tilt(self.robot, problems, {part: f.diagnosis for part, f in group.items()}, stands_for)
         if not found.disagree and not found.is_simpler:
             return list(findings)
@@ -354,7 +354,7 @@ class RobotMachine(Machine):
             place = links.get(link, body)
             parts = [part for part in parts if robot.moves_body(part, place)]
             machine = self._assuming(owner, Payload(mass_kg=0.0, link=link, **dict.fromkeys(PAYLOAD_AT, 0.0)))
-            problems = {part: machine.motion_problem(part, measurements, gains) for part in parts}
+            problems = {part: machine._problem_of(group[part], measurements, gains) for part in parts}
             idle = set.intersection(*({*robot.idle_axes(part, place)} for part in parts))
             centred = {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
             mass = candidate(machine.robot.joint(owner).in_units(Payload), {}, link=link, **centred)
@@ -458,6 +458,11 @@ class RobotMachine(Machine):
 
     def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> JointProblem:
         return JointProblem(self.robot, part, of_joints(measurements, [part]), gains=gains)
+
+    def _problem_of(self, f: Finding, measurements: Measurements, gains: GainsAre) -> JointProblem:
+        """``motion_problem`` of one part in which effects of the file that its diagnosis did not fit stay."""
+        held = {e.name for e in self.robot.config.joints[f.part].effects} - {*f.diagnosis.present}
+        return JointProblem(self.robot, f.part, of_joints(measurements, [f.part]), gains=gains, held=held)
 
     # effects ---------------------------------------------------------------------------------------------------------
 
