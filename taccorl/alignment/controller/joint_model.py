@@ -80,7 +80,7 @@ class Numbers(NamedTuple):
     waits_s: float = 0.0
     """Time for which a row's target waits until the drive's loop reads it [s]; the row's effort is newer by the same time."""
     effort_scale: float = 1.0
-    """Ratio of the recorded effort to the torque that drives a model of law effort."""
+    """Ratio of the recorded effort to the torque; under law effort that drives the model."""
 
 
 class _Prepared(NamedTuple):
@@ -242,7 +242,7 @@ def _side_by_side(
     for model, (case, bodies, numbers) in zip(models, prepared, strict=True):
         joint, (sent, parts, hold, step_s) = model.joint, of_model[model]
         late_s = joint.target_late_s
-        when = late_s, parts, hold, step_s, case.effort_scale
+        when = late_s, parts, hold, step_s, case.effort_scale if joint.target_kind == "effort" else 1.0
         kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
         # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
         gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
@@ -254,6 +254,8 @@ def _side_by_side(
         drive["gravity_cos"] += weight * case.lever.cos_m
         drive["command_delay__delay_s"] += case.waits_s
         drive["effort_age"] -= case.waits_s
+        if drive["integral_action__rate_per_s"] > 0.0:
+            drive["start_nm"] = motion.start_nm / case.effort_scale
         drive["effort_holds_weight"] = float(joint.effort_holds_weight)
         if drive["effort_after"] and late_s > 0.0:
             # A row's target arrives late_s after the row: the effort that it causes begins then, from the position at that time.
@@ -265,9 +267,10 @@ def _side_by_side(
         geared = drive["backlash__play_rad"] > 0.0 or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
         finer = math.ceil(step_s / GEAR_STEP_S - 1e-9) if geared and drive["midpoint"] > 0.0 else 1
         loads = motion.coupling_nm + held_n + joint.moving_masses_nm(motion, bodies)
-        missing.setdefault((finer, geared, *when), (sent._replace(added=sent.added / case.effort_scale), {}))[1][
-            keys[-1]
-        ] = (tuple(drive.values()), loads)
+        missing.setdefault((finer, geared, *when), (sent._replace(added=sent.added / when[-1]), {}))[1][keys[-1]] = (
+            tuple(drive.values()),
+            loads,
+        )
     for (finer, _, _, parts, hold, step_s, _), (sent, those) in missing.items():
         drives, loads = zip(*those.values(), strict=True)
         start = motion.start, hold * finer, parts, step_s / finer, motion.start_speed, int(each_step)
