@@ -56,6 +56,7 @@ from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
 from taccorl.diagnosis.search.problem import candidate
+from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
@@ -286,18 +287,7 @@ class RobotMachine(Machine):
             text = f"no tilt of the base explains {' and '.join(group)} together: it would leave {', '.join(errors)}"
         else:
             now = self.robot.rigid.model.opt.gravity + self.robot.more_gravity
-            leans = np.degrees(np.arccos(np.clip(found.direction @ now / np.linalg.norm(now), -1.0, 1.0)))
-            ends = ", ".join(
-                f"{axis} {low:.4f} … {high:.4f}"
-                for axis, low, high in zip("xyz", found.low, found.high, strict=True)
-                if high - low > 1e-6
-            )
-            what = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items()]
-            text = (
-                f"one tilt of the base by {leans:.2g}° explains as much at {' and '.join(group)} as {', '.join(what)}, with "
-                f"fewer numbers: write `gravity: [{', '.join(f'{x:.4f}' for x in found.direction + 0.0)}]` (95 %: {ends}) into "
-                f"{self.robot.path.name} instead (--until=noise_floor does so), and check it with a level"
-            )
+            text = found.words(now, stands_for, self.robot.path.name)
             leaned = {
                 part: dataclasses.replace(cast(JointFinding, f), leaned=found.joints[part]) for part, f in group.items()
             }
@@ -336,7 +326,7 @@ class RobotMachine(Machine):
 
     def _with_one_mass(self, body: int, findings: Sequence[Finding], how: How, sure: bool) -> list[Finding]:
         """``findings`` with one payload in place of what several joints lack, if it holds with fewer numbers at all that move
-        it: in ``body`` or else in a link before it. Without a payload if it holds in none of them."""
+        it: in ``body`` or the link before it that leaves least. Without a payload if it holds in none of them."""
         robot, (measurements, gains, diagnosed) = self.robot, how
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
         stands_for = {part: found for part, f in group.items() if (found := standing_in(f.diagnosis, "payload"))}
@@ -361,9 +351,15 @@ class RobotMachine(Machine):
             return one_mass(problems, {part: group[part].diagnosis for part in parts}, stands_for, mass)
 
         link, found = "", fitted([*group])
+
+        def left(one: tuple[str, OneMass]) -> tuple[bool, float]:
+            return not one[1].holds, sum(one[1].errors.get(p, left_of(f) ** 0.5) ** 2 for p, f in group.items())
+
         for name, place in links.items():
-            if not found.holds and all(robot.moves_body(part, place) for part in alone or stands_for):
-                link, found = name, fitted([*group], name)
+            if found.holds and max(found.errors.values()) <= SearchConfig().floor:
+                break
+            if all(robot.moves_body(part, place) for part in alone or stands_for):
+                link, found = min((link, found), (name, fitted([*group], name)), key=left)
         if not found.holds:
             added = [part for part, names in stands_for.items() if "payload" in names]
             again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
@@ -424,8 +420,7 @@ class RobotMachine(Machine):
         return [f"gravity [{', '.join(f'{x:.4f}' for x in gravity)}]" for gravity in found]
 
     def _owners(self, findings: Sequence[Finding]) -> set[str]:
-        """Of joints with a payload in the same body the one that determines its mass best; without a payload the one nearest to
-        the body."""
+        """Of joints with a payload in the same body the one that determines its mass best; without a payload the nearest one."""
 
         def unsure(f: Finding) -> tuple[float, int]:
             low, high = f.diagnosis.intervals.get("payload.mass_kg", (0.0, math.inf))
