@@ -271,8 +271,7 @@ def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
 
 
 def unbalanced(root: Element) -> str:
-    """Text on the first link whose inertia no body can have: place, link, principal moments, and what to write; empty if there is
-    none."""
+    """Text on the first link whose inertia no body can have: place, link, principal moments, and what to write; empty: none."""
     for inertia in root.all("inertia"):
         try:
             xx, yy, zz, xy, xz, yz = (

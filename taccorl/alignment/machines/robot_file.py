@@ -337,8 +337,7 @@ def load_robot(path: Path) -> Robot:
 
 
 def _refuse_todo(path: Path) -> None:
-    """Raises SpecError: lines of the file still say ``TODO``. The message quotes each line with its comment, which says what to
-    write instead."""
+    """Raises SpecError: lines of the file still say ``TODO``. The message quotes each with its comment: what to write."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

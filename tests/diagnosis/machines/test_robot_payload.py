@@ -130,8 +130,7 @@ def test_a_wrong_torque_constant_of_a_joint_that_weight_loads_is_no_mass(tmp_pat
 
 @pytest.mark.slow
 def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(tmp_path: Path) -> None:
-    """0.35 kg at 0.4 m from the yaw axis is half of its known inertia: without it the delay is wrong, and efforts fit only with a
-    factor."""
+    """0.35 kg at 0.4 m from the yaw axis is half of its inertia: without it the delay is wrong, and efforts need a factor."""
     fit, validation = [], []
     for j, name in enumerate(JOINTS):
         fit += [recorded(name, j, 0.3, 2.5, j), recorded(f"{name}_again", j, 0.3, 2.5, 10 + j, name)]
