@@ -291,9 +291,10 @@ def _holding(
     ``torque_ff``, which the recorded effort lacks, is in neither. Within ``ENDS_S`` of either end it is the recorded one."""
     sent, parts, _, _ = of
     before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]]) / case.effort_scale
-    # What a row shows is of the part before it, whose target is half a part old.
-    slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
-    held = answer.effort - before - case.gains.torque_ff + case.gains.kp * slope
+    # What a row shows is of the part before it, whose target is half a part old; and between two rows the target's line is
+    # 1/12 of its second difference beside its curve.
+    lag = 0.5 / parts * np.gradient(motion.target) + np.pad(np.diff(motion.target, 2), 1) / 12.0
+    held = answer.effort - before - case.gains.torque_ff + case.gains.kp * motion.kp_scale * lag
     since = motion.time_s - motion.time_s[0]
     is_judged = np.minimum(since, since[-1] - since) >= ENDS_S
     return JointResponse(answer.reported, held * is_judged + motion.effort / case.effort_scale)

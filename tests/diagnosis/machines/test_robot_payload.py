@@ -320,7 +320,9 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
     assert [f.diagnosis.names for f in hinges] == [(), ("payload",)]
     low, high = payload.interval["x_m"]
     if not low <= SCARA_AT_M[0] <= high:
-        pytest.xfail(f"x is {low:.3f} … {high:.3f} m: a speed that the loops take 0.4 ms earlier replaces a part of m r²")
+        pytest.xfail(
+            f"x is {low:.3f} … {high:.3f} m: a speed that the loops take 0.4 ms earlier replaces a part of m r²"
+        )
 
 
 @pytest.mark.slow
