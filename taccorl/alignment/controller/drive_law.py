@@ -190,8 +190,7 @@ class DriveLaw:
         return found
 
     def timestep_s(self, rate_hz: float, inertia: float, held: float) -> float:
-        """Physics step [s] for rows at ``rate_hz``, an inertia [kg·m²] and the stiffness that holds a model of law effort
-        [N·m/rad]."""
+        """Physics step [s] for rows at ``rate_hz``, an inertia [kg·m²] and the stiffness that holds law effort [N·m/rad]."""
         damping = self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))

@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_numbers import Drive
@@ -115,8 +116,7 @@ class JointResponse:
     """(T,) reported positions [rad]."""
     effort: np.ndarray
     """(T,) torque of the motor at the time of each row, before the row's command acts, within the motor's limits [N·m]; with or
-    without the gravity compensation as ``RigidJoint.effort_holds_weight`` states. ``Replay.effort`` has the same value one row
-    earlier."""
+    without the gravity compensation as ``RigidJoint.effort_holds_weight`` states. ``Replay.effort`` has it one row earlier."""
 
 
 class JointModel:
@@ -291,10 +291,9 @@ def _holding(
     ``torque_ff``, which the recorded effort lacks, is in neither. Within ``ENDS_S`` of either end it is the recorded one."""
     sent, parts, _, _ = of
     before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]]) / case.effort_scale
-    # What a row shows is of the part before it, whose target is half a part old; and between two rows the target's line is
-    # 1/12 of its second difference beside its curve.
-    lag = 0.5 / parts * np.gradient(motion.target) + np.pad(np.diff(motion.target, 2), 1) / 12.0
-    held = answer.effort - before - case.gains.torque_ff + case.gains.kp * motion.kp_scale * lag
+    # What a row shows is of the part before it, whose target is half a part old.
+    slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
+    held = answer.effort - before - case.gains.torque_ff + case.gains.kp * slope
     since = motion.time_s - motion.time_s[0]
     is_judged = np.minimum(since, since[-1] - since) >= ENDS_S
     return JointResponse(answer.reported, held * is_judged + motion.effort / case.effort_scale)
@@ -346,7 +345,9 @@ def _in_time(motion: JointMotion, late_s: float, received: int, parts: int, held
     found = _Sent(target, supply, on, np.repeat(sent.added, parts))
     if received > 1:
         middle = 0.5 * (edges[1:] + edges[:-1]) - held
-        found = found._replace(target=np.interp(middle, came, sent.target))
+        # A line between measured positions lies beside their curve, and the spring on it would be an inertia.
+        line = np.interp(middle, came, sent.target) if held else CubicSpline(came, sent.target)(middle)
+        found = found._replace(target=line)
     return found
 
 

@@ -136,8 +136,7 @@ class RigidJoint(ABC):
         return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
-        """Ratios of a recording's gains to ``gains``: (for the position error, for the velocity); 1 if the recording states
-        none."""
+        """Ratios of a recording's gains to ``gains``: (for the position error, for the speed); else 1."""
         own = (self.gains.kp, max(self.gains.kd, 1e-9))
         factor = m.gain_scale.get(self.signal, 1.0)
         kp, kd = (
