@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_195,
+    "taccorl/alignment": 15_194,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
-    "taccorl/diagnosis": 11_442,
+    "taccorl/diagnosis": 11_445,
     "taccorl/episodes": 4_184,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 56_092,
+    "tests": 56_093,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

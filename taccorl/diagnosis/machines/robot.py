@@ -286,8 +286,7 @@ class RobotMachine(Machine):
             ]
             text = f"no tilt of the base explains {' and '.join(group)} together: it would leave {', '.join(errors)}"
         else:
-            now = self.robot.rigid.model.opt.gravity + self.robot.more_gravity
-            text = found.words(now, stands_for, self.robot.path.name)
+            text = found.words(stands_for, self.robot.path.name)
             leaned = {
                 part: dataclasses.replace(cast(JointFinding, f), leaned=found.joints[part]) for part, f in group.items()
             }
@@ -326,12 +325,12 @@ class RobotMachine(Machine):
 
     def _with_one_mass(self, body: int, findings: Sequence[Finding], how: How, sure: bool) -> list[Finding]:
         """``findings`` with one payload in place of what several joints lack, if it holds with fewer numbers at all that move
-        it: in ``body`` or the link before it that leaves least. Without a payload if it holds in none of them."""
+        it: in ``body`` or a link before it that leaves less. Without a payload if it holds in none of them."""
         robot, (measurements, gains, diagnosed) = self.robot, how
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
         stands_for = {part: found for part, f in group.items() if (found := standing_in(f.diagnosis, "payload"))}
-        alone = [part for part, names in stands_for.items() if "payload" in names]
-        alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
+        rivals = {part: f.diagnosis.rivals.get("payload") for part, f in group.items()}
+        alone = [part for part, names in stands_for.items() if "payload" in names and not rivals[part]]
         loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
         if not stands_for or (sure and loaded and len(alone) == 1):
             return list(findings)  # weight that turns with a joint shows where the mass is
@@ -352,14 +351,16 @@ class RobotMachine(Machine):
 
         link, found = "", fitted([*group])
 
-        def left(one: tuple[str, OneMass]) -> tuple[bool, float]:
-            return not one[1].holds, sum(one[1].errors.get(p, left_of(f) ** 0.5) ** 2 for p, f in group.items())
+        def left(one: OneMass) -> float:
+            squares = (one.errors[part] ** 2 if part in one.errors else left_of(f) for part, f in group.items())
+            return sum(squares) if one.holds else math.inf
 
         for name, place in links.items():
             if found.holds and max(found.errors.values()) <= SearchConfig().floor:
                 break
             if all(robot.moves_body(part, place) for part in alone or stands_for):
-                link, found = min((link, found), (name, fitted([*group], name)), key=left)
+                other = fitted([*group], name)
+                link, found = (name, other) if ALIKE * left(other) < left(found) else (link, found)
         if not found.holds:
             added = [part for part, names in stands_for.items() if "payload" in names]
             again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
@@ -370,8 +371,7 @@ class RobotMachine(Machine):
                 f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(links.get(link, body))} explains as much at "
                 f"{' and '.join(stands_for)}, with as many numbers: record a joint that weight loads, or one more that moves it"
             )
-            several = len(stands_for) > 1
-            return [remarked(f, text) if several and f.part in stands_for else f for f in findings]
+            return [remarked(f, text) if len(stands_for) > 1 and f.part in stands_for else f for f in findings]
         clear = [part for part in found.errors if found.errors[part] <= CLEAR_FLOORS]
         if len(clear) < len(found.errors):  # what other joints lack besides must not say where the mass is
             found = fitted(clear or [owner], link)

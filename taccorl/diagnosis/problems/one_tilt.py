@@ -89,9 +89,12 @@ class OneTilt:
     joints: Mapping[str, Leaned]
     """Joint → its numbers with the tilt."""
 
-    def words(self, gravity: np.ndarray, stands_for: Mapping[str, Sequence[str]], file: str) -> str:
-        """Text on the tilt from ``gravity`` (3,), in place of the effects ``stands_for`` of each joint."""
-        leans = np.degrees(np.arccos(np.clip(self.direction @ gravity / np.linalg.norm(gravity), -1.0, 1.0)))
+    down: np.ndarray
+    """(3,) that vector without the tilt."""
+
+    def words(self, stands_for: Mapping[str, Sequence[str]], file: str) -> str:
+        """Text on the tilt in place of the effects ``stands_for`` of each joint."""
+        leans = np.degrees(np.arccos(np.clip(self.direction @ self.down, -1.0, 1.0)))
         ends = [
             (axis, low, high) for axis, low, high in zip("xyz", self.low, self.high, strict=True) if high - low > 1e-6
         ]
@@ -149,4 +152,5 @@ def one_tilt(
         (direction + sides[0]) / length,
         (direction + sides[1]) / length,
         leaned,
+        whole.down,
     )

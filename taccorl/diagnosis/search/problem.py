@@ -203,8 +203,7 @@ class Problem(Protocol):
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """Copy of ``effects`` in which values that are estimated in closed form from the fit recordings (maps of taxels) are
-        set."""
+        """Copy of ``effects`` in which values estimated in closed form from the fit recordings (maps of taxels) are set."""
         ...
 
 
