@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_285,
+    "taccorl/alignment": 14_289,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
-    "taccorl/diagnosis": 11_445,
+    "taccorl/diagnosis": 11_446,
     "taccorl/episodes": 4_184,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
@@ -19,12 +19,12 @@ MOST_LINES = {
     "taccorl/rl": 2_467,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
-    "taccorl/sim": 9_249,
+    "taccorl/sim": 9_256,
     "taccorl/surrogate": 3_303,
     "taccorl/tasks": 2_502,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 56_078,
+    "tests": 56_095,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

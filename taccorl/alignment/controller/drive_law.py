@@ -39,11 +39,9 @@ NEEDED: Mapping[Law, tuple[str, ...]] = {
 """Law → fields of ``DriveLaw`` that it requires."""
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4  # Range of the physics step [s]
 STEP_SHARE = 0.05
-"""Physics step as a share of inertia / K_d. Steps are of second order: the error of a PWM servo's step of 0.8 rad is then 0.1
-mrad."""
+"""Physics step as a share of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
 WINDING_WITHIN = 3.0
-"""Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's values; data sheets are no
-better."""
+"""Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's; data sheets are no better."""
 GAIN_UNITS: Mapping[Law, tuple[str, str]] = {"cascade": ("1/s", "N·m·s/rad"), "pwm": ("1/rad", "s/rad")}
 """Law → units of ``kp`` and ``kd``; of other laws N·m/rad and N·m·s/rad."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
@@ -157,8 +155,7 @@ class DriveLaw:
 
     @property
     def loop_gains(self) -> Gains:
-        """Gains of position error and velocity, and the constant torque [N·m/rad, N·m·s/rad, N·m], in the same form for every
-        law."""
+        """Gains of position error and velocity, and the constant torque [N·m/rad, N·m·s/rad, N·m], alike for every law."""
         kp, kd = (self.kp or 0.0) * self.kp_factor, (self.kd or 0.0) * self.kd_factor
         if self.law == "cascade":
             return Gains(kp * kd, kd, self.torque_ff)
@@ -179,15 +176,13 @@ class DriveLaw:
         return found
 
     def timestep_s(self, rate_hz: float, inertia: float, held: float) -> float:
-        """Physics step [s] for rows at ``rate_hz``, an inertia [kg·m²] and the stiffness that holds a model of law effort
-        [N·m/rad]."""
+        """Physics step [s] for rows at ``rate_hz``, an inertia [kg·m²] and the stiffness that holds law effort [N·m/rad]."""
         damping = self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def allows_effect(self, effect: str) -> bool:
-        """True if an effect of this name can act with this law (an integral, for example, does not exist in the controller of
-        law torque)."""
+        """True if an effect of this name can act with this law (law torque, for example, has no integral)."""
         if self.law == "effort":
             needs = {*registry.get(effect).needs}
             return effect == "payload" or (bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS)

@@ -35,6 +35,8 @@ class _Own(NamedTuple):
     speed_age: float = 0.0
     """Mean age of the speed that K_d multiplies in a sampled loop [s], its period: to the first order an inertia smaller by K_d ·
     age, except while the motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""
+    start_nm: float = math.inf
+    """Effort at rest at the start [N·m]: an integral may give any within the dry friction. inf: as if there were no friction."""
     midpoint: float = 0.0
     """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
     dropped_commands__seed: float = 0.0  # Seed of the commands that are lost

@@ -53,14 +53,11 @@ from taccorl.sim.effects.friction import AT_RAD_PER_S, BRISTLE_DAMPING_S, DRY_SH
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
 
-# Of the twin's own constraints: effects/friction.py and gear.py.
 _FRICTION_RATE = 2.0 / (DRY_SHARE * DRY_TIME_S)  # 1/s, MuJoCo's b = 2 / (d_max · time constant)
 _FRICTION_SOFTNESS = (1.0 - DRY_SHARE) / DRY_SHARE
 _LIMIT_RATE = 2.0 / (LIMIT_SHARE * LIMIT_TIME_S)
 _LIMIT_STIFFNESS = 1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE  # 1/s², times the impedance
 _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
-
-
 _PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
 _COMMAND, _MIDPOINT, _EFFORT_AFTER, _SENSOR_DELAY = map(Drive._fields.index, _PLACES)
 
@@ -80,8 +77,7 @@ def _fields(typingctx: Any, numbers: Any) -> Any:
 
 @compiled
 def _friction(force: Any, metric: Any, about: Any, v: Any, limit: Any, step_s: float) -> Any:
-    """MuJoCo's dry friction within ± ``limit`` on a mass ``metric`` that ``force`` acts on; ``about`` is MuJoCo's estimate of
-    ``metric``."""
+    """MuJoCo's dry friction within ± ``limit`` on a mass ``metric`` under ``force``; ``about``: MuJoCo's estimate of it."""
     stiff = about * (1.0 / _FRICTION_SOFTNESS)
     reference = (-_FRICTION_RATE / (1.0 + step_s * _FRICTION_RATE)) * v
     return min(max((reference * metric - force) * stiff / (metric + stiff), -limit), limit)
@@ -126,12 +122,13 @@ def _asked(
     added: float,
 ) -> Any:
     """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
-    error lies within the dead band is known from it. ``kind`` is ``Drive.command``; ``supply``, ``on`` and ``added`` are as in
-    ``simulate``."""
+    error lies within the dead band is known from it. A sampled loop adds its newest error for a whole period, of which half is to
+    come, to its ``integral``. ``kind`` is ``Drive.command``; ``supply``, ``on`` and ``added`` are as in ``simulate``."""
     if kind == TORQUE:
         none = 0.0 * p.kp
         return on * (command + p.torque_ff + added), none, none
     if kind == VELOCITY:
+        integral += 0.5 * p.speed_age * command
         asked = p.kd * (command - v + p.integral_action__rate_per_s * integral) + p.torque_ff + added
         return on * asked, on * p.kd * p.integral_action__rate_per_s, on * p.kd  # ∫ q̇ dt is the position: a spring
     slope, angle, width = p.encoder_scale__factor, _reading(p, q), p.error_deadband__width_rad
@@ -144,7 +141,9 @@ def _asked(
         far = (width <= 0.0) | (abs(before - angle) > width)
         error = where(far, error - where(width > 0.0, math.copysign(width, before - angle), 0.0), 0.0)
         stiffness = where(far, stiffness, 0.0)
-    stiffness += p.commands_speed * p.encoder_scale__factor * p.kd * p.integral_action__rate_per_s
+    of_way = p.commands_speed * p.encoder_scale__factor
+    stiffness += of_way * (p.kd + 0.5 * p.speed_age * p.kp) * p.integral_action__rate_per_s
+    integral += 0.5 * p.speed_age * (command - of_way * q)
     by_error = p.kp * (error + p.integral_action__rate_per_s * integral)
     factor = where((by_error < 0.0) & (p.commands_speed > 0.0), p.direction_gain__factor, 1.0)
     by_error, stiffness = factor * by_error, factor * stiffness
@@ -168,8 +167,7 @@ def _two_masses(m11: Any, m22: Any, link: Any, f1: Any, f2: Any, about: Any, v: 
 
 def _sources() -> np.ndarray:
     """() array, an argument whose type is named after the sources of the kernel and the fields of ``Drive``. Numba looks for a
-    compiled kernel by the types of its arguments and the date of its own file, so that changes of what it imports would not
-    reach it."""
+    compiled kernel by the types of its arguments and the date of its own file, not by what it imports."""
     modules = (_arriving, _drive_numbers, _lanes, _late_speed, *FAMILIES)
     texts = [repr(Drive._fields).encode(), *(Path(str(m.__file__)).read_bytes() for m in modules)]
     return np.zeros((), [("of_" + sha256(b"".join(texts)).hexdigest()[:16], "u1")])
@@ -227,7 +225,6 @@ def _simulated(
     steps_of_row = every if every > 0 else hold * parts
     rows = sent.size * hold // steps_of_row
     none = 0.0 * p.kp
-    # Numbers of effects under the names of their equations.
     coulomb = p.coulomb_friction__torque_nm + p.asymmetric_friction__torque_nm
     one_way = p.asymmetric_friction__torque_nm * p.asymmetric_friction__asymmetry
     asymmetry = where(coulomb != 0.0, one_way / coulomb, 0.0)
@@ -315,11 +312,14 @@ def _simulated(
     of_speed = none + 1.0 if kind == VELOCITY else p.kd / where(p.kp > 0.0, p.kp, 1.0)
     went = none + 1.0 if kind == VELOCITY else p.encoder_scale__factor * (of_speed + 0.5 * h)
     slow_went, late_went = speeds * of_speed * turned * slow_s, speeds * of_speed * (lost - 0.5 * p.speed_age)
+    way = (0.0 if kind == VELOCITY else 1.0) * p.encoder_scale__factor
+    of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
     if with_integral:
-        of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
-        integral = where(integral_rate > 0.0, missing / (holding * of_error), 0.0)
-        torque += where(integral_rate > 0.0, missing / holding, 0.0)
-        missing = where(integral_rate > 0.0, 0.0, missing)
+        most, seen_nm = coulomb + static, p.start_nm + where(p.effort_holds_weight == 0.0, holding * carried, 0.0)
+        rubbed = where(p.start_nm < math.inf, min(max(needed - seen_nm, -most), most), 0.0)
+        integral = where(integral_rate > 0.0, (missing - rubbed) / (holding * of_error), 0.0)
+        torque += where(integral_rate > 0.0, (missing - rubbed) / holding, 0.0)
+        missing = where(integral_rate > 0.0, rubbed, missing)
     z = where(has_bristle, min(max(-missing, -static), static) / bristle, 0.0)
     missing += z * bristle
     bent = where(bends, min(max(-missing, -coulomb), coulomb) / bending, 0.0)
@@ -365,7 +365,7 @@ def _simulated(
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(p, kind, by, by, q, v, summed, supply[part], on[part], added[seen])
             by_speed -= on[part] * p.back_emf  # which has no age
-            older = p.effort_age * by_position * v + shown_lead * by_speed * acceleration
+            older = p.effort_age * (by_position * v - of_error * (by - way * q)) + shown_lead * by_speed * acceleration
             if with_filter:
                 older += shown_slow * by_speed * (v - late_v)
             older = where(lag_s > 0.0, lost * by_speed * acceleration, older) + by_position * stiff_lost * acceleration
@@ -385,10 +385,9 @@ def _simulated(
         if is_late:
             store(readings, n, _reading(p, q))
 
-        # The drive.
         strength *= _of_direction(p, given + carried)
         if with_integral:  # that of a speed is taken ahead as the position is, which is its other part
-            came = h * (now if kind == VELOCITY else now - p.encoder_scale__factor * q)
+            came = h * (now - way * q)
             integral += ahead * speeds * came
             summed += ahead * speeds * came
         asked, stiffness, damping = _asked(p, kind, now, acts, q, v, summed, supply[part], on[part], added[part])
@@ -410,7 +409,6 @@ def _simulated(
         drawn, inertia = where(cut, limited, drawn), where(cut, whole_inertia, ruled_inertia)
         stiffness, damping = where(cut, 0.0, gain * stiffness), where(cut, 0.0, gain * damping)
 
-        # What else turns the motor's shaft.
         force = drawn - (viscous + drag * abs(v)) * v - spring_stiffness * (q - spring_rest)
         damping += viscous + 2.0 * drag * abs(v)
         stiffness += spring_stiffness
@@ -482,8 +480,7 @@ def _simulated(
             v_next = v + h * a1
             gear += h * (gear_v + into * h * a2)
             gear_v += h * a2
-        # As the step took it: at the step's end.
-        at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
+        at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next  # of the step
         torque += newest_share * (at_end - torque)
         moved = h * (ahead * v_next + (1.0 - ahead) * v)
         if with_bends:

@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_numbers import Drive
@@ -73,7 +74,7 @@ class Numbers(NamedTuple):
     """Overrides: name of a field of ``drive_numbers.Drive`` → value that is used instead of the joint's own."""
     waits_s: float = 0.0
     """Time for which a row's target waits until the drive's loop reads it [s]; the row's effort is newer by the same time."""
-    effort_scale: float = 1.0  # Ratio of the recorded effort to the torque that drives a model of law effort
+    effort_scale: float = 1.0  # Ratio of the recorded effort to the torque; under law effort that drives the model
 
 
 class _Prepared(NamedTuple):
@@ -107,8 +108,7 @@ class JointResponse:
     reported: np.ndarray  # (T,) reported positions [rad]
     effort: np.ndarray
     """(T,) torque of the motor at the time of each row, before the row's command acts, within the motor's limits [N·m]; with or
-    without the gravity compensation as ``RigidJoint.effort_holds_weight`` states. ``Replay.effort`` has the same value one row
-    earlier."""
+    without the gravity compensation as ``RigidJoint.effort_holds_weight`` states. ``Replay.effort`` has it one row earlier."""
 
 
 class JointModel:
@@ -234,7 +234,7 @@ def _side_by_side(
     for model, (case, bodies, numbers) in zip(models, prepared, strict=True):
         joint, (sent, parts, hold, step_s) = model.joint, of_model[model]
         late_s = joint.target_late_s
-        when = late_s, parts, hold, step_s, case.effort_scale
+        when = late_s, parts, hold, step_s, case.effort_scale if joint.target_kind == "effort" else 1.0
         kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
         # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
         gains = Gains(kp, kd - kp * (joint.position_age_s + case.age_s), case.gains.torque_ff)
@@ -246,6 +246,8 @@ def _side_by_side(
         drive["gravity_cos"] += weight * case.lever.cos_m
         drive["command_delay__delay_s"] += case.waits_s
         drive["effort_age"] -= case.waits_s
+        if drive["integral_action__rate_per_s"] > 0.0:
+            drive["start_nm"] = motion.start_nm / case.effort_scale
         drive["effort_holds_weight"] = float(joint.effort_holds_weight)
         if drive["effort_after"] and late_s > 0.0:
             # A row's target arrives late_s after the row: the effort that it causes begins then, from the position at that time.
@@ -257,9 +259,10 @@ def _side_by_side(
         geared = drive["backlash__play_rad"] > 0.0 or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
         finer = math.ceil(step_s / GEAR_STEP_S - 1e-9) if geared and drive["midpoint"] > 0.0 else 1
         loads = motion.coupling_nm + held_n + joint.moving_masses_nm(motion, bodies)
-        missing.setdefault((finer, geared, *when), (sent._replace(added=sent.added / case.effort_scale), {}))[1][
-            keys[-1]
-        ] = (tuple(drive.values()), loads)
+        missing.setdefault((finer, geared, *when), (sent._replace(added=sent.added / when[-1]), {}))[1][keys[-1]] = (
+            tuple(drive.values()),
+            loads,
+        )
     for (finer, _, _, parts, hold, step_s, _), (sent, those) in missing.items():
         drives, loads = zip(*those.values(), strict=True)
         start = motion.start, hold * finer, parts, step_s / finer, motion.start_speed, int(each_step)
@@ -332,7 +335,9 @@ def _in_time(motion: JointMotion, late_s: float, received: int, parts: int, held
     found = _Sent(target, supply, on, np.repeat(sent.added, parts))
     if received > 1:
         middle = 0.5 * (edges[1:] + edges[:-1]) - held
-        found = found._replace(target=np.interp(middle, came, sent.target))
+        # A line between measured positions lies beside their curve, and the spring on it would be an inertia.
+        line = np.interp(middle, came, sent.target) if held else CubicSpline(came, sent.target)(middle)
+        found = found._replace(target=line)
     return found
 
 

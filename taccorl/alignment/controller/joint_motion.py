@@ -4,6 +4,7 @@ Letters in shapes: T rows, N numbers of a pose.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -37,8 +38,7 @@ AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surroundings:
-    """State of the rest of the machine in one recording. Objects are equal only if they are the same, so that results for one can
-    be kept."""
+    """State of the rest of the machine in one recording. Objects are equal only if the same, so that results can be kept."""
 
     coupling_nm: np.ndarray
     """(T · F,) torque that the joint must hold against the motion of the other joints [N·m], F times per row; 0 if they stand
@@ -63,8 +63,7 @@ class Surroundings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointMotion(Surroundings):
-    """Data of one joint from one recording. Row k holds the state of the joint at the time of command k, before this command
-    acts."""
+    """Data of one joint from one recording. Row k holds the state of the joint at the time of command k, before it acts."""
 
     name: str
     time_s: np.ndarray  # (T,) times [s]
@@ -73,6 +72,7 @@ class JointMotion(Surroundings):
     measured: np.ndarray  # (T,) measured positions [rad]; NaN where not measured
     effort: np.ndarray  # (T,) efforts [N·m]; NaN where not recorded
     start: float  # Position reported at rest before the first command [rad]
+    start_nm: float = math.inf  # Effort reported there [N·m]; inf: not recorded
     start_speed: float = 0.0  # Speed at the first row of a recording that begins in motion [rad/s]
     kp_scale: float = 1.0
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other

@@ -24,7 +24,7 @@ _TARGET_COLUMNS = {
     "torque": "tau_target",
     "effort": "tau, and no target",
 }
-START_ROWS = 8  # Rows from which the speed at the start is computed. A choice.
+START_ROWS = 8  # Rows from which speed and effort at the start are computed. A choice.
 SMOOTH_S = 0.05
 """Window of the quadratic that is the measured position at which a model of law effort is held [s]: half of 1 / ``FOLLOW_HZ``."""
 MOST_YIELD = 0.05
@@ -84,6 +84,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
         command_s=m.command_s if m.command_s.size and joint.keeps_times else None,
         start=start,
         start_speed=start_speed,
+        start_nm=float(np.nan_to_num(np.mean(effort[:START_ROWS]), nan=np.inf)),
         kp_scale=kp_scale,
         kd_scale=kd_scale,
         kp_known=signal in m.kp,

@@ -8,6 +8,7 @@ Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 import math
 from abc import ABC
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import mujoco
@@ -88,8 +89,7 @@ class RigidJoint(ABC):
     0.1 mrad."""
 
     follows_line: ClassVar[bool] = False
-    """True: targets between rows are interpolated linearly at their own times. False: they have the next row's value, as in a
-    replay."""
+    """True: targets between rows are interpolated linearly at their own times. False: they have the next row's value (replay)."""
     keeps_times: ClassVar[bool] = False
     """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
     target_late_s: float = 0.0
@@ -101,8 +101,7 @@ class RigidJoint(ABC):
 
     @property
     def winding(self) -> Mapping[str, float]:
-        """Stall torque [N·m] and back-EMF [N·m·s/rad] of a motor with law pwm, which are fitted in place of gains; empty for
-        others."""
+        """Stall torque [N·m] and back-EMF [N·m·s/rad] of a motor with law pwm, fitted in place of gains; empty for others."""
         return {}
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
@@ -188,25 +187,31 @@ def with_masses(
     terms: Rigid, model: mujoco.MjModel, joint: str, pose: np.ndarray, masses: Sequence[PointMass]
 ) -> Rigid:
     """``terms`` of one joint with the inertia m r² and the weight of ``masses``, the other joints held at ``pose`` (nq,)."""
-    data, lever = mujoco.MjData(model), np.zeros((3, model.nv))
-    data.qpos[:] = pose
-    dof, address = model.joint(joint).dofadr[0], model.joint(joint).qposadr[0]
     hinge = model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_HINGE
     for one in masses:
-        weight = []
-        for angle in (0.5 * np.pi, 0.0) if hinge else (0.0,):
-            data.qpos[address] = angle
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            at = data.xpos[one.body] + data.xmat[one.body].reshape(3, 3) @ one.place_m
-            mujoco.mj_jac(model, data, lever, None, at, one.body)
-            weight.append(float(-one.mass_kg * model.opt.gravity @ lever[:, dof]))
-        terms = terms._replace(inertia=terms.inertia + one.mass_kg * float(lever[:, dof] @ lever[:, dof]))
-        if hinge:
-            terms = terms._replace(gravity_sin=terms.gravity_sin + weight[0], gravity_cos=terms.gravity_cos + weight[1])
-        else:
-            terms = terms._replace(weight_n=terms.weight_n + weight[0])
+        there, turning = _levers(model, joint, pose.tobytes(), one.body)
+        lever = there + turning @ one.place_m
+        inertia = terms.inertia + one.mass_kg * float(lever[1] @ lever[1])
+        first, last = map(float, -one.mass_kg * lever @ model.opt.gravity)
+        sine, cosine = (terms.gravity_sin + first, terms.gravity_cos + last) if hinge else terms[2:4]
+        weight = terms.weight_n + last * (not hinge)
+        terms = terms._replace(inertia=inertia, gravity_sin=sine, gravity_cos=cosine, weight_n=weight)
     return terms
+
+
+@lru_cache(maxsize=1024)
+def _levers(model: mujoco.MjModel, joint: str, pose: bytes, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """(2, 3) j and (2, 3, 3) L of the lever j + L c of a point at c (3,) in a body, with the joint at π / 2 and at 0."""
+    data, jac, levers = mujoco.MjData(model), np.zeros((2, 3, model.nv)), np.zeros((2, 4, 3))
+    data.qpos[:] = np.frombuffer(pose)
+    for k, angle in enumerate((0.5 * np.pi, 0.0)):
+        data.qpos[model.joint(joint).qposadr[0]] = angle
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jac(model, data, *jac, data.xpos[body], body)
+        along, about = jac[:, :, model.joint(joint).dofadr[0]]
+        levers[k] = along, *np.cross(about, data.xmat[body].reshape(3, 3).T)
+    return levers[:, 0], levers[:, 1:].swapaxes(1, 2)
 
 
 def torque_along(

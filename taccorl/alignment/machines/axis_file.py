@@ -52,8 +52,7 @@ class AxisConfig(DriveLaw):
     """``commanded``: the drive runs kp and kd. ``fitted``: nobody knows them, they are the start of a fit, which without efforts
     leaves ``inertia`` as it is, because positions determine ratios only. Not for law pwm, whose motor is fitted."""
     rotor_inertia: float = 0.0
-    """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it the search does not consider play and
-    compliance."""
+    """Share of ``inertia`` on the motor's side of the gear [kg·m²]; without it play and compliance are not searched."""
     weight_sin: float = 0.0  # S [N·m] in the torque S sin q + C cos q that holds the axis's own weight
     weight_cos: float = 0.0
     """C [N·m] in the torque S sin q + C cos q that holds the weight of a turning axis at angle q; of a slide, its weight [N]."""

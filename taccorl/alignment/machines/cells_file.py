@@ -234,6 +234,5 @@ def cells_digest(config: CellsConfig) -> str:
 
 
 def save_cells(config: CellsConfig, path: Path) -> None:
-    """Write ``cells_text`` to a file, which is replaced as a whole or not at all. Raises TaccorlError: the folder cannot be
-    written to."""
+    """Write ``cells_text`` to a file, which is replaced as a whole or not at all. Raises TaccorlError: it is read-only."""
     write_whole(path, cells_text(config))

@@ -257,8 +257,7 @@ def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
 
 
 def unbalanced(root: Element) -> str:
-    """Text on the first link whose inertia no body can have: place, link, principal moments, and what to write; empty if there is
-    none."""
+    """Text on the first link whose inertia no body can have: place, link, principal moments, and what to write; empty: none."""
     for inertia in root.all("inertia"):
         try:
             full = [[float(inertia.get(f"i{min(a, b)}{max(a, b)}", "0")) for a in "xyz"] for b in "xyz"]

@@ -319,8 +319,7 @@ def _rules(robot: Robot) -> Rules:
 
 
 def _refuse_todo(path: Path) -> None:
-    """Raises SpecError: lines of the file still say ``TODO``. The message quotes each line with its comment, which says what to
-    write instead."""
+    """Raises SpecError: lines of the file still say ``TODO``. The message quotes each with its comment: what to write."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):

@@ -106,6 +106,7 @@ class RobotJoint(DriveJoint):
         self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
         self.position_age_s += law.position_age_s
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
+        self._unloaded: dict[bytes, Rigid] = {}
 
     @property
     def known(self) -> JointFacts:
@@ -143,7 +144,9 @@ class RobotJoint(DriveJoint):
     def _terms(self, pose: np.ndarray, masses: Sequence[PointMass] = ()) -> Rigid:
         """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor."""
         model = self._robot.rigid.model
-        terms = with_masses(rigid_terms(model, self.signal, pose), model, self.signal, pose, masses)
+        if (key := pose.tobytes() + model.opt.gravity.tobytes()) not in self._unloaded:
+            self._unloaded[key] = rigid_terms(model, self.signal, pose)
+        terms = with_masses(self._unloaded[key], model, self.signal, pose, masses)
         if not (more := self._robot.more_gravity).any():
             return terms
         with under_gravity(model, more):  # the weight is linear in gravity

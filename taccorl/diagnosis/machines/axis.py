@@ -36,8 +36,7 @@ SMOOTH_S = 0.05
 INERTIA_OFF = 5.0
 """Ratio of the file's inertia to that in the recording from which on the file must be wrong."""
 INERTIA_SURE = 0.6
-"""Least correlation of acceleration and the torque without friction, damping and weight, at which the inertia in the recording
-is used."""
+"""Least correlation of acceleration and torque without friction, damping and weight, at which a recording's inertia is used."""
 
 
 @machines.register("axis")

@@ -346,8 +346,7 @@ class Machine(ABC):
         return list(findings)
 
     def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
-        """Copy of the machine with everything that was found, and text: why a part of it could not be written; empty if all
-        was."""
+        """Copy of the machine with everything that was found, and text: why a part of it could not be written, or empty."""
         found = [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in findings]
         return self.with_additions(found), ""
 
@@ -356,8 +355,7 @@ class Machine(ABC):
         return []
 
     def refitted(self, findings: Sequence[Finding]) -> Self:
-        """The machine with the always fitted numbers refitted and no further effect: the reference for the improvement by
-        effects."""
+        """The machine with the always fitted numbers refitted and no further effect: the reference for effects."""
         firsts = [(f.part, f.diagnosis.before) for f in findings]
         return self.with_additions(
             [

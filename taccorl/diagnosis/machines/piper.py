@@ -167,8 +167,7 @@ class PiperTwin(Machine):
         return found
 
     def with_additions(self, additions: Sequence[Addition]) -> "PiperTwin":
-        """Add effects and numbers. k_n and k_d are common to all pads, so that the values fitted to several arms' pads must
-        agree."""
+        """Add effects and numbers. k_n and k_d are common to all pads, so that values of several arms' pads must agree."""
         config = copy.deepcopy(self.config)
         of_pads = {a.part: (a.base, a.intervals) for a in additions if a.base and a.part not in _SIGNALS}
         if of_pads:

@@ -56,6 +56,7 @@ from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
 from taccorl.diagnosis.search.problem import candidate
+from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
@@ -274,7 +275,7 @@ class RobotMachine(Machine):
         stands_for = {part: names for part, f in group.items() if (names := standing_in(f.diagnosis, "unbalance"))}
         if len(group) < 2 or not stands_for:
             return list(findings)
-        problems = {part: self.motion_problem(part, measurements, gains) for part in group}
+        problems = {part: self._problem_of(f, measurements, gains) for part, f in group.items()}
         found = one_tilt(self.robot, problems, {part: f.diagnosis for part, f in group.items()}, stands_for)
         if not found.disagree and not found.is_simpler:
             return list(findings)
@@ -285,19 +286,7 @@ class RobotMachine(Machine):
             ]
             text = f"no tilt of the base explains {' and '.join(group)} together: it would leave {', '.join(errors)}"
         else:
-            now = self.robot.rigid.model.opt.gravity + self.robot.more_gravity
-            leans = np.degrees(np.arccos(np.clip(found.direction @ now / np.linalg.norm(now), -1.0, 1.0)))
-            ends = ", ".join(
-                f"{axis} {low:.4f} … {high:.4f}"
-                for axis, low, high in zip("xyz", found.low, found.high, strict=True)
-                if high - low > 1e-6
-            )
-            what = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items()]
-            text = (
-                f"one tilt of the base by {leans:.2g}° explains as much at {' and '.join(group)} as {', '.join(what)}, with "
-                f"fewer numbers: write `gravity: [{', '.join(f'{x:.4f}' for x in found.direction + 0.0)}]` (95 %: {ends}) into "
-                f"{self.robot.path.name} instead (--until=noise_floor does so), and check it with a level"
-            )
+            text = found.words(stands_for, self.robot.path.name)
             leaned = {
                 part: dataclasses.replace(cast(JointFinding, f), leaned=found.joints[part]) for part, f in group.items()
             }
@@ -336,12 +325,12 @@ class RobotMachine(Machine):
 
     def _with_one_mass(self, body: int, findings: Sequence[Finding], how: How, sure: bool) -> list[Finding]:
         """``findings`` with one payload in place of what several joints lack, if it holds with fewer numbers at all that move
-        it: in ``body`` or else in a link before it. Without a payload if it holds in none of them."""
+        it: in ``body`` or a link before it that leaves less. Without a payload if it holds in none of them."""
         robot, (measurements, gains, diagnosed) = self.robot, how
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
         stands_for = {part: found for part, f in group.items() if (found := standing_in(f.diagnosis, "payload"))}
-        alone = [part for part, names in stands_for.items() if "payload" in names]
-        alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
+        rivals = {part: f.diagnosis.rivals.get("payload") for part, f in group.items()}
+        alone = [part for part, names in stands_for.items() if "payload" in names and not rivals[part]]
         loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
         if not stands_for or (sure and loaded and len(alone) == 1):
             return list(findings)  # weight that turns with a joint shows where the mass is
@@ -354,16 +343,24 @@ class RobotMachine(Machine):
             place = links.get(link, body)
             parts = [part for part in parts if robot.moves_body(part, place)]
             machine = self._assuming(owner, Payload(mass_kg=0.0, link=link, **dict.fromkeys(PAYLOAD_AT, 0.0)))
-            problems = {part: machine.motion_problem(part, measurements, gains) for part in parts}
+            problems = {part: machine._problem_of(group[part], measurements, gains) for part in parts}
             idle = set.intersection(*({*robot.idle_axes(part, place)} for part in parts))
             centred = {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
             mass = candidate(machine.robot.joint(owner).in_units(Payload), {}, link=link, **centred)
             return one_mass(problems, {part: group[part].diagnosis for part in parts}, stands_for, mass)
 
         link, found = "", fitted([*group])
+
+        def left(one: OneMass) -> float:
+            squares = (one.errors[part] ** 2 if part in one.errors else left_of(f) for part, f in group.items())
+            return sum(squares) if one.holds else math.inf
+
         for name, place in links.items():
-            if not found.holds and all(robot.moves_body(part, place) for part in alone or stands_for):
-                link, found = name, fitted([*group], name)
+            if found.holds and max(found.errors.values()) <= SearchConfig().floor:
+                break
+            if all(robot.moves_body(part, place) for part in alone or stands_for):
+                other = fitted([*group], name)
+                link, found = (name, other) if ALIKE * left(other) < left(found) else (link, found)
         if not found.holds:
             added = [part for part, names in stands_for.items() if "payload" in names]
             again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
@@ -374,8 +371,7 @@ class RobotMachine(Machine):
                 f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(links.get(link, body))} explains as much at "
                 f"{' and '.join(stands_for)}, with as many numbers: record a joint that weight loads, or one more that moves it"
             )
-            several = len(stands_for) > 1
-            return [remarked(f, text) if several and f.part in stands_for else f for f in findings]
+            return [remarked(f, text) if len(stands_for) > 1 and f.part in stands_for else f for f in findings]
         clear = [part for part in found.errors if found.errors[part] <= CLEAR_FLOORS]
         if len(clear) < len(found.errors):  # what other joints lack besides must not say where the mass is
             found = fitted(clear or [owner], link)
@@ -424,8 +420,7 @@ class RobotMachine(Machine):
         return [f"gravity [{', '.join(f'{x:.4f}' for x in gravity)}]" for gravity in found]
 
     def _owners(self, findings: Sequence[Finding]) -> set[str]:
-        """Of joints with a payload in the same body the one that determines its mass best; without a payload the one nearest to
-        the body."""
+        """Of joints with a payload in the same body the one that determines its mass best; without a payload the nearest one."""
 
         def unsure(f: Finding) -> tuple[float, int]:
             low, high = f.diagnosis.intervals.get("payload.mass_kg", (0.0, math.inf))
@@ -458,6 +453,11 @@ class RobotMachine(Machine):
 
     def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> JointProblem:
         return JointProblem(self.robot, part, of_joints(measurements, [part]), gains=gains)
+
+    def _problem_of(self, f: Finding, measurements: Measurements, gains: GainsAre) -> JointProblem:
+        """``motion_problem`` of one part in which effects of the file that its diagnosis did not fit stay."""
+        held = {e.name for e in self.robot.config.joints[f.part].effects} - {*f.diagnosis.present}
+        return JointProblem(self.robot, f.part, of_joints(measurements, [f.part]), gains=gains, held=held)
 
     # effects ---------------------------------------------------------------------------------------------------------
 

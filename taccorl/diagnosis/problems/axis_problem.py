@@ -112,21 +112,17 @@ class AxisProblem(WithoutMaps):
         """Text that names the channels whose errors are minimised and reported, such as positions."""
         return " and ".join(f"{kind}s" for kind in self._kinds) + " together" * (len(self._kinds) > 1)
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone. NaN after the last measured
-        row. ``effects``: in addition to those of the file that are not fitted."""
-        return self.simulate_all([(base, effects)], [recording])[0][0]
-
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
-        """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
+        """For each recording and case (T, C) simulated position [rad, m] and effort [N·m, N]; of law effort the effort alone. NaN
+        after the last measured row. ``cases``: fitted numbers, and effects besides those of the file that are not fitted."""
         models = [JointModel(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
-        is_input, scales = self._kinds[0] == "effort", [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
+        scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
         numbers = [
-            Numbers(m.gains, own, waits_s=base.get("loop_waits_s", 0.0), effort_scale=by if is_input else 1.0)
+            Numbers(m.gains, own, waits_s=base.get("loop_waits_s", 0.0), effort_scale=by)
             for m, (base, own), by in zip(models, cases, scales, strict=True)
         ]
         motions = [measured_part(recording) for recording in recordings]
-        channels = slice(is_input, 1 + self.effort)
+        channels = slice(self._kinds[0] == "effort", 1 + self.effort)
         return [
             [whole_rows([a.reported, scale * a.effort][channels], r) for a, scale in zip(those, scales, strict=True)]
             for those, r in zip(simulate_each(models, motions, numbers, self._answers), recordings, strict=True)
@@ -227,7 +223,6 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
 
 
 def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:
-    """Simulated response of the axis to a recording's targets, with the effects of its file and ``effects``, one value per
-    row."""
+    """Simulated response of the axis to a recording's targets, with the file's effects and ``effects``, for each row."""
     model = JointModel(DrivenAxis(axis))
     return model.simulate(motion, model.gains, effects)

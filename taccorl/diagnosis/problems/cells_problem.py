@@ -141,8 +141,7 @@ class CellsProblem(WithoutMaps):
         )
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated readings in the unit of the file, with the gain and offset of each cell that fit best with
-        ``effects``."""
+        """(T, C) simulated readings in the unit of the file, with the gains and offsets of cells that fit best."""
         calibration, known = self._calibrated(effects)
         response = known.get(recording.name)
         if response is None:

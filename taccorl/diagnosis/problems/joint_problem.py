@@ -189,10 +189,6 @@ class JointProblem(WithoutMaps):
             torques.append(self.model.inertia_kgm2(m) * np.gradient(np.gradient(angle, m.time_s), m.time_s))
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """``simulate_all`` of one case and one recording, (T, C)."""
-        return self.simulate_all([(base, effects)], [recording])[0][0]
-
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """For each recording and case (T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver
         would report it; with ``law: effort`` the effort alone. NaN after the last measured row. ``cases``: always fitted numbers,
@@ -216,8 +212,8 @@ class JointProblem(WithoutMaps):
             newer = 2.0 * bool(self.model.joint.facts["effort_after"])
             speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
             facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
-        driven_by = base.get(EFFORT_SCALE.name, 1.0) if self._first else 1.0
-        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), driven_by)
+        scale = base.get(EFFORT_SCALE.name, 1.0)
+        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), scale)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""

@@ -13,8 +13,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion, first_rows
 from taccorl.diagnosis.search.problem import Recording
 
 MORE_ROWS = 4
-"""Rows after the last measured one that are simulated, too: torques are interpolated to the next row, and slopes at the end are
-one-sided."""
+"""Rows after the last measured one simulated, too: torques are interpolated to the next row, slopes at the end one-sided."""
 
 
 @lru_cache(maxsize=64)

@@ -9,12 +9,13 @@ import numpy as np
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
-from taccorl.diagnosis.search.problem import Candidate, Recording, Values, WithoutMaps, chosen, split_rows
+from taccorl.diagnosis.search.problem import Candidate, Case, Recording, Values, WithoutMaps, chosen, split_rows
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 
-_FIRST_STEPS, _STEPS = 6, 40
+_FIRST_STEPS, _LIKELY, _NEXT_STEPS, _STEPS = 2, 2, 4, 40
+"""Most steps from every start; number of the best that go on, and their further steps; steps of the last fit."""
 ALIKE = 1.25
 """Factor on the squared validation error up to which a shared number explains as much at one joint (12 % of the error)."""
 _BESIDE = 0.3
@@ -37,13 +38,10 @@ class OneMassProblem(WithoutMaps):
     ) -> None:
         self._problems = problems
         self._effects = {joint: chosen(problem, names[joint]) for joint, problem in problems.items()}
-        self.base = tuple(
-            replace(f, name=f"{joint}/{f.name}")
-            for joint, problem in problems.items()
-            for f in (*problem.base, *(f for c in self._effects[joint] for f in c.frees))
-        )
+        own = {j: (*p.base, *(f for c in self._effects[j] for f in c.frees)) for j, p in problems.items()}
+        self.base = tuple(replace(f, name=f"{j}/{f.name}") for j, frees in own.items() for f in frees)
+        self._names = {j: [f.name for f in frees] for j, frees in own.items()}
         self.candidates = {payload.name: payload}
-        self._done: dict[tuple, np.ndarray] = {}
 
     def own(self, joint: str, model: Fit) -> tuple[tuple[Effect, ...], Values, dict[str, tuple[float, float]]]:
         """Effects, always fitted numbers and 95 % intervals of one joint in a fit of this problem."""
@@ -57,18 +55,21 @@ class OneMassProblem(WithoutMaps):
         """Recordings of one joint as recordings of this problem."""
         return [replace(r, name=f"{joint}/{r.name}", data=(joint, r)) for r in own]
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated channels of one recording of one joint, in the units of ``recording.measured``; ``base`` has the
-        numbers of all joints, ``j/name`` → value, and ``effects`` the payload."""
-        joint, own = recording.data
-        values = {name.split("/", 1)[1]: value for name, value in base.items() if name.startswith(f"{joint}/")}
-        key = (own, *values.items(), *map(repr, effects))
-        if key not in self._done:  # a number of one joint does not change the others
-            if len(self._done) > 2000:
-                self._done.clear()
-            found = [c.make(values) for c in self._effects[joint]]
-            self._done[key] = self._problems[joint].simulate(values, [*found, *self.at(joint, own, effects)], own)
-        return self._done[key]
+    def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+        """For each recording of a joint and case (T, C) simulated channels in the units of ``Recording.measured``. ``cases``:
+        numbers of all joints, ``j/name`` → value, and the payload. A number of one joint does not change the others."""
+        answers = []
+        for joint, r in (recording.data for recording in recordings):
+            own = [{name: base[f"{joint}/{name}"] for name in self._names[joint]} for base, _ in cases]
+            keys = [(*values.values(), *map(repr, e)) for values, (_, e) in zip(own, cases, strict=True)]
+            unlike = {key: k for k, key in enumerate(keys)}
+            here = [
+                (own[k], [c.make(own[k]) for c in self._effects[joint]] + [*self.at(joint, r, cases[k][1])])
+                for k in unlike.values()
+            ]
+            found = dict(zip(unlike, self._problems[joint].simulate_all(here, [r])[0], strict=True))
+            answers.append([found[key] for key in keys])
+        return answers
 
     def at(self, joint: str, own: Recording, effects: Sequence[Effect]) -> Sequence[Effect]:
         """What the shared effects are at one joint in one of its recordings: themselves."""
@@ -121,7 +122,10 @@ def one_mass(
     start |= {mass.name: float(np.median(masses))} if masses else {}
     beside = [start | {mass.name: -mass.start}] * (mass.low < 0.0 and not masses)
     beside += [start | {f.name: side * _BESIDE * f.high} for f in payload.frees[1:] for side in (-1.0, 1.0)]
-    rough = best_fit(whole, fit_to, (payload.name,), [start, *beside], _FIRST_STEPS)
+    rough = sorted(
+        (fit(whole, fit_to, (payload.name,), one, _FIRST_STEPS) for one in (start, *beside)), key=lambda f: f.error
+    )
+    rough = best_fit(whole, fit_to, (payload.name,), [f.values for f in rough[:_LIKELY]], _NEXT_STEPS)
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
     holds, before, after, errors = True, 0, 1 + len(payload.frees[1:]), {}
     for j, d in alone.items():

@@ -79,8 +79,7 @@ class OneTilt:
     """Joints that it leaves with a larger error than what was found there alone → validation error alone and with the tilt [noise
     floors]."""
     is_simpler: bool
-    """Whether its two numbers are fewer than those of the effects in whose place it stands, and the constant torques that it
-    explains."""
+    """Whether its two numbers are fewer than those of effects in whose place it stands, and constant torques that it explains."""
     direction: np.ndarray
     """(3,) unit vector along gravity in the model's frame."""
     low: np.ndarray
@@ -89,6 +88,23 @@ class OneTilt:
     """(3,) upper ends."""
     joints: Mapping[str, Leaned]
     """Joint → its numbers with the tilt."""
+
+    down: np.ndarray
+    """(3,) that vector without the tilt."""
+
+    def words(self, stands_for: Mapping[str, Sequence[str]], file: str) -> str:
+        """Text on the tilt in place of the effects ``stands_for`` of each joint."""
+        leans = np.degrees(np.arccos(np.clip(self.direction @ self.down, -1.0, 1.0)))
+        ends = [
+            (axis, low, high) for axis, low, high in zip("xyz", self.low, self.high, strict=True) if high - low > 1e-6
+        ]
+        what = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items()]
+        return (
+            f"one tilt of the base by {leans:.2g}° explains as much at {' and '.join(self.joints)} as {', '.join(what)}, with "
+            f"fewer numbers: write `gravity: [{', '.join(f'{x:.4f}' for x in self.direction + 0.0)}]` (95 %: "
+            f"{', '.join(f'{axis} {low:.4f} … {high:.4f}' for axis, low, high in ends)}) into {file} instead "
+            "(--until=noise_floor does so), and check it with a level"
+        )
 
 
 def one_tilt(
@@ -136,4 +152,5 @@ def one_tilt(
         (direction + sides[0]) / length,
         (direction + sides[1]) / length,
         leaned,
+        whole.down,
     )

@@ -138,8 +138,7 @@ class TouchProblem(WithoutMaps):
         self._still_count = _still_floor(motions)
         repeated = _repeat_floor(motions, self._still_count)
         self.floor_count = np.maximum(self._still_count, repeated.taxel_count)
-        """(P, R, C) noise floor of a row of each taxel [counts]; if a motion was repeated, including the variation between
-        repeats."""
+        """(P, R, C) noise floor of a row of each taxel [counts], with the variation between repeats, if any."""
         self._touched_count = repeated.touched_count
         self.not_shared: list[str] = []
         """Validation recordings that press hardly any taxel which a fit recording presses (``recordings``)."""

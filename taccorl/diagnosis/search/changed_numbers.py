@@ -18,7 +18,7 @@ import numpy as np
 from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
 from taccorl.diagnosis.search.evidence import gain_of
 from taccorl.diagnosis.search.fit import Fit, best_fit
-from taccorl.diagnosis.search.fits import PROBED, STEPS, Fits, Model, best, model_of, refusal
+from taccorl.diagnosis.search.fits import PROBED_BESIDE, STEPS, Fits, Model, best, model_of, refusal
 from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Values, with_held, with_scale
 from taccorl.diagnosis.search.result import Changed
 
@@ -38,8 +38,7 @@ NEGLIGIBLE = 0.01
 BACK = 0.1
 """Likewise this share of the change that it needs without the added effects. A choice."""
 REFIT_WORSE = 1.3
-"""Factor on the validation error from which on a refit of the always fitted numbers is a finding: more than the noise of another
-motion causes."""
+"""Factor on the validation error from which on a refit of the fitted numbers is a finding: more than another motion's noise."""
 GAINS_MOVED = 2.0
 """Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
 wrong unit of time, or gains other than the commanded ones."""
@@ -180,7 +179,7 @@ def better_than_present(fits: Fits, answer: Model, names: Sequence[str]) -> list
     for name in fits.present if not fits.at_floor(answer) else ():
         part = fits.without(answer, name)
         others = [n for n in names if n not in answer.names]
-        found = [m for m in fits.children(part, others, PROBED) if m.full and not fits.why_not(m, part)]
+        found = [m for m in fits.children(part, others, PROBED_BESIDE) if m.full and not fits.why_not(m, part)]
         instead = best(found, fits.config) if found else answer
         if gain_of(instead.squares, answer.squares) < fits.config.sure_gain:
             continue

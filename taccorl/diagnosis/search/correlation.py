@@ -37,8 +37,7 @@ def rate_of(time_s: np.ndarray) -> float:
 
 def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
     """(T,) int, index of the block of 0.5 s (``BLOCK_S``) to which each of the T = ``num_rows`` rows of a recording belongs. A
-    remainder shorter than half a block joins the block before it, because a block of one row would have the weight of a whole
-    one."""
+    remainder shorter than half a block joins the block before it, because one row would have the weight of a block."""
     length = max(1, round(BLOCK_S * rate_hz))
     block = np.arange(num_rows) // length
     last = int(block[-1]) if num_rows else 0

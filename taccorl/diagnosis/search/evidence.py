@@ -57,8 +57,7 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     Raftery 1995); negative if the criterion rises.
 
     The noise is known (residuals are in floors), and the residual of ``child`` above one floor also counts as noise. The
-    number of rows is that of independent residuals of ``child``. ``more_parameters``: number of parameters of ``child`` that
-    ``parent`` lacks."""
+    number of rows is that of independent residuals of ``child``. ``more_parameters``: those that ``parent`` lacks."""
     rows = child.effective_rows
     noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
     fallen = float(parent.residuals @ parent.residuals - child.residuals @ child.residuals) / noise

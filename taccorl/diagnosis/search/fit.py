@@ -149,8 +149,7 @@ class Fit:
 
     @property
     def ended(self) -> tuple[Free, ...]:
-        """Numbers that the recordings drove to an end of their range: those of ``at_an_end`` whose interval is not the whole
-        range."""
+        """Numbers that the recordings drove to an end of their range: of ``at_an_end``, whose interval is not all of it."""
         at = self.at_an_end
         ends = self.intervals() if at else {}
         return tuple(f for f in at if ends[f.name][0] > f.low or ends[f.name][1] < f.high)

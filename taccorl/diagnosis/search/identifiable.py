@@ -261,8 +261,7 @@ def _kd_over(fit: Fit, over: str, kd: float | None) -> float:
 
 
 def _timed(n: Identified, kd: float) -> Identified:
-    """An inertia is seen less K_d τ: (J + ΔJ − K_d τ) q̈; K_d / K_p is seen less a, a delay or lag more by a. Others are as they
-    are."""
+    """An inertia is seen less K_d τ: (J + ΔJ − K_d τ) q̈; K_d / K_p is seen less a, a delay or lag more by a. Others are as is."""
     if n.name == "kd/kp":
         return dataclasses.replace(n, high=n.high + POSITION_AGE_S)
     if n.name.endswith(LATE):

@@ -193,8 +193,7 @@ class Problem(Protocol):
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """Called after the first fit of the always fitted numbers, with their ``values``; may update the start values of
-        effects."""
+        """Called after the first fit of the always fitted numbers, with their ``values``; may update starts of effects."""
         ...
 
     def noisier(self, recording: Recording) -> Recording:
@@ -204,8 +203,7 @@ class Problem(Protocol):
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """Copy of ``effects`` in which values that are estimated in closed form from the fit recordings (maps of taxels) are
-        set."""
+        """Copy of ``effects`` in which values estimated in closed form from the fit recordings (maps of taxels) are set."""
         ...
 
 
@@ -216,6 +214,12 @@ class WithoutMaps:
     at_once = 1
     loop_s = 0.0
     other_gain: Free | None = None
+
+    def simulate(
+        self: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+    ) -> np.ndarray:
+        """``simulate_all`` of one case and one recording, (T, C). Subclasses define one of the two."""
+        return self.simulate_all([(base, effects)], [recording])[0][0]
 
     def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """Simulate one case after another, (T, C) each."""

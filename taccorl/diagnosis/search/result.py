@@ -42,8 +42,7 @@ class SearchConfig:
     """Least share of the validation squared error above the floor that a better model removes: less is within what the floor and
     the twin's equations leave open."""
     min_score: float = 2.0
-    """Least improvement of a better model in standard errors between blocks, unless it reaches ``sure_gain``: 2 are hardly
-    chance."""
+    """Least improvement of a better model in standard errors between blocks, but for ``sure_gain``; 2 are hardly chance."""
     sure_gain: float = 0.5
     """Share for which ``min_score`` is not required: an effect that acts rarely (a limit that is reached twice) never gets a high
     score."""

@@ -236,8 +236,7 @@ class Beam:
         return sorted(found, key=lambda m: m.fit.error)[: self.config.width]
 
     def _exchanged(self, answer: Model, further: bool = True) -> Model:
-        """The best of ``answer`` and the models with one effect exchanged, taken away or, if ``further``, added; again for that
-        one."""
+        """The best of ``answer`` and the models with one effect exchanged, taken away or, if ``further``, added; and again."""
         fits = self.fits
         for _ in range(EXCHANGES):
             parts = self.parts(answer)

@@ -24,8 +24,7 @@ from taccorl.diagnosis.search.problem import Free, Problem, Recording
 PRIOR_SHARE = 0.25
 """Standard deviation D of the prior in shares of a number's range, on the scale on which it is searched."""
 OPEN_FROM = 0.3
-"""Standard error in multiples of D from which a number counts as hardly determined. Without such a number nothing is fitted
-again."""
+"""Standard error in multiples of D from which a number counts as hardly determined. Else nothing is fitted again."""
 MOST_MORE = 0.02
 """Largest relative increase of the squared error, on the recordings of the fit and on those of validation, for which numbers
 return."""

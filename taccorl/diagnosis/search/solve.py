@@ -49,8 +49,7 @@ class Found:
 
 
 class Solved(NamedTuple):
-    """Result of ``solve``: fields of ``Found``, and the recordings, or rows of them, that were fitted and by which effects were
-    chosen."""
+    """Result of ``solve``: fields of ``Found``, and the recordings, or rows of them, that were fitted and that chose effects."""
 
     diagnosis: Diagnosis
     can_tell: Identifiability

@@ -36,8 +36,7 @@ def presses(
     name: str, law=lambda f: f, gains: np.ndarray = GAINS, share=None, load_factor: float = 1.0
 ) -> CellMeasurement:
     """Three presses of 6 s at 50 Hz. The cells read ``gains`` · ``law``(their share of the load) + 20, with 1 count of noise.
-    ``share``: share of the load of each cell in each press, (3, K); 1 by default. ``load_factor``: factor on the recorded
-    load."""
+    ``share``: share of the load of each cell in each press, (3, K); 1 by default. ``load_factor``: of the recorded load."""
     rng, t = np.random.default_rng(len(name)), np.arange(0.0, 18.0, 0.02)
     each = [np.interp(t - 6 * n, [0, 2, 3, 5, 6], [0, 0, 1, 1, 0]) * peak for n, peak in enumerate(PEAKS_N[name])]
     force = np.sum(each, axis=0)

@@ -131,20 +131,25 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
     found = answer(axis, recording(target))
     assert np.abs(found.reported - integrated(target, torque, 0.08)).max() < 1e-4
     assert found.reported[-1] == pytest.approx(0.3, abs=1e-3) and found.effort[-1] == pytest.approx(0.6, rel=0.01)
+    axis.effects += (EffectEntry("coulomb_friction", {"torque_nm": 0.5}),)  # within which it begins with any effort
+    for seen, given in ((0.3, 0.3), (0.9, 0.5), (np.nan, 0.0)):
+        held = answer(axis, dataclasses.replace(recording(np.zeros(50)), effort=np.full((50, 1), seen)))
+        assert held.effort == pytest.approx(np.full(50, given), abs=2e-3)
 
 
 @pytest.mark.parametrize("law", ["cascade", "velocity"])
-def test_an_integral_adds_up_a_speed_as_late_as_the_loop_knows_it(law):
+def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_the_rest(law):
     """A loop of 1 kHz smooths the speed of two readings by a quarter in each period: 1 ms · (1 − ¼) / ¼ = 3 ms late. The sum of
-    that speed lacks 20 · 4 N·m/rad · 3 ms = 0.24 N·m·s/rad of damping, which is 8 … 20 mrad here."""
+    that speed lacks 20 · 4 N·m/rad · 3 ms = 0.24 N·m·s/rad of damping, 8 … 20 mrad; half a period of the newest error 1 … 2 mrad,
+    and 0.04 … 0.07 N·m of a row's effort."""
     time_s, hz, rate = np.arange(600) / RATE_HZ, 1000, 20.0
     wave = 0.3 * np.sin(2 * np.pi * (0.3 + 0.4 * time_s) * time_s)
     target = wave if law == "cascade" else np.gradient(wave, time_s)
     q = v = late = total = torque = before = 0.0
-    truth = np.empty(len(target))
+    truth, effort = np.empty((2, len(target)))
     for step in range(len(target) * round(1 / (RATE_HZ * DT_S))):
         row, within = divmod(step, round(1 / (RATE_HZ * DT_S)))
-        truth[row] = q if within == 0 else truth[row]
+        truth[row], effort[row] = (q, torque) if within == 0 else (truth[row], effort[row])
         if step % round(1 / (hz * DT_S)) == 0:
             late, before = late + 0.25 * ((q - before) * hz - late), q
             error = (8.0 * (target[row] - q) if law == "cascade" else target[row]) - late
@@ -152,13 +157,12 @@ def test_an_integral_adds_up_a_speed_as_late_as_the_loop_knows_it(law):
             torque = 4.0 * (error + rate * total)
         v += DT_S * torque / 0.08
         q += DT_S * v
-    gains = {"kp": 8.0, "kd": 4.0} if law == "cascade" else {"kd": 4.0}
+    gains, kind = ({"kp": 8.0, "kd": 4.0}, "position") if law == "cascade" else ({"kd": 4.0}, law)
     effect = EffectEntry("integral_action", {"rate_per_s": rate})
     axis = AxisConfig(name="servo", unit="rad", inertia=0.08, law=law, **gains, loop_hz=hz, speed_late_s=3e-3)
-    found = answer(
-        dataclasses.replace(axis, effects=(effect,)), recording(target, "position" if law == "cascade" else law)
-    )
-    assert np.abs(found.reported - truth).max() < 3e-3, np.abs(found.reported - truth).max()
+    found = answer(dataclasses.replace(axis, effects=(effect,)), recording(target, kind))
+    assert np.abs(found.reported - truth).max() < 2e-4, np.abs(found.reported - truth).max()
+    assert np.median(np.abs(found.effort - effort)) < 5e-3, np.median(np.abs(found.effort - effort))
 
 
 def test_a_torque_accelerates_and_none_lets_the_axis_coast():

@@ -65,8 +65,7 @@ def swung(machine: Machine, seed: int, hz: float) -> Measurement:
 
 
 def test_the_chosen_pose_is_the_one_with_another_weight_that_touches_nothing(machine):
-    """The pan joint feels a leaning base, and the inertia of the arm, by cos(lift), least at ± 1 rad; at + 1 the arm is in the
-    post."""
+    """The pan joint feels a leaning base, and the inertia of the arm, by cos(lift), least at ± 1 rad; at 1 it is in the post."""
     like = swung(machine, 1, 0.3)
     pose = chosen_pose(machine, "pan", like, SPAN, ["lift"])
     assert -FARTHEST["rad"] <= pose.positions["lift"] < -0.95 * FARTHEST["rad"]

@@ -55,8 +55,7 @@ def turned(
     lift: float = 0.0,
     swing: float = 0.0,
 ) -> Measurement:
-    """The pan joint swings for 5 s, from rest, and lift is held or swings. At 1 kHz the drives add the weight of an upright
-    arm."""
+    """The pan joint swings for 5 s, from rest, and lift is held or swings. At 1 kHz drives add an upright arm's weight."""
     model, upright = mujoco.MjModel.from_xml_string(MODEL), mujoco.MjModel.from_xml_string(MODEL)
     model.opt.gravity[:] = 9.81 * np.array([math.sin(tilt_rad), 0.0, -math.cos(tilt_rad)])
     data, believed, rng = mujoco.MjData(model), mujoco.MjData(upright), np.random.default_rng(seed)

@@ -109,6 +109,22 @@ def piston(unit: Any = "m", **changed: Any) -> tuple[AxisConfig, Measurement]:
     return AxisConfig(name="piston", unit=unit, law="effort", limits=(-0.1, 0.5), **numbers), pushes
 
 
+def test_the_line_between_rows_of_law_effort_is_no_inertia():
+    """15 N·m of friction make the spring K that holds the model stiff: K T² / 12 of rows 10 ms apart would be 0.1 kg·m²."""
+    time_s, (size, omega) = np.arange(1500) / 100, np.array([[0.4, 0.2], [2.1, 4.7]])
+    phases = omega * time_s[:, None]
+    at, speed, faster = (
+        f(phases) @ (size * omega**k) for f, k in ((np.sin, 0), (np.cos, 1), (lambda x: -np.sin(x), 2))
+    )
+    more = {"effort": 2.2 * faster + 15.0 * np.sign(speed), "target_kinds": ("effort",)}
+    friction = (EffectEntry("coulomb_friction", {"torque_nm": 15.0}),)
+    axis = AxisConfig(name="pan", unit="rad", law="effort", inertia=2.2, force_unit_n=10.0, effects=friction)
+    swings = of_signal("swings", 100.0, at, at, "pan", "rad", **more)
+    (trace,) = Axis(axis, "pan").compare(Measurements((swings,))).traces
+    sure = np.abs(speed) > 0.3
+    assert abs((trace.measured - trace.replayed)[sure] @ faster[sure] / (faster[sure] @ faster[sure])) < 0.03
+
+
 @pytest.mark.parametrize("unit", ["m", "rad"])
 @pytest.mark.parametrize("inertia", [0.3, 0.03, 3e-3, 3e-4])
 def test_a_model_without_mass_does_not_hide_a_wrong_friction(unit: str, inertia: float):

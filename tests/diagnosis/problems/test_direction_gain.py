@@ -57,8 +57,7 @@ def moved(
     friction_n: tuple[float, float] = (0.0, 0.0),
     repeat_of: str | None = None,
 ) -> Measurement:
-    """A log of 8 s at 200 Hz in steps of 0.1 ms: sines of 8 and 4 cm, dry friction forwards and backwards, noise of 0.02 mm and
-    2 N."""
+    """A log of 8 s at 200 Hz in steps of 0.1 ms: sines of 8 and 4 cm, dry friction both ways, noise 0.02 mm and 2 N."""
     time_s, dt_s = np.arange(8 * RATE_HZ) / RATE_HZ, 1.0 / RATE_HZ / PARTS
     fade = np.clip(np.minimum(time_s - 0.5, 7.5 - time_s), 0.0, 1.0)
     slow, fast = (np.sin(2 * math.pi * hz * time_s) for hz in wave_hz)
