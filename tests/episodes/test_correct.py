@@ -29,6 +29,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts import expert_of
 from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import ScriptedExpert
 
 TASK = "assembly_2"
 PUSH_RAD = 0.02
@@ -299,6 +300,35 @@ def test_arms_do_not_jump_at_the_takeover(task: str) -> None:
     expert = expert_of(sim.task)(sim, np.random.default_rng(0), EXACT)
     expert.resume()
     assert np.abs(expert.act() - before)[[*range(6), *range(7, 13)]].max() < 0.02
+    sim.close()
+
+
+@pytest.mark.parametrize("task", ["assembly_1", "test_tube", "puzzle"])
+def test_a_hand_on_the_way_to_a_part_goes_on_and_one_at_the_part_closes(task: str) -> None:
+    """Taken over 30 mm above its grasp, and when its pads have begun to close: it neither rises nor opens before it grips."""
+    sim, gripper = Simulation(tasks.get(task)()), ROBOT.gripper_index("right")
+
+    def acted(expert: ScriptedExpert, until_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Actions (n, 14), and heights (n,) of the hand before them, until one closes it to ``until_m``."""
+        rows = []
+        while not rows or rows[-1][0][gripper] > until_m:
+            height_m, action = float(sim.tcp("right")[0, 2, 3]), expert.act()
+            rows.append((action, height_m))
+            sim.step(action[None].astype(np.float64))
+        return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+
+    sim.reset([3])
+    expert = expert_of(sim.task)(sim, np.random.default_rng(3), EXACT)
+    expert.start()
+    actions, heights = acted(expert, 0.06)
+    for step in (int(np.flatnonzero(heights > heights[-1] + 0.03)[-1]), len(actions)):
+        sim.reset([3])
+        for action in actions[:step]:
+            sim.step(action[None].astype(np.float64))
+        expert = expert_of(sim.task)(sim, np.random.default_rng(4), EXACT)
+        expert.resume()
+        again, heights = acted(expert, 0.04)
+        assert heights.max() < heights[0] + 0.003 and (np.diff(again[:, gripper]) < 1e-6).all() and len(again) < 90
     sim.close()
 
 

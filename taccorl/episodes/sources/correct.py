@@ -38,7 +38,7 @@ from taccorl.tasks.experts.scripted import ScriptedExpert
 
 TAKEOVERS = ("failures", "all")
 """Values of ``CorrectionPlan.takeover``."""
-_CORRECTION = Stage("correction", version=5)
+_CORRECTION = Stage("correction", version=6)
 _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of a takeover: default_rng([scene seed, which, number of the takeover])
 _STALL_STEPS = CONTROL_HZ  # 1 s
 _STILL = ROBOT.per_action(0.02, 0.001)

@@ -60,14 +60,14 @@ class AirAssemblyExpert(ScriptedExpert):
             if self.holds("left", self.scene.holder):
                 return self._go_on_holding()
             self.require_lying("left", self.scene.holder)
-            return chain(self.free("left"), self._left())
+            return self._left()
         plug = self.scene.plug
         if self.holds("right", plug):
             return self._go_on_joining()
         if self._mating().fit(self).depth_m > self.enough_m:
             return self._leave()
         self.require_lying("right", plug)
-        return chain(self.free("right"), self._lift("right", plug, _HEAD), self._meet())
+        return chain(self._lift("right", plug, _HEAD), self._meet())
 
     def _go_on_holding(self) -> Script:
         """Continue with the part with the hole in the left hand."""

@@ -23,7 +23,7 @@ from taccorl.sim.twin import CONTROL_HZ
 from taccorl.tasks.experts.hands import DT_S, LEARNED, Hand, Pulses, ScriptedExpertConfig, follow, squeezed_m
 from taccorl.tasks.experts.kinematics import ArmKinematics, retargeted
 from taccorl.tasks.experts.mating import Aim, Mating, deflection
-from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, minimum_jerk, rotvec, transform, turn
+from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, is_on_way, minimum_jerk, rotvec, transform, turn
 
 _TREMOR_KEPT = math.exp(-DT_S / 0.3)  # from one control step to the next; its correlation time is 0.3 s
 _RECOIL_MPS = 0.08  # of a hand that has felt a block
@@ -32,7 +32,8 @@ _AT_MOUTH_M = 0.004  # shallower is the rim, deeper is a wedge
 _STRAIGHT = 0.5  # of the turn that is felt: a part that is in the mouth and turned by less is pushed on
 _SAME_SIDE_RAD, _SAME_HEIGHT_M = 0.15, 0.005  # a part that lies like that lies on the side on which it lay at the reset
 _LOOSE_M = 0.001  # wider than a firm grip is not firm
-_OPEN_ENOUGH_M = 0.003  # narrower than open
+_OPEN_ENOUGH_M, _AT_GRASP_M = 0.003, 0.01  # narrower than open; where a hand may close
+_ON_THE_WAY = (0.015, 0.3)  # a hand so near the way from ahead of a grasp to it is on it [m, rad]
 APART_M = 0.002  # the end of a held part that is farther before its hole touches nothing
 _NEAR_MATE_M = 0.008  # no pulses where the end of a held part is nearer before its hole, or in it
 
@@ -73,8 +74,7 @@ class ScriptedExpert(ABC):
         """Motion of one arm as a generator: one yield per control step."""
 
     def finish(self, arm: str, subtask: str) -> Script:
-        """Motion that completes a subtask, starting with the held part close before its mate. The last subtask of an arm ends
-        with its retreat.
+        """Motion that completes a subtask, from the held part close before its mate; an arm's last one ends with its retreat.
 
         Raises:
             TaccorlError: this expert can only start at the beginning of an episode.
@@ -144,14 +144,15 @@ class ScriptedExpert(ABC):
         return cls.remaining is not ScriptedExpert.remaining
 
     def resume(self) -> None:
-        """Take over both arms in the simulation's present state, independently of what happened since its reset.
-
-        The first action repeats the command in force, so that the arms do not jump.
+        """Take over both arms in the simulation's present state, independently of what happened since its reset. The first
+        action repeats the command in force, so that the arms do not jump.
 
         Raises:
             LostError, TaccorlError: as ``remaining``.
         """
         self.stand_by()
+        for hand in self.hands.values():
+            hand.brought = True
         self._scripts = {arm: self.remaining(arm) for arm in ROBOT.arms}
         self.running = set(ROBOT.arms)
 
@@ -250,8 +251,7 @@ class ScriptedExpert(ABC):
     def settle(
         self, arm: str, tolerance_m: float = 0.0004, longest_s: float = 1.2, tolerance_rad: float = 0.006
     ) -> Script:
-        """Wait until the hand has reached its target within both tolerances, at most ``longest_s``, as a person does before a
-        delicate step."""
+        """Wait until the hand has reached its target within both tolerances, at most ``longest_s``."""
         for _ in range(round(longest_s * CONTROL_HZ)):
             error = deflection(self.hands[arm].goal, self.tcp(arm))
             if np.linalg.norm(error[:3]) < tolerance_m and np.linalg.norm(error[3:]) < tolerance_rad:
@@ -266,15 +266,12 @@ class ScriptedExpert(ABC):
     def close(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
         """Close on a part of width ``width_m``, then squeeze with ``force_n`` (the configuration's by default).
 
-        The smallest gripper command is 0, so that a narrow part is squeezed with less force: at most
-        33 N at 20 mm with sprung pads.
-        """
+        The smallest gripper command is 0: a narrow part is squeezed with less, at most 33 N at 20 mm with sprung pads."""
         force_n = self.config.grip_n if force_n is None else force_n
         yield from self._grip(arm, squeezed_m(self.sim.config.robot, width_m, force_n), 0.4)
 
     def firm(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
-        """Increase the grip force on a part of width ``width_m`` that another controller has gripped to that of ``close``, if
-        it is lower."""
+        """Increase the grip force on a part of ``width_m`` that another controller has gripped to that of ``close``."""
         least_n = self.config.grip_n if force_n is None else force_n
         if self.hands[arm].opening_m > squeezed_m(self.sim.config.robot, width_m, least_n) + _LOOSE_M:
             yield from self.close(arm, width_m, force_n)
@@ -412,7 +409,7 @@ class ScriptedExpert(ABC):
         return replace(aim, part_from_tcp=part_from_tcp, turned=mating.turned(self), given=np.zeros(6))
 
     def pushed(self, arm: str) -> np.ndarray:
-        """(6,) [m, rad] displacement of the TCP by contact forces, in the world frame: translation, then rotation vector."""
+        """(6,) displacement of the TCP by contact forces, in the world frame: translation [m], then rotation vector [rad]."""
         return deflection(self.kinematics[arm].pose(self.hands[arm].predicted_rad), self.tcp(arm))
 
     # what a person sees and errs about ---------------------------------------------------------------------------------
@@ -461,10 +458,17 @@ class ScriptedExpert(ABC):
     ) -> Script:
         """Move to ``gripped(meant)`` by way of ``ahead`` of it (a pose (4, 4)), with the peak speeds ``far_mps`` and
         then ``speed_mps``. The intended target is ``meant``: policies cannot see where a hand is going to miss, and one that
-        learnt it stopped at the first height at which hands have gripped.
+        learnt it stopped at the first height at which hands have gripped. A hand that another controller has brought on the way
+        goes on, and closes at its end: a policy that learnt to go back first stayed ahead of the part.
         """
-        goal, before = self.gripped(meant), ahead(meant)
-        yield from self.move(arm, self.near(ahead(goal)), speed_mps=far_mps, intended=lambda: before)
+        goal, before, here = self.gripped(meant), ahead(meant), self.tcp(arm)
+        brought, self.hands[arm].brought = self.hands[arm].brought, False
+        if brought:
+            if np.linalg.norm(meant[:3, 3] - here[:3, 3]) < _AT_GRASP_M:
+                return
+            yield from self.free(arm)
+        if not (brought and is_on_way(here, before, meant, *_ON_THE_WAY)):
+            yield from self.move(arm, self.near(ahead(goal)), speed_mps=far_mps, intended=lambda: before)
         yield from self.move(arm, goal, speed_mps=speed_mps, settle=True, intended=lambda: meant)
 
     def holds(self, arm: str, part: Part) -> bool:

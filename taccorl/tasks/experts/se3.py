@@ -77,3 +77,11 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     pose = start @ turn(share * rotvec(start, end))
     pose[:3, 3] = (1 - share) * start[:3, 3] + share * end[:3, 3]
     return pose
+
+
+def is_on_way(here: np.ndarray, start: np.ndarray, end: np.ndarray, near_m: float, near_rad: float) -> bool:
+    """Whether the pose ``here`` is no farther than ``near_m`` from the straight way between two poses (4, 4), and turned by no
+    more than ``near_rad`` from its end."""
+    way, gone = end[:3, 3] - start[:3, 3], here[:3, 3] - start[:3, 3]
+    left = gone - float(np.clip(gone @ way / (way @ way), 0.0, 1.0)) * way
+    return bool(np.linalg.norm(left) < near_m and np.linalg.norm(rotvec(here, end)) < near_rad)

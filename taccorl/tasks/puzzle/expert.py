@@ -62,7 +62,6 @@ class PuzzleExpert(ScriptedExpert):
         for shape in own:
             part, mating = self._part(shape), self._mating(shape)
             if not self.holds(arm, part):
-                yield from self.free(arm)
                 yield from self._lift(arm, shape)
             else:
                 yield from self.firm(arm, part.grasps["knob"].width_m)

@@ -54,7 +54,7 @@ class TestTubeExpert(ScriptedExpert):
             if self.holds("left", rack):
                 return self._go_on_holding()
             self.require_lying("left", rack)
-            return chain(self.free("left"), self._left())
+            return self._left()
         if self.holds("right", tube):
             return self._go_on_inserting()
         if self.is_in(self._mating()) or self._task.inside(self._task.fit(self.sim))[0]:  # or falls in
@@ -63,7 +63,7 @@ class TestTubeExpert(ScriptedExpert):
         seat = self.body("stand") @ self._task.stand.seats["tube"]
         if np.linalg.norm((inverse(seat) @ self.body("tube"))[:3, 3]) > _IN_STAND_M:
             raise LostError("tube is neither in a hand nor in the stand")
-        return chain(self.free("right"), self._lift(), self._turn_upright(), self._insert_when_held())
+        return chain(self._lift(), self._turn_upright(), self._insert_when_held())
 
     def _go_on_holding(self) -> Script:
         """With the rack in the left hand."""
