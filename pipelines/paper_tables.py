@@ -319,7 +319,7 @@ def draw(rows: Rows, path: Path) -> None:
 
 def draw_grips(rows: Rows, path: Path) -> None:
     """A picture: completed by number of demonstrations; intervals of the scenes."""
-    figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    figure, axis = plt.subplots(figsize=(9, 3.4), layout="constrained")
     for key, of in grips(rows).items():
         counts = list(map(_counts, (of[n] for n in sorted(of))))
         height, ends = 100 * np.divide(*np.transpose(counts)), 100 * np.transpose([wilson_interval(*c) for c in counts])
@@ -327,7 +327,7 @@ def draw_grips(rows: Rows, path: Path) -> None:
     axis.set(xscale="log", ylim=(0, 100), xlabel="demonstrations", ylabel="completed [%]")
     axis.set_xticks(DEMONSTRATIONS, map(str, DEMONSTRATIONS), minor=False)
     axis.set_title("assembly_1, simulated; whiskers: 95 % of the scenes", fontsize=9)
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -78,11 +78,9 @@ def pushed_expert(sim: Simulation, seed: int, after: int) -> PolicyEpisode:
         if not held_at and (sim.judge.subtask[0] >= 1).all():
             held_at.append(t)
         since = t - held_at[0] - after if held_at else 0
-        return (
-            None
-            if since > 10
-            else np.clip(expert.act() + np.clip(since / 10, 0, 1) * push, ROBOT.action_low, ROBOT.action_high)
-        )
+        if since > 10:
+            return None
+        return np.clip(expert.act() + np.clip(since / 10, 0, 1) * push, ROBOT.action_low, ROBOT.action_high)
 
     return acted(sim, seed, act)
 
@@ -129,8 +127,6 @@ def test_wrong_words_are_named(changes: dict, message: str) -> None:
 
 
 def test_an_expert_that_begins_at_the_beginning_only_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from taccorl.tasks.experts.scripted import ScriptedExpert
-
     monkeypatch.setattr(expert_of(tasks.get("puzzle")), "remaining", ScriptedExpert.remaining)
     with pytest.raises(TaccorlError, match="--task=puzzle"):
         plan(task="puzzle")
@@ -306,29 +302,26 @@ def test_arms_do_not_jump_at_the_takeover(task: str) -> None:
 @pytest.mark.parametrize("task", ["assembly_1", "test_tube", "puzzle"])
 def test_a_hand_on_the_way_to_a_part_goes_on_and_one_at_the_part_closes(task: str) -> None:
     """Taken over 30 mm above its grasp, and when its pads have begun to close: it neither rises nor opens before it grips."""
-    sim, gripper = Simulation(tasks.get(task)()), ROBOT.gripper_index("right")
+    sim, right = plan(task=task).make(), ROBOT.gripper_index("right")
+    heights: list[float] = []
 
-    def acted(expert: ScriptedExpert, until_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Actions (n, 14), and heights (n,) of the hand before them, until one closes it to ``until_m``."""
-        rows = []
-        while not rows or rows[-1][0][gripper] > until_m:
-            height_m, action = float(sim.tcp("right")[0, 2, 3]), expert.act()
-            rows.append((action, height_m))
-            sim.step(action[None].astype(np.float64))
-        return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    def act(t: int) -> np.ndarray | None:
+        if t == 0:
+            expert.start()
+        heights.append(float(sim.tcp("right")[0, 2, 3]))
+        return expert.act() if sim.targets[0, right] > 0.06 else None
 
-    sim.reset([3])
     expert = expert_of(sim.task)(sim, np.random.default_rng(3), EXACT)
-    expert.start()
-    actions, heights = acted(expert, 0.06)
-    for step in (int(np.flatnonzero(heights > heights[-1] + 0.03)[-1]), len(actions)):
-        sim.reset([3])
-        for action in actions[:step]:
-            sim.step(action[None].astype(np.float64))
-        expert = expert_of(sim.task)(sim, np.random.default_rng(4), EXACT)
+    actions = acted(sim, 3, act).actions
+    for step in (int(np.flatnonzero(np.array(heights) > heights[-1] + 0.03)[-1]), len(actions)):
+        acted(sim, 3, lambda t, step=step: actions[t] if t < step else None)
+        expert, rows, begun_m = expert_of(sim.task)(sim, np.random.default_rng(4), EXACT), [], sim.tcp("right")[0, 2, 3]
         expert.resume()
-        again, heights = acted(expert, 0.04)
-        assert heights.max() < heights[0] + 0.003 and (np.diff(again[:, gripper]) < 1e-6).all() and len(again) < 90
+        while sim.targets[0, right] > 0.04 and len(rows) < 90:
+            rows.append((sim.targets[0, right], sim.tcp("right")[0, 2, 3] - begun_m))
+            sim.step(expert.act()[None].astype(np.float64))
+        openings_m, risen_m = np.array(rows).T
+        assert risen_m.max() < 0.003 and np.diff(openings_m).max() < 1e-6 and len(rows) < 90
     sim.close()
 
 
