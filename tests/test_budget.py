@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_289,
+    "taccorl/alignment": 14_291,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
     "taccorl/diagnosis": 11_446,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 56_118,
+    "tests": 56_124,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

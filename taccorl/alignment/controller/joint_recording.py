@@ -81,7 +81,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
         measured=measured,
         effort=effort,
         **vars(dataclasses.replace(rest, torque_ff_nm=added)),
-        command_s=m.command_s if m.command_s.size and joint.keeps_times else None,
+        command_s=m.command_s if m.command_s.size and joint.keeps_times and joint.target_kind != "effort" else None,
         start=start,
         start_speed=start_speed,
         start_nm=float(np.nan_to_num(np.mean(effort[:START_ROWS]), nan=np.inf)),

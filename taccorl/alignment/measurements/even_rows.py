@@ -49,6 +49,8 @@ def even_rows(m: Measurement) -> Measurement:
     grid = start_s + np.arange(round((m.time_s[-1] - start_s) / period) + 1) * period
     columns = {name: _between(grid, m.time_s, getattr(m, name), period) for name in ("measured", "velocity", "effort")}
     target = _commands(grid, m.time_s, m.target, period)
+    inputs = np.array([kind == "effort" for kind in m.target_kinds] or [False])  # no commands, but measured positions
+    target = np.where(inputs & np.isfinite(columns["measured"]), columns["measured"], target)
     command_s = _commands(grid, m.time_s, m.time_s[:, None], period)[:, 0] - grid[0]
     columns |= {name: _commands(grid, m.time_s, getattr(m, name), period) for name in m.extra_columns}
     if m.enabled.size:
