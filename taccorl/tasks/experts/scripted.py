@@ -459,7 +459,7 @@ class ScriptedExpert(ABC):
         """Move to ``gripped(meant)`` by way of ``ahead`` of it (a pose (4, 4)), with the peak speeds ``far_mps`` and
         then ``speed_mps``. The intended target is ``meant``: policies cannot see where a hand is going to miss, and one that
         learnt it stopped at the first height at which hands have gripped. A hand that another controller has brought on the way
-        goes on, and closes at its end: a policy that learnt to go back first stayed ahead of the part.
+        goes on, and closes at its end.
         """
         goal, before, here = self.gripped(meant), ahead(meant), self.tcp(arm)
         brought, self.hands[arm].brought = self.hands[arm].brought, False
