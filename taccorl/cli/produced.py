@@ -26,8 +26,8 @@ class KeptOptions:
     """Where work is done, and kept."""
 
     store: Path = Path("outputs/store")
-    """Folder that keeps finished attempts, so that a second run continues where the first ended, and frames once all are there;
-    lerobot-train finds the frames by --dataset.cache_store."""
+    """Folder of intermediate results. Finished attempts are kept there, so that a stopped run continues; with --pictures=cache
+    also the frames, which lerobot-train reads with --dataset.cache_store."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where attempts run: --engine.type=local --engine.workers=16, or ray."""
 

@@ -21,8 +21,8 @@ EYE_SIZES, EYE_M = 1.1, 1.15
 
 
 def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
-    """Blueprint with a view for each kind of data in the episode. ``at_s``: time at which the view stops (for pictures) [s];
-    None: it plays from the start."""
+    """Rerun layout with a view for each kind of data in the episode. ``at_s``: the time that a screenshot shows [s], without
+    playing; None: it plays from the start."""
     pads = pads_of(episode)
     parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
     return arranged(rrb.Horizontal(*parts), time_panel(at_s))

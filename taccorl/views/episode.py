@@ -75,8 +75,8 @@ def save_episode(
 
 
 def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
-    """Part of an episode for a picture at one time: an episode of one row, the newest at or before ``at_s`` [s] (else the first
-    row), at its original place on the time line."""
+    """The one row of an episode that a screenshot at ``at_s`` [s] shows: the last row that is not later, or the first row if all
+    are. It keeps its time."""
     fps = log.episode.spec.fps
     row = min(max(math.floor((at_s - log.begins_s) * fps + 1e-6), 0), log.episode.num_rows - 1)
     part = part_of(log.episode, row / fps, (row + 1) / fps)

@@ -301,7 +301,7 @@ def test_arms_do_not_jump_at_the_takeover(task: str) -> None:
 
 @pytest.mark.parametrize("task", ["assembly_1", "test_tube", "puzzle"])
 def test_a_hand_on_the_way_to_a_part_goes_on_and_one_at_the_part_closes(task: str) -> None:
-    """Taken over 30 mm above its grasp, and when its pads have begun to close: it neither rises nor opens before it grips."""
+    """The expert takes over a hand 30 mm above a part, and one whose pads have begun to close on it: neither rises or opens."""
     sim, right = plan(task=task).make(), ROBOT.gripper_index("right")
     heights: list[float] = []
 

@@ -182,7 +182,7 @@ class DriveLaw:
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def allows_effect(self, effect: str) -> bool:
-        """True if an effect of this name can act with this law (law torque, for example, has no integral)."""
+        """Whether an effect of this name is possible under this control law: ``integral_action`` is not under law torque."""
         if self.law == "effort":
             needs = {*registry.get(effect).needs}
             return effect == "payload" or (bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS)

@@ -89,7 +89,7 @@ class RigidJoint(ABC):
     0.1 mrad."""
 
     follows_line: ClassVar[bool] = False
-    """True: targets between rows are interpolated linearly at their own times. False: they have the next row's value (replay)."""
+    """Target between two rows: True: on the straight line between theirs. False: that of the later row, as a replay holds it."""
     keeps_times: ClassVar[bool] = False
     """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
     target_late_s: float = 0.0

@@ -178,7 +178,7 @@ def read_measurements(
             f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
         )
     found = [_with_note(m, index, folder, names if whole else None) for m in found]
-    # Who asks for one file wants to fit it.
+    # If the path is a single file, it is fitted, whatever ``use`` measurements.yaml states for it.
     named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
     every = index.validation_every * whole if validation_every is None else validation_every
     divided = split(found, **named, validation_every=every, fit_needed=fit_needed)

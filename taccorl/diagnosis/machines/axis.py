@@ -36,7 +36,7 @@ SMOOTH_S = 0.05
 INERTIA_OFF = 5.0
 """Ratio of the file's inertia to that in the recording from which on the file must be wrong."""
 INERTIA_SURE = 0.6
-"""Least correlation of acceleration and torque without friction, damping and weight, at which a recording's inertia is used."""
+"""Least correlation of acceleration with torque (less friction, damping, weight) at which the inertia is compared."""
 
 
 @machines.register("axis")

@@ -355,7 +355,7 @@ class Machine(ABC):
         return []
 
     def refitted(self, findings: Sequence[Finding]) -> Self:
-        """The machine with the always fitted numbers refitted and no further effect: the reference for effects."""
+        """The machine with no effect added, and with the numbers refitted that every fit adjusts, to compare errors with."""
         firsts = [(f.part, f.diagnosis.before) for f in findings]
         return self.with_additions(
             [

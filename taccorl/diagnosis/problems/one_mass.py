@@ -56,8 +56,8 @@ class OneMassProblem(WithoutMaps):
         return [replace(r, name=f"{joint}/{r.name}", data=(joint, r)) for r in own]
 
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
-        """For each recording of a joint and case (T, C) simulated channels in the units of ``Recording.measured``. ``cases``:
-        numbers of all joints, ``j/name`` → value, and the payload. A number of one joint does not change the others."""
+        """Simulate each recording with each case: [recording][case] → (T, C) channels in units of ``Recording.measured``. A case
+        holds the numbers of all joints, ``j/name`` → value, and the payload; joint j depends on its own numbers only."""
         answers = []
         for joint, r in (recording.data for recording in recordings):
             own = [{name: base[f"{joint}/{name}"] for name in self._names[joint]} for base, _ in cases]

@@ -49,7 +49,7 @@ class Found:
 
 
 class Solved(NamedTuple):
-    """Result of ``solve``: fields of ``Found``, and the recordings, or rows of them, that were fitted and that chose effects."""
+    """Result of ``solve``: the diagnosis, and which recordings (or rows of them) were fitted and which chose the effects."""
 
     diagnosis: Diagnosis
     can_tell: Identifiability

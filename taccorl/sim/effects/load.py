@@ -168,7 +168,7 @@ class Payload(ArmEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values of a search: at its typical place, and a quarter of the range of places to either side along each axis."""
+        """Start values of a search: the mass at its typical place, or a quarter of the range beside it along one axis."""
         masses, places = super().starts(seen), [p for p in cls.parameters() if p.unit == "m"]
         moved = [{p.name: p.typical + side * (p.high - p.low)} for p in places for side in (-0.25, 0.25)]
         return masses + [masses[-1] | place for place in moved]

@@ -97,7 +97,7 @@ class Hand:
     tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))  # (6,) present tremor [m, rad]
     steadiness: float = 1.0  # Factor on the tremor, 0 … 1
     rests: bool = False  # True while what it holds stands on the table, which pulses would push away
-    brought: bool = False  # True from where another controller left it until it begins to reach for a part
+    brought: bool = False  # True from the takeover of a policy until the hand begins to reach for a part
     mating: Mating | None = None
     """The held part and its hole, from the approach to the hole until the hand opens; else None."""
     intended: np.ndarray = field(init=False)

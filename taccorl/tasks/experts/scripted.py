@@ -32,8 +32,8 @@ _AT_MOUTH_M = 0.004  # shallower is the rim, deeper is a wedge
 _STRAIGHT = 0.5  # of the turn that is felt: a part that is in the mouth and turned by less is pushed on
 _SAME_SIDE_RAD, _SAME_HEIGHT_M = 0.15, 0.005  # a part that lies like that lies on the side on which it lay at the reset
 _LOOSE_M = 0.001  # wider than a firm grip is not firm
-_OPEN_ENOUGH_M, _AT_GRASP_M = 0.003, 0.01  # narrower than open; where a hand may close
-_ON_THE_WAY = (0.015, 0.3)  # a hand so near the way from ahead of a grasp to it is on it [m, rad]
+_OPEN_ENOUGH_M, _AT_GRASP_M = 0.003, 0.01  # how much less is still open; so near its grasp a hand closes where it is
+_ON_THE_WAY = (0.015, 0.3)  # largest distance and turn of a hand that is on its way down to a grasp [m, rad]. Choices.
 APART_M = 0.002  # the end of a held part that is farther before its hole touches nothing
 _NEAR_MATE_M = 0.008  # no pulses where the end of a held part is nearer before its hole, or in it
 
@@ -458,16 +458,16 @@ class ScriptedExpert(ABC):
     ) -> Script:
         """Move to ``gripped(meant)`` by way of ``ahead`` of it (a pose (4, 4)), with the peak speeds ``far_mps`` and
         then ``speed_mps``. The intended target is ``meant``: policies cannot see where a hand is going to miss, and one that
-        learnt it stopped at the first height at which hands have gripped. A hand that another controller has brought on the way
-        goes on, and closes at its end.
+        learnt it stopped at the first height at which hands have gripped. A hand that a policy has left on this way goes on
+        from there; one that it has left at the part does not move.
         """
         goal, before, here = self.gripped(meant), ahead(meant), self.tcp(arm)
         brought, self.hands[arm].brought = self.hands[arm].brought, False
-        if brought:
-            if np.linalg.norm(meant[:3, 3] - here[:3, 3]) < _AT_GRASP_M:
-                return
-            yield from self.free(arm)
-        if not (brought and is_on_way(here, before, meant, *_ON_THE_WAY)):
+        on_way = brought and is_on_way(here, before, meant, *_ON_THE_WAY)
+        if on_way and np.linalg.norm(meant[:3, 3] - here[:3, 3]) < _AT_GRASP_M:
+            return
+        yield from self.free(arm) if brought else ()
+        if not on_way:
             yield from self.move(arm, self.near(ahead(goal)), speed_mps=far_mps, intended=lambda: before)
         yield from self.move(arm, goal, speed_mps=speed_mps, settle=True, intended=lambda: meant)
 
