@@ -1,9 +1,9 @@
-"""``python -m pipelines.diagnosis_study pack chirp … [--seeds=5] [--workers=2] [--rows=PATH] [--first_seed=710000]``
+"""``python -m pipelines.diagnosis_study pack chirp … [--seeds=5] [--workers=2] [--rows=PATH] [--first_seed=740000]``
 
 Is the search for missing effects right? On surrogate robots. Rows go to docs/diagnosis_study.jsonl as they are finished; what is
 there is not run again (a case that failed is, with ``--again``). ``--page`` writes docs/diagnosis.md and runs nothing. Thresholds
 were chosen on seeds 300 to 999 and 15000 to 99999. Rows from 100000 on led to ``out_of_dents``;
-the page is of seeds from 710000 on.
+the page is of seeds from 740000 on.
 """
 
 import json
@@ -30,7 +30,7 @@ from taccorl.surrogate.hidden import OUTSIDE, REGISTERED  # noqa: E402
 from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # noqa: E402
 
 ROWS = Path("docs/diagnosis_study.jsonl")
-FIRST_SEED = 710000
+FIRST_SEED = 740000
 PAIRS = (
     "coulomb_friction+command_delay",
     "coulomb_friction+gravity_mismatch",
