@@ -28,9 +28,10 @@ score() { # GPU TASK NAME OPTIONS
     --episodes="${SCORED:-512}" --seed=70000 --failures=0 "${@:4}" --out="$out/score_$2_$3" >"$out/score_$2_$3.log" 2>&1
   since "$2 scored by $3: $?"
 }
-post_train() { # GPU NAME OPTIONS
+post_train() { # GPU NAME OPTIONS, with the physics steps of pipelines.learn's demonstrations
+  printf 'physics:\n  steps_per_control_step: 20\n' >"$out/twin.yaml"
   on "$1" python3 -m taccorl.cli.main post-train --config_path=configs/post_train/small.yaml --policy.path="$policies/${tasks[0]}" \
-    --env.task="${tasks[0]}" --anchor.weight=0 --noise_check=false --rerun=false --save_freq=1 --keep_checkpoints=1 "${@:3}" \
+    --env.task="${tasks[0]}" --env.twin="$out/twin.yaml" --anchor.weight=0 --noise_check=false --rerun=false --save_freq=1 --keep_checkpoints=1 "${@:3}" \
     --out="$out/$2" >"$out/score_$2.log" 2>&1
   since "$2 ended: $?"
   cp "$out/$2/progress.jsonl" "$out/score_$2.jsonl"
