@@ -58,8 +58,10 @@ def plain_name(name: str, place: str) -> str:
         place: file, line and key, for the message.
 
     Raises:
-        SpecError: it has control characters, which steer a terminal, or marks of HTML.
+        SpecError: it is blank, or has control characters, which steer a terminal, or marks of HTML.
     """
+    if not name.strip():
+        raise SpecError(f"{place}: the name is blank; write one")
     for c in name:
         if not c.isprintable() or c in "<>&":
             raise SpecError(

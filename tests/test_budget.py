@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_291,
+    "taccorl/alignment": 14_297,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_734,
     "taccorl/diagnosis": 11_446,
@@ -19,12 +19,12 @@ MOST_LINES = {
     "taccorl/rl": 2_467,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
-    "taccorl/sim": 9_256,
+    "taccorl/sim": 9_257,
     "taccorl/surrogate": 3_303,
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 56_125,
+    "tests": 56_135,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -159,7 +159,8 @@ class EffectsDocument[T](Document[T]):
         for name, child in items:
             path = f"{key}/{name}" if key else name
             if name not in known:
-                raise self.error(path, f"unknown key {name!r}; {nearest(name, known)}")
+                other = "; the file of a robot, axis or cells begins with its kind: `kind: robot`" * (cls is TwinConfig)
+                raise self.error(path, f"unknown key {name!r}; {nearest(name, known)}{other}")
             values[name] = self._build(hints[name], child, path)
         return values
 

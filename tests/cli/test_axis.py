@@ -274,6 +274,12 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench, said, tmp_path)
         ("inertia: 40.0", "inertia: 4.0", "Write `inertia: "),
         ("limits: [-0.15, 0.15]", "limits: [0.0, 0.05]", "its limits are [0, 0.05]"),
         ("name: slide", "name: sled", "did you mean"),
+        ("name: slide", "name: ' '", "the name is blank"),
+        (
+            "kind: axis",
+            f"kind: axis\neffects: [{2 * '{effect: coulomb_friction, torque_nm: 1}, '}]",
+            "friction stands twice",
+        ),
     ],
 )
 def test_a_file_of_another_axis_is_refused(bench, said, tmp_path, old, new, message):

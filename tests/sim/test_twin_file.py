@@ -148,6 +148,7 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         ("effects:\n- torque_nm: 1\n", 2, "key 'effect' is missing; its value is one of: armature, "),
         ("effects:\n- effect: coulomb_fricton\n", 2, "no effect 'coulomb_fricton'; did you mean 'coulomb_friction'?"),
         ("effects: {coulomb_friction: 1}\n", 1, "expected a list, found keys and values"),
+        ("model: arm.xml\n", 1, "begins with its kind: `kind: robot`"),
         (ONE + "  torqe_nm: 1\n", 4, "unknown key 'torqe_nm'; did you mean 'torque_nm'?"),
         (ONE + "  arm: lfet\n", 4, "'lfet' is not one of 'left', 'right', 'both'; did you mean 'left'?"),
         (ONE + "  joints: [joint5, joint7]\n", 4, "no joint 'joint7'; did you mean"),

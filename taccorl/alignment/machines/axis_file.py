@@ -140,6 +140,8 @@ class AxisConfig(DriveLaw):
         found = []
         for entry in self.effects:
             name, values = entry.name, dict[str, Any](entry.values)
+            if name in [effect.name for effect in found]:
+                raise TaccorlError(f"effects: {name} stands twice, and an axis has one of each effect; remove one")
             cls = self.effect_class(name)
             if cls is None and name in NEED_ROTOR and not self.rotor_inertia:
                 raise TaccorlError(f"effects: {name} needs the motor's share of inertia: write `rotor_inertia: …`")

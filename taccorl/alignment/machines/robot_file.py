@@ -93,7 +93,9 @@ class RobotConfig:
     joints: dict[str, JointConfig]  # Name of the joint in the model → its drive
 
     def __post_init__(self) -> None:
-        check_numbers("robot", self, not_negative=("gravity_compensation",))
+        if not 0.0 <= self.gravity_compensation <= 1.0:
+            share = f"robot.gravity_compensation: is {self.gravity_compensation:g}; give the share of the weight, 0 … 1"
+            raise TaccorlError(f"{share}. A controller that is wrong about the weight is the effect gravity_mismatch")
         if self.gravity and (len(self.gravity) != 3 or not math.isfinite(sum(self.gravity)) or not any(self.gravity)):
             raise TaccorlError(f"robot.gravity: is {self.gravity}; give the three numbers x, y, z of a direction")
 
@@ -303,6 +305,8 @@ def _rules(robot: Robot) -> Rules:
         yield joint not in rigid.joints, f"joints/{joint}", unknown
         for k, effect in enumerate(drive.effects):
             key, name = f"joints/{joint}/effects/{k}", effect.name
+            twice = name in [other.name for other in drive.effects[:k]]
+            yield twice, key, f"{name} stands twice at {joint}, which has one of each effect; remove one"
             can_act = acts_on_joint(type(effect), weight=True, rotor=True, payload=True)
             yield not can_act, key, f"{name} cannot act on one joint of a robot file; remove it"
             of_slide = name in OF_A_TURN and rigid.joints[joint].unit == "m"

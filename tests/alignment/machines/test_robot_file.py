@@ -410,6 +410,9 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: backlash, play_rad: 0.01}]}"),
          r"backlash needs.*inertia.*write rotor_inertia \(kg·m²\).*gear.*shoulder"),
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
+        (("kd: 5.0}", f"kd: 5.0, effects: [{2 * '{effect: viscous_friction, damping_nms_per_rad: 1}, '}]}}"),
+         "viscous_friction stands twice at"),
+        (("joints:", "gravity_compensation: 3.0\njoints:"), r"robot\.yaml:3: .*is 3; give the share of the weight, 0 … 1"),
     ],
 )  # fmt: skip
 def test_wrong_models_and_robot_files_are_refused(change: tuple[str, str], says: str, tmp_path: Path) -> None:
