@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from by_lerobot import write_with_lerobot
+from test_draft import inspect_and_ingest
 
 from taccorl.cli.main import main
 from taccorl.data.checks import check_episode
@@ -65,19 +65,9 @@ def test_faults_of_touch_are_found_without_a_sensor_spec(tmp_path: Path, key: st
 def test_a_draft_ingests_touch_with_its_layout(tmp_path: Path) -> None:
     key = "observation.tactile.primary"
     values = touch(*KINDS[key])
-    root = build(tmp_path / "d", {key: values})
-    draft = tmp_path / "draft.yaml"
-    assert main(["ingest", "inspect", str(root), f"--draft={draft}"]) == 0
-    for path in (draft, tmp_path / "draft_dataset.yaml"):
-        found = yaml.safe_load(path.read_text())
-        for feature in found["features"].values():
-            if "shape" in feature:
-                feature |= {"unit": "unknown", "frame": "pad", "range": [-1000, 1000]}
-        path.write_text(yaml.safe_dump(found))
-    out = tmp_path / "out"
-    words = [f"--spec={draft}", f"--out={out}", f"--store={tmp_path / 'store'}"]
-    assert main(["ingest", str(root), *words]) == 0
-    ingested = Dataset(out)
+    ingested = inspect_and_ingest(
+        build(tmp_path / "d", {key: values}), tmp_path, unit="unknown", frame="pad", range="[-1000, 1000]"
+    )
     assert ingested.spec.features[key].layout == (12, 32)
     assert ingested.info["features"][key]["layout"] == [12, 32]
     stored = ingested.episode(0).arrays[key]

@@ -1,6 +1,5 @@
 """Vectors, poses, twists, wrenches, IMU readings and odometry: read as numbers by name, drafted as features with their units."""
 
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,10 +8,9 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from test_draft import inspect_and_ingest
 
-from taccorl.cli.main import main
 from taccorl.data import decode
-from taccorl.data.dataset import Dataset
 from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import find_sources
 from taccorl.data.ros import unit_of, vector_type
@@ -186,11 +184,9 @@ def write_bag(folder: Path) -> Path:
 def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_frames(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag")
     assert all(not t.problem and t.num_values for t in inspect_source(*find_sources(bag)[0]).topics)
-    assert main(["ingest", "inspect", str(bag), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
-    written = {"text": "drive", "unit": "m/s", "range": "[-20, 20]", "frame": "base_link"}
-    for path in tmp_path.glob("mine*.yaml"):
-        assert "not used" not in path.read_text()
-        path.write_text(re.sub(r"(\w+): TODO\b", lambda m: f"{m[1]}: {written[m[1]]}", path.read_text()))
+    told = {"text": "drive", "unit": "m/s", "range": "[-20, 20]", "frame": "base_link"}
+    arrays = inspect_and_ingest(bag, tmp_path, **told).episode(0).arrays
+    assert not any("not used" in path.read_text() for path in tmp_path.glob("mine*.yaml"))
     spec = load_recording_spec(tmp_path / "mine.yaml")
     features = spec.target.features
     assert features["observation.ft_wrench"].unit == ("N", "N", "N", "Nm", "Nm", "Nm")
@@ -202,9 +198,6 @@ def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_fra
     assert features["observation.imu_data"].unit == (*["rad/s"] * 3, *["m/s2"] * 3)
     assert features["observation.wind"].unit == "m/s" and features["observation.wind"].frame == "base_link"
     assert spec.features["action"].channels == ("cmd_vel",)
-    words = [f"--spec={tmp_path / 'mine.yaml'}", f"--out={tmp_path / 'out'}", f"--store={tmp_path / 'store'}"]
-    assert main(["ingest", str(bag), *words]) == 0
-    arrays = Dataset(tmp_path / "out").episode(0).arrays
     assert arrays["observation.odom"][5].tolist() == pytest.approx([1, 2, 3, 0.5, 0.1, 0.2, 0.3, 4, 5, 6, 7, 8, 9])
     assert arrays["action"][5].tolist() == [4, 5, 6, 7, 8, 9]
     # Rows come at 30 Hz, samples at 100 Hz; sample k, at k / 100 s, has the force k / 100 N. Row t holds the newest sample at its

@@ -9,9 +9,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-import test_db3
+import test_bags
 from mcap.writer import Writer
-from test_db3 import START_NS, STORE, db3_of, write_bag
+from test_bags import START_NS, db3_of, write_bag
 from test_hdf5 import ROWS, state, write
 from test_hdf5 import write as write_hdf5
 
@@ -34,14 +34,7 @@ def angle(k: int, j: int) -> float:
 
 @pytest.fixture
 def bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    original = test_db3.joint_state
-
-    def moving(k: int) -> Any:
-        m, angles = original(k), np.array([angle(k, j) for j in range(6)])
-        kind = STORE.types["sensor_msgs/msg/JointState"]
-        return kind(header=m.header, name=m.name, position=angles, velocity=angles, effort=angles)
-
-    monkeypatch.setattr(test_db3, "joint_state", moving)
+    monkeypatch.setattr(test_bags, "angles", lambda k: np.array([angle(k, j) for j in range(6)]))
     return write_bag(tmp_path / "bag", num=NUM)
 
 
@@ -102,7 +95,7 @@ def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_
 def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(bag, spec):
     path = db3_of(bag)
     with sqlite3.connect(path) as connection:
-        ((number, log_ns),) = connection.execute("SELECT id, timestamp FROM messages WHERE id = 20")
+        ((number, log_ns),) = connection.execute("SELECT id, timestamp FROM messages WHERE id = 21")
     changed = log_ns ^ 1
     change(path, log_ns.to_bytes(8, "big"), changed.to_bytes(8, "big"))  # the table's or the index's, as it lies
     entry = entry_of(bag, spec)
