@@ -7,13 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from made_traces import comparison, trace
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.checks.clock import CLOCK
-from taccorl.cli.measured import of_recordings, of_replays, without_explained
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.cli.measured import of_recordings, of_replays, refuse_long, without_explained
 from taccorl.data.finding import Finding, not_judged
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.result import Comparison
+from taccorl.errors import TaccorlError
 from taccorl.report.findings import found_in_recordings
 from taccorl.report.terminal import show
 from taccorl.sim.twin import TwinConfig
@@ -189,3 +194,14 @@ def test_a_late_answer_is_not_said_where_the_replay_is_as_late(rows_late, left, 
     late, other = Finding("late_answer", "note", made.signal, "late"), Finding("jitter", "warning", "", "rows")
     found = without_explained({"a.csv": [late, other], "b.csv": [late]}, comparison(made))
     assert found == {"a.csv": [late] * left + [other], "b.csv": [late]}
+
+
+def at_rest(rows: int) -> Measurement:
+    still = np.zeros(rows)
+    return of_signal("long.csv", 1000.0, still, still, "drive", "m", origin=Origin("twin", "no robot"))
+
+
+def test_a_recording_of_more_rows_than_a_diagnosis_replays_is_refused_with_its_numbers():
+    refuse_long(Measurements((at_rest(500_000),)))
+    with pytest.raises(TaccorlError, match=r"long\.csv.*500001 rows, 500 s.*500000.*10 s"):
+        refuse_long(Measurements((at_rest(1000), at_rest(500_001))))

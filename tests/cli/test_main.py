@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 import taccorl
+from taccorl.cli import progress as tables
 from taccorl.cli.check import CheckConfig
 from taccorl.cli.evaluate import EvaluateConfig
 from taccorl.cli.help import SHOWN
@@ -177,3 +179,33 @@ def test_a_reader_that_goes_away_is_no_error_message(words, tmp_path):
     done = subprocess.run([*TACCORL, *given], stdout=write_end, stderr=subprocess.PIPE, text=True)
     os.close(write_end)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+# ---- what verbs print while they work ----
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_left(monkeypatch, capsys) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
+    with tables.Bars(2) as bars:
+        for second in range(13):  # 50 rows a second
+            now_s = 100.0 + second
+            bars.update("a.mcap", 50 * second, 1000)
+        now_s = 117.0
+        bars.update("b.mcap", 0, 400)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "a.mcap: 250 of 1000, 50/s, 15 s left",  # 750 rows at 50/s
+        "a.mcap: 500 of 1000, 50/s, 10 s left",
+        "b.mcap: 0 of 400",
+    ]
+
+
+def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(monkeypatch, capsys) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
+    steps = pickle.loads(pickle.dumps(tables.Steps()))
+    for second in (1, 4, 6, 8, 12):
+        now_s = 100.0 + second
+        steps("elbow", f"step {second}")
+    assert capsys.readouterr().err.splitlines() == ["elbow: step 6 (6 s)", "elbow: step 12 (12 s)"]

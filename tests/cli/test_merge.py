@@ -1,7 +1,6 @@
 """``taccorl merge`` as a user types it, on small datasets of random numbers (no robot)."""
 
 import dataclasses
-import json
 import shlex
 import shutil
 import sys
@@ -21,10 +20,8 @@ WORDS = ("--real=surrogate", "--sim=twin", "--out=both", "--store=store")
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a surrogate's dataset and the twin's, in which they were merged once."""
+    from by_lerobot import write_described
     from tiny_dataset import tiny_episode, tiny_spec, write_tiny
-
-    from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record
-    from taccorl.data.lerobot_format import write_episodes
 
     folder = tmp_path_factory.mktemp("merge_cli")
     write_tiny(folder / "foreign", rows=(16,), with_spec=False)  # without what taccorl writes down of a dataset
@@ -33,11 +30,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             dataclasses.replace(tiny_episode(tiny_spec(), 20 + seed, seed), origin=origin, success=True)
             for seed in seeds
         ]
-        write_episodes(episodes, folder / name)
-        meta = folder / name / PROVENANCE
-        meta.mkdir()
-        (meta / "episodes.json").write_text(json.dumps([episode_record(e, "") for e in episodes]))
-        (meta / "dataset_spec.json").write_text(json.dumps(dataset_spec_to_json(tiny_spec())))
+        write_described(folder / name, episodes)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert main(["merge", *WORDS]) == 0

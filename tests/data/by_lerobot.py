@@ -1,12 +1,15 @@
 """Datasets of given rows, written by LeRobot itself."""
 
+import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from taccorl.data.lerobot_format import quiet_lerobot
+from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record
+from taccorl.data.episode import Episode
+from taccorl.data.lerobot_format import quiet_lerobot, write_episodes
 
 Row = Mapping[str, Any]  # Feature → array, picture (rows, columns, 3) or text; and ``task``
 
@@ -43,4 +46,13 @@ def write_with_lerobot(
                 dataset.add_frame(dict(row))
             dataset.save_episode()
         dataset.finalize()
+    return root
+
+
+def write_described(root: Path, episodes: Sequence[Episode]) -> Path:
+    """Episodes of one spec by taccorl's writer, with the records and the spec that ``taccorl ingest`` writes beside them."""
+    write_episodes(episodes, root)
+    (root / PROVENANCE).mkdir()
+    (root / PROVENANCE / "episodes.json").write_text(json.dumps([episode_record(e, "") for e in episodes]))
+    (root / PROVENANCE / "dataset_spec.json").write_text(json.dumps(dataset_spec_to_json(episodes[0].spec)))
     return root

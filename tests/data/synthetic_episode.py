@@ -13,7 +13,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.signal import lfilter
 
+from taccorl.data.checks import check_episode
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
+from taccorl.data.finding import Finding
 from taccorl.data.origin import Origin
 from tests.views.made_episode import bimanual_spec
 
@@ -231,3 +233,17 @@ def copies(episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """State, action and (T, 4, 32, 12) touch, to be changed."""
     a = episode.arrays
     return a[STATE].copy(), a[ACTION].copy(), a[TOUCH].copy().reshape(-1, 4, 32, 12)
+
+
+def serious(findings: list[Finding]) -> list[Finding]:
+    return [f for f in findings if f.severity != "note"]
+
+
+def found(episode: Episode, check: str, *, pictures: bool = False) -> list[Finding]:
+    return [f for f in check_episode(episode, pictures=pictures) if f.check == check]
+
+
+def one(episode: Episode, check: str, *, pictures: bool = False) -> Finding:
+    findings = found(episode, check, pictures=pictures)
+    assert len(findings) == 1, findings
+    return findings[0]

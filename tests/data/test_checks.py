@@ -17,8 +17,11 @@ from synthetic_episode import (
     TOUCH,
     base,
     copies,
+    found,
     good_timing,
     make,
+    one,
+    serious,
     with_arrays,
 )
 
@@ -30,20 +33,6 @@ from taccorl.data.finding import Finding
 FPS = SPEC.fps
 NUM_SEEDS = 30
 FEW_SEEDS = 2
-
-
-def serious(findings: list[Finding]) -> list[Finding]:
-    return [f for f in findings if f.severity != "note"]
-
-
-def found(episode: Episode, check: str, *, pictures: bool = False) -> list[Finding]:
-    return [f for f in check_episode(episode, pictures=pictures) if f.check == check]
-
-
-def one(episode: Episode, check: str, *, pictures: bool = False) -> Finding:
-    findings = found(episode, check, pictures=pictures)
-    assert len(findings) == 1, findings
-    return findings[0]
 
 
 @pytest.fixture(scope="module")

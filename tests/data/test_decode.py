@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.descriptor_pb2 import FileDescriptorProto
 
 from taccorl.data import decode, pictures
 from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
@@ -43,19 +43,6 @@ def joints(names: list[str], position: list[float], **more: Any) -> SimpleNamesp
     return SimpleNamespace(header=header, name=names, position=position, **more)
 
 
-def protobuf_class(name: str, /, **fields: Any) -> Any:
-    """A message class described at run time: field → (type constant, repeated)."""
-    kinds = descriptor_pb2.FieldDescriptorProto
-    file = descriptor_pb2.FileDescriptorProto(name=f"{name}.proto", package="t", syntax="proto3")
-    message = file.message_type.add(name=name)
-    for number, (field, (kind, repeated)) in enumerate(fields.items(), start=1):
-        label = kinds.LABEL_REPEATED if repeated else kinds.LABEL_OPTIONAL
-        message.field.add(name=field, number=number, type=kind, label=label)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"t.{name}"))
-
-
 # --- names
 
 
@@ -70,11 +57,9 @@ def test_a_type_is_the_same_with_and_without_msg_in_the_middle():
 
 
 def test_a_missing_field_names_the_nearest():
-    kinds = descriptor_pb2.FieldDescriptorProto
-    message = protobuf_class("Joints", position=(kinds.TYPE_DOUBLE, True), velocity=(kinds.TYPE_DOUBLE, True))()
-    for value in (SimpleNamespace(position=1, velocity=2), {"position": 1, "velocity": 2}, message):
-        with pytest.raises(RecordingError, match="no field 'postion'; did you mean 'position'"):
-            decode.get(value, "postion")
+    for value in (SimpleNamespace(package=1, syntax=2), {"package": 1, "syntax": 2}, FileDescriptorProto()):
+        with pytest.raises(RecordingError, match="no field 'pakage'; did you mean 'package'"):
+            decode.get(value, "pakage")
 
 
 # --- stamps

@@ -116,13 +116,12 @@ def test_without_a_topic_named_as_a_command_the_user_chooses(chosen: str, tmp_pa
     assert spec.features["observation.state"].channels == ("arm_joint_states",)
 
 
-def test_two_arms_with_pads_are_drafted_with_touch(tmp_path: Path) -> None:
+def test_two_arms_with_pads_are_drafted_and_ingested_with_touch(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128)))
-    drafts = drafted(path)
-    (tmp_path / "mine.yaml").write_text(drafts.recording)
-    (tmp_path / "mine_dataset.yaml").write_text(drafts.dataset)
-    fill_in(tmp_path)
+    write_mcap(path, StandInConfig(duration_s=2.5, camera_size=(96, 128)))
+    dataset = inspect_and_ingest(path, tmp_path)
+    assert dataset.num_rows(0) > 60
+    assert np.abs(dataset.episode(0).arrays["observation.tactile"]).max() > 30
     spec = load_recording_spec(tmp_path / "mine.yaml")
     names = spec.target.features["observation.state"].names
     assert (names[0], names[13], len(names)) == ("left_joint1.pos", "right_gripper.pos", 14)
@@ -131,14 +130,6 @@ def test_two_arms_with_pads_are_drafted_with_touch(tmp_path: Path) -> None:
     assert spec.target.sensors["observation.tactile"].name == "flexitac_v2"
     assert spec.channels["joint_states_ctrl_left"].pick[-1] == "gripper"
     assert spec.clock == "header" and spec.clock_of("left_robot_left_finger") == "log"
-
-
-def test_a_touching_draft_of_the_stand_in_ingests(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    write_mcap(path, StandInConfig(duration_s=2.5, camera_size=(96, 128)))
-    dataset = inspect_and_ingest(path, tmp_path)
-    assert dataset.num_rows(0) > 60
-    assert np.abs(dataset.episode(0).arrays["observation.tactile"]).max() > 30
 
 
 def test_a_file_that_names_no_rate_leaves_it_to_the_user(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from mcap.writer import CompressionType, Writer
+from test_spec import RECORDING
+from test_spec import write as write_spec
 
 from taccorl.cli.main import main
 from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording
@@ -23,66 +24,19 @@ from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, wri
 T0_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
 
-SENSOR = {
-    "spec_version": 1, "name": "little_pad", "rows": 2, "columns": 3, "adc_bits": 8, "wire_shift_bits": 0, "rate_hz": 100,
-    "wire": {"rows": 3, "columns": 2, "dtype": "uint8", "transpose": True}, "scan_time_s": 0.01, "unit": "adc_count",
-    "baseline": {"rule": "median_of_first", "frames": 2, "max_spread_count": 12}, "noise_count": 15, "scheme": "fixed_scale",
-    "gain_per_count": 0.01,
-}  # fmt: skip
-VECTOR = {"dtype": "float32", "shape": [2], "unit": "rad", "frame": "joint", "rate_hz": 100, "range": [-4, 4]}
-PICTURE = {"dtype": "video", "shape": [8, 8, 3], "unit": "rgb8", "frame": "camera", "rate_hz": 30, "range": [0, 255]}
-DATASET = {
-    "spec_version": 1, "name": "little", "robot_type": "one_arm", "fps": 30, "action_time": "next_row",
-    "features": {
-        "observation.state": VECTOR,
-        "action": VECTOR,
-        "observation.images.front": PICTURE,
-        "observation.tactile": {
-            "dtype": "int16", "shape": [6], "unit": "adc_count", "frame": "pad", "rate_hz": 100, "range": [-255, 255],
-            "sensor": "pad.yaml", "pads": ["a"],
-        },
-    },
-}  # fmt: skip
-JOINTS = {
-    "type": "sensor_msgs/msg/JointState",
-    "field": "position",
-    "pick": ["j1", "g"],
-    "rate_hz": 100,
-    "max_age_s": 0.05,
-}
 
-
-def recording_spec(folder: Path, **channels: dict[str, Any] | None) -> RecordingSpec:
-    """A spec whose channels are the usual ones with the given keys changed (None removes a key)."""
-    usual: dict[str, dict[str, Any]] = {
-        "state": {"topic": "/joints", "scale": [2.0, 1.0], **JOINTS},
-        "command": {"topic": "/command", **JOINTS},
-        "front": {"topic": "/camera", "rate_hz": 30, "max_age_s": 0.1},
-        "pad": {"topic": "/pad", "field": "data", "clock": "log", "rate_hz": 100, "max_age_s": 0.05},
-    }
-    for name, change in channels.items():
-        merged = {**usual[name], **(change or {})}
-        usual[name] = {k: v for k, v in merged.items() if v is not None}
-    document = {
-        "spec_version": 1, "dataset": "dataset.yaml", "reader": "mcap", "clock": "header", "channels": usual,
-        "episodes": {"by": "markers", "topic": "/episode"}, "instruction": {"from": "markers"},
-        "features": {
-            "observation.state": {"channels": ["state"], "align": "asof"},
-            "action": {"channels": ["command"], "align": "asof"},
-            "observation.images.front": {"channels": ["front"], "align": "asof"},
-            "observation.tactile": {"channels": ["pad"], "align": "asof"},
-        },
-    }  # fmt: skip
-    for name, content in (("pad", SENSOR), ("dataset", DATASET), ("recording", document)):
-        (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
-    return load_recording_spec(folder / "recording.yaml")
+def recording_spec(folder: Path, **channels: dict[str, Any]) -> RecordingSpec:
+    """The little spec with the given keys of channels changed."""
+    changed = {name: {**channel, **channels.get(name, {})} for name, channel in RECORDING["channels"].items()}
+    return load_recording_spec(write_spec(folder, recording=RECORDING | {"channels": changed}))
 
 
 TYPES = {
     "/joints": "sensor_msgs/msg/JointState",
     "/command": "sensor_msgs/msg/JointState",
     "/camera": "sensor_msgs/msg/CompressedImage",
-    "/pad": "std_msgs/msg/UInt8MultiArray",
+    "/pad_a": "std_msgs/msg/UInt8MultiArray",
+    "/pad_b": "std_msgs/msg/UInt8MultiArray",
     "/episode": "std_msgs/msg/String",
 }
 
@@ -111,7 +65,7 @@ def usual_messages() -> list[Sent]:
         sent.append(("/joints", log, joint_state(stamp, 0.07, k)))
         sent.append(("/command", log, joint_state(stamp, 0.08, k + 0.5)))
         sent.append(("/camera", log, picture(stamp, b"picture %d" % k)))
-        sent.append(("/pad", log, {"data": [10 * k + i for i in range(6)]}))
+        sent += [(f"/pad_{x}", log, {"data": [10 * k + i for i in range(6)]}) for x in "ab"]
         sent.append(("/unwanted", log, {"x": 1}))
     sent.append(("/episode", T0_NS + 30 * MS, {"data": "success"}))
     return sent
@@ -153,18 +107,18 @@ def test_a_recording_becomes_channels_with_their_own_times(tmp_path):
     recording = load(tmp_path, usual_messages())
     state = recording.channels["state"]
     assert state.values is not None
-    assert state.values.tolist() == [[0.0, 0.07], [2.0, 0.07], [4.0, 0.07]]  # j1 × 2, then g, by name
+    assert state.values.tolist() == [[0.0, 0.07], [1.5, 0.07], [3.0, 0.07]]  # j1 × 1.5, then g, by name
     assert (state.log_ns - T0_NS).tolist() == [0, 10 * MS, 20 * MS]
     assert state.stamp_ns is not None
     assert (state.log_ns - state.stamp_ns).tolist() == [MS] * 3
-    pad = recording.channels["pad"]
+    pad = recording.channels["pad_a"]
     assert pad.stamp_ns is None
     assert pad.values is not None
     assert pad.values.dtype == np.uint8
     assert pad.values[1].tolist() == [10, 12, 14, 11, 13, 15]  # 3 × 2 on the wire, 2 × 3 on the pad
     assert recording.channels["front"].values is None
     assert recording.texts == {"/episode": [(T0_NS, "start:insert"), (T0_NS + 30 * MS, "success")]}
-    assert recording.counts == {"/joints": 3, "/command": 3, "/camera": 3, "/pad": 3, "/episode": 2}
+    assert recording.counts == {"/joints": 3, "/command": 3, "/camera": 3, "/pad_a": 3, "/pad_b": 3, "/episode": 2}
     assert recording.damage == []
 
 
@@ -177,7 +131,7 @@ def test_a_channel_may_have_any_name(tmp_path):
     source = write(tmp_path / "a.mcap", usual_messages())
     recording = load_recording(source, load_recording_spec(path), tmp_path / "scratch")
     assert recording.channels[name].values is not None
-    assert len(list(tmp_path.rglob("*.spool"))) == len(list((tmp_path / "scratch").iterdir())) == 3
+    assert len(list(tmp_path.rglob("*.spool"))) == len(list((tmp_path / "scratch").iterdir())) == 4
 
 
 # --- pictures
@@ -229,7 +183,7 @@ def instead(topic: str, message: Any) -> list[Sent]:
 
 def test_all_missing_topics_are_named_at_once_and_markers_too(tmp_path):
     message = refusal(tmp_path, [m for m in usual_messages() if m[0] in ("/joints", "/camera")])
-    assert "without messages in the recording: /command, /pad, /episode (" in message
+    assert "without messages in the recording: /command, /pad_a, /pad_b, /episode (" in message
     assert message.count("known: /camera, /joints") == 1, "the list of topics once, for all that resemble none"
     assert "the file names no topics" in refusal(tmp_path, [])
 
@@ -242,22 +196,22 @@ def test_another_type_is_named_even_where_its_content_does_not_fit_either(tmp_pa
 
 
 def test_a_header_clock_without_headers_is_refused(tmp_path):
-    expected = "/pad has no header stamp: write `clock: log` on channel 'pad'"
-    assert refusal(tmp_path, usual_messages(), pad={"clock": "header"}) == expected
+    expected = "/pad_a has no header stamp: write `clock: log` on channel 'pad_a'"
+    assert refusal(tmp_path, usual_messages(), pad_a={"clock": "header"}) == expected
     headless = {"name": ["g", "j1"], "position": [0.0, 0.0]}  # one message among many is enough
     assert "/joints has no header stamp" in refusal(tmp_path, instead("/joints", headless))
 
 
 def test_a_topic_is_either_pictures_or_numbers(tmp_path):
-    message = refusal(tmp_path, usual_messages(), pad={"topic": "/camera"})
+    message = refusal(tmp_path, usual_messages(), pad_a={"topic": "/camera"})
     assert message == "/camera: the spec reads it both as pictures and as numbers"
 
 
 @pytest.mark.parametrize(
     ("topic", "message", "expected"),
     [
-        ("/pad", {"data": [1] * 5}, "message 1: 5 taxels, but sensor little_pad has 3×2; other layouts: a file in"),
-        ("/pad", {"date": [1]}, "message 1: no field 'data'; did you mean 'date'?"),
+        ("/pad_a", {"data": [1] * 5}, "message 1: 5 taxels, but sensor little_pad has 3×2; other layouts: a file in"),
+        ("/pad_a", {"date": [1]}, "message 1: no field 'data'; did you mean 'date'?"),
         ("/joints", joint_state(T0_NS, 1.0), "message 1: 1 values for 2 names in 'position'"),
         ("/episode", {"data": 3}, "expected a text (std_msgs/String), found int"),
         ("/episode", {"text": "x"}, "expected a text (std_msgs/String), found dict"),

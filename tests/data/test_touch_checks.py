@@ -5,7 +5,21 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from synthetic_episode import ACTION, GRIPPER, PADS, SPEC, STATE, TOUCH, base, copies, make, with_arrays
+from synthetic_episode import (
+    ACTION,
+    GRIPPER,
+    PADS,
+    SPEC,
+    STATE,
+    TOUCH,
+    base,
+    copies,
+    found,
+    make,
+    one,
+    serious,
+    with_arrays,
+)
 
 from taccorl.data import grip_checks, touch_checks
 from taccorl.data.checks import check_episode, check_recording_episodes
@@ -24,18 +38,8 @@ def flat(touch: np.ndarray) -> np.ndarray:
     return touch.reshape(len(touch), -1)
 
 
-def found(episode: Episode, check: str) -> list[Finding]:
-    return [f for f in check_episode(episode, pictures=False) if f.check == check]
-
-
-def one(episode: Episode, check: str) -> Finding:
-    findings = found(episode, check)
-    assert len(findings) == 1, findings
-    return findings[0]
-
-
-def serious(episode: Episode) -> list[Finding]:
-    return [f for f in check_episode(episode, pictures=False) if f.severity != "note"]
+def serious_of(episode: Episode) -> list[Finding]:
+    return serious(check_episode(episode, pictures=False))
 
 
 def pad(episode: Episode, name: str) -> touch_checks.Pad:
@@ -141,19 +145,19 @@ UNUSUAL: dict[str, Callable[[Episode], Episode]] = {
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", UNUSUAL)
 def test_touch_that_is_merely_unusual_gives_nothing(name: str, seed: int) -> None:
-    assert serious(UNUSUAL[name](make(seed=seed))) == []
+    assert serious_of(UNUSUAL[name](make(seed=seed))) == []
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("changes", [{"part_m": {"left": 0.0, "right": 0.0}}, {"noise_count": 0.0}])
 def test_grippers_that_close_on_nothing_and_twins_without_noise_give_nothing(changes: dict, seed: int) -> None:
-    assert serious(make(seed=seed, **changes)) == []
+    assert serious_of(make(seed=seed, **changes)) == []
 
 
 def test_part_held_from_start_to_end_gives_nothing(good: Episode) -> None:
     held = slice(170, 250)  # 5.7 to 8.3 s of 12 s: both hold
     arrays = {key: values[held] for key, values in good.arrays.items()}
-    assert serious(dataclasses.replace(good, arrays=arrays, picture_keys=())) == []
+    assert serious_of(dataclasses.replace(good, arrays=arrays, picture_keys=())) == []
 
 
 def test_contact_coverage_is_told_and_of_windows_that_of_the_newest_reading(good: Episode) -> None:
@@ -173,7 +177,7 @@ def test_soft_part_felt_while_the_gripper_still_closes_gives_nothing() -> None:
         for hold in grip_checks.read_grippers(episode).holds[arm]:  # type: ignore[union-attr]
             rows = np.arange(hold.first, hold.end)
             state[rows, GRIPPER[arm]] += 0.0008 * np.exp(-(rows - hold.first) / 15)
-    assert [f for f in serious(with_arrays(episode, state=state)) if f.check == "touch_lag"] == []
+    assert [f for f in serious_of(with_arrays(episode, state=state)) if f.check == "touch_lag"] == []
 
 
 @pytest.mark.parametrize(
@@ -233,7 +237,7 @@ def test_dead_taxel_in_a_contact_is_found(good: Episode, p: int, value: int | No
 def test_taxel_stuck_from_the_start_is_found_although_the_baseline_hides_it(good: Episode, value: int) -> None:
     episode = rewired(good, put(np.s_[:, LEFT_B, 20, 3], value))
     assert (episode.arrays[TOUCH].reshape(-1, 4, 32, 12)[:, LEFT_B, 20, 3] == 0).all()
-    [finding] = serious(episode)
+    [finding] = serious_of(episode)
     assert (finding.check, finding.severity) == ("stuck_taxel", "warning")
     assert f"left_b: stuck at {value} counts on the wire, 1 taxel (row, column): (20, 3)" in finding.text
 
@@ -269,7 +273,7 @@ PLANTED: dict[str, tuple[Callable[[Episode], Episode], str, tuple[int, int] | No
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_fault_is_the_only_thing_found(good: Episode, name: str) -> None:
     plant, check, rows, words = PLANTED[name]
-    [finding] = serious(plant(good))
+    [finding] = serious_of(plant(good))
     assert (finding.check, finding.severity) == (check, "warning")
     assert rows is None or finding.rows == rows
     assert words in finding.text
@@ -373,7 +377,7 @@ def test_pads_of_the_other_arm_are_an_error(good: Episode, order: list[int], nam
 
 def test_swap_is_seen_when_one_arm_alone_holds() -> None:
     episode = make(seed=13, part_m={"left": 0.0, "right": 0.02})
-    assert serious(episode) == []
+    assert serious_of(episode) == []
     assert one(reorder(episode, [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B]), "swapped_pads").severity == "error"
 
 
@@ -472,5 +476,5 @@ FAULTS: dict[str, tuple[str, Callable[[int], Episode]]] = {
 @pytest.mark.parametrize("num_episodes", [FEW_SEEDS, pytest.param(NUM_SEEDS, marks=pytest.mark.slow)])
 def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name: str, num_episodes: int) -> None:
     check, fault = FAULTS[name]
-    hits = sum(any(f.severity != "note" for f in found(fault(seed), check)) for seed in range(num_episodes))
+    hits = sum(bool(serious(found(fault(seed), check))) for seed in range(num_episodes))
     assert hits >= 0.95 * num_episodes, f"{hits} of {num_episodes}"

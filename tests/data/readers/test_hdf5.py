@@ -129,9 +129,6 @@ def test_everything_can_be_looked_at_without_a_spec(tmp_path: Path) -> None:
     assert all(m.value is None and m.stamp_ns is None for m in seen)
     assert sorted({m.log_ns for m in seen}) == [0, 10**9, 2 * 10**9]  # no rate known: one row a second, and said so
     assert reader.metadata["time"]["rate"].startswith("the file names no rate")
-    with h5py.File(path, "a") as file:
-        file.attrs["fps"] = 50
-    assert [m.log_ns for m in messages(path, "/action")] == [0, 20_000_000, 40_000_000]
 
 
 def test_only_the_asked_part_is_read(tmp_path: Path) -> None:

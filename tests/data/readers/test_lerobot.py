@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from by_lerobot import write_with_lerobot
+from by_lerobot import write_described, write_with_lerobot
 
 from taccorl.data.cutting import Cutter
-from taccorl.data.dataset import Dataset, dataset_spec_to_json, episode_record
+from taccorl.data.dataset import Dataset
 from taccorl.data.draft import draft_specs
 from taccorl.data.episode import Episode
 from taccorl.data.inspection import inspect_source
@@ -70,16 +70,7 @@ def made_episode(index: int) -> Episode:
 @pytest.fixture(scope="session")
 def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A taccorl dataset of two episodes; read only."""
-    from taccorl.data.lerobot_format import write_episodes
-
-    root = tmp_path_factory.mktemp("ours") / "dataset"
-    episodes = [made_episode(index) for index in range(2)]
-    write_episodes(episodes, root)
-    meta = root / "meta" / "taccorl"
-    meta.mkdir()
-    (meta / "episodes.json").write_text(json.dumps([episode_record(e, "") for e in episodes]))
-    (meta / "dataset_spec.json").write_text(json.dumps(dataset_spec_to_json(episodes[0].spec)))
-    return root
+    return write_described(tmp_path_factory.mktemp("ours") / "dataset", [made_episode(index) for index in range(2)])
 
 
 @pytest.fixture(scope="session")
