@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from taccorl.robots import ROBOT
+from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict
@@ -54,9 +55,13 @@ class PressBench(Task):
         return dict.fromkeys(ROBOT.arms, ())
 
 
-def start(*effects: Effect, num_sims: int = 1, num_threads: int = 1) -> Simulation:
+def typical_effect(name: str) -> Effect:
+    return make_effect(name, **{p.name: p.typical for p in effects.get(name).parameters()})
+
+
+def start(*present: Effect, num_sims: int = 1, num_threads: int = 1) -> Simulation:
     """Both arms at rest at home, the left gripper just open around the block."""
-    config = TwinConfig(effects=list(effects))
+    config = TwinConfig(effects=list(present))
     sim = Simulation(PressBench(), config, num_sims=num_sims, num_threads=num_threads)
     sim.reset(range(num_sims))
     joints, targets = np.r_[LEFT_HOME, BLOCK_M + 5e-4, RIGHT_HOME, 0.07], sim.targets[0].copy()

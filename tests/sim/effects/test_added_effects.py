@@ -1,15 +1,17 @@
 """Effects together in one twin, and what is said when they cannot be."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from press_bench import BLOCK_M, perform, start
 
+from pipelines.effects_page import PAGE, text
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.effects import make_effect
+from taccorl.sim.effects import make_effect, prose
 from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, effect, effects, number
 from taccorl.sim.effects.touch_memory import TouchLag
 from taccorl.sim.simulation import Watch
@@ -200,3 +202,24 @@ def test_an_effect_with_an_unknown_slot_or_need_is_refused_where_it_is_registere
     with pytest.raises(TaccorlError, match=f"did you mean {meant}"):
         effect("of_one", *words)(type("OfOne", (JointEffect,), {}))
     assert "of_one" not in effects
+
+
+# ---- docs/effects.md ----
+
+
+def test_the_page_of_effects_is_current():
+    assert PAGE.read_text(encoding="utf-8") == text(), "run make pictures"
+
+
+def test_a_section_of_another_form_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    texts = prose.PAGE.read_text(encoding="utf-8")
+    monkeypatch.setattr(prose, "PAGE", tmp_path / "effects.md")
+    for old, new, told in (
+        ("- **Record:** One slow sweep", "One", "cogging: its section"),
+        ("| cable_spring | end_stop |", "| cable_string | end_stop |", "the last table names cable_string"),
+    ):
+        prose.PAGE.write_text(texts.replace(old, new))
+        prose._sections.cache_clear()
+        with pytest.raises(TaccorlError, match=told):
+            _ = effects.get("armature").equation
+    prose._sections.cache_clear()

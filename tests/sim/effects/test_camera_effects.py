@@ -5,13 +5,12 @@ import functools
 
 import numpy as np
 import pytest
-from press_bench import PressBench, start
+from press_bench import PressBench, start, typical_effect
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import CameraOffset
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.cameras import blurred, toned
-from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
@@ -39,11 +38,6 @@ def apart(seen: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(seen.astype(int) - other.astype(int)).mean())
 
 
-def typical(name: str) -> Effect:
-    cls = effects.get(name)
-    return make_effect(name, **{p.name: p.typical for p in cls.parameters()})
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_of_an_absent_effect_are_bit_identical(name: str):
     np.testing.assert_array_equal(swing(start(make_effect(name))), nominal())
@@ -53,14 +47,14 @@ def test_pictures_of_an_absent_effect_are_bit_identical(name: str):
 def test_pictures_fade_out_towards_the_absent_value(name: str):
     cls = effects.get(name)
     nearly = {p.name: p.absent + 0.01 * (p.typical - p.absent) for p in cls.parameters() if p.absent is not None}
-    there = apart(swing(start(typical(name))), nominal())
+    there = apart(swing(start(typical_effect(name))), nominal())
     assert there > 0.2
     assert apart(swing(start(make_effect(name, **nearly))), nominal()) <= 0.05 * there
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_are_the_same_alone_in_a_batch_from_a_snapshot_and_from_stored_states(name: str):
-    effect = typical(name)
+    effect = typical_effect(name)
     alone = swing(start(effect))
     batch = start(effect, num_sims=2, num_threads=2)
     first = swing(batch, last=3)
@@ -83,7 +77,7 @@ def test_pictures_are_the_same_alone_in_a_batch_from_a_snapshot_and_from_stored_
 
 @pytest.mark.parametrize("name", NAMES)
 def test_physics_and_the_other_cameras_do_not_change(name: str):
-    effect = dataclasses.replace(typical(name), cameras=["right_wrist"])
+    effect = dataclasses.replace(typical_effect(name), cameras=["right_wrist"])
     sim, plain = start(effect), start()
     seen = swing(sim)
     swing(plain)

@@ -1,8 +1,10 @@
 """Each effect of the pads against its closed form, on readings written down here; pads in the order left_a … right_b."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from press_bench import BLOCK_M, perform, start
+from press_bench import BLOCK_M, perform, start, typical_effect
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -242,8 +244,8 @@ OF_READINGS = [name for name in effects if "cells" in effects.get(name).kinds() 
 
 @pytest.mark.parametrize("name", [name for name in OF_READINGS if "temperature" not in effects.get(name).needs])
 def test_only_the_chosen_pads_change_and_do_so_as_they_would_among_all(name: str) -> None:
-    values = {p.name: p.typical for p in effects.get(name).parameters()}
-    some, everything = Pads(make_effect(name, pads=["right_a", "left_b"], **values)), Pads(make_effect(name, **values))
+    everything = typical_effect(name)
+    some, everything = Pads(replace(everything, pads=["right_a", "left_b"])), Pads(everything)
     for _ in range(2):
         seen, full = some.read(bumps(), 0.01), everything.read(bumps(), 0.01)
         np.testing.assert_array_equal(seen[[0, 3]], bumps()[[0, 3]])
@@ -295,13 +297,12 @@ def test_creep_goes_on_whether_somebody_looks_or_not() -> None:
 @pytest.mark.parametrize("name", ["touch_lag", "touch_delay", "taxel_creep", "taxel_hysteresis"])
 def test_an_effect_with_memory_takes_pads_of_any_size(name: str) -> None:
     """The taxels do not interact: a pad of 16 × 16 reads what the first 256 taxels of a pad of 32 × 12 read."""
-    cls = effects.get(name)
     rng = np.random.default_rng(0)
     scans = rng.uniform(0.0, 2.0, (5, 1, len(ROBOT.pads), ROBOT.pad.num_taxels)).astype(np.float32)
     seen = {}
     for shape in (ROBOT.pad.shape, (16, 16)):
         time_s = np.zeros(1)
-        added = AddedEffects([cls(**{p.name: p.typical for p in cls.parameters()})], time_s, pad_shape=shape)
+        added = AddedEffects([typical_effect(name)], time_s, pad_shape=shape)
         frames = []
         for scan in scans[..., : shape[0] * shape[1]]:
             reading = scan.reshape(1, -1, *shape)

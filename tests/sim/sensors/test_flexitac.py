@@ -12,8 +12,9 @@ from taccorl.data.sensor_spec import load_sensor_spec
 from taccorl.data.spec import data_specs_folder, find_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.robot import RobotConfig
-from taccorl.sim.sensors import Sensor, as_wire, sensors
+from taccorl.sim.sensors import Sensor, as_wire, sensors, standard_normal
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, at_scan_instants, normal_reading, scan_instants_s
+from taccorl.sim.sensors.noise import ScanNoise
 
 PADS = ("left_a", "left_b", "right_a", "right_b")
 SPEC = load_sensor_spec(find_spec("flexitac_v2"))
@@ -257,3 +258,20 @@ def test_an_unknown_sensor_and_wrong_numbers_of_generators_are_refused() -> None
 def test_settings_that_no_board_has_are_refused(setting: str, value: object) -> None:
     with pytest.raises(TaccorlError, match=f"flexitac: {setting}"):
         FlexiTacConfig(**{setting: value}).build(PADS)  # type: ignore[arg-type]
+
+
+def test_noise_is_numpys_bit_for_bit() -> None:
+    """Half a million numbers: the ziggurat's tail, 1 of 3700 numbers, is among them; seeds of one and of two words."""
+    rng = np.random.default_rng(0)
+    seeds = np.r_[0, 1, 2**32 - 1, 2**32, 2**63 - 1, rng.integers(0, 2**63, 150), rng.integers(0, 2**32, 150)]
+    steps = np.r_[0, 0, 1, 5, 2**32 - 1, rng.integers(0, 900, 300)]
+    expected = [np.random.default_rng(of).standard_normal(1536, np.float32) for of in zip(seeds, steps, strict=True)]
+    noise = ScanNoise(seeds, steps)
+    drawn = noise.draw((len(seeds), 4, 32, 12))
+    assert np.abs(drawn).max() > 3.7 and np.array_equal(drawn.reshape(len(seeds), -1), np.stack(expected))
+    assert np.array_equal(noise.of(3, 7).draw((4, 1536)), drawn.reshape(-1, 1536)[3:7])
+
+
+def test_as_many_seeds_as_simulations_are_wanted() -> None:
+    with pytest.raises(TaccorlError, match="2 generators for 3"):
+        standard_normal(ScanNoise(np.arange(2), np.arange(2)), (3, 4, 32, 12))
