@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from taccorl.data.origin import Origin
 from taccorl.episodes.attempt import outcome_of
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.episodes.sources.collect import CollectPlan, attempt
@@ -86,9 +85,4 @@ def test_subtask_labels_rise_one_at_a_time_and_become_stages(recorded):
     assert ((steps == 0) | (steps == 1)).all()
     assert episode.stages[0] == (0, "left: grasp socket, right: grasp plug")
     assert any("right: insert plug" in name for _, name in episode.stages)
-
-
-def test_everything_says_that_it_is_no_robot(recorded):
-    *_, episode = recorded
-    assert episode.origin == Origin("twin", "MuJoCo twin, not a robot")
     assert episode.provenance["simulation"]["seed"] == episode.arrays["sim.seed"][0, 0]

@@ -2,8 +2,6 @@
 number, and what is kept has been done twice."""
 
 import dataclasses
-import json
-import shutil
 
 import numpy as np
 import pytest
@@ -20,7 +18,6 @@ from taccorl.episodes.sources.mimicgen.source import SourcePool
 from taccorl.episodes.sources.mimicgen.spec import GatesSpec, load_mimic_spec, with_options
 from taccorl.episodes.sources.mimicgen.stored import execute
 from taccorl.episodes.sources.mimicgen.touching import Touching
-from taccorl.errors import DatasetError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.tasks.assembly_2.scene import Assembly2
@@ -172,22 +169,6 @@ def test_no_joint_is_sent_faster_than_it_may_turn_and_it_still_arrives(hands_at)
         np.testing.assert_allclose(np.abs(hands.joints_rad["left"] - start), min(0.1 * (k + 1), 0.35), atol=1e-12)
         np.testing.assert_array_equal(hands.joints_rad["right"], goal["right"])
     np.testing.assert_allclose(last[:6], goal["left"] - hands._rest["left"].offset_rad, atol=1e-6)
-
-
-def test_a_recording_without_simulator_state_is_refused_with_the_way_out(collected, tmp_path):
-    shutil.copytree(collected, tmp_path / "real")
-    for name in ("info.json", "taccorl/dataset_spec.json"):  # as of a robot's recording
-        path = tmp_path / "real" / "meta" / name
-        document = json.loads(path.read_text())
-        document["features"] = {key: f for key, f in document["features"].items() if not key.startswith("sim.")}
-        path.write_text(json.dumps(document))
-    with pytest.raises(DatasetError, match=r"has no sim\.state, .* taccorl collect --task=assembly_2"):
-        read_sources(tmp_path / "real", load_mimic_spec("assembly_2"))
-
-
-def test_sources_of_another_task_are_refused(collected):
-    with pytest.raises(DatasetError, match="is of assembly_2: --task=assembly_2, or"):
-        read_sources(collected, load_mimic_spec("assembly_1"))
 
 
 # attempts -----------------------------------------------------------------------------------------------------------------

@@ -21,10 +21,11 @@ from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, attempt_episo
 from taccorl.episodes.sources.mimicgen.director import Ahead, ArmTarget, Director
 from taccorl.episodes.sources.mimicgen.disturbance import Disturbance, Exact, drifted
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
-from taccorl.episodes.sources.mimicgen.source import SourcePool
+from taccorl.episodes.sources.mimicgen.source import Source, SourcePool
 from taccorl.episodes.sources.mimicgen.spec import (
     DisturbanceSpec,
     GatesSpec,
+    MimicSpec,
     NoiseSpec,
     check_task,
     load_mimic_spec,
@@ -79,10 +80,12 @@ class Sinking:
         return {arm: self.arm_targets[arm] for arm in going}
 
 
-def directed(spec, *, felt: bool, moved_m: float = 0.0) -> tuple[Director, dict[str, np.ndarray]]:
+def directed(
+    spec: MimicSpec, *, felt: bool, moved_m: float = 0.0, source: Source | None = None
+) -> tuple[Director, dict[str, np.ndarray]]:
     """Arm → goals (steps, 4, 4) of a director with ideal hands, the plug moved."""
     world = scene(plug=pose(0.30 + moved_m, -0.16, 0.02))
-    pool = SourcePool(spec, [demonstration(scene())])
+    pool = SourcePool(spec, [source or demonstration(scene())])
     director = Director(
         pool, world, world.openings, np.random.default_rng(0), hz=HZ, contact_hands=Sinking if felt else None
     )
@@ -115,15 +118,9 @@ def test_hands_are_taken_over_at_the_contact_row_and_left_alone_until_then(schem
 
 
 def test_a_source_that_touches_nothing_is_replayed_to_its_end():
-    spec, source = mimic_spec(), demonstration(scene())
+    source = demonstration(scene())
     untouched = dataclasses.replace(source, mated={body: np.zeros_like(of) for body, of in source.mated.items()})
-    world = scene()
-    director = Director(
-        SourcePool(spec, [untouched]), world, world.openings, np.random.default_rng(0), hz=HZ, contact_hands=Sinking
-    )
-    while not director.done:
-        for arm, arm_target in director.step(world).items():
-            world.execute(arm, arm_target.goal, arm_target.opening_m)
+    director, _ = directed(mimic_spec(), felt=True, source=untouched)
     assert isinstance(director.contact_hands, Sinking)
     assert director.contact_hands.taken == []
 
