@@ -15,101 +15,63 @@ from taccorl.errors import SpecError
 REMOVE = object()
 
 # Two joints and two 2 × 3 pads: everything that the shipped specs have, small enough to do the arithmetic by hand.
-SENSOR = {
-    "spec_version": 1,
-    "name": "little_pad",
-    "rows": 2,
-    "columns": 3,
-    "wire": {"rows": 3, "columns": 2, "dtype": "uint8", "transpose": True},
-    "adc_bits": 10,
-    "wire_shift_bits": 2,
-    "rate_hz": 100.0,
-    "scan_time_s": 0.01,
-    "unit": "adc_count",
-    "baseline": {"rule": "median_of_first", "frames": 5, "max_spread_count": 12.0},
-    "noise_count": 15.0,
-    "scheme": "fixed_scale",
-    "gain_per_count": 0.0133,
-}
-PADS = {
-    "dtype": "int16",
-    "unit": "adc_count",
-    "frame": "pad",
-    "rate_hz": 100.0,
-    "range": [-255.0, 255.0],
-    "pads": ["a", "b"],
-}
-DATASET = {
-    "spec_version": 1,
-    "name": "little",
-    "robot_type": "one_arm",
-    "fps": 30,
-    "action_time": "next_row",
-    "video_codec": "h264",
-    "features": {
-        "observation.state": {
-            "dtype": "float32",
-            "shape": [2],
-            "names": ["joint", "gripper"],
-            "unit": ["rad", "m"],
-            "frame": "joint",
-            "rate_hz": 200.0,
-            "range": {"joint": [-1.5, 1.5], "gripper": [0.0, 0.1]},
-        },
-        "action": {
-            "dtype": "float32",
-            "shape": [2],
-            "names": ["joint", "gripper"],
-            "unit": "rad",
-            "frame": "joint",
-            "rate_hz": 200.0,
-            "range": [-2.0, 2.0],
-        },
-        "observation.images.front": {
-            "dtype": "video",
-            "shape": [64, 96, 3],
-            "unit": "rgb8",
-            "frame": "camera",
-            "rate_hz": 30.0,
-            "range": [0.0, 255.0],
-        },
-        "observation.tactile": {**PADS, "shape": [12], "sensor": "pad.yaml"},
-        "observation.tactile_window": {**PADS, "shape": [48], "sensor": "pad.yaml", "history": 4, "optional": True},
-    },
-}
-PAD_CHANNEL = {"field": "data", "clock": "log", "latency_s": 0.01, "rate_hz": 100.0, "max_age_s": 0.04}
-RECORDING = {
-    "spec_version": 1,
-    "dataset": "dataset.yaml",
-    "reader": "mcap",
-    "clock": "header",
-    "split_bag": False,
-    "max_clock_spread_s": 0.25,
-    "episodes": {"by": "markers", "topic": "/episode", "min_s": 1.0},
-    "instruction": {"from": "markers"},
-    "channels": {
-        "state": {
-            "topic": "/joints",
-            "type": "sensor_msgs/msg/JointState",
-            "field": "position",
-            "pick": ["j1", "g"],
-            "scale": [1.5, 1.0],
-            "rate_hz": 200.0,
-            "max_age_s": 0.03,
-        },
-        "command": {"topic": "/command", "field": "position", "rate_hz": 200.0, "drop_zero_stamp": True},
-        "front": {"topic": "/camera", "rate_hz": 30.0, "max_age_s": 0.08, "channel_order": "rgb"},
-        "pad_a": {"topic": "/pad_a", **PAD_CHANNEL},
-        "pad_b": {"topic": "/pad_b", **PAD_CHANNEL},
-    },
-    "features": {
-        "observation.state": {"channels": ["state"], "align": "asof"},
-        "action": {"channels": ["command"], "align": "hold"},
-        "observation.images.front": {"channels": ["front"], "align": "asof"},
-        "observation.tactile": {"channels": ["pad_a", "pad_b"], "align": "asof"},
-        "observation.tactile_window": {"channels": ["pad_a", "pad_b"], "align": "window"},
-    },
-}
+SENSOR = yaml.safe_load("""
+spec_version: 1
+name: little_pad
+rows: 2
+columns: 3
+wire: {rows: 3, columns: 2, dtype: uint8, transpose: true}
+adc_bits: 10
+wire_shift_bits: 2
+rate_hz: 100.0
+scan_time_s: 0.01
+unit: adc_count
+baseline: {rule: median_of_first, frames: 5, max_spread_count: 12.0}
+noise_count: 15.0
+scheme: fixed_scale
+gain_per_count: 0.0133
+""")
+PADS = "dtype: int16, unit: adc_count, frame: pad, rate_hz: 100.0, range: [-255.0, 255.0], pads: [a, b]"
+ARM = "dtype: float32, shape: [2], names: [joint, gripper], frame: joint, rate_hz: 200.0"
+DATASET = yaml.safe_load(f"""
+spec_version: 1
+name: little
+robot_type: one_arm
+fps: 30
+action_time: next_row
+video_codec: h264
+features:
+  observation.state: {{{ARM}, unit: [rad, m], range: {{joint: [-1.5, 1.5], gripper: [0.0, 0.1]}}}}
+  action: {{{ARM}, unit: rad, range: [-2.0, 2.0]}}
+  observation.images.front:
+    {{dtype: video, shape: [64, 96, 3], unit: rgb8, frame: camera, rate_hz: 30.0, range: [0.0, 255.0]}}
+  observation.tactile: {{{PADS}, sensor: pad.yaml, shape: [12]}}
+  observation.tactile_window: {{{PADS}, sensor: pad.yaml, shape: [48], history: 4, optional: true}}
+""")
+PAD_CHANNEL = "field: data, clock: log, latency_s: 0.01, rate_hz: 100.0, max_age_s: 0.04"
+JOINTS = "topic: /joints, type: sensor_msgs/msg/JointState, field: position, pick: [j1, g], scale: [1.5, 1.0]"
+RECORDING = yaml.safe_load(f"""
+spec_version: 1
+dataset: dataset.yaml
+reader: mcap
+clock: header
+split_bag: false
+max_clock_spread_s: 0.25
+episodes: {{by: markers, topic: /episode, min_s: 1.0}}
+instruction: {{from: markers}}
+channels:
+  state: {{{JOINTS}, rate_hz: 200.0, max_age_s: 0.03}}
+  command: {{topic: /command, field: position, rate_hz: 200.0, drop_zero_stamp: true}}
+  front: {{topic: /camera, rate_hz: 30.0, max_age_s: 0.08, channel_order: rgb}}
+  pad_a: {{topic: /pad_a, {PAD_CHANNEL}}}
+  pad_b: {{topic: /pad_b, {PAD_CHANNEL}}}
+features:
+  observation.state: {{channels: [state], align: asof}}
+  action: {{channels: [command], align: hold}}
+  observation.images.front: {{channels: [front], align: asof}}
+  observation.tactile: {{channels: [pad_a, pad_b], align: asof}}
+  observation.tactile_window: {{channels: [pad_a, pad_b], align: window}}
+""")
 FILES = {"pad": SENSOR, "dataset": DATASET, "recording": RECORDING}
 
 
@@ -176,9 +138,7 @@ def test_the_little_spec_loads_and_its_limits_stand_in_the_order_of_the_names(tm
 
 
 def test_an_optional_feature_may_stay_empty_and_is_not_mapped(tmp_path):
-    spec = load_recording_spec(
-        write(tmp_path, recording=changed(RECORDING, ("features", "observation.tactile_window"), REMOVE))
-    )
+    spec = load_recording_spec(write(tmp_path, recording=changed(RECORDING, WINDOW, REMOVE)))
     assert list(spec.mapped) == [k for k in DATASET["features"] if k != "observation.tactile_window"]
 
 
@@ -259,12 +219,7 @@ TACTILE, WINDOW = ("features", "observation.tactile"), ("features", "observation
         (("gain_per_count",), -0.1, "gain_per_count", "-0.1 is not above 0"),
         (("baseline", "frames"), 0, "baseline → frames", "0 is not above 0"),
         (("wire_shift_bits",), 10, "wire_shift_bits", "10 of 10 bits leave no bit for the count"),
-        (
-            ("adc_bits",),
-            10**9,
-            "wire_shift_bits",
-            "leave no bit for the count",
-        ),  # and no memory is taken to find that out
+        (("adc_bits",), 10**9, "wire_shift_bits", "leave no bit for the count"),  # takes no memory to find out
         (("spec_version",), 2, "spec_version", "2; this taccorl reads version 1"),
         (("unit",), "counts", "unit", "'counts' is not a unit of datasets; did you mean 'adc_count'?"),
         (("wire", "dtype"), "float32", "wire → dtype", "'float32' is not one of 'uint8', 'uint16'"),
