@@ -231,9 +231,7 @@ def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_wa
     assert code == 2 and "slew_limit" in text and not Path("y.yaml").exists()
 
 
-def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_apart(
-    bench, said, tmp_path, monkeypatch
-):
+def test_test_recordings_alone_are_compared_and_files_of_one_name_are_told_apart(bench, said, tmp_path, monkeypatch):
     (tmp_path / "bench").mkdir()
     (tmp_path / "new").mkdir()
     (tmp_path / "bench" / "one.csv").write_text((bench / "bench" / "one.csv").read_text())

@@ -115,13 +115,10 @@ def test_a_tilde_is_the_home_folder_not_a_folder_named_tilde(monkeypatch: pytest
     assert robot("x", "--name=x", "--home=~/data").home == Path("/home/someone/data")
 
 
-def test_options_go_before_the_config_file(tmp_path: Path) -> None:
+def test_options_go_before_the_config_file_which_may_have_any_name(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("name: from file\njoints: 5\npaths: [a]\nmotor: {type: big, voltage_v: 24}\n")
     found = robot(f"--config_path={tmp_path / 'c.yaml'}", "--joints=4", "b")
     assert found == Robot(paths=[Path("b")], name="from file", joints=4, motor=BigMotor(voltage_v=24.0))
-
-
-def test_a_config_file_may_have_any_name(tmp_path: Path) -> None:
     path = tmp_path / "run #3: ünï.yaml"
     path.write_text("name: x\npaths: [a]\n")
     assert robot(f"--config_path={path}").name == "x"

@@ -511,9 +511,7 @@ def test_what_prune_frees_is_what_no_published_dataset_holds(store, tmp_path, wi
 
 
 @pytest.mark.parametrize("hurt", [flip, flip_and_set_the_times_back])
-def test_what_is_edited_in_place_where_it_is_published_is_not_served_by_the_store(
-    store, tmp_path, without_clones, hurt, caplog
-):
+def test_what_is_edited_where_it_is_published_is_not_served(store, tmp_path, without_clones, hurt, caplog):
     made = publish(store, tmp_path / "a")
     hurt(made / "data/rows", np.random.default_rng(1))
     edited = sha(made / "data/rows")
@@ -526,9 +524,7 @@ def test_what_is_edited_in_place_where_it_is_published_is_not_served_by_the_stor
     assert verify(made).changed == ("data/rows",)
 
 
-def test_where_the_file_system_neither_clones_nor_links_there_are_two_copies(
-    store, tmp_path, without_clones, monkeypatch
-):
+def test_where_a_file_system_neither_clones_nor_links_are_two_copies(store, tmp_path, without_clones, monkeypatch):
     def refuse(*_):
         raise OSError(errno.EXDEV, "another file system")
 

@@ -8,6 +8,7 @@ import torch
 from reaching import DemoAnchor, LinePolicy, LineWorld, imitated
 
 from taccorl.errors import TaccorlError
+from taccorl.rl.advantages import estimate_advantages, explained_variance, normalise
 from taccorl.rl.critic import Critic
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, Decisions, policy_loss
@@ -73,14 +74,11 @@ def test_another_policy_than_the_one_that_acted_is_refused() -> None:
         learner.update(found, torch.Generator())
 
 
-def test_gradient_is_linear_in_beta_and_the_anchor_is_in_it() -> None:
+def test_gradient_is_linear_in_beta_and_the_same_in_any_micro_batches() -> None:
     without, g0, g1, g2 = gradient(None), gradient(0.0), gradient(1.0), gradient(2.0)
     torch.testing.assert_close(g0, without)
     assert (g1 - g0).norm() > 0.1 * g0.norm()  # a dead anchor: 0
     torch.testing.assert_close(g2 - g0, 2 * (g1 - g0), atol=1e-6, rtol=1e-4)
-
-
-def test_gradient_does_not_depend_on_micro_batches() -> None:
     torch.testing.assert_close(gradient(1.0, 192), gradient(1.0, 50), atol=1e-6, rtol=1e-4)
 
 
@@ -308,3 +306,28 @@ def test_the_anchor_holds_the_policy_to_the_demonstrations() -> None:
     assert all(before < 0.3 and after > 0.8 for before, after, _ in found)
     free, loose, held = (drift for _, _, drift in found)
     assert held < loose < 0.5 * free
+
+
+# ---- advantages ----
+
+
+def test_three_decisions_by_hand() -> None:
+    """γ = 0.5, λ = 0.5; the second ends the episode by its time limit, with V = 8 for the last observation.
+    δ = 0 + 0.5·4 − 2 = 0; 1 + 0.5·8 − 4 = 1; 0 + 0.5·6 − 1 = 2. A = 0 + 0.25·1 = 0.25; 1; 2. R = A + V = 2.25; 5; 3."""
+    column = {
+        "reward_TN": [0.0, 1.0, 0.0],
+        "value_TN": [2.0, 4.0, 1.0],
+        "next_value_TN": [4.0, 8.0, 6.0],
+        "end_TN": [False, True, False],
+    }
+    given = {name: torch.tensor(x)[:, None] for name, x in column.items()}
+    advantage, returns = estimate_advantages(**given, gamma=0.5, gae_lambda=0.5)
+    assert advantage[:, 0].tolist() == [0.25, 1.0, 2.0] and returns[:, 0].tolist() == [2.25, 5.0, 3.0]
+
+
+def test_normalised_advantages_and_explained_variance() -> None:
+    found = normalise(torch.tensor([1.0, 2.0, 3.0, 6.0]))  # mean 3, deviation √3.5
+    assert found.tolist() == pytest.approx([(x - 3) / (3.5**0.5 + 1e-5) for x in (1, 2, 3, 6)])
+    returns = torch.tensor([0.0, 1.0, 0.0, 1.0])
+    assert explained_variance(returns + 5, returns) == pytest.approx(1.0)  # an offset is not variance
+    assert explained_variance(torch.zeros(4), returns) == pytest.approx(0.0)

@@ -194,16 +194,13 @@ def test_compiled_prism_stands_where_its_outline_says_to_a_few_nanometres():
     assert len(got) == 2 * len(right)
 
 
-def test_an_extruded_rectangle_is_a_box_and_a_frame_keeps_its_volume():
+def test_extruded_rectangles_are_boxes_and_other_outlines_prisms():
     (solid,) = extrude(box(1, 2, 4, 4), 0.5, 1.0)
     assert isinstance(solid, Box)
     assert solid.half_m == (1.5, 1.0, 0.25)
     assert solid.part_from_solid[:3, 3].tolist() == [2.5, 3.0, 0.75]
     frame = extrude(Polygon(box(0, 0, 3, 3).exterior, [box(1, 1, 2, 2).exterior]), 0.5, 1.0)
     assert sum(solid.volume_m3 for solid in frame) == pytest.approx(8 * 0.5)
-
-
-def test_a_trapezoid_is_a_prism_not_a_box():
     (solid,) = extrude(Polygon([(0, 0), (3, 0), (2, 1), (1, 1)]), 0, 1)
     assert isinstance(solid, Prism)
     (turned,) = extrude(Polygon([(0, 0), (1, 1), (0, 2), (-1, 1)]), 0, 1)  # a square on its corner is not axis-parallel

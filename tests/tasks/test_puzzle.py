@@ -159,9 +159,7 @@ def test_all_three_in_their_holes_succeed_after_half_a_second(sim):
         ("heart", 0, 0, 180, False),
     ],
 )
-def test_a_piece_is_in_near_the_floor_level_and_turned_so_that_it_looks_the_same(
-    sim, piece, above_mm, tilt_deg, turned_deg, counts
-):
+def test_a_piece_is_in_near_the_floor_level_and_turned_as_it_fits(sim, piece, above_mm, tilt_deg, turned_deg, counts):
     pose = over_hole(sim, piece, IN_HOLE_M + above_mm / 1e3, turned_deg=turned_deg)
     pose[:3, :3] = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix() @ pose[:3, :3]
     put_all_in(sim, **{piece: pose})

@@ -26,21 +26,15 @@ def test_active_sum_and_peak_are_what_one_adds_up_by_hand():
     assert rows.num_active.tolist() == [2, 0]  # 16 and 31 are above 15; 15 is not
     assert rows.sum_count.tolist() == [16 + 31, 0]
     assert rows.peak_count.tolist() == [31, 15]
-
-
-def test_sum_of_a_saturated_pad_does_not_overflow_int16():
     full = Pad("left_a", FLEXITAC, np.full((1, 32, 12), 255, dtype=np.int16))
     assert full.sum_count.tolist() == [32 * 12 * 255]  # 97920 > 32767
 
 
-def test_gate_opens_beyond_30_counts_which_is_the_papers_threshold():
+def test_gate_opens_beyond_30_counts_of_any_pad_which_is_the_papers_threshold():
     assert (CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS) == (0.4, 1)
     assert np.isclose(pad([[0, 0], [0, 0]]).gate_count, 30.0)  # 0.4 / (1/75)
     rows = pad([[30, 30], [30, 30]], [[31, 0], [0, 0]], [[0, 0], [0, -31]], [[0, 0], [0, 0]])
     assert contact_gate([rows]).tolist() == [False, True, True, False]  # |f|: the paper's eq. counts both signs
-
-
-def test_gate_asks_all_pads_together():
     quiet, loud = pad([[0, 0], [0, 0]]), pad([[0, 0], [0, 90]])
     assert contact_gate([quiet, loud]).tolist() == [True]
     assert contact_gate([quiet, quiet]).tolist() == [False]
