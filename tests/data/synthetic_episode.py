@@ -158,9 +158,7 @@ def pictures_of(state: np.ndarray, seed: int) -> dict[str, np.ndarray]:
         (FRONT.replace("front", "right_wrist"), [7, 8]),
     ):
         background = rng.integers(40, 160, (PICTURE_PX, PICTURE_PX, 3))
-        frames = np.repeat(background[None], len(state), axis=0) + rng.normal(
-            0, 2, (len(state), PICTURE_PX, PICTURE_PX, 3)
-        )
+        frames = np.repeat(background[None], len(state), axis=0) + rng.normal(0, 2, (len(state), *background.shape))
         where = 20 + 12 * np.stack([state[:, joints].sum(axis=1), state[:, joints[::2]].sum(axis=1)], axis=1)
         for t, (r, c) in enumerate(np.clip(where, 0, PICTURE_PX - 14).astype(int)):
             frames[t, r : r + 14, c : c + 14] = 230

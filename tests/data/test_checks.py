@@ -327,13 +327,10 @@ def test_exchanged_action_and_state_and_exchanged_arms_are_errors(good):
         assert one(swapped, "swapped_arms").severity == "error"
 
 
-def test_arms_that_move_alike_are_not_called_swapped(good):
+def test_arms_that_move_alike_or_alone_are_called_swapped_only_if_they_are(good):
     state, action, _ = copies(good)
     state[:, 7:], action[:, 7:] = state[:, :7], action[:, :7]
     assert found(without(with_arrays(good, state=state, action=action), TOUCH), "swapped_arms") == []
-
-
-def test_swap_is_seen_when_only_one_arm_moves(good):
     still = still_left(good)
     assert found(still, "swapped_arms") == []
     assert found(with_arrays(still, action=np.roll(still.arrays[ACTION], 7, axis=1)), "swapped_arms")

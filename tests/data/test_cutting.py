@@ -27,7 +27,7 @@ from taccorl.surrogate.drivers import (
     STATE_TOPICS,
 )
 from tests.recordings.pictures import read_frame_id
-from tests.recordings.stand_in import StandInConfig, StandInTruth, write_mcap
+from tests.recordings.stand_in import StandInConfig, write_mcap
 
 FPS = 30
 STATE, ACTION, TOUCH, WINDOW = "observation.state", "action", "observation.tactile", "observation.tactile_window"
@@ -47,9 +47,7 @@ class Made:
 
     def __init__(self, path: Path, **config: Any) -> None:
         self.path = path
-        self.truth: StandInTruth = write_mcap(
-            path, StandInConfig(**({"duration_s": 3.0, "camera_size": SIZE} | config))
-        )
+        self.truth = write_mcap(path, StandInConfig(**({"duration_s": 3.0, "camera_size": SIZE} | config)))
 
     def sample_ns(self, topic: str, log_clock: bool = False) -> np.ndarray:
         """(N,) when each message's content was, as its own clock says; log clock: less the pads' latency."""

@@ -371,13 +371,8 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
         table = pa.concat_tables(pq.read_table(p) for p in sorted((root / "data").rglob("*.parquet")))
         stats = json.loads((root / "meta" / "stats.json").read_text())
         for key in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
-            rows = table[key].to_numpy()
-            expected = {
-                "min": rows.min(),
-                "max": rows.max(),
-                "mean": rows.mean(dtype=float),
-                "std": rows.std(dtype=float),
-            }
+            rows = table[key].to_numpy().astype(float)
+            expected = {name: getattr(rows, name)() for name in ("min", "max", "mean", "std")}
             found = {name: stats[key][name][0] for name in expected}
             assert found == pytest.approx(expected), key
         assert [f.text for f in check_statistics(Dataset(root))] == []

@@ -25,16 +25,10 @@ def channel(**options: Any) -> ChannelSpec:
 
 
 def sensor(rows: int, columns: int, *, dtype: Any = "uint8", transpose: bool = False, adc_bits: int = 8) -> SensorSpec:
-    wire = dataclasses.replace(
-        FLEXITAC.wire,
-        rows=columns if transpose else rows,
-        columns=rows if transpose else columns,
-        dtype=dtype,
-        transpose=transpose,
-    )
-    return dataclasses.replace(
-        FLEXITAC, name="pad", rows=rows, columns=columns, wire=wire, adc_bits=adc_bits, wire_shift_bits=0
-    )
+    on_wire = {"rows": columns, "columns": rows} if transpose else {"rows": rows, "columns": columns}
+    wire = dataclasses.replace(FLEXITAC.wire, **on_wire, dtype=dtype, transpose=transpose)
+    bits = {"adc_bits": adc_bits, "wire_shift_bits": 0}
+    return dataclasses.replace(FLEXITAC, name="pad", rows=rows, columns=columns, wire=wire, **bits)
 
 
 def joints(names: list[str], position: list[float], **more: Any) -> SimpleNamespace:
@@ -118,28 +112,24 @@ def test_joints_are_picked_by_name_in_any_order():
     assert extract({"name": ["joint2", "joint1", "gripper"], "position": [2, 1, 3]}).tolist() == [1, 2, 3]
 
 
-def test_scale_multiplies_after_picking_in_the_order_of_pick():
+def test_scale_multiplies_after_picking_and_must_fit_the_values():
     extract = decode.VectorExtractor(channel(field="position", pick=("gripper", "joint1"), scale=(0.001, 2.0)))
     assert extract(joints(["joint1", "gripper"], [10.0, 70.0])).tolist() == [0.07, 20.0]
     one_for_all = decode.VectorExtractor(channel(field="position", scale=(2.0,)))
     assert one_for_all(joints([], [1, 2, 3])).tolist() == [2, 4, 6]
+    with pytest.raises(RecordingError, match=r"3 values,.*spec.*2"):
+        decode.VectorExtractor(channel(field="p", scale=(1.0, 2.0)))({"p": [1, 2, 3]})
 
 
-def test_pipers_six_velocities_for_seven_names_are_not_guessed_at():
+def test_names_that_do_not_fit_their_values_or_the_spec_are_refused():
     message = joints(NAMES, [0.0] * 7, velocity=[0.1] * 6)
     extract = decode.VectorExtractor(channel(field="velocity", pick=("joint1",)))
     with pytest.raises(RecordingError, match="6 values for 7 names in 'velocity'"):
         extract(message)
     with pytest.raises(RecordingError, match="8 values for 7 names"):
         decode.VectorExtractor(channel(field="position", pick=("joint1",)))(joints(NAMES, [0.0] * 8))
-
-
-def test_a_missing_joint_names_the_nearest():
     with pytest.raises(RecordingError, match="'joint7' is not among its names; did you mean 'joint6'"):
         decode.VectorExtractor(channel(field="position", pick=("joint7",)))(joints(NAMES, [0.0] * 7))
-
-
-def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
     message = joints([*NAMES, *NAMES], [float(k) for k in range(14)])
     with pytest.raises(RecordingError, match="'joint1' stands twice among its names"):
         decode.VectorExtractor(channel(field="position", pick=("joint1",)))(message)
@@ -170,11 +160,6 @@ def test_what_is_no_list_of_named_numbers_is_refused(message, reason):
 def test_a_vector_without_a_field_is_the_message_itself():
     assert decode.VectorExtractor(channel())(np.arange(3, dtype=np.float32)).tolist() == [0, 1, 2]
     assert decode.VectorExtractor(channel(field="x"))({"x": 2}).tolist() == [2.0]
-
-
-def test_factors_must_fit_the_values():
-    with pytest.raises(RecordingError, match=r"3 values,.*spec.*2"):
-        decode.VectorExtractor(channel(field="p", scale=(1.0, 2.0)))({"p": [1, 2, 3]})
 
 
 # --- pads
@@ -209,16 +194,14 @@ def test_counts_are_the_same_from_bytes_lists_arrays_and_base64(frame):
     assert counts.dtype == np.uint8
 
 
-def test_sixteen_bit_counts_come_little_endian():
+def test_sixteen_bit_counts_come_little_endian_and_no_others_are_taken():
     pad = sensor(1, 2, dtype="uint16", adc_bits=12)
     assert decode.pad_extractor(channel(), pad)(b"\x01\x00\xff\x0f").tolist() == [1, 4095]
-
-
-def test_counts_that_the_adc_cannot_send_are_refused():
-    """1 and 4095 with their bytes swapped: 256 and 65295."""
-    pad = sensor(1, 2, dtype="uint16", adc_bits=12)
+    # 1 and 4095 with their bytes swapped: 256 and 65295.
     with pytest.raises(RecordingError, match=r"count.*65295,.*pad sends at most 4095"):
         decode.pad_extractor(channel(), pad)(b"\x00\x01\x0f\xff")
+    with pytest.raises(RecordingError, match=r"3 bytes.*whole number.*uint16 counts"):
+        decode.pad_extractor(channel(), pad)(bytes(3))
 
 
 @pytest.mark.parametrize(
@@ -246,11 +229,6 @@ def test_counts_that_the_adc_cannot_send_are_refused():
 def test_what_is_no_frame_of_counts_is_refused(frame, reason):
     with pytest.raises(RecordingError, match=reason):
         decode.pad_extractor(channel(), sensor(2, 2))(frame)
-
-
-def test_half_a_sixteen_bit_count_is_refused():
-    with pytest.raises(RecordingError, match=r"3 bytes.*whole number.*uint16 counts"):
-        decode.pad_extractor(channel(), sensor(1, 2, dtype="uint16", adc_bits=12))(bytes(3))
 
 
 # --- pictures
@@ -377,18 +355,10 @@ def wire_of(image: np.ndarray, encoding: str) -> np.ndarray:
     return np.stack([first, second], axis=2).reshape(len(image), -1)
 
 
-@pytest.mark.parametrize(
-    "encoding",
-    [
-        "yuv422",
-        "uyvy",
-        "yuv422_yuy2",
-        "yuyv",
-        "nv12",
-        "nv21",
-        *(f"bayer_{order}8" for order in ("rggb", "bggr", "gbrg", "grbg")),
-    ],
-)
+BAYER = [f"bayer_{order}8" for order in ("rggb", "bggr", "gbrg", "grbg")]
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12", "nv21", *BAYER])
 def test_raw_encodings_of_cameras_give_their_colours(encoding):
     colours = np.array([(220, 20, 60), (20, 160, 40), (30, 40, 200)], np.uint8)
     image = np.repeat(np.repeat(colours[None], 16, axis=0), 16, axis=1)
@@ -405,14 +375,8 @@ DEPTH_PNG = cv2.imencode(".png", np.full((4, 6), 4700, np.uint16))[1].tobytes()
 
 
 def raw(**changes: Any) -> dict[str, Any]:
-    return {
-        "height": 4,
-        "width": 6,
-        "encoding": "rgb8",
-        "step": 18,
-        "data": base64.b64encode(bytes(72)).decode(),
-        **changes,
-    }
+    data = base64.b64encode(bytes(72)).decode()
+    return {"height": 4, "width": 6, "encoding": "rgb8", "step": 18, "data": data, **changes}
 
 
 @pytest.mark.parametrize(

@@ -331,9 +331,7 @@ def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(ingests, goo
     assert content(aside) == {"thesis.txt": b"do not touch"}
 
 
-def test_another_dataset_is_left_alone_and_the_same_content_under_another_name_is_known(
-    ingests, good, tmp_path, capsys
-):
+def test_another_dataset_is_left_alone_and_the_same_content_of_another_name_is_known(ingests, good, tmp_path, capsys):
     assert ingests.run(good / "a.mcap") == 0
     assert ingests.written() == 1
     before = content(ingests.out)

@@ -143,10 +143,10 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
     assert [*check_bookkeeping(Dataset(tmp_path / "all"))] == []
     joined, numbers = (
         Dataset(tmp_path / "all"),
-        [(part, k) for part in parts for k in range(Dataset(part).num_episodes)],
+        [(part, k) for part in map(Dataset, parts) for k in range(part.num_episodes)],
     )
     for number, (part, k) in enumerate(numbers):
-        one, other = joined.episode(number), Dataset(part).episode(k)
+        one, other = joined.episode(number), part.episode(k)
         assert one.instruction == other.instruction
         np.testing.assert_array_equal(one.arrays["action"], other.arrays["action"])
 

@@ -51,9 +51,7 @@ def spec(tmp_path_factory: pytest.TempPathFactory) -> DatasetSpec:
     return load_dataset_spec(path)
 
 
-def made_up(
-    spec: DatasetSpec, num_rows: int = 40, first_id: int = 0, fail_at: int | None = None, seed: int = 0
-) -> Episode:
+def made_up(spec: DatasetSpec, num_rows: int = 40, first_id: int = 0, fail_at: int = -1, seed: int = 0) -> Episode:
     """Row k shows picture first_id + k, state (first_id + k, k / 7) and random touch."""
     rng = np.random.default_rng(seed)
     k = np.arange(num_rows)
@@ -124,9 +122,7 @@ def test_a_slow_encoder_loses_no_frame(spec, tmp_path, slow_encoder):
     assert row_ids(tmp_path / "ds") == list(range(20))
 
 
-def test_dropped_frames_are_found_and_the_dataset_is_written_again_exactly(
-    spec, tmp_path, slow_encoder, monkeypatch, caplog
-):
+def test_dropped_frames_are_found_and_the_dataset_is_written_again(spec, tmp_path, slow_encoder, monkeypatch, caplog):
     monkeypatch.setattr(lerobot_format, "_wait_for_room", lambda dataset: None)  # no back-pressure
     attempts: list[tuple[bool, list[str]]] = []
     original = lerobot_format._write

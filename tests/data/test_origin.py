@@ -54,17 +54,11 @@ def test_what_is_stated_is_read_back_as_it_was_and_no_text_overrules_it() -> Non
         assert Origin.read(json.loads(json.dumps(origin.record()))) == origin
 
 
-def test_an_unknown_domain_is_refused_with_its_value() -> None:
+def test_a_domain_that_does_not_exist_or_contradicts_the_data_is_refused() -> None:
     with pytest.raises(TaccorlError, match=r"'reel'.*real"):
         Origin.read({"domain": "reel"})
-
-
-def test_no_text_of_a_simulation_goes_with_real() -> None:
     with pytest.raises(TaccorlError, match="contradicts the data"):
         Origin("real", "stand-in recording, not a robot")
-
-
-def test_a_simulator_s_columns_go_with_no_real_domain() -> None:
     with pytest.raises(TaccorlError, match=r"sim\.\*"):
         Origin.read({"domain": "real", "origin": ""}, ["action", "sim.state"])
     assert Origin.read({"domain": "surrogate", "origin": ""}, ["sim.state"]).domain == "surrogate"

@@ -155,6 +155,7 @@ def test_digest_ignores_comments_layout_and_the_order_of_keys(tmp_path):
     assert load_recording_spec(write(tmp_path, recording=defaults)).digest == before
 
 
+SLOW = pytest.mark.slow
 OTHER_WORDS = [
     "hdf5", "log", "header", "h264", "libsvtav1", "hold", "asof", "bgr", "int16", "uint16", "topic", "/other", "other", "unknown",
 ]  # fmt: skip
@@ -164,10 +165,8 @@ OTHER_WORDS = [
     ("name", "num_changed", "relations"),
     [
         ("pad", 10, "spec_version rows columns wire.rows wire.columns wire.transpose adc_bits baseline.rule scheme"),
-        pytest.param(
-            "dataset", 43, "spec_version action_time dtype shape names sensor history", marks=pytest.mark.slow
-        ),
-        pytest.param("recording", 35, "spec_version dataset by from channels align", marks=pytest.mark.slow),
+        pytest.param("dataset", 43, "spec_version action_time dtype shape names sensor history", marks=SLOW),
+        pytest.param("recording", 35, "spec_version dataset by from channels align", marks=SLOW),
     ],
 )
 def test_digest_changes_with_every_leaf(tmp_path, name, num_changed, relations):

@@ -52,22 +52,16 @@ def _restore(sim, episode, row: int) -> None:
     sim.restore_rows(episode.arrays["sim.state"][row : row + 1], episode.arrays["sim.seed"][row])
 
 
-def test_a_run_goes_on_bit_exactly_from_any_stored_row(recorded):
+def test_any_stored_row_restores_the_encoders_and_the_run_goes_on_bit_exactly(recorded):
     _, sim, _, episode = recorded
     for row in (0, 100, 250):
         _restore(sim, episode, row)
         for later in range(row, row + 3):
             np.testing.assert_array_equal(sim.state_rows()[0], episode.arrays["sim.state"][later])
             sim.step(episode.arrays["sim.executed"][later : later + 1].astype(float))
-
-
-def test_stored_state_restores_what_the_encoders_said(recorded):
-    _, sim, _, episode = recorded
     for row in (0, len(episode.arrays["action"]) // 2, len(episode.arrays["action"]) - 1):
         _restore(sim, episode, row)
-        np.testing.assert_array_equal(
-            sim.proprioception()[0].astype(np.float32), episode.arrays["observation.state"][row]
-        )
+        np.testing.assert_array_equal(sim.proprioception()[0].astype("f4"), episode.arrays["observation.state"][row])
 
 
 def test_success_comes_after_the_hold_and_ends_the_episode(recorded):

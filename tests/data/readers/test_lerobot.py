@@ -195,12 +195,9 @@ def with_times(root: Path, copy: Path, stamped_s: list[float]) -> Path:
     return copy
 
 
-def test_rows_that_somebody_deleted_leave_a_gap_in_time(theirs: Path, tmp_path: Path) -> None:
+def test_times_are_kept_as_stamped_and_deleted_rows_leave_a_gap(theirs: Path, tmp_path: Path) -> None:
     gap = with_times(theirs, tmp_path / "gap", [0.0, 0.1, 0.2, 0.7, 0.8, 0.9])
     assert [m.log_ns // 10**8 for m in reader_of(gap).messages({"note"})] == [0, 1, 2, 7, 8, 9]
-
-
-def test_times_that_are_not_row_over_fps_are_kept_as_stamped(theirs: Path, tmp_path: Path) -> None:
     odd = with_times(theirs, tmp_path / "odd", [0.0, 0.13, 0.21, 0.34, 0.4, 0.5])
     found = [m.log_ns / 1e9 for m in reader_of(odd).messages({"note"})]
     assert found == pytest.approx([0.0, 0.13, 0.21, 0.34, 0.4, 0.5], abs=1e-6)

@@ -124,9 +124,7 @@ def gripped_and_lifted(pool):
     return int(np.flatnonzero(closed & ~free)[-1 - np.count_nonzero(closed[lifted:] & ~free[lifted:])]), lifted
 
 
-def test_a_hand_that_grips_what_stands_on_the_table_holds_it_fast_and_one_that_carries_it_does_not(
-    hands_at, gripped_and_lifted, pool
-):
+def test_a_hand_holds_fast_what_stands_on_the_table_and_not_what_it_carries(hands_at, gripped_and_lifted, pool):
     touching, found = Touching(hands_at(0)[0]), []
     last = len(pool.sources[1].mated["plug"]) - 1
     for row in (30, *gripped_and_lifted, last):

@@ -96,9 +96,7 @@ def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(plan, tmp_path, 
 
 
 @pytest.mark.slow
-def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next_attempt(
-    augmented, plan, tmp_path, monkeypatch
-):
+def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next(augmented, plan, tmp_path, monkeypatch):
     folder, _ = augmented
     step, steps = Simulation.step, []
 
@@ -134,9 +132,7 @@ class Deadly(AugmentPlan):
 
 
 @pytest.mark.slow
-def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again(
-    augmented, plan, tmp_path, monkeypatch
-):
+def test_an_attempt_that_kills_its_process_twice_is_counted_and_not_made_again(augmented, plan, tmp_path, monkeypatch):
     shutil.copytree(augmented[0] / "store", tmp_path / "store")  # it holds attempt 1, which succeeds
     store, some, engine = Store(tmp_path / "store"), plan(Deadly, episodes=1), LocalEngine(workers=2)
     shutil.rmtree(store.find(some.steps[0].stage, some.config(0), some.inputs(0)).path)

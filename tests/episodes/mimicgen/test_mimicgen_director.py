@@ -212,13 +212,10 @@ def test_hands_that_are_not_at_their_goal_wait_before_contact():
     assert max(waited.off_m.values()) <= 0.0005
 
 
-def test_a_hand_that_never_comes_to_its_goal_waits_as_long_as_the_spec_says():
+def test_hands_wait_as_long_as_the_spec_says_unless_they_are_at_their_goal_or_replayed_plainly():
     at_once, waited = (until_contact(RestingOff, settle) for settle in (0, 30))
     assert at_once.off_m["right"] == pytest.approx(0.003)
     assert waited.num_steps - at_once.num_steps == 30
-
-
-def test_hands_that_are_at_their_goal_do_not_wait_nor_those_of_plain_replay():
     assert until_contact(IdealHands, 30).num_steps == until_contact(IdealHands, 0).num_steps
     at_once, plain = (until_contact(RestingOff, settle, retarget="eef_command") for settle in (0, 30))
     assert at_once.num_steps == plain.num_steps
