@@ -1,9 +1,14 @@
 """Arithmetic of the study on rows written by hand, and one real job."""
 
+import dataclasses
 from typing import Any
 
+import numpy as np
 import pytest
 
+from pipelines import diagnosis_page
+from pipelines.studies.cells import CellsRow, run_cells, table
+from pipelines.studies.figures import SLOPE, confusion_matrix, detection_curves, half_detected
 from pipelines.studies.joints_and_pads import (
     IDENTICAL,
     MATERIAL,
@@ -21,6 +26,7 @@ from pipelines.studies.joints_and_pads import (
     run,
     silently_wrong,
 )
+from taccorl.data.origin import Origin
 from taccorl.sim.effects import effects
 from taccorl.surrogate.hidden import KINDS
 
@@ -173,3 +179,100 @@ def test_the_same_job_gives_the_same_row_but_for_the_time_it_took():
     assert rows[0] == rows[1]
     assert rows[0]["key"] == job.key and rows[0]["left_floors"] == pytest.approx(12.0, rel=0.2)
     assert material(rows[0]) and exact_but_for_algebra(rows[0]) and named(rows[0]) and not silently_wrong(rows[0])
+
+
+# ---- sensors of cells ----
+
+ROW = CellsRow(
+    hidden="taxel_creep",
+    seed=1,
+    found=("taxel_creep",),
+    named=True,
+    status="at_floor",
+    before=9.0,
+    after=1.0,
+    error=0.02,
+    cpu_s=2.0,
+)
+
+
+def test_exact_is_the_hidden_effect_alone_and_of_a_clean_sensor_nothing():
+    assert ROW.exact
+    assert not dataclasses.replace(ROW, found=("taxel_creep", "touch_lag")).exact
+    assert not dataclasses.replace(ROW, found=()).exact
+    assert dataclasses.replace(ROW, hidden="", found=()).exact
+    assert not dataclasses.replace(ROW, before=1.4).material
+
+
+def test_the_table_has_a_line_an_effect_and_names_each_case_that_was_not_exact():
+    wrong = dataclasses.replace(ROW, seed=2, found=("touch_lag",), error=float("nan"), status="something_else")
+    lines = table([ROW, wrong, dataclasses.replace(ROW, seed=3, before=1.2, found=())])
+    assert "| taxel_creep | 3 | 2 | 1 of 2 | 9.00 | 1.00 | 2.0% |" in lines
+    assert "taxel_creep (seed 2): touch_lag, something_else" in lines[-1]
+    assert "taxel_creep (seed 3): nothing, at_floor" in lines[-1]
+
+
+def test_one_case_is_run():
+    row = run_cells("", 3)
+    assert row.exact and row.status == "nothing_missing"
+    assert row.after < 1.3
+
+
+def test_a_section_is_replaced_and_others_stay(tmp_path, monkeypatch):
+    page = tmp_path / "page.md"
+    page.write_text("# Own\n\n## Design\n\ntext\n")
+    monkeypatch.setattr(diagnosis_page, "PAGE", page)
+    diagnosis_page.replace_section("Axes", "one")
+    diagnosis_page.replace_section("Cells", "two")
+    diagnosis_page.replace_section("Axes", "three")
+    own, marker, others = page.read_text().partition(diagnosis_page.OTHERS)
+    assert own == "# Own\n\n## Design\n\ntext\n\n"
+    assert marker
+    assert others == "\n\n## Cells\n\ntwo\n\n## Axes\n\nthree\n"
+
+
+# ---- figures hold the counts that they were given ----
+
+ORIGIN = Origin("surrogate", "a test")
+
+
+def test_confusion_matrix_holds_the_counts():
+    counts = {"a": {"a": 18, "b": 1, "something else": 1}, "b": {"b": 20}, "none": {"nothing": 20}}
+    figure = confusion_matrix(counts, [ORIGIN], "who is taken for whom")
+    axes = figure.axes[0]
+    labels = [t.get_text() for t in axes.get_xticklabels()]
+    rows = [t.get_text() for t in axes.get_yticklabels()]
+    found = {(rows[round(t.get_position()[1])], labels[round(t.get_position()[0])]): t.get_text() for t in axes.texts}
+    assert found == {
+        ("a (n = 20)", "a"): "18",
+        ("a (n = 20)", "b"): "1",
+        ("a (n = 20)", "something else"): "1",
+        ("b (n = 20)", "b"): "20",
+        ("none (n = 20)", "nothing"): "20",
+    }
+
+
+def test_half_detection_is_where_misses_turn_into_finds():
+    signals = np.geomspace(0.25, 4.0, 41)
+    half, low, high = half_detected(signals, signals > 1.0)
+    assert half == pytest.approx(1.0, rel=0.1)
+    assert 0.7 < low < half < high < 1.4
+    # drawn from the curve itself: the true 2 lies within the interval
+    rng = np.random.default_rng(0)
+    signals = np.exp(rng.uniform(np.log(0.3), np.log(10), 200))
+    half, low, high = half_detected(signals, rng.random(200) < 1 / (1 + (2.0 / signals) ** SLOPE))
+    assert low < 2.0 < high < 1.3 * low
+    assert half_detected(np.array([3.0, 5.0]), np.array([True, True]))[1] == 0.0  # never missed
+    assert half_detected(np.array([0.1, 0.2]), np.array([False, False]))[2] == np.inf  # never found
+
+
+def test_detection_curves_count_seeds_bin_by_bin():
+    points = {"backlash": (np.array([4.0] * 10 + [1.0] * 10), np.array([True] * 10 + [True, False] * 5))}
+    figure = detection_curves(points, [ORIGIN], "detection", (0.5, 2.0, 8.0))
+    axes = figure.axes[0]
+    assert axes.get_title() == "backlash (n = 20)"
+    dots = [float(mark.get_ydata()[0]) for mark in axes.lines if mark.get_marker() == "o"]
+    assert dots == [0.5, 1.0]
+    bars = [list(mark.get_ydata()) for mark in axes.lines if mark.get_alpha() == 0.6]
+    # Wilson, 10 of 10 at z = 1.96: low = 1 / (1 + z² / n) = 0.7225; 5 of 10: 0.5 ± 0.2634
+    np.testing.assert_allclose(bars, [[0.2366, 0.7634], [0.7225, 1.0]], atol=1e-3)

@@ -8,6 +8,7 @@ import re
 import shlex
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +33,8 @@ from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.training import reading
 from taccorl.training.cotrain import merge_domains
-from taccorl.training.reading import FastReader, with_windows
+from taccorl.training.reading import FastReader, install, with_windows
+from taccorl.training.video_backend import default_video_backend
 
 
 @pytest.fixture(scope="module")
@@ -467,3 +469,31 @@ def test_one_domain_left_by_a_choice_of_episodes_is_noticed(place, tmp_path):
     assert np.ravel(dataset.meta.stats[IS_SIM]["mean"])[0] == 1
     with pytest.raises(TaccorlError, match=r"gives real rows the weight 0\.5"):
         make_policy(TactilePI05Config(**TINY), ds_meta=dataset.meta)
+
+
+# ---- which decoder LeRobot takes for videos ----
+
+BROKEN = "raise RuntimeError('Could not load libtorchcodec. Likely causes: …')"
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder in which this process looks for torchcodec first, and none that was imported."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchcodec"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    default_video_backend.cache_clear()
+    yield tmp_path
+    default_video_backend.cache_clear()
+    sys.modules.pop("torchcodec", None)
+
+
+@pytest.mark.parametrize(("torchcodec", "expected"), [(BROKEN, "pyav"), ("", "torchcodec")])
+def test_a_torchcodec_that_cannot_be_loaded_is_left_out_in_silence(torchcodec, expected, site, capfd, caplog):
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.datasets import lerobot_dataset
+
+    (site / "torchcodec.py").write_text(torchcodec)
+    install()
+    assert DatasetConfig("local/x").video_backend == lerobot_dataset.get_safe_default_video_backend() == expected
+    assert "".join(capfd.readouterr()) + caplog.text == ""
