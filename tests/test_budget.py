@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 14_297,
     "taccorl/cli": 4_870,
-    "taccorl/data": 8_734,
+    "taccorl/data": 8_740,
     "taccorl/diagnosis": 11_446,
     "taccorl/episodes": 4_184,
     "taccorl/evaluation": 1_883,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 55_536,
+    "tests": 55_540,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

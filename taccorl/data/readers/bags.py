@@ -10,6 +10,7 @@ is refused; ``rosbag reindex`` makes the index.
 
 import contextlib
 import functools
+import os
 import shutil
 import sqlite3
 import struct
@@ -146,17 +147,22 @@ class _File:
         if not header.startswith(b"SQLite format 3\0") or len(header) < 100:
             raise RecordingError(f"{self.path}: is not an SQLite file: it begins with {header[:16]!r}")
         page_bytes, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
-        whole = (65536 if page_bytes == 1 else page_bytes) * pages
+        page_bytes = 65536 if page_bytes == 1 else page_bytes
+        whole, part = page_bytes * pages, 0
         if size < whole:
+            part = size % page_bytes
             self.lost(f"the file ends {whole - size:,} bytes early (cut off?)", (size, whole))
         path, how = self.path, "mode=ro&immutable=1"  # immutable: no lock, no journal, no shared memory file
         unfinished = [p for end in ("-wal", "-journal") if (p := path.with_name(path.name + end)).is_file()]
-        if any(p.stat().st_size for p in unfinished):
-            # A recorder that died left its newest messages there; SQLite merges them by writing, so into a copy.
+        in_writing = any(p.stat().st_size for p in unfinished)
+        if in_writing or part:
+            # A recorder that died left its newest messages there; SQLite merges them by writing, so into a copy. Of a page that
+            # was cut off it reads zeros for what is missing, so the copy ends before it.
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="taccorl_")))
             for original in (self.path, *unfinished):
                 shutil.copyfile(original, folder / original.name)
-            path, how = folder / self.path.name, "mode=rw"
+            path, how = folder / self.path.name, "mode=rw" if in_writing else how
+            os.truncate(path, size - part)
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)
         stack.enter_context(contextlib.closing(connection))
         connection.text_factory = lambda raw: raw.decode(errors="replace")
