@@ -6,16 +6,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_297,
+    "taccorl/alignment": 14_291,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_740,
-    "taccorl/diagnosis": 11_446,
+    "taccorl/diagnosis": 11_438,
     "taccorl/episodes": 4_184,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_069,
     "taccorl/policies": 3_462,
-    "taccorl/report": 2_500,
+    "taccorl/report": 2_502,
     "taccorl/rl": 2_467,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 55_540,
+    "tests": 55_542,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -42,7 +42,6 @@ KINDS: Mapping[Status, Kind] = {
     "gains_moved": "gains_moved",
     "nothing_missing": "nothing_missing",
     "numbers_off": "numbers_off",
-    "too_many": "more",
 }
 """Status of a search → kind, where the status alone decides."""
 FOUND: Mapping[Kind, str] = {
@@ -51,7 +50,7 @@ FOUND: Mapping[Kind, str] = {
     "gains_moved": "{w.part}: no effect is needed, but only with gains far from the twin's: {w.moved}.",
     "nothing_missing": "{w.part}: nothing is missing; the error is {w.after:.2f} noise floors ({refitted}).",
     "numbers_off": "{w.part}: {w.off}.",
-    "something_else": "{w.part}: no known effect explains what {w.remains}.",
+    "something_else": "{w.part}: no known effect {w.remains}.",
     "more": "{w.part} lacks {w.names}{w.place}, and something more: {w.fell}, and the floor is not reached.",
     "ties": "{w.part} lacks {w.names}{w.place}: {w.fell}, and these recordings do not tell which it is.",
     "effects": "{w.part} lacks {w.names}{w.sizes}{w.place}: {w.fell}.",
@@ -61,7 +60,7 @@ UNCERTAIN: Mapping[Kind, str] = {
     "data_first": "the recordings contradict themselves or the clock",
     "not_converged": "{w.trouble}",
     "gains_moved": "wrong time stamps or gains explain the data as well as the fitted gains do",
-    "something_else": "every known effect was tried and refused",
+    "something_else": "every known effect was tried, and none explains most of it",
     "more": "what is still missing may change what was named",
 }
 """Kind of low confidence → its first reason."""
@@ -200,8 +199,10 @@ def added(d: Diagnosis) -> tuple[str, ...]:
 def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
     if data:
         return "data_first"
-    if d.status == "something_else":
-        return "more" if added(d) else "something_else"
+    if d.status in ("something_else", "too_many"):
+        first, after = (max(d.errors[stage]["validation"], 1.0) ** 2 for stage in (d.baseline, "after"))
+        most = d.standing_out or first - after >= SearchConfig().sure_gain * (first - 1.0)
+        return "more" if added(d) and most else "something_else"
     return KINDS.get(d.status) or ("ties" if any(d.rivals.get(name) for name in added(d)) else "effects")
 
 
@@ -225,16 +226,17 @@ class _Words:
     @property
     def remains(self) -> str:
         if not self.d.standing_out:
-            return f"is missing; {self.after:.2f} noise floors remain"
+            left = f"; {self.after:.2f} noise floors remain"
+            alone = "alone " * (self.d.status == "too_many")  # tried one at a time
+            return f"{alone}explains what is missing{f': with {self.names}, the nearest, {self.fell}' if added(self.d) else left}"
         place = self.d.standing_out[0]
         least = (1.0 - NEAR) ** 0.5 * place.error
         near = {name: f"{name} ({error:.2f})" for name, error in self.d.nearest if error < least}
-        why = [
-            e.verdict for r in self.d.rounds[-1:] for e in r.evidence if e.name == next(iter(near), "") and e.verdict
-        ]
+        why = [e.verdict for r in self.d.rounds[-1:] for e in r.evidence if e.verdict and e.name in [*near][:1]]
         tried = f"nearest there: {_some([*near.values()])}{f', refused: {why[0]}' if why else ''}"
         none = "none comes near to it there" if self.d.nearest else "none was tried there, in a test recording"
-        return f"stands out: {place.words()}, {place.error:.2f} noise floors ({self.after:.2f} in all); {tried if near else none}"
+        left = f"{place.error:.2f} noise floors ({self.after:.2f} in all)"
+        return f"explains what stands out: {place.words()}, {left}; {tried if near else none}"
 
     @property
     def trouble(self) -> str:

@@ -104,8 +104,7 @@ class _Truth:
         return opening - (opening - target) * (down - up)
 
     def sample(self, grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        columns = np.atleast_2d(grid.T)
-        return np.stack([np.interp(time_s, self.time_s, c) for c in columns], axis=1)
+        return np.stack([np.interp(time_s, self.time_s, c) for c in np.atleast_2d(grid.T)], axis=1)
 
 
 def _footprint(rng: np.random.Generator) -> np.ndarray:

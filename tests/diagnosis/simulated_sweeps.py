@@ -62,8 +62,7 @@ def sweeps(config: TwinConfig, signals: tuple[str, ...] = (SIGNAL,), seconds: fl
     first = recorded(config, chirp(0, seconds, signals), 0)
     again = dataclasses.replace(recorded(config, first.target, 7), name="sweep_0_again", repeat_of=first.name)
     second = recorded(config, chirp(1, seconds, signals), 1)
-    validation = recorded(config, chirp(2, seconds, signals), 2)
-    return Measurements((first, again, second), (validation,), rule="by hand")
+    return Measurements((first, again, second), (recorded(config, chirp(2, seconds, signals), 2),), rule="by hand")
 
 
 def write_folder(folder: Path, measurements: Measurements, signals: tuple[str, ...] = (SIGNAL,)) -> Path:

@@ -69,8 +69,7 @@ def commands(page: str) -> list[Command]:
             text = block["text"].replace("\\\n", " ")
             lines = (shlex.split(line, comments=True) for line in text.splitlines() if PROGRAMS.match(line))
             found += [Command(words, NOT_RUN not in (block["comment"] or "")) for words in lines if words]
-    cells = CELL.findall(FENCE.sub("", page))
-    return found + [Command(shlex.split(line), True) for line in cells]
+    return found + [Command(shlex.split(line), True) for line in CELL.findall(FENCE.sub("", page))]
 
 
 def sections() -> list[Command]:

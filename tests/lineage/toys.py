@@ -65,8 +65,7 @@ def make_raw(folder: Path, num: int = 2) -> Path:
 def run_pipeline(store: Store, raw: Path, destination: Path | None = None, *, log: Path | None = None) -> Artefact:
     config = IngestConfig(log=log)
     episodes = [store.run(INGEST, config, [store.source(path)]) for path in sorted(raw.iterdir())]
-    stage = MERGE if destination is None else MERGE_DATASET
-    return store.run(stage, config, episodes, destination=destination)
+    return store.run(MERGE if destination is None else MERGE_DATASET, config, episodes, destination=destination)
 
 
 def run_and_die(store_root: Path, destination: Path | None = None) -> None:

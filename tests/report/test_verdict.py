@@ -169,15 +169,18 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
 
 def test_one_effect_where_more_is_missing_is_not_called_the_answer():
     recordings = [record(k, Bump(strength=5.0), Ripple(strength=1.0)) for k in range(2)]
-    d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:], config=SearchConfig(max_effects=1))
+    one = SearchConfig(max_effects=1)
+    d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:], config=one)
     assert d.status == "too_many"
     v = verdict(PART, d)
     assert (v.kind, v.level) == ("more", "low")
     assert d.names[0] in v.finding and "--until=noise_floor" in v.record_next
+    errors = d.errors | {"after": d.errors["after"] | {"validation": 0.8 * d.errors["fitted"]["validation"]}}
+    little = verdict(PART, changed(d, errors=errors))  # 36 % of the squared error go
+    assert little.kind == "something_else"
+    assert "no known effect alone explains" in little.finding and f"{d.names[0]}, the nearest" in little.finding
     recordings = [record(k, Square(strength=5.0), Ripple(strength=1.0)) for k in range(2)]
-    d = diagnose(
-        MadeProblem(Square, Squire, Ripple), recordings[:1], recordings[1:], config=SearchConfig(max_effects=1)
-    )
+    d = diagnose(MadeProblem(Square, Squire, Ripple), recordings[:1], recordings[1:], config=one)
     assert d.status == "too_many" and d.rounds[0].ties == ("squire",)
     v = verdict(PART, d)
     assert "square or squire" in v.finding and v.level == "low"

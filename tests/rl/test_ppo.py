@@ -21,14 +21,12 @@ SETTINGS = PPOSettings(actor_lr=3e-4, critic_lr=1e-3, batch_size=64)
 def ppo(policy: LinePolicy, settings: PPOSettings = SETTINGS, beta: float | None = None, steps: str = "one") -> PPO:
     torch.manual_seed(1)
     sde = FlowSDE(FlowSDESettings(stochastic_steps=steps))
-    anchor = None if beta is None else DemoAnchor(policy, beta)
-    return PPO(policy, Critic(64, hidden=(64, 64)), sde, settings, anchor)
+    return PPO(policy, Critic(64, hidden=(64, 64)), sde, settings, None if beta is None else DemoAnchor(policy, beta))
 
 
 def rollout(learner: PPO, num_envs: int = 16, decisions: int = 12, seed: int = 0) -> Decisions:
     generator = torch.Generator().manual_seed(seed)
-    world = LineWorld(num_envs, seed)
-    return collect(world, learner, decisions, generator).decisions
+    return collect(LineWorld(num_envs, seed), learner, decisions, generator).decisions
 
 
 def weights(policy: LinePolicy) -> torch.Tensor:

@@ -224,8 +224,7 @@ def box_depth(p: np.ndarray) -> np.ndarray:
 def wedge_depth(p: np.ndarray) -> np.ndarray:
     """Legs x = −20 mm, y = −10 mm; hypotenuse from (20, −10) to (−20, 20): 3 x + 4 y = 20 mm, normal (3, 4) / 5."""
     x, y, z = np.moveaxis(p, -1, 0)
-    sides = [x + 0.02, y + 0.01, (0.02 - 3 * x - 4 * y) / 5, 0.015 - np.abs(z)]
-    return np.min(sides, axis=0)
+    return np.min([x + 0.02, y + 0.01, (0.02 - 3 * x - 4 * y) / 5, 0.015 - np.abs(z)], axis=0)
 
 
 SHAPES = {
@@ -238,8 +237,7 @@ SHAPES = {
 
 
 def shape(name: str) -> ShapeTables:
-    model = model_of(SHAPES[name][0], {"wedge": prism_vertices(WEDGE_M, -0.015, 0.015)})
-    return shapes_of(model, [0], np.float64)
+    return shapes_of(model_of(SHAPES[name][0], {"wedge": prism_vertices(WEDGE_M, -0.015, 0.015)}), [0], np.float64)
 
 
 @pytest.mark.parametrize("name", SHAPES)

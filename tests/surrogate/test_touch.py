@@ -32,8 +32,7 @@ def replayed(case: TouchCase, press: touch.Press, hidden=()) -> tuple[np.ndarray
     twin = TwinConfig(sensor=FlexiTacConfig(normal_stiffness_per_m=case.k_n, normal_damping_s_per_m=case.k_d))
     motion = touch_motion(record_touch(case, press), twin, touch.pressed_object(case, press))
     model = TouchModel(twin)
-    reading = model.simulate(motion, case.k_n, case.k_d, hidden)
-    return model.counts(motion, reading), motion.measured.astype(float)
+    return model.counts(motion, model.simulate(motion, case.k_n, case.k_d, hidden)), motion.measured.astype(float)
 
 
 def rms(x: np.ndarray) -> float:

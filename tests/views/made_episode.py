@@ -37,8 +37,7 @@ def bimanual_spec(picture_size: int = 224) -> DatasetSpec:
 
 def grip(num_rows: int) -> np.ndarray:
     """(T,) 0 … 1: how firmly something is held."""
-    phase = np.linspace(0.0, 1.0, num_rows)
-    return np.clip(1.0 - np.abs(phase - 0.6) / 0.2, 0.0, 1.0)
+    return np.clip(1.0 - np.abs(np.linspace(0.0, 1.0, num_rows) - 0.6) / 0.2, 0.0, 1.0)
 
 
 def touch_counts(num_rows: int) -> np.ndarray:

@@ -31,8 +31,7 @@ from numba.core import types
 from taccorl.alignment.controller import arriving as _arriving
 from taccorl.alignment.controller import drive_numbers as _drive_numbers
 from taccorl.alignment.controller import lanes as _lanes
-from taccorl.alignment.controller import late_speed as _late_speed
-from taccorl.alignment.controller.arriving import arriving
+from taccorl.alignment.controller.arriving import arriving, late_speed
 from taccorl.alignment.controller.drive_numbers import FAMILIES, TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.lanes import (
     LANES,
@@ -48,7 +47,6 @@ from taccorl.alignment.controller.lanes import (
     store,
     where,
 )
-from taccorl.alignment.controller.late_speed import late_speed
 from taccorl.sim.effects.friction import AT_RAD_PER_S, BRISTLE_DAMPING_S, DRY_SHARE, DRY_TIME_S
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
@@ -168,7 +166,7 @@ def _two_masses(m11: Any, m22: Any, link: Any, f1: Any, f2: Any, about: Any, v: 
 def _sources() -> np.ndarray:
     """() array, an argument whose type is named after the sources of the kernel and the fields of ``Drive``. Numba looks for a
     compiled kernel by the types of its arguments and the date of its own file, not by what it imports."""
-    modules = (_arriving, _drive_numbers, _lanes, _late_speed, *FAMILIES)
+    modules = (_arriving, _drive_numbers, _lanes, *FAMILIES)
     texts = [repr(Drive._fields).encode(), *(Path(str(m.__file__)).read_bytes() for m in modules)]
     return np.zeros((), [("of_" + sha256(b"".join(texts)).hexdigest()[:16], "u1")])
 

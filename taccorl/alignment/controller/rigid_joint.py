@@ -43,11 +43,12 @@ class Rigid(NamedTuple):
 
 
 class PointMass(NamedTuple):
-    """A mass without extent that is fixed to a body of a model, and that no controller compensates."""
+    """A mass that is fixed to a body of a model, and that no controller compensates; without extent unless ``spread_m2``."""
 
     mass_kg: float
     body: int  # Id of the body
-    place_m: tuple[float, float, float]  # Place in the body's frame [m]
+    place_m: tuple[float, float, float]  # Place of its centre in the body's frame [m]
+    spread_m2: np.ndarray = np.zeros((3, 3))  # (3, 3) mean of r rᵀ over it, r from its centre in that frame [m²]
 
 
 class MassTorque(NamedTuple):
@@ -62,7 +63,8 @@ class MassTorque(NamedTuple):
     def of(self, one: PointMass) -> np.ndarray:
         """(T,) torque [N·m] for one mass in that body."""
         at = np.array(one.place_m)
-        return one.mass_kg * (self.constant + self.linear @ at + at @ self.square @ at)
+        square = np.sum(self.square * (np.outer(at, at) + one.spread_m2), axis=(1, 2))
+        return one.mass_kg * (self.constant + self.linear @ at + square)
 
 
 class RigidJoint(ABC):
@@ -191,7 +193,8 @@ def with_masses(
     for one in masses:
         there, turning = _levers(model, joint, pose.tobytes(), one.body)
         lever = there + turning @ one.place_m
-        inertia = terms.inertia + one.mass_kg * float(lever[1] @ lever[1])
+        own = np.sum(turning[1] @ one.spread_m2 * turning[1])
+        inertia = terms.inertia + one.mass_kg * float(lever[1] @ lever[1] + own)
         first, last = map(float, -one.mass_kg * lever @ model.opt.gravity)
         sine, cosine = (terms.gravity_sin + first, terms.gravity_cos + last) if hinge else terms[2:4]
         weight = terms.weight_n + last * (not hinge)

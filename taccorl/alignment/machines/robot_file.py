@@ -175,19 +175,18 @@ class Robot:
 
     def masses(self) -> dict[str, PointMass]:
         """Joint → the mass of its effect ``payload``, which all joints move that move its body."""
-        return {
-            name: self.mass(name, effect)
-            for name, joint in self.config.joints.items()
-            for effect in joint.effects
-            if isinstance(effect, Payload) and not effect.is_absent
-        }
+        every = [(name, effect) for name, joint in self.config.joints.items() for effect in joint.effects]
+        return {name: self.mass(name, e) for name, e in every if isinstance(e, Payload) and not e.is_absent}
 
     def mass(self, signal: str, payload: Payload) -> PointMass:
         """The mass of a ``payload`` at one joint: its place is along the axes of its body, from that body's centre of mass."""
-        body = self.body_of(signal, payload)
-        offset = [getattr(payload, name) for name in PAYLOAD_AT]
-        x, y, z = (float(a + b) for a, b in zip(self.rigid.model.body_ipos[body], offset, strict=True))
-        return PointMass(payload.mass_kg, body, (x, y, z))
+        model, body = self.rigid.model, self.body_of(signal, payload)
+        x, y, z = (float(a + getattr(payload, n)) for a, n in zip(model.body_ipos[body], PAYLOAD_AT, strict=True))
+        mujoco.mju_quat2Mat(turn := np.empty(9), model.body_iquat[body])
+        inertia = payload.like_link * model.body_inertia[body] / max(model.body_mass[body], 1e-9)
+        own = 0.5 * inertia.sum() - inertia
+        axes = turn.reshape(3, 3)
+        return PointMass(payload.mass_kg, body, (x, y, z), axes * own @ axes.T)
 
     def removable_kg(self, body: int) -> float:
         """Most mass that a payload below 0 may remove from a body [kg]: a share of that of all bodies fixed to one another."""
@@ -270,8 +269,7 @@ class Robot:
 
     def digest(self) -> str:
         """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""
-        model = self.rigid.path.read_bytes()
-        return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
+        return hashlib.sha256(self.text(self.path).encode() + self.rigid.path.read_bytes()).hexdigest()[:16]
 
 
 def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:

@@ -77,8 +77,7 @@ def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool
         return False
     if cls.name in NEED_ROTOR and not rotor:
         return False
-    typical = {p.name: p.typical for p in cls.parameters()}
-    return bool(make_effect(cls.name, **typical).drive())
+    return bool(make_effect(cls.name, **{p.name: p.typical for p in cls.parameters()}).drive())
 
 
 class RobotJoint(DriveJoint):
@@ -128,8 +127,7 @@ class RobotJoint(DriveJoint):
         return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
 
     def timestep_s(self, motion: JointMotion) -> float:
-        inertia = self.known.inertia + self._config.armature
-        return self._config.timestep_s(motion.rate_hz, inertia, motion.kp_scale)
+        return self._config.timestep_s(motion.rate_hz, self.known.inertia + self._config.armature, motion.kp_scale)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = self._terms(motion.pose, self._every_mass(bodies))
@@ -267,9 +265,10 @@ class RobotJoint(DriveJoint):
         robot, last = self._robot, self._payload_in
         known = robot.assumed.get(last, self._masses.get(self.signal))
         at = np.zeros(3) if known is None else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
-        axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal, last)
-        link = {"link": robot.body_name(last)} if last != robot.last_body(self.signal) else {}
-        return link | {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
+        spread = known is not None and known.spread_m2.any()
+        axes = (0, 1, 2) if last in robot.assumed or spread else robot.idle_axes(self.signal, last)
+        link = {"link": robot.body_name(last)} if spread or last != robot.last_body(self.signal) else {}
+        return link | ({"like_link": True} if spread else {}) | {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
 
     def _coupling(self, m: Measurement, pose: np.ndarray, along: "Along | None") -> tuple[np.ndarray, np.ndarray]:
         """(T · F,) torque because other joints move, without payloads (``moving_masses_nm``); of a sliding joint the model's

@@ -48,8 +48,7 @@ def summarised(numbers: Mapping[str, float]) -> tuple[dict[str, float], dict[str
 
 def cell_errors(traces: Sequence[TouchTrace]) -> np.ndarray:
     """(R, C) RMS residual of each cell of a sensor over all recordings, in noise floors."""
-    squares = np.concatenate([np.square(t.residual[:, 0]) for t in traces])
-    return np.sqrt(squares.mean(axis=0)) / traces[0].floor[0]
+    return np.sqrt(np.concatenate([np.square(t.residual[:, 0]) for t in traces]).mean(axis=0)) / traces[0].floor[0]
 
 
 def best_of(cells: CellNumbers) -> str:

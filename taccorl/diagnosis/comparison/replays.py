@@ -123,8 +123,7 @@ def in_contact(m: Measurement) -> np.ndarray:
     pads = len(ROBOT.pads)
     beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), pads, -1) > CONTACT_COUNTS).any(axis=2))
     felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(pads)]
-    by_arm = np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1))
-    return np.asarray(by_arm.any(axis=1)).T
+    return np.asarray(np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1)).any(axis=1)).T
 
 
 def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:

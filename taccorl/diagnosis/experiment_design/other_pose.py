@@ -73,8 +73,7 @@ class OtherPose:
         """Number of moving links without a shape in the model, whose collisions are not checked."""
         model = self.robot.robot.rigid.model
         shaped = {int(b) for b in model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) > 0]}
-        moving = {int(b) for b in model.jnt_bodyid}
-        return len(moving - shaped)
+        return len({int(b) for b in model.jnt_bodyid} - shaped)
 
     def way(self, rate_hz: float) -> dict[str, np.ndarray]:
         """``driven`` → (T,) targets [rad, m] from the present position to that of the pose, a half wave of a cosine at

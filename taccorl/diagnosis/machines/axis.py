@@ -134,11 +134,7 @@ class Axis(Machine):
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
         return Comparison(
-            twin=name,
-            effects=self.effects,
-            traces=tuple(traces),
-            split=measurements.record(),
-            clock=beside_onsets(clock),
+            twin=name, effects=self.effects, traces=(*traces,), split=measurements.record(), clock=beside_onsets(clock)
         )
 
     @property

@@ -59,9 +59,11 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
-def placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
+def placed(
+    f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]], ties: Sequence[str]
+) -> Finding:
     """The finding with the intervals of a payload that was fitted to several joints, ``ends``, and a remark that names what it
-    explains: ``stands_for``, joint → effects that alone explain as much there."""
+    explains: ``stands_for``, joint → effects that alone explain as much there; and ``ties``, bodies where it does as well."""
     d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
     effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
     others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
@@ -69,11 +71,12 @@ def placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapp
     text = (
         f"payload: its mass, {' and '.join(known)} are fitted to all joints that feel it and lack little besides"
         if known
-        else "payload: no joint determines its place, which is taken as the centre of mass of its body"
+        else "payload: its mass is fitted to all joints that feel it; its place is the centre of mass of its body"
     )
     if TORQUE_FF.name not in d.base:
         text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
+    text += f"; in {' or '.join(ties)} a mass explains as much" if ties else ""
     of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())
     number = ("", 1.0) if of_mass else d.or_number
     d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_number=number)

@@ -52,7 +52,7 @@ from taccorl.diagnosis.machines.machine import (
 )
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
-from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, one_mass
+from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, is_better, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
 from taccorl.diagnosis.search.problem import candidate
@@ -102,9 +102,8 @@ class RobotMachine(Machine):
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         config, joint = self.robot.config.joints[part], self.robot.joint(part)
         own = {**config.numbers, "position_age_s": (config.position_age_s, "s")}
-        unit_of = Scale(unit=joint.unit).unit_of
         made = [joint.in_units(type(e))(**{p.name: getattr(e, p.name) for p in e.parameters()}) for e in config.effects]
-        return {name: (value, unit_of(unit)) for name, (value, unit) in own.items()} | numbers_of(made)
+        return {n: (value, Scale(unit=joint.unit).unit_of(unit)) for n, (value, unit) in own.items()} | numbers_of(made)
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -193,13 +192,14 @@ class RobotMachine(Machine):
     def diagnose(self, part: str, measurements: Measurements, **options: Any) -> Finding:
         found = diagnose_joint(self.robot, part, measurements, **options)
         if any("payload" in own for own in (found.diagnosis.names, *found.diagnosis.rivals.values())):
-            body = self._payload_body(found)
-            text = (
-                f"payload in {self.robot.body_name(body)}: x_m, y_m and z_m are along its axes in "
-                f"{self.robot.rigid.path.name}, from its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
-            )
+            body, file, far = self._payload_body(found), self.robot.rigid.path.name, self.robot.reach_m(part)
+            name = self.robot.body_name(body)
+            text = f"payload in {name}: x_m, y_m and z_m are along its axes in {file}, within ± {far:.3g} m of its centre of mass"
             if idle := self.robot.idle_axes(part, body):
                 text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
+            if own := [p.mass_kg for f in payloads([found]) if (p := payload_of(f)).like_link]:
+                times = 1.0 + own[0] / self.robot.rigid.model.body_mass[body]
+                text = f"mass and inertia of {name} are {times:.4g} times those in {file}: correct them there"
             found = dataclasses.replace(found, remark=text)
         if found.diagnosis.status == "something_else" and not self.robot.config.joints[part].rotor_inertia:
             text = f"{' and '.join(NEED_ROTOR)} were not tried: {self.robot.path.name} has no rotor_inertia of {part}"
@@ -302,7 +302,6 @@ class RobotMachine(Machine):
         shared = {f.part: self._payload_body(f) for f in owners if payload_of(f).link}
         owners = [f for f in owners if not any(self.robot.moves_body(f.part, shared[p]) for p in {*shared} - {f.part})]
         owners = [f for f in owners if f.part in self._owners(owners)]
-        found = [Addition(f.part, [payload_of(f)], {}, {}) for f in owners]
         felt = {
             f.part: owner
             for owner in owners
@@ -312,7 +311,7 @@ class RobotMachine(Machine):
         if not felt:
             return list(findings)
         again: dict[str, Finding] = {}
-        for f in how[2](self.with_additions(found), list(felt)):
+        for f in how[2](self.with_additions([Addition(f.part, [payload_of(f)], {}, {}) for f in owners]), list(felt)):
             mass, body = payload_of(felt[f.part]), self.robot.body_name(self._payload_body(felt[f.part]))
             text = (
                 f"judged with the payload of {mass.mass_kg:.3g} kg in {body} that this diagnosis found at "
@@ -329,58 +328,59 @@ class RobotMachine(Machine):
         robot, (measurements, gains, diagnosed) = self.robot, how
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
         stands_for = {part: found for part, f in group.items() if (found := standing_in(f.diagnosis, "payload"))}
-        rivals = {part: f.diagnosis.rivals.get("payload") for part, f in group.items()}
-        alone = [part for part, names in stands_for.items() if "payload" in names and not rivals[part]]
+        tied = [part for part, f in group.items() if f.diagnosis.rivals.get("payload")]
+        alone = [part for part, names in stands_for.items() if "payload" in names and part not in tied]
         loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
         if not stands_for or (sure and loaded and len(alone) == 1):
             return list(findings)  # weight that turns with a joint shows where the mass is
         if len(group) == 1 and not alone and self.units[next(iter(group))] == "rad":
             return list(findings)  # one vertical hinge tells a mass from a rotor in no way
         (owner,) = self._owners([group[part] for part in alone or stands_for])
-        links = robot.links_before(body)
+        at_centre = dict.fromkeys(PAYLOAD_AT, 0.0)
 
-        def fitted(parts: Sequence[str], link: str = "") -> OneMass:
-            place = links.get(link, body)
+        def fitted(parts: Sequence[str], assumed: Payload) -> OneMass:
+            place = robot.body_of(owner, assumed)
             parts = [part for part in parts if robot.moves_body(part, place)]
-            machine = self._assuming(owner, Payload(mass_kg=0.0, link=link, **dict.fromkeys(PAYLOAD_AT, 0.0)))
+            machine, own = self._assuming(owner, assumed), {"link": assumed.link, "like_link": assumed.like_link}
             problems = {part: machine._problem_of(group[part], measurements, gains) for part in parts}
             idle = set.intersection(*({*robot.idle_axes(part, place)} for part in parts))
-            centred = {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
-            mass = candidate(machine.robot.joint(owner).in_units(Payload), {}, link=link, **centred)
+            at = at_centre if assumed.like_link else {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
+            mass = candidate(machine.robot.joint(owner).in_units(Payload), {}, **own, **at)
             return one_mass(problems, {part: group[part].diagnosis for part in parts}, stands_for, mass)
 
-        link, found = "", fitted([*group])
-
-        def left(one: OneMass) -> float:
-            squares = (one.errors[part] ** 2 if part in one.errors else left_of(f) for part, f in group.items())
-            return sum(squares) if one.holds else math.inf
-
-        for name, place in links.items():
-            if found.holds and max(found.errors.values()) <= SearchConfig().floor:
+        places = [(link, spread) for spread in (False, True) for link in ("", *robot.links_before(body))]
+        tried = [Payload(mass_kg=0.0, link=link, like_link=spread, **at_centre) for link, spread in places]
+        first = found = fitted([*group], tried[0])
+        every = [first]
+        for one in tried[1:]:
+            if one.like_link and found.holds and max(found.errors.values()) <= SearchConfig().floor:
                 break
-            if all(robot.moves_body(part, place) for part in alone or stands_for):
-                other = fitted([*group], name)
-                link, found = (name, other) if ALIKE * left(other) < left(found) else (link, found)
+            if all(robot.moves_body(part, robot.body_of(owner, one)) for part in alone or stands_for):
+                every.append(fitted([*group], one))
+                found = every[-1] if is_better(every[-1], found, first) else found
+        bodies = [robot.body_of(owner, o.payload) for o in every if o.holds and not is_better(found, o, first)]
+        ties = {robot.body_name(k) for k in bodies} - {robot.body_name(robot.body_of(owner, found.payload))}
         if not found.holds:
             added = [part for part, names in stands_for.items() if "payload" in names]
             again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
             findings = [again.get(f.part, f) for f in findings]
             return [without_payload(f, list(group)) if f.part in stands_for else f for f in findings]
         if not (found.is_simpler or alone):
+            mass, where = found.payload.mass_kg, robot.body_name(robot.body_of(owner, found.payload))
             text = (
-                f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(links.get(link, body))} explains as much at "
-                f"{' and '.join(stands_for)}, with as many numbers: record a joint that weight loads, or one more that moves it"
+                f"one mass of {mass:.3g} kg in {where} explains as much at {' and '.join(stands_for)}, with as many numbers: "
+                "record a joint that weight loads, or one more that moves it"
             )
             return [remarked(f, text) if len(stands_for) > 1 and f.part in stands_for else f for f in findings]
         clear = [part for part in found.errors if found.errors[part] <= CLEAR_FLOORS]
         if len(clear) < len(found.errors):  # what other joints lack besides must not say where the mass is
-            found = fitted(clear or [owner], link)
+            found = fitted(clear or [owner], found.payload)
         left_out = [name for name in stands_for[owner] if name != "payload"]
         (again,) = diagnosed(self._assuming(owner, found.payload), [owner], left_out)
         if "payload" not in again.diagnosis.names:
             return list(findings)
         ends = {k: v for k, v in found.model.intervals().items() if k.startswith("payload.")}
-        return [placed(again, ends, stands_for) if f.part == owner else f for f in findings]
+        return [placed(again, ends, stands_for, sorted(ties)) if f.part == owner else f for f in findings]
 
     def _payload_body(self, found: Finding) -> int:
         """Id of the body of the payload that a finding adds, or would add."""
@@ -477,9 +477,8 @@ class RobotMachine(Machine):
             config = robot.config.joints[a.part]
             numbers = {key: float(value) for key, value in config.law_numbers(a.base).items()}
             # The file has the registered classes, whose numbers are the same.
-            new = [
-                make_effect(e.name, **{f.name: getattr(e, f.name) for f in dataclasses.fields(e)}) for e in a.effects
-            ]
+            made = [(e.name, {f.name: getattr(e, f.name) for f in dataclasses.fields(e)}) for e in a.effects]
+            new = [make_effect(name, **own) for name, own in made]
             if "position_age_s" in a.base:
                 numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])
             half_s = 0.5 * float(a.base.get("loop_s", 0.0))

@@ -30,8 +30,16 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.joint_problem import EFFORT_SCALE, LOOP, other_gain, recording_of, seen_in, unlike_rows
-from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
+from taccorl.diagnosis.problems.joint_problem import (
+    EFFORT_SCALE,
+    LOOP,
+    measured_part,
+    other_gain,
+    recording_of,
+    seen_in,
+    unlike_rows,
+    whole_rows,
+)
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Case, Free, Recording, Values, WithoutMaps, candidate, holding

@@ -161,8 +161,7 @@ class CellsProblem(WithoutMaps):
 
     def _fitted_rows(self, r: Recording) -> np.ndarray:
         """(T, K) readings of all cells in the rows that are fitted."""
-        there = np.isfinite(r.measured).any(axis=1, keepdims=True)
-        return np.where(there, r.data.measured, np.nan)
+        return np.where(np.isfinite(r.measured).any(axis=1, keepdims=True), r.data.measured, np.nan)
 
     def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
         """Gain and offset of each cell as fitted together with ``effects``: ``gain_thumb`` [unit of the reading per unit of the

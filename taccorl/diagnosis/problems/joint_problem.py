@@ -6,6 +6,7 @@ iit-DLSLab/sim2real-robot-identification).
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -16,13 +17,12 @@ from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import FOLLOWED, WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import LANES
 from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
-from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_motion import JointMotion, first_rows
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
-from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Case, Free, Recording, Values, WithoutMaps, candidate, holding
@@ -72,6 +72,8 @@ PAYLOAD_PLACE = tuple(
     for name in ("payload_sin_m", "payload_cos_m")
 )
 """Bounds of s and c of ``PayloadLever`` [m], fitted if a fit recording holds a payload at an unstated place. A choice."""
+MORE_ROWS = 4
+"""Rows after the last measured one simulated, too: torques are interpolated to the next row, slopes at the end one-sided."""
 OF_RECORDINGS = (EFFORT_SCALE.name, EFFORT_AGE.name, *(f.name for f in PAYLOAD_PLACE))
 """Always fitted numbers that describe recordings and are not stored in the twin."""
 
@@ -375,3 +377,18 @@ def floors_of(
             raise TaccorlError(f"{signal}: its {kind} was not measured in any recording")
         found.append(floors[signal])
     return found
+
+
+@lru_cache(maxsize=64)
+def measured_part(recording: Recording) -> JointMotion:
+    """Motion of the recording, up to a few rows after the last measured one: a fit needs nothing after it."""
+    seen = np.flatnonzero(np.isfinite(recording.measured).any(axis=1))
+    return first_rows(recording.data, int(seen[-1]) + 1 + MORE_ROWS) if len(seen) else recording.data
+
+
+def whole_rows(columns: Sequence[np.ndarray], recording: Recording) -> np.ndarray:
+    """(T, C) ``columns`` of fewer rows side by side, and NaN below."""
+    whole = np.full((len(recording.time_s), len(columns)), np.nan)
+    for k, column in enumerate(columns):
+        whole[: len(column), k] = column
+    return whole

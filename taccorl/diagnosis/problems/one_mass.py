@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
-from taccorl.diagnosis.search.evidence import above_floor, block_squares
+from taccorl.diagnosis.search.evidence import Blocks, above_floor, block_squares, standard_score
 from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
 from taccorl.diagnosis.search.problem import Candidate, Case, Recording, Values, WithoutMaps, chosen, split_rows
-from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 
@@ -87,8 +87,13 @@ class OneMass:
     is_simpler: bool
     """Whether it takes fewer numbers than the effects in whose place it stands, and the constant torques and changes of the
     file's numbers that it explains."""
-    errors: Mapping[str, float]
-    """Joint → validation error with the mass [noise floors]."""
+    squares: Mapping[str, tuple[Blocks, Blocks]]
+    """Joint → squared validation errors of what was found there alone, and with the mass [floors²]."""
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Joint → validation error with the mass [noise floors, 1 at least]."""
+        return {joint: error_of(with_it) for joint, (_, with_it) in self.squares.items()}
 
     @property
     def payload(self) -> Payload:
@@ -127,16 +132,16 @@ def one_mass(
     )
     rough = best_fit(whole, fit_to, (payload.name,), [f.values for f in rough[:_LIKELY]], _NEXT_STEPS)
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
-    holds, before, after, errors = True, 0, 1 + len(payload.frees[1:]), {}
+    holds, before, after, squares = True, 0, len(payload.frees), {}
     for j, d in alone.items():
-        (_, errors[j]), here = holds_at(whole, model, problems[j], d, j, split[j][1])
+        squares[j], here = holds_at(whole, model, problems[j], d, j, split[j][1])
         holds = holds and here
         before += sum(_least_numbers(name, d, problems[j]) for name in stands_for.get(j, ()))
         before += is_explained(d, model.values.get(f"{j}/{TORQUE_FF.name}"))
         counted = (TORQUE_FF.name, *stands_for.get(j, ()))
         now = [(c, model.values.get(f"{j}/{c.name}", c.after)) for c in d.changed if c.name not in counted]
         before += sum(abs(value - c.before) < _OFF * abs(c.after - c.before) for c, value in now)
-    return OneMass(model, holds, after < before, errors)
+    return OneMass(model, holds, after < before, squares)
 
 
 def holds_at(
@@ -146,15 +151,28 @@ def holds_at(
     alone: Diagnosis,
     joint: str,
     recordings: Sequence[Recording],
-) -> tuple[tuple[float, float], bool]:
-    """Validation errors at one joint [noise floors, 1 at least] of what was found there alone and of ``model``, a fit to several,
-    and whether the second is about as low."""
-    squares = [
-        above_floor(block_squares(problem, alone.after, recordings)),
-        above_floor(block_squares(whole, model, whole.recordings(joint, recordings))),
-    ]
-    holds = squares[1] <= ALIKE * squares[0]
-    return (float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))), holds
+) -> tuple[tuple[Blocks, Blocks], bool]:
+    """Squared validation errors at one joint [floors²] of what was found there alone and of ``model``, a fit to several, and
+    whether the second is about as low."""
+    own = block_squares(problem, alone.after, recordings)
+    with_it = block_squares(whole, model, whole.recordings(joint, recordings))
+    return (own, with_it), above_floor(with_it) <= ALIKE * above_floor(own)
+
+
+def is_better(one: OneMass, other: OneMass, everywhere: OneMass) -> bool:
+    """Whether ``one`` surely leaves less at all joints of ``everywhere`` together, by paired half seconds, or alone holds. A
+    joint that a mass is not at has what was found there alone."""
+    if not (one.holds and other.holds):
+        return one.holds
+    pairs = [[o.squares.get(j, own[:1])[-1] for o in (other, one)] for j, own in everywhere.squares.items()]
+    gains = [more - less for more, less in pairs]
+    squares, weights = (np.concatenate(own) for own in zip(*((g.squares, g.weights) for g in gains), strict=True))
+    return standard_score(Blocks(squares, weights / len(gains))) >= SearchConfig().sure_score
+
+
+def error_of(squares: Blocks) -> float:
+    """RMS error [noise floors], 1 at least."""
+    return float(np.sqrt(above_floor(squares)))
 
 
 def fitted_numbers(d: Diagnosis) -> Values:

@@ -15,7 +15,7 @@ from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.machines.robot_joint import under_gravity
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import Leaned
-from taccorl.diagnosis.problems.one_mass import OneMassProblem, fitted_numbers, holds_at, is_explained
+from taccorl.diagnosis.problems.one_mass import OneMassProblem, error_of, fitted_numbers, holds_at, is_explained
 from taccorl.diagnosis.problems.tilted_base import MOST_RAD
 from taccorl.diagnosis.search.fit import FINE, Fit, fit, over_own_scale
 from taccorl.diagnosis.search.problem import Recording, candidate, split_rows
@@ -63,11 +63,8 @@ class OneTiltProblem(OneMassProblem):
                 columns.append((terms.gravity_sin, terms.gravity_cos))
             self._weights[key] = np.array(columns).T
         sine, cosine = self._weights[key] @ (lean.a, lean.b)
-        values: dict[str, Any] = {
-            "torque_nm": float(np.hypot(sine, cosine)),
-            "hangs_at_rad": float(np.arctan2(-cosine, sine)),
-        }
-        return [_UNBALANCE(**values)]
+        size, angle = float(np.hypot(sine, cosine)), float(np.arctan2(-cosine, sine))
+        return [_UNBALANCE(**dict[str, Any](torque_nm=size, hangs_at_rad=angle))]
 
 
 @dataclass(frozen=True)
@@ -129,9 +126,8 @@ def one_tilt(
     model = over_own_scale(whole, fit(whole, fit_to, ("leaning",), model.values, _STEPS, FINE), fit_to)[0]
     disagree, before = {}, 0
     for j, d in alone.items():
-        errors, holds = holds_at(whole, model, problems[j], d, j, split[j][1])
-        if not holds:
-            disagree[j] = errors
+        (own, with_it), holds = holds_at(whole, model, problems[j], d, j, split[j][1])
+        disagree |= {} if holds else {j: (error_of(own), error_of(with_it))}
         before += sum(f.name.split(".")[0] in stands_for.get(j, ()) for f in d.after.frees)
         before += is_explained(d, model.values.get(f"{j}/torque_ff"))
     ends = np.array([model.intervals()[f"leaning.{name}"] for name in "ab"])
@@ -144,13 +140,5 @@ def one_tilt(
     for j in problems:
         effects, base, intervals = whole.own(j, model)
         leaned[j] = Leaned(gravity=(x, y, z), effects=effects, base=base, intervals=intervals)
-    return OneTilt(
-        model,
-        disagree,
-        before > 2,
-        direction / length,
-        (direction + sides[0]) / length,
-        (direction + sides[1]) / length,
-        leaned,
-        whole.down,
-    )
+    low, high = ((direction + side) / length for side in sides)
+    return OneTilt(model, disagree, before > 2, direction / length, low, high, leaned, whole.down)

@@ -136,8 +136,7 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
 def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
     """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
     problem = with_held(fits.problem, stated)
-    starts = [model.values, model.values | fits.given]
-    return best_fit(problem, fits.fit_to, model.names, starts, STEPS)
+    return best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
 
 
 def of_refit(fits: Fits, answer: Model) -> list[str]:

@@ -366,8 +366,7 @@ class Fits:
         return (problem, other) if lost <= 0.05 * won else (self.problem, model)
 
     def _fine(self, model: Fit, problem: Problem | None = None) -> Fit:
-        last = self.config.last_steps
-        return fit(problem or self.problem, self.fit_to, model.names, model.values, last, FINE)
+        return fit(problem or self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
 
     def error(self, model: Fit) -> float:
         """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""

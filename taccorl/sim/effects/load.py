@@ -111,8 +111,7 @@ class EndStop(JointEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: stops at and within either recorded end, which yield by 2 or 20 % of the range at most."""
-        span = max(seen["span_rad"], 0.02)
-        low = seen.get("lowest_rad", -0.5 * span)
+        low = seen.get("lowest_rad", -0.5 * (span := max(seen["span_rad"], 0.02)))
         high = seen.get("highest_rad", low + span)
         reach, torque_nm = max(high - low, 1e-3), max(seen["peak_torque_nm"], 0.01)
         return [
@@ -161,6 +160,8 @@ class Payload(ArmEffect):
     z_m: float = number("c_z", "m", None, 0.1, (-0.05, 0.25), "a choice: between flange and pads (TCP at 0.168)")
     link: str = ""
     """Body of a robot file's model to which it is fixed; empty: the last one that the joint moves, of the PiPER the hand."""
+    like_link: bool = False
+    """Whether its mass is spread as that of its body: a link of another density. Else it is a point."""
 
     @classmethod
     def accepted(cls, p: Parameter) -> tuple[float, float]:
@@ -170,23 +171,26 @@ class Payload(ArmEffect):
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: the mass at its typical place, or a quarter of the range beside it along one axis."""
         masses, places = super().starts(seen), [p for p in cls.parameters() if p.unit == "m"]
-        moved = [{p.name: p.typical + side * (p.high - p.low)} for p in places for side in (-0.25, 0.25)]
-        return masses + [masses[-1] | place for place in moved]
+        sides = [(p, side) for p in places for side in (-0.25, 0.25)]
+        return masses + [masses[-1] | {p.name: p.typical + side * (p.high - p.low)} for p, side in sides]
 
     @property
     def reads_as(self) -> str:
-        return f"{self.link or 'the last link that it moves'} is lighter than its model" * (self.mass_kg < 0.0)
+        so = "heavier throughout" if self.mass_kg > 0.0 else "lighter" + " throughout" * self.like_link
+        text = f"{self.link or 'the last link that it moves'} is {so} than its model"
+        return text * (self.mass_kg < 0.0 or self.like_link)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        if self.link or self.mass_kg < 0.0:
-            what = f"link is {self.link!r}" if self.link else f"mass_kg is {self.mass_kg:g} kg, below 0"
+        if self.link or self.like_link or self.mass_kg < 0.0:
+            what = (
+                f"mass_kg is {self.mass_kg:g} kg, below 0" if self.mass_kg < 0.0 else f"link {self.link or 'like_link'}"
+            )
             raise TaccorlError(f"effect payload: {what}, which only robot files can state; remove it")
-        inertia = 0.4 * self.mass_kg * _RADIUS_M**2
         for arm in self.arms():
             ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")
             ball.mass, ball.explicitinertial = self.mass_kg, True
             ball.ipos = [self.x_m, self.y_m, self.z_m]
-            ball.inertia = [inertia] * 3
+            ball.inertia = [0.4 * self.mass_kg * _RADIUS_M**2] * 3
 
 
 @effect("unbalance", slot="load", needs="position")

@@ -78,8 +78,7 @@ class PadShift(PadFrameEffect):
         return [{"across_m": s, "along_m": t} for s, t in ((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half))]
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
-        side = 1.0 if pad.endswith("_a") else -1.0
-        return np.array([side * self.across_m, self.along_m, 0.0])
+        return np.array([(1.0 if pad.endswith("_a") else -1.0) * self.across_m, self.along_m, 0.0])
 
 
 @effect("pad_compliance", slot="robot", needs="contact")

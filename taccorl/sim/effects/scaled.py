@@ -92,10 +92,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
         units = {"rad_per_nm": scale.length / scale.force, "nm": scale.force, "rad": scale.length}
         units["rad_per_s"] = scale.length
-        own = {
-            key: value / next((u for end, u in units.items() if key.endswith(f"_{end}")), 1.0)
-            for key, value in seen.items()
-        }
+        own = {k: v / next((u for end, u in units.items() if k.endswith(f"_{end}")), 1.0) for k, v in seen.items()}
         return [{key: value * factors[key] for key, value in start.items()} for start in base.starts(own)]
 
     by = "; in the file of an axis `force_unit_n` and `length_unit_m` set such bounds"

@@ -46,8 +46,7 @@ def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
     target = np.where(np.arange(400) < 10, 0.0, 0.8)
 
     def torque(goal: float, q: float, v: float) -> float:
-        duty = min(max(6.0 * (goal - q), -1.0), 1.0)
-        return 1.0 * (12.0 * duty - 1.1 * v) / 4.0
+        return (12.0 * min(max(6.0 * (goal - q), -1.0), 1.0) - 1.1 * v) / 4.0
 
     inertia, weight = 0.02 + 0.3 * 0.15**2, 0.3 * 9.81 * 0.15
     truth = integrated(target, torque, inertia, weight)

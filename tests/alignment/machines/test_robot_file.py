@@ -141,19 +141,23 @@ def test_a_payload_on_a_vertical_slide_weighs_and_has_inertia(tmp_path: Path) ->
     np.testing.assert_allclose(searched.reported, answer.reported, atol=1e-12)
 
 
-@pytest.mark.parametrize(("link", "gravity"), [("", ""), ("", "gravity: [0.2, -0.1, -1]\n"), ("upper", "")])
+@pytest.mark.parametrize(("link", "gravity"), [("", ""), ("", "gravity: [1, -0.5, -5]\n"), ("upper", ""), ("like", "")])
 def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, link: str, gravity: str) -> None:
     """Both joints move: the torque that one costs the other, from MuJoCo's own inverse dynamics of a model with that mass."""
     time_s = np.arange(600) / 200
     both = swept(shoulder=0.4 * np.sin(3.0 * time_s), elbow=1.0 + 0.5 * np.sin(4.0 * time_s))
-    held = f"effects: [{{effect: payload, mass_kg: 0.5, x_m: 0.1, y_m: 0.02, z_m: -0.05, link: '{link}'}}]"
-    at, joint, end = ("0.4", "shoulder", "kd: 5.0}") if link else ("0.3", "elbow", "effort_limit: 100.0}")
+    place = "x_m: 0.0, y_m: 0.0, z_m: 0.0, like_link: true" if link == "like" else "x_m: 0.1, y_m: 0.02, z_m: -0.05"
+    upper = link.replace("like", "")
+    held = f"effects: [{{effect: payload, mass_kg: 0.5, {place}, link: '{upper}'}}]"
+    at, joint, end = ("0.4", "shoulder", "kd: 5.0}") if upper else ("0.3", "elbow", "effort_limit: 100.0}")
     ball = f'<body pos="{at} 0.02 -0.05"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-9 1e-9 1e-9"/></body>'
     (tmp_path / "true").mkdir()
-    file, after = gravity + ROBOT_YAML, '<body name="lower"' if link else "</body></body></body></worldbody>"
-    true = robot(tmp_path / "true", file, TWO_LINKS.replace(after, ball + after))
-    plain, made = (robot(tmp_path, file.replace(end, text)) for text in (end, f"{end[:-1]}, {held}}}"))
-    if link:
+    file, after = gravity + ROBOT_YAML, '<body name="lower"' if upper else "</body></body></body></worldbody>"
+    own, wide = 'mass="1" diaginertia="1e-9 1e-9 1e-9"', 'quat="0.9 0.1 0.3 0.2" mass="{0}" diaginertia="{1} {1} {0}"'
+    light, heavy = (TWO_LINKS.replace(own, wide.format(kg, 0.6 * kg)) for kg in (1, 1.5))
+    true = robot(tmp_path / "true", file, heavy if link == "like" else light.replace(after, ball + after))
+    plain, made = (robot(tmp_path, file.replace(end, text), light) for text in (end, f"{end[:-1]}, {held}}}"))
+    if upper:
         with pytest.raises(SpecError, match=r"elbow.*link: elbow moves no body 'upper'"):
             robot(tmp_path, file.replace("100.0}", f"100.0, {held}}}"))
     moved = moved_together(true, both)
@@ -168,13 +172,13 @@ def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, link: st
         terms = [r.joint(name).rigid(m, r.joint(name).effects([])) for r, m in zip((made, true), seen[:2], strict=True)]
         np.testing.assert_allclose(terms[0], terms[1], atol=1e-7)
         (stated,) = made.joint(joint).effects([])
-        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_m", "y_m", "z_m", "link")})
+        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_m", "y_m", "z_m", "link", "like_link")})
         # At one joint the file has it; at the other one, of a robot without it, a search tries it.
         for r, m, own in ((made, seen[0], made.joint(name).effects([])), (plain, seen[2], [one])):
             loads = m.coupling_nm + r.joint(name).moving_masses_nm(m, own)
             np.testing.assert_allclose(loads, seen[1].coupling_nm, atol=1e-6)
         felt = np.abs(seen[2].coupling_nm - seen[1].coupling_nm).max() > 0.3  # N·m, without the payload
-        assert felt == (not link), "the elbow does not move the upper link"
+        assert felt == (not upper), "the elbow does not move the upper link"
 
 
 def test_coupling_is_the_torque_that_the_other_joints_motion_costs(tmp_path: Path) -> None:

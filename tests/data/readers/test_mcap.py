@@ -556,8 +556,7 @@ def with_bytes_before(at: int, more: bytes) -> bytes:
     """The zstd file with ``more`` put in at ``at``, behind all that its index points to, and the index made right again."""
     data, (_, summary), (footer, _) = FILES["zstd"], place_of("zstd", 0x0F), place_of("zstd", 0x02)
     moved = data[summary:footer] + struct.pack("<BQQQ", 0x02, 20, summary + len(more), 0)
-    crc = struct.pack("<I", zlib.crc32(moved))
-    return data[:at] + more + data[at:summary] + moved + crc + mcap_records.MAGIC
+    return data[:at] + more + data[at:summary] + moved + struct.pack("<I", zlib.crc32(moved)) + mcap_records.MAGIC
 
 
 def test_an_applications_own_record_is_passed_over(tmp_path):

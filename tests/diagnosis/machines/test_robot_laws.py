@@ -54,8 +54,7 @@ def torque(law: str, goal: float, q: float, v: float) -> float:
     if law == "torque":
         return goal
     volts = 12.0 * min(max(6.0 * (goal - q), -1.0), 1.0)
-    current_a = (volts - 0.8 * v) / 4.0
-    return 0.8 * current_a
+    return 0.8 * (volts - 0.8 * v) / 4.0
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from taccorl.alignment.measurements.folder import Measurements, read_measurement
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
-from taccorl.diagnosis.problems.measured_part import measured_part
+from taccorl.diagnosis.problems.joint_problem import measured_part
 from taccorl.diagnosis.problems.one_mass import OneMassProblem
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.problem import Recording, split_rows

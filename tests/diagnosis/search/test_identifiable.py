@@ -86,8 +86,7 @@ def swept(loop_hz: float, filter_s: float, coulomb_nm: float) -> Recording:
 def fitted(recording: Recording, *names: str) -> Fit:
     problem = OneJoint(*names)
     starts = {k: v for name in names for k, v in problem.candidates[name].starts[1].items()}
-    coarse = fit(problem, [recording], names, starts, 60)
-    return fit(problem, [recording], names, coarse.values, 60, FINE)
+    return fit(problem, [recording], names, fit(problem, [recording], names, starts, 60).values, 60, FINE)
 
 
 def named(numbers: Sequence[Identified]) -> dict[str, Identified]:

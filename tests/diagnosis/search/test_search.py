@@ -187,8 +187,7 @@ def test_an_effect_that_was_fitted_to_nothing_is_not_added():
         """Ripple's own strength is not in the data; its base numbers can do more as soon as the effect is there."""
 
         def simulate(self, base, effects, recording):
-            total = super().simulate(base, effects, recording)
-            return total + len(effects) * np.sin(5.0 * recording.time_s)[:, None]
+            return super().simulate(base, effects, recording) + len(effects) * np.sin(5.0 * recording.time_s)[:, None]
 
     t = np.arange(0.0, 10.0, 0.005)
     fit, validation, _ = made(extra=np.sin(5.0 * t))

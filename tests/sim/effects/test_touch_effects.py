@@ -42,8 +42,7 @@ class Pads:
 
 def bumps() -> np.ndarray:
     """(4, 32, 12) some readings of 0 … 3, with 0 where nothing touches."""
-    reading = np.random.default_rng(0).uniform(-2, 3, SHAPE[1:])
-    return np.maximum(reading, 0).astype(np.float32)
+    return np.maximum(np.random.default_rng(0).uniform(-2, 3, SHAPE[1:]), 0).astype(np.float32)
 
 
 @pytest.mark.parametrize(
