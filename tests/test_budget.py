@@ -6,11 +6,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_291,
+    "taccorl/alignment": 14_302,
     "taccorl/cli": 4_870,
     "taccorl/data": 8_740,
     "taccorl/diagnosis": 11_438,
-    "taccorl/episodes": 4_184,
+    "taccorl/episodes": 4_172,
     "taccorl/evaluation": 1_883,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_069,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 55_542,
+    "tests": 55_559,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -37,7 +37,7 @@ class DiagnoseConfig(PartsConfig):
     floor, and write the corrected twin."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
     """``auto``: gains are fixed to the commanded ones if every recording states them, since fitted gains can hide a missing
-    effect."""
+    effect. Not of an axis, whose file says so; with efforts they are fitted within a factor of 1.25 but for `known: [kp, kd]`."""
     without: list[str] = field(default_factory=list)
     """Effects that the search does not add. Where a joint's twin has one already, it stays with its present numbers."""
     out: Path = Path("diagnosis")

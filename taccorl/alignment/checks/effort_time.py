@@ -301,6 +301,17 @@ def law_fit(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> La
     return LawFit(float(solution[2]), -float(solution[1]), (float(sd[2]), float(sd[1])), share, float(solution[0]))
 
 
+def law_of_all(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:
+    """``law_fit`` of all recordings; where they do not show the sign together, and all that show it alone show a reversed one, at
+    least two, that of the clearest of these."""
+    whole = law_fit(law, recordings, signal)
+    if whole is None or whole.sign:
+        return whole
+    alone = [fit for m in recordings if (fit := law_fit(law, [m], signal)) and fit.sign]
+    reversed_ = len(alone) > 1 and all(fit.sign < 0 for fit in alone)
+    return min(alone, key=lambda fit: fit.left) if reversed_ else whole
+
+
 _Equations = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 

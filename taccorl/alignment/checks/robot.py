@@ -156,7 +156,7 @@ def _line(m: Measurement, name: str, factor: str = "…") -> str:
     return write(m, f"`factor: {factor}` for {name}.tau in a columns file", scale)
 
 
-@check("error", "reversed_effort")
+@check("error", "reversed_effort", explains=("effort_time",))
 def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) -> list[Finding]:
     """Finding on an effort with the wrong sign: by its law, which no mass changes, or where no law shows the sign by inertia.
     ``left``: share that the effort with the opposite sign leaves of what it leaves as it is."""

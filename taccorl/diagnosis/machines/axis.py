@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
-from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_fit
+from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_of_all
 from taccorl.alignment.checks.robot import beyond_effort, in_degrees, reversed_effort
 from taccorl.alignment.checks.telemetry import least_motion
 from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S, with_gains
@@ -79,7 +79,7 @@ class Axis(Machine):
         """Check recordings: positions and efforts beyond the limits, an impossible inertia, an effort of the wrong sign or time.
         Returns recording → findings."""
         found, config, file = {}, self.config, f"{self.name}.yaml"
-        fit = law_fit(config, [m for m in measurements.all if config.name in m.signals], config.name)
+        fit = law_of_all(config, [m for m in measurements.all if config.name in m.signals], config.name)
         for m in measurements.all:
             self._check_signal(m)
             wrong = [*_beyond_limits(config, m), *beyond_effort(config, m, config.name, file)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.columns import check_columns
-from taccorl.alignment.checks.effort_time import check_effort_time, law_fit
+from taccorl.alignment.checks.effort_time import check_effort_time, law_of_all
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.drive_law import FOLLOWED
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
@@ -115,7 +115,7 @@ class RobotMachine(Machine):
         """Recording → findings: positions or efforts beyond their limits, an impossible inertia, missing columns."""
         found: dict[str, list[DataFinding]] = {}
         own = {j: [self._whole(m) for m in measurements.all if moves(m, j)] for j in self.robot.config.joints}
-        fits = {name: law_fit(law, own[name], name) for name, law in self.robot.config.joints.items()}
+        fits = {name: law_of_all(law, own[name], name) for name, law in self.robot.config.joints.items()}
         for m in measurements.all:
             found[m.name] = check_robot(self.robot, m, self._whole(m), [name for name in own if moves(m, name)], fits)
         check_columns(self.robot, own, found)

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from simulated_slide import logged, robot_machine
 
-from taccorl.alignment.checks.effort_time import LawFit
+from taccorl.alignment.checks.effort_time import LawFit, law_fit
 from taccorl.alignment.checks.telemetry import check_measurements, one_cause
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -110,6 +110,23 @@ def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, 
     assert errors(stated, made) == set()
     against = [changed(m, ("effort",), [0, 1, 2], [1.0, 1.0, -1.0]) for m in made]
     assert errors(stated, against) == {("reversed_effort", "elbow")}
+
+
+def test_a_reversed_effort_that_most_recordings_hardly_show_is_that_and_no_other_time(
+    machine: RobotMachine, tmp_path: Path
+) -> None:
+    """Noise of 2 N·m in slow motions hides the law of all recordings together, not that of the two quick ones. The forearm's
+    centre of mass is elsewhere, so that inertia does not show the sign."""
+    there = robot_machine(tmp_path, ARM.replace(".05 0 .12", ".12 0 -.05"), FILE)
+    quick, slow, creep = (changed(m, ("effort",), [0, 1, 2], [1.0, 1.0, -1.0]) for m in recordings(there))
+    noise = np.random.default_rng(5).standard_normal((6, 1600, 3)) * [0.0, 0.0, 2.0]
+    made = [quick, dataclasses.replace(quick, name="quicker")]
+    for k, m in enumerate([slow, creep] * 3):
+        made.append(dataclasses.replace(m, name=f"{m.name}_{k}", effort=m.effort + noise[k]))
+    law = machine.robot.config.joints["elbow"]
+    fits = [law_fit(law, own, "elbow") for own in (made, made[:1])]
+    assert [fit and fit.sign for fit in fits] == [0, -1], "or the case is none"
+    assert errors(machine, made) == {("reversed_effort", "elbow")}
 
 
 def test_gains_beside_a_target_share_that_no_drive_has_show_no_sign_of_the_effort() -> None:

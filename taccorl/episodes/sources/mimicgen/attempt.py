@@ -14,7 +14,6 @@ from taccorl.data.episode import INTENDED
 from taccorl.episodes.attempt import Actions, Targets, act
 from taccorl.episodes.sources.mimicgen.director import ArmTarget, Director
 from taccorl.episodes.sources.mimicgen.disturbance import Disturbance, Exact
-from taccorl.episodes.sources.mimicgen.expert_contact import ExpertContact
 from taccorl.episodes.sources.mimicgen.gates import GateKeeper, foreign_contact
 from taccorl.episodes.sources.mimicgen.rest import RestOffset, joint_addresses
 from taccorl.episodes.sources.mimicgen.source import SourcePool
@@ -26,12 +25,45 @@ from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.task import HOLD_S
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.experts import expert_of
 from taccorl.tasks.experts.kinematics import ArmKinematics, retargeted
 
 _UNREACHABLE_M = 0.005  # that inverse kinematics leaves: the hand would be elsewhere
 _AFTER_STEPS = round((HOLD_S + 0.5) * CONTROL_HZ)  # a goal reached last of all must still hold
 _DISTURBANCE = 3  # apart from the pads' noise, which draws from (scene seed, 2)
 _WORD = "mimicgen"  # apart from the scenes of ``taccorl collect`` with the same seed
+
+
+class ExpertContact:
+    """``ContactHands`` of ``contact_mode: closed_loop_expert``: in contact the expert moves the hands instead of the source,
+    whose motion does not react to it. The expert detects a block from how far the hand is pushed back, backs off and aims
+    again. Its aiming error and tremor are drawn from the attempt's generator; the caller corrects the steady-state offset."""
+
+    def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
+        """After a reset."""
+        self._expert = expert_of(sim.task)(sim, rng)
+        self._expert.stand_by()
+
+    @property
+    def corrections(self) -> list[tuple[int, str]]:
+        return self._expert.events
+
+    def take(self, arm: str, subtask: str, arm_target: ArmTarget) -> None:
+        self._expert.take_over(arm, subtask, arm_target.goal, arm_target.opening_m)
+
+    def step(self) -> Mapping[str, ArmTarget]:
+        expert = self._expert
+        if expert.done:
+            expert.step_count += 1
+            return {}
+        expert.act()
+        hands = {arm: expert.hands[arm] for arm in expert.running}
+        return {
+            arm: ArmTarget(
+                goal=hand.goal, opening_m=hand.opening_m, contact=not hand.learns, noisy=False, intended=hand.intended
+            )
+            for arm, hand in hands.items()
+        }
 
 
 def attempt_seeds(root: int, task: str, k: int) -> tuple[int, np.random.Generator]:
