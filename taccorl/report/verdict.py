@@ -181,6 +181,7 @@ def _change(c: Changed, d: Diagnosis) -> str:
     edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (c.name == EFFORT_SCALE)
     edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))
     ends = f"{clean(low, high - low)} … {clean(high, high - low)}"
+    ends = f"not determined: with other numbers any of {ends} fits" if c.name in d.undetermined else ends
     return f"{c.name} {c.was} → {clean(c.after, high - low)}{unit_words(c.unit)} ({ends}){edit}"
 
 
@@ -341,12 +342,9 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
             "little as noise that is not quite known may leave"
         )
     if named and validation > FLOOR:
-        yield (
-            f"validation recordings keep {validation:.2f} of {first:.2f} noise floors, so little that no effect was looked for"
-        )
-    also = {"": "", EFFORT_SCALE: "a wrong torque constant does as well"}.get(
-        d.or_number[0], "another gain does as well"
-    )
+        yield f"validation recordings keep {validation:.2f} of {first:.2f} floors, so little that no effect was looked for"
+    words = {"": "", EFFORT_SCALE: "a wrong torque constant does as well"}
+    also = words.get(d.or_number[0], "another gain does as well")
     yield from filter(None, (also, unjudged(d, short), may_be_two(d)))
     if d.one_pose:
         yield (
@@ -355,6 +353,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
         )
     if d.at_bound:
         yield f"{_some(d.at_bound)} at the end of its range"
+    if unknown := [c.name for c in d.changed if c.name in d.undetermined]:
+        yield f"the recordings do not determine {_some(unknown)}"
 
 
 def _record_next(

@@ -104,6 +104,14 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
     v = verdict(PART, changed(nothing, status="numbers_off", changed=(off,), intervals=nothing.intervals | ends))
     assert (v.kind, v.level) == ("numbers_off", "high")
     assert "0.052 → 0.252 N·m (0.246 … 0.258)" in v.finding and "12.30" in v.finding and "nothing" not in v.finding
+    unknown = changed(
+        nothing, status="numbers_off", changed=(off,), intervals=nothing.intervals | ends, undetermined=(off.name,)
+    )
+    doubted = verdict(PART, unknown)
+    assert (
+        "not determined: with other numbers any of 0.246 … 0.258 fits" in doubted.finding
+        and doubted.level == "moderate"
+    )
     for stage in ("before", "after"):
         assert f"{nothing.errors[stage]['validation']:.2f}" in v.finding
     assert not v.record_next.startswith("Nothing") and "coulomb_friction" in v.record_next
