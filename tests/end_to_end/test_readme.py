@@ -137,9 +137,9 @@ class Walk:
             "taccorl ingest recordings/": self.some_recordings,
             "taccorl init-robot my_arm.xml": self.model_of_an_arm,
             "taccorl compare sweeps/ --twin=my_robot.yaml": self.tables_of_an_arm,
-            "taccorl compare sweeps/ --twin=twin.yaml": self.sweeps_of_the_piper,
+            "taccorl align sweeps/ --twin=twin.yaml": self.sweeps_of_the_piper,
             "taccorl compare presses/": self.presses,
-            "taccorl merge": lambda: shutil.copytree("outputs/my_dataset", "recorded") and None,
+            "taccorl merge": self.two_domains,
         }
 
     def run(self, *words: str) -> None:
@@ -150,6 +150,10 @@ class Walk:
         print(f"$ {shlex.join(words)}\n{done.stdout[-3000:]}{done.stderr[-3000:]}")
         assert done.returncode == 0, f"{shlex.join(words)} ended with {done.returncode}"
         assert "Traceback" not in done.stderr
+
+    def two_domains(self) -> None:
+        shutil.copytree("outputs/my_dataset", "recorded")
+        self.run("taccorl", "augment", "--source=sources", "--task=assembly_2", "--episodes=1", "--out=many")
 
     def some_recordings(self) -> None:
         shutil.copytree(self.recordings, "recordings")
