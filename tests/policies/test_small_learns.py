@@ -221,7 +221,8 @@ def test_steps_behind_the_episodes_end_do_not_count(rows):
     loss = policy.forward({**rows, "action_is_pad": pad})[0]
     wanted = [errors[b, : 10 - int(pad[b].sum()), :14].mean() for b in range(8)]
     torch.testing.assert_close(loss, torch.stack(wanted).mean(), rtol=1e-5, atol=0)
-    # Whatever stands there reaches the rest only as input that the denoiser sees, as in LeRobot's pi05; its error is not counted.
+    # Other values in the padded actions must not make the loss infinite. Their own error is not counted, but the denoiser sees
+    # them as input, as in LeRobot's pi05.
     assert torch.isfinite(row_losses({**other, "action_is_pad": pad}, seed=5)).all()
 
 

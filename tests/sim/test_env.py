@@ -251,7 +251,8 @@ def test_numbers_are_the_simulators_poses(task):
 
 
 def test_rows_and_environments_have_the_same_numbers():
-    """The same scene and actions; the row's poses are of the instant of its state, and can be had again from its sim.state."""
+    """An environment and the recorder of datasets get the same scene and actions. Each row holds the poses of the parts at the
+    time of its joint state, and a simulation restored to the row's ``sim.state`` has the same poses."""
     envs = TaccorlVectorEnv("assembly_2", 2, part_poses=True, num_threads=1)
     observation, _ = envs.reset(seed=[5, 6])
     sim = Simulation(tasks.get("assembly_2")())

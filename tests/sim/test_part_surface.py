@@ -310,7 +310,7 @@ def test_shapes_without_an_exact_depth_are_refused() -> None:
 
 
 def test_mesh_that_is_not_convex_is_refused() -> None:
-    """A tetrahedron with a dent: MuJoCo collides it as if the dent were filled."""
+    """The mesh is a tetrahedron with a dent. MuJoCo collides the convex hull of a mesh, which fills the dent."""
     spec = mujoco.MjSpec()
     vertices = np.array([(0, 0, 0), (0.03, 0, 0), (0, 0.03, 0), (0, 0, 0.03), (0.005, 0.005, 0.005)])
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4)]

@@ -302,8 +302,8 @@ def law_fit(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> La
 
 
 def law_of_all(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:
-    """``law_fit`` of all recordings; where they do not show the sign together, and all that show it alone show a reversed one, at
-    least two, that of the clearest of these."""
+    """``law_fit`` of all recordings together. If that leaves the sign open, but at least two recordings have a sure sign each and
+    all of these signs are reversed: the fit of the recording that leaves least."""
     whole = law_fit(law, recordings, signal)
     if whole is None or whole.sign:
         return whole

@@ -43,12 +43,12 @@ class Rigid(NamedTuple):
 
 
 class PointMass(NamedTuple):
-    """A mass that is fixed to a body of a model, and that no controller compensates; without extent unless ``spread_m2``."""
+    """An additional mass, rigidly fixed to a body, that gravity compensation leaves out. A point if ``spread_m2`` is 0."""
 
     mass_kg: float
     body: int  # Id of the body
     place_m: tuple[float, float, float]  # Place of its centre in the body's frame [m]
-    spread_m2: np.ndarray = np.zeros((3, 3))  # (3, 3) mean of r rᵀ over it, r from its centre in that frame [m²]
+    spread_m2: np.ndarray = np.zeros((3, 3))  # (3, 3) mean of r rᵀ [m²], r from its centre, body frame
 
 
 class MassTorque(NamedTuple):
@@ -91,7 +91,7 @@ class RigidJoint(ABC):
     0.1 mrad."""
 
     follows_line: ClassVar[bool] = False
-    """Target between two rows: True: on the straight line between theirs. False: that of the later row, as a replay holds it."""
+    """Target between two rows. True: interpolated linearly. False: held at the value of the later row, as in a replay."""
     keeps_times: ClassVar[bool] = False
     """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
     target_late_s: float = 0.0

@@ -151,7 +151,7 @@ class _File:
         whole, part = page_bytes * pages, 0
         if size < whole:
             part = size % page_bytes
-            self.lost(f"the file ends {whole - size:,} bytes early (cut off?)", (size, whole))
+            self.lost(f"the file ends {whole - size:,} bytes early (cut off?)", (size - part, whole))
         path, how = self.path, "mode=ro&immutable=1"  # immutable: no lock, no journal, no shared memory file
         unfinished = [p for end in ("-wal", "-journal") if (p := path.with_name(path.name + end)).is_file()]
         in_writing = any(p.stat().st_size for p in unfinished)

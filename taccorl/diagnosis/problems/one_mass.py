@@ -92,7 +92,7 @@ class OneMass:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Joint → validation error with the mass [noise floors, 1 at least]."""
+        """Joint → validation error with the mass [noise floors], as by ``error_of``."""
         return {joint: error_of(with_it) for joint, (_, with_it) in self.squares.items()}
 
     @property
@@ -160,8 +160,8 @@ def holds_at(
 
 
 def is_better(one: OneMass, other: OneMass, everywhere: OneMass) -> bool:
-    """Whether ``one`` surely leaves less at all joints of ``everywhere`` together, by paired half seconds, or alone holds. A
-    joint that a mass is not at has what was found there alone."""
+    """Whether ``one`` is better than ``other``: it alone holds, or it leaves less at all joints of ``everywhere`` together, by
+    ``sure_score`` standard errors between half seconds. A joint that a mass does not load keeps its own diagnosis."""
     if not (one.holds and other.holds):
         return one.holds
     pairs = [[o.squares.get(j, own[:1])[-1] for o in (other, one)] for j, own in everywhere.squares.items()]
@@ -171,7 +171,7 @@ def is_better(one: OneMass, other: OneMass, everywhere: OneMass) -> bool:
 
 
 def error_of(squares: Blocks) -> float:
-    """RMS error [noise floors], 1 at least."""
+    """Root mean square error [noise floors]; 1 where it is below 1."""
     return float(np.sqrt(above_floor(squares)))
 
 

@@ -111,7 +111,8 @@ class EndStop(JointEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: stops at and within either recorded end, which yield by 2 or 20 % of the range at most."""
-        low = seen.get("lowest_rad", -0.5 * (span := max(seen["span_rad"], 0.02)))
+        span = max(seen["span_rad"], 0.02)
+        low = seen.get("lowest_rad", -0.5 * span)
         high = seen.get("highest_rad", low + span)
         reach, torque_nm = max(high - low, 1e-3), max(seen["peak_torque_nm"], 0.01)
         return [
@@ -181,10 +182,9 @@ class Payload(ArmEffect):
         return text * (self.mass_kg < 0.0 or self.like_link)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        if self.link or self.like_link or self.mass_kg < 0.0:
-            what = (
-                f"mass_kg is {self.mass_kg:g} kg, below 0" if self.mass_kg < 0.0 else f"link {self.link or 'like_link'}"
-            )
+        below = f"mass_kg is {self.mass_kg:g} kg, below 0" * (self.mass_kg < 0.0)
+        stated = [below, f"link is {self.link!r}" * bool(self.link), "like_link is true" * self.like_link]
+        if what := " and ".join(filter(None, stated)):
             raise TaccorlError(f"effect payload: {what}, which only robot files can state; remove it")
         for arm in self.arms():
             ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")

@@ -120,14 +120,15 @@ def test_a_joint_rests_where_the_drive_balances_the_law(effects, offset, torque_
 @pytest.mark.parametrize(
     ("name", "values", "torque_nm", "least", "most"),
     [
-        # Of what breaks it away: 0.5 N·m; 0.5 (1 + a) and 0.5 (1 − a); 1 N·m of bristles that bend by 0.1 mrad, which hold 0.7.
+        # Applied torque below the breakaway torque: the joint stays. Breakaway is 0.5 N·m (Coulomb), 0.5 (1 ± a) N·m (asymmetric)
+        # and 1 N·m (Stribeck); the last has bristles, which yield by up to 0.1 mrad.
         ("coulomb_friction", {"torque_nm": 0.5}, -0.45, -2e-5, 2e-5),
         ("coulomb_friction", {"torque_nm": 0.5}, 0.25, -2e-5, 2e-5),
         ("coulomb_friction", {"torque_nm": 0.5}, 0.495, -2e-5, 2e-5),
         ("asymmetric_friction", LEANING, 0.6, -2e-5, 2e-5),
         ("asymmetric_friction", LEANING, -0.3, -2e-5, 2e-5),
         ("stribeck_friction", STRIBECK | {"presliding_rad": 1e-4, "stribeck_rad_per_s": 0.05}, 0.7, 0.0, 3e-4),
-        # By what is beyond 0.65 or −0.35 N·m, as far as it gets in this time.
+        # Applied torque beyond the breakaway torque, 0.65 and −0.35 N·m: the joint moves, driven by the excess of 0.05 N·m.
         ("asymmetric_friction", LEANING, 0.7, 0.9 * 0.05 / KP, 1.1 * 0.05 / KP),
         ("asymmetric_friction", LEANING, -0.4, -1.1 * 0.05 / KP, -0.9 * 0.05 / KP),
     ],

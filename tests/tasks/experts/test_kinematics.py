@@ -1,4 +1,5 @@
-"""Rigid transforms against scipy; inverse kinematics back to where forward kinematics came from, or an error that says where."""
+"""Rigid transforms agree with scipy. Inverse kinematics returns joint angles whose forward kinematics is the asked pose, or an
+error that names the pose."""
 
 import numpy as np
 import pytest
