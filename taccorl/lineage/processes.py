@@ -315,9 +315,7 @@ def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int, number: int = 0) -
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which then ends us in order
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that a stage can tidy up
     loaded = attempt(pickle.loads, fn_bytes)
-    with contextlib.suppress(
-        EOFError, BrokenPipeError
-    ):  # no more work; it may all have been done before this was ready
+    with contextlib.suppress(EOFError, ConnectionError):  # all work was done, perhaps before this was ready
         pipe.send_bytes(pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None)))
         while isinstance(loaded, Done):
             message = pipe.recv_bytes()

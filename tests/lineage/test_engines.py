@@ -428,13 +428,16 @@ def test_the_same_on_ray_itself(tmp_path, monkeypatch):
         ray.shutdown()
 
 
-def test_a_worker_that_is_ready_after_all_work_is_done_ends_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("when_ready", [False, True])
+def test_a_worker_for_whom_no_work_is_left_ends_without_a_word(when_ready, capfd) -> None:
     context = multiprocessing.get_context("spawn")
     near, far = context.Pipe()
-    near.close()
     worker = context.Process(target=_work, args=(far, pickle.dumps(fate), os.getpid()))
     worker.start()
     far.close()
+    if when_ready:
+        assert near.poll(60)  # and never read: the worker's next read is reset, not at its end
+    near.close()
     worker.join(timeout=60)
     assert worker.exitcode == 0
     assert "Traceback" not in capfd.readouterr().err
