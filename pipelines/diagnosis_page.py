@@ -31,7 +31,7 @@ RUN = "pack chirp pairs none loop outside removed dropped touch touch_none touch
 HEAD = f"""# Is the search for missing effects right?
 
 **Every case is a surrogate robot, simulated**, written apart from the twin (finer steps, dynamics of its own, bristle friction,
-noise, quantisation, jitter, disturbances). Known effects are hidden in one joint or the pads of one arm; the search (0df6c820)
+noise, quantisation, jitter, disturbances). Known effects are hidden in one joint or the pads of one arm; the search (94553cfb)
 does not know the gains. Half of the cases use efforts, half a loop sampled at 0.5 to 4 kHz. No threshold was chosen on them.
 
 | word | meaning |

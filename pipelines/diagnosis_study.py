@@ -30,7 +30,7 @@ from taccorl.surrogate.hidden import OUTSIDE, REGISTERED  # noqa: E402
 from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # noqa: E402
 
 ROWS = Path("docs/diagnosis_study.jsonl")
-FIRST_SEED = 740000
+FIRST_SEED = 770000
 PAIRS = (
     "coulomb_friction+command_delay",
     "coulomb_friction+gravity_mismatch",
