@@ -155,9 +155,12 @@ class TwinShard:
         observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": rows_N})
         self._window_NWK[rows_N] = self._repeated(observation[TACTILE_KEY][rows_N])
         self._began_later_N[rows_N] = False
-        for i, (state, window_WK) in self.starts.draw(rows_N).items():
-            self.envs.reset(seed=self._seeds(), options={"reset_mask": np.arange(len(rows_N)) == i, "state": state})
-            self._window_NWK[i], self._began_later_N[i] = window_WK, True
+        if drawn := self.starts.draw(rows_N):
+            states, windows = zip(*drawn.values(), strict=True)
+            chosen_N = np.isin(np.arange(len(rows_N)), list(drawn))
+            state = Snapshot.joined(states)
+            self.envs.reset(seed=self._seeds(), options={"reset_mask": chosen_N, "state": state})
+            self._window_NWK[chosen_N], self._began_later_N[chosen_N] = windows, True
 
     def _seeds(self) -> list[int]:
         return [episode_seed(self._root, self._first + i, int(k)) for i, k in enumerate(self._episode_N)]

@@ -86,7 +86,9 @@ class TwinWorld:
         return Acted(**joined, last=self._seen(last) if last else None)
 
     def _seen(self, parts: Sequence[Observation]) -> Observations:
-        observation = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        observation = parts[0]
+        if len(parts) > 1:
+            observation = {key: np.concatenate([part[key] for part in parts]) for key in observation}
         privileged_NP = torch.from_numpy(observation[PRIVILEGED]).float().to(self._device)
         with self.clock.part("policy"):
             numbers = {key: observation[key] for key in (STATE_KEY, TACTILE_KEY, PARTS_KEY) if key in observation}

@@ -1,5 +1,6 @@
 """Deterministic sequence of scene seeds for each environment, a function of the first seed and the episode's number only."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from taccorl.errors import TaccorlError
 
 
+@functools.lru_cache(maxsize=1 << 16)
 def episode_seed(root: int, index: int, episode: int) -> int:
     """Scene seed (0 … 2³² − 1) of the ``episode``-th episode of environment ``index``, both from 0: a pure function of ``root``,
     the first seed, and both numbers."""

@@ -68,9 +68,10 @@ class Canvas:
             yield
 
     def draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], views: list[View], out: np.ndarray) -> None:
-        """Render the views of each of ``sims`` (model, data) and write them to ``out`` (simulations · cameras, rows, columns, 3)
-        uint8 RGB, simulation after simulation."""
-        sheet = self._sheet_for(len(out))
+        """Render the views of each of ``sims`` (model, data) and write them to ``out`` (cameras, simulations, rows, columns, 3)
+        uint8 RGB."""
+        count = len(views) * out.shape[1]
+        sheet = self._sheet_for(count)
         first = held = 0
         for model, data in sims:
             if _assets(model) != self._assets:
@@ -82,7 +83,7 @@ class Canvas:
                 self._draw_view(model, data, view)
                 sheet.keep(held, self._mjr)
                 held += 1
-                if held == sheet.capacity or first + held == len(out):
+                if held == sheet.capacity or first + held == count:
                     _deal(sheet.read(held, self._mjr), views, out, first)
                     first, held = first + held, 0
 
@@ -145,6 +146,7 @@ class _Sheet:
         from OpenGL import GL
 
         self._gl, self._cell, self._across, self.capacity = GL, cell, across, down * across
+        self._pixels = np.empty((down * cell[0], across * cell[1], 3), np.uint8)
         self._color, self._frame = GL.glGenRenderbuffers(1), GL.glGenFramebuffers(1)
         GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, self._color)
         GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, GL.GL_RGBA8, across * cell[1], down * cell[0])
@@ -160,9 +162,11 @@ class _Sheet:
         gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, mjr.offFBO)
 
     def read(self, count: int, mjr: mujoco.MjrContext) -> list[np.ndarray]:
-        """The first ``count`` cells, upright, in arrays (cells, rows, columns, 3): one for each row of the sheet."""
+        """The first ``count`` cells, upright, in arrays (cells, rows, columns, 3): one for each row of the sheet. The next call
+        writes over them."""
         gl, (rows, columns), across = self._gl, self._cell, min(count, self._across)
-        pixels = np.empty((-(-count // across) * rows, across * columns, 3), np.uint8)
+        shape = (-(-count // across) * rows, across * columns, 3)
+        pixels = self._pixels.reshape(-1)[: np.prod(shape)].reshape(shape)
         gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._frame)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
         gl.glReadPixels(0, 0, pixels.shape[1], pixels.shape[0], gl.GL_RGB, gl.GL_UNSIGNED_BYTE, pixels)
@@ -176,13 +180,14 @@ class _Sheet:
 
 
 def _deal(strips: list[np.ndarray], views: list[View], out: np.ndarray, first: int) -> None:
-    """Put cells, the first of which is picture ``first`` of ``out``, into their cameras' windows; bars stay black."""
+    """Put cells, the first of which is view ``first`` of all simulations' views, into their cameras' windows of ``out``, as
+    ``Canvas.draw`` has it; bars stay black."""
     for cells in strips:
         for number, view in enumerate(views):
             mine, window = (number - first) % len(views), view.window
-            frames = out[first + mine : first + len(cells) : len(views)]
-            inside = frames[:, window.top : window.top + window.rows, window.left : window.left + window.columns]
-            inside[:] = cells[mine :: len(views), -window.rows :, : window.columns]  # drawn into the cell's lower left
+            drawn = cells[mine :: len(views), -window.rows :, : window.columns]  # into the cell's lower left
+            frames = out[number, (first + mine) // len(views) :][: len(drawn)]
+            frames[:, window.top : window.top + window.rows, window.left : window.left + window.columns] = drawn
         first += len(cells)
 
 

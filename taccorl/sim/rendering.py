@@ -122,12 +122,12 @@ class Renderer:
             yield model, data
 
     def _draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], num_sims: int) -> np.ndarray:
-        out = np.zeros((num_sims * len(self._views), *self._shape, 3), np.uint8)
-        if len(out):
+        out = np.zeros((len(self._views), num_sims, *self._shape, 3), np.uint8)  # each camera's pictures are contiguous
+        if out.size:
             canvas = self._canvas()
             with canvas.current():
                 canvas.draw(sims, self._views, out)
-        return out.reshape(num_sims, len(self._views), *self._shape, 3)
+        return out.swapaxes(0, 1)
 
     def _canvas(self) -> "Canvas":
         if self._gl is None:

@@ -6,6 +6,7 @@ Letters in shapes: N simulations, S sub-commands of one control step, A numbers 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -49,6 +50,17 @@ class Snapshot:
     scene: np.ndarray
     """(n,) ``scene_digest`` of the scenes: only simulations of the same task, difficulty, twin and randomisation accept the
     snapshot."""
+
+    @classmethod
+    def joined(cls, parts: Sequence["Snapshot"]) -> "Snapshot":
+        """One snapshot of the rows of all ``parts``, in their order."""
+
+        def join(values: list[Any]) -> Any:
+            if isinstance(values[0], dict):
+                return {name: join([value[name] for value in values]) for name in values[0]}
+            return np.concatenate(values)
+
+        return cls(**join([vars(part) for part in parts]))
 
 
 @dataclass(frozen=True)
