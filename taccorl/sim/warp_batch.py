@@ -42,8 +42,8 @@ class WarpSettings:
     contacts: int = 64
     """Contacts, and pairs of geoms close to each other, for which each world has room; worlds share the sum. The experts of the
     four tasks need up to 23."""
-    constraints: int = 192
-    """Rows of the constraint solver for which each world has room. The experts need up to 94."""
+    constraints: int = 576
+    """Rows of the constraint solver for which each world has room. The experts need up to 94, a policy of the puzzle 283."""
 
     @classmethod
     def parse(cls, physics: str) -> "WarpSettings | None":
