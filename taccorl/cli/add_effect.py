@@ -2,7 +2,8 @@
 ``taccorl add-effect taxel_creep --twin=twin.yaml --pads=left``: an effect of pads.
 
 The values are those that the last ``taccorl diagnose`` of this twin fitted, and with them the values that were refitted
-together: gains of a joint, k_n and k_d of pads. An effect that was tied with the chosen one can also be added.
+together: gains of a joint, k_n and k_d of pads. An effect that was tied with the chosen one can also be added. Numbers of the
+file that the diagnosis says are off are written likewise: ``taccorl add-effect kd``.
 ``--values={torque_nm: 0.4}`` gives values by hand instead. Prints the numbers that change, old and new, and those that stay.
 Writes a copy, ``twin+coulomb_friction.yaml``, which collection, generation and training load.
 """
@@ -30,8 +31,9 @@ class AddEffectConfig:
     """Add one physical effect to a twin."""
 
     effect: str
-    """Name of the effect; docs/effects.md lists them. Several with commas between them: those that one diagnosis found, at one
-    joint or at several. The numbers are those of a fit with exactly these."""
+    """Name of the effect; docs/effects.md lists them. Or of a number that the diagnosis says is off, such as kd or inertia.
+    Several with commas between them: what one diagnosis found, at one joint or at several. The numbers are those of a fit with
+    exactly these."""
     twin: Path | None = None
     """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
@@ -57,7 +59,7 @@ def run(config: AddEffectConfig) -> int:
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.terminal import show
 
-    machine, hand, made_by = load_machine(config.twin), config.values, []
+    machine, hand, made_by, said = load_machine(config.twin), config.values, [], {}
     if key := next((key for key in hand if {*":="} & {*key}), ""):
         raise TaccorlError(f"--values: {key!r} is one word; YAML needs a colon and a space: '{{torque_nm: 0.4}}'")
     names = list(dict.fromkeys(config.effect.split(",")))
@@ -66,12 +68,11 @@ def run(config: AddEffectConfig) -> int:
     if hand:
         added = machine.by_hand(names[0], config.joints, config.pads, hand)
     else:
-        added, made_by = _diagnosed(config, machine, names)
+        added, made_by, said = _diagnosed(config, machine, names)
     mended = machine.with_additions(added)
-    for part in dict.fromkeys(a.part for a in added):
-        evidence = dict.fromkeys(e.evidence for a in added if a.part == part for e in a.effects if e.evidence)
-        lines = Section(text=[f"  {line}" for line in evidence])
-        show(_changes(part, machine.numbers(part), mended.numbers(part)), lines)
+    for a in added:
+        words = Section(text=[f"  {said.get(a.part, 'by hand')}"])
+        show(_changes(a.part, machine.numbers(a.part), mended.numbers(a.part)), words)
     mended.save(out)
     against = None if config.in_place else out
     show(Section(text=[f"wrote {out}; next: {compare_words(made_by, [a.part for a in added], config.twin, against)}"]))
@@ -91,10 +92,6 @@ def compare_words(made_by: list[str], parts: list[str], twin: Path | None, again
 
 def _place(config: AddEffectConfig) -> Path:
     """Where to write, before any work is done."""
-    from taccorl.sim.effects import effects
-
-    for name in config.effect.split(","):
-        effects.get(name)
     if config.in_place:
         if config.twin is None or config.out is not None:
             raise TaccorlError("--in_place=true changes the file of --twin=…; give that option, and do not give --out")
@@ -106,18 +103,20 @@ def _place(config: AddEffectConfig) -> Path:
     return out
 
 
-def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) -> tuple[list["Addition"], list[str]]:
-    """What the diagnosis of this machine says of these effects, part by part: the numbers of the fit with exactly those of
-    them that it found there; and the words of its command. Raises TaccorlError: there is no diagnosis of this machine, or it
-    did not fit one of the effects."""
+def _diagnosed(
+    config: AddEffectConfig, machine: "Machine", names: list[str]
+) -> tuple[list["Addition"], list[str], dict[str, str]]:
+    """What the diagnosis of this machine says of these effects and numbers, part by part: the numbers of the fit with exactly
+    those of them that it found there; the words of its command; and part → its verdict, or evidence of a part of it. Raises
+    TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects."""
     from taccorl.report.report import numbers_of
     from taccorl.sim.effects import effects
 
     path = numbers_of(config.diagnosis)
     if not path.is_file():
-        number = effects.get(names[0]).parameters()[0]
-        way_out = f"run `taccorl diagnose` first, or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
-        raise TaccorlError(f"{path}: no diagnosis there; {way_out}")
+        own = effects.get(names[0]).parameters()[:1] if names[0] in effects else ()
+        by_hand = [f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'" for number in own]
+        raise TaccorlError(f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(by_hand)}")
     report = json.loads(path.read_text(encoding="utf-8"))
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
         made_with = report.get("provenance", {}).get("twin", "another twin")
@@ -128,9 +127,11 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     diagnoses = report["diagnoses"]
     parts = machine.select(list(diagnoses), config.joints, config.pads)
     found = {name for part in parts for name in _found(diagnoses[part])}
-    additions, refused, written = [], [], set()
+    for name in {*names}.difference(*(_off(diagnoses[part]) for part in parts)):
+        effects.get(name)
+    additions, refused, written, said = [], [], set(), {}
     for part in parts:
-        own = _found(diagnoses[part])
+        own = [*_found(diagnoses[part]), *_off(diagnoses[part])]
         # What was found at some part is not taken where it only ties with what was found.
         wanted = {name for name in names if name in own or (name not in found and name in _fitted(diagnoses[part]))}
         try:
@@ -141,18 +142,26 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
         if fit is None:
             continue
         additions.append(_addition(machine, part, fit))
-        written |= {e["effect"] for e in fit["effects"]}
+        written |= {*(e["effect"] for e in fit["effects"]), *_off(diagnoses[part])}
+        said[part] = report["verdicts"][part]["finding"] if fit is diagnoses[part] else fit["effects"][-1]["evidence"]
     if refused and (config.joints or config.pads or not additions):
         raise refused[0]
     if left := [name for name in names if name not in written]:
         tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]} | found)
         raise TaccorlError(f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}")
-    return additions, shlex.split(report["provenance"].get("command", ""))
+    return additions, shlex.split(report["provenance"].get("command", "")), said
 
 
 def _found(diagnosis: dict[str, Any]) -> list[str]:
     """Effects that a diagnosis of one part added."""
     return [e["effect"] for e in diagnosis["effects"] if e["effect"] not in diagnosis["present"]]
+
+
+def _off(diagnosis: dict[str, Any]) -> list[str]:
+    """Numbers, of no effect, that a diagnosis of one part says are off in the file; not a scale of efforts, which no file has."""
+    from taccorl.diagnosis.search.problem import EFFORT_SCALE
+
+    return [c["name"] for c in diagnosis.get("changed", ()) if "." not in c["name"] and c["name"] != EFFORT_SCALE]
 
 
 def _fitted(diagnosis: dict[str, Any]) -> set[str]:
@@ -163,10 +172,10 @@ def _fitted(diagnosis: dict[str, Any]) -> set[str]:
 def _fit_of(wanted: set[str], part: str, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
     """The fit with exactly the effects ``wanted`` beside those of the file; None if the diagnosis looked at none of them.
     Raises TaccorlError: the diagnosis refused one of them, or did not fit them together."""
-    own, new = {*_found(diagnosis)}, wanted - {*diagnosis["present"]}
+    own, new = {*_found(diagnosis)}, wanted - {*diagnosis["present"], *_off(diagnosis)}
     if new == own:
         for name in wanted if not new else ():
-            if name not in [c["name"].rpartition(".")[0] for c in diagnosis.get("changed", [])]:
+            if name not in {n for c in diagnosis.get("changed", []) for n in (c["name"], c["name"].rpartition(".")[0])}:
                 raise TaccorlError(
                     f"{part}: the numbers of {name} in the file explain the recordings as well as refitted ones; give "
                     "--values={…} to change them nevertheless"

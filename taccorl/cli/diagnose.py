@@ -170,7 +170,9 @@ def _next(
     found = sorted(found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"])  # the largest first
     names = list(dict.fromkeys(name for f in found for name in added(f.diagnosis)))
     off = [(f.part, c) for f in found for c in f.diagnosis.changed if c.name != EFFORT_SCALE]  # which no file has
-    of_file = [c.effect for f in found if f.diagnosis.status == "numbers_off" for c in f.diagnosis.changed if c.effect]
+    refitted = [c for f in found if f.diagnosis.status == "numbers_off" or not names for c in f.diagnosis.changed]
+    of_file = [c.effect or c.name for c in refitted if c.name != EFFORT_SCALE]
+    undecided = any(c.instead for c in refitted)
     whole = machine.changes_as_a_whole(found)
     further = shlex.join(command("diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"))
     if config.until == "noise_floor":
@@ -192,8 +194,8 @@ def _next(
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
         tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
-        yield f"next: {shlex.join([*words, *_given(config)])}"
+        yield from ["next: record what decides, see Record next"] * undecided
+        yield f"{'to write what was refitted' if undecided else 'next'}: {shlex.join([*words, *_given(config)])}"
         yield from [f"{' or '.join(tied)} does as well as {names[0]}: see Record next"] * bool(tied)
-    elif off or any(machine.option_of(f.part) for f in found):
-        yield from ["next: record what decides, see Record next"] * any(c.instead for _, c in off)
+    elif any(machine.option_of(f.part) for f in found):
         yield f"a twin with the refitted numbers: {further}"

@@ -25,17 +25,17 @@ def cells_of(c: Comparison) -> list[Cell]:
 
 def how_far(c: Comparison, *others: Comparison) -> Section:
     """One row for each signal and use; beside each other the twin as it was and ``others``, such as with refitted numbers."""
-    later = [{(s.signal, s.kind, s.use): s for s in (*o.scores(), *o.pad_scores())} for o in others]
+    every = [{(s.signal, s.kind, s.use): s for s in (*o.scores(), *o.pad_scores())} for o in (c, *others)]
     heads = ["signal", "recordings", f"RMSE {c.twin} (95 %)", "× floor"]
     for other in others:
         heads += [f"RMSE {other.twin} (95 %)", "× floor", "change"]
-    scores = [*c.scores(), *c.pad_scores()]
+    scores = [*every[0].values()]
     rows = []
     for s in scores:
         row: list[Value] = [f"{s.signal} {'' if s.signal == 'touch' else s.kind}".strip(), f"{s.use} ({s.recordings})"]
         row += _errors(s)
         before = s
-        for found in later:
+        for found in every[1:]:
             other = found.get((s.signal, s.kind, s.use))
             row += [*_errors(other), change(before.rmse, other.rmse)] if other is not None else [""] * 3
             before = other or before
@@ -50,8 +50,17 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
         notes.append("or more, of touch: the noise of each taxel; what presses do not repeat is not in it")
     if any(s.lower_bound and s.kind != "touch" for s in scores):
         notes.append("or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound")
+    for signal in dict.fromkeys(s.signal for s in scores if s.kind == "effort" and c.of(s.signal)):
+        words = ", ".join(f"{use} {' → '.join(_together(found, signal, use) for found in every)}" for use in c.uses)
+        notes.append(f"{signal}: position and effort together, as diagnose counts: {words} × floor")
     heads += ["NRMSE", "noise floor", "n"]
     return Section(title="How far off", heads=heads, rows=rows, right=range(2, len(heads)), notes=notes)
+
+
+def _together(found: Mapping[tuple, Score], signal: str, use: Use) -> str:
+    """RMS error of all rows of position and effort [noise floors]; of ``diagnose`` it differs by rows at a limit."""
+    own = [found[signal, kind, use] for kind in ("position", "effort") if (signal, kind, use) in found]
+    return f"{(sum(s.n * s.ratio**2 for s in own) / sum(s.n for s in own)) ** 0.5:.2f}" if own else "–"
 
 
 def verdict(c: Comparison, after: Comparison | None) -> Section:

@@ -42,7 +42,7 @@ def brief(f: Finding, v: Verdict, options: Sequence[str] = ()) -> Section:
         text += [f"Record next: {v.record_next}", *[Cell(v.command, "bold")] * bool(v.command)]
     text += [f"Remark: {remark}" for remark in v.remarks[:REMARKS]]
     text += [f"and {len(v.remarks) - REMARKS} more remarks: see the page"] * (len(v.remarks) > REMARKS)
-    text += [f"{_judged(f)}; noise floor {f.noise}", *[f.remark] * bool(f.remark)]
+    text += [f"{_judged(f)}; errors of {f.measured}; noise floor {f.noise}", *[f.remark] * bool(f.remark)]
     return Section(title=_title(f), parts=[Section(text=text)])
 
 

@@ -156,39 +156,52 @@ def test_a_log_of_positions_and_efforts_alone_shows_the_friction(said, tmp_path,
     assert low <= friction_n <= high and high - low < 0.02 * FRICTION_N
 
 
+KNOWS = f"{FILE}effects: [{{effect: coulomb_friction, torque_nm: {FRICTION_N}}}]\n"
+
+
 @pytest.mark.slow
-def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench, said, tmp_path):
-    """The file has 3 of 12 N. Held there, the rest of 9 N is missing."""
-    drive, found = tmp_path / "drive.yaml", tmp_path / "found"
-    drive.write_text(f"{FILE}effects: [{{effect: coulomb_friction, torque_nm: 3.0}}]\n")
-    words = (f"--twin={drive}", f"--diagnosis={found}")
-    code, text = said("diagnose", bench / "bench", f"--twin={drive}", f"--out={found}", FEW, "--until=noise_floor")
-    report = json.loads((found / "report.json").read_text())
+@pytest.mark.parametrize(
+    ("name", "before", "true", "file"),
+    [
+        ("coulomb_friction.torque_nm", 3.0, FRICTION_N, KNOWS.replace(": 12.0", ": 3.0")),
+        ("inertia", 48.0, MASS_KG, KNOWS.replace(": 40.0", ": 48.0") + "known: [kp, kd, coulomb_friction]\n"),
+    ],
+)
+def test_a_number_of_the_file_that_is_off_is_the_result_and_is_written(
+    bench, said, tmp_path, monkeypatch, name, before, true, file
+):
+    """What `diagnose` states and what `compare` prints with the written file is one number."""
+    monkeypatch.chdir(tmp_path)
+    Path("drive.yaml").write_text(file)
+    words = (bench / "bench", "--twin=drive.yaml", FEW)
+    code, text = said("diagnose", *words)
+    report = json.loads(Path("diagnosis/report.json").read_text())
     d = report["diagnoses"]["slide"]
     (c,) = d["changed"]
-    assert (c["name"], c["before"], c["unit"]) == ("coulomb_friction.torque_nm", 3.0, "N")
-    low, high = d["intervals"][c["name"]]
-    assert low < c["after"] < high and c["after"] == pytest.approx(FRICTION_N, rel=0.15)
-    assert c["without"] > 3.0 * d["errors"]["after"]["validation"]
-    said_so = f"coulomb_friction.torque_nm 3 → {c['after']:.5g} N ({low:.5g} … {high:.5g})"
+    low, high = d["intervals"][name]
+    assert (c["name"], c["before"]) == (name, before) and low < c["after"] < high
+    assert c["after"] == pytest.approx(true, rel=0.15) and c["without"] > 3.0 * d["errors"]["after"]["validation"]
+    said_so = f"{name} {before:g} → {c['after']:.5g} {c['unit']} ({low:.5g} … {high:.5g})"
     assert code == 0 and said_so in report["verdicts"]["slide"]["finding"] and said_so in text
-    assert (
-        f"coulomb_friction.torque_nm of slide 3 → {c['after']:.4g} N" in text.split(f"wrote {found / 'drive.yaml'}")[1]
-    )
-    assert load_axis(found / "drive.yaml").effects[0].values["torque_nm"] == pytest.approx(c["after"])
-    code, text = said("add-effect", "coulomb_friction", *words)
-    assert code == 0 and "taccorl compare" in text
-    assert load_axis(tmp_path / "drive+coulomb_friction.yaml").effects[0].values["torque_nm"] == pytest.approx(
-        c["after"]
-    )
+    printed = shlex.split(text.split("taccorl add-effect ")[-1].splitlines()[0])
+    assert printed == [name.partition(".")[0], "--twin=drive.yaml"]
+    code, text = said("add-effect", *printed)
+    assert code == 0 and text.count("of the file is off") == 1, text
+    text = said(*shlex.split(text.split("next: taccorl ")[1].splitlines()[0]))[1]
+    shown = re.search(r"validation ([\d.]+) → ([\d.]+) × floor", text)
+    stated = [d["errors"][stage]["validation"] for stage in ("before", "after")]
+    assert shown and [*map(float, shown.groups())] == pytest.approx(stated, rel=0.02), text
+    text = said("diagnose", *words, "--until=noise_floor")[1]
+    assert f"{name} of slide {before:g} → {c['after']:.4g} {c['unit']}" in text.split("wrote diagnosis/drive.yaml")[1]
+    assert Path("diagnosis/drive.yaml").read_text() == Path(f"drive+{printed[0]}.yaml").read_text()
     for changed, added, way in (
-        ([], [], "--values"),
+        ([], [], "--values" if "." in name else "no effect 'inertia'"),
         ([c], [{"effect": "viscous_friction", "damping_nms_per_rad": 1.0}], "add-effect viscous_friction"),
     ):
         d |= {"changed": changed, "effects": [*d["effects"], *added]}
-        (found / "report.json").write_text(json.dumps(report))
-        code, text = said("add-effect", "coulomb_friction", *words, f"--out={tmp_path / 'other.yaml'}")
-        assert code == 2 and "slide: " in text and way in text, text
+        Path("diagnosis/report.json").write_text(json.dumps(report))
+        code, text = said("add-effect", *printed, "--out=other.yaml")
+        assert code == 2 and way in text, text
 
 
 @pytest.mark.slow
