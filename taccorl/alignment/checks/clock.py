@@ -273,9 +273,6 @@ def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> s
     return "Set `latency_s` of the state's channel in the recording spec"
 
 
-# beside a replay ---------------------------------------------------------------------------------------------------------
-
-
 @check("error", SHIFTED)
 @check("warning", UNDECIDED)
 def check_against_twin(

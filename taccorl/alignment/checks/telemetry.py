@@ -171,9 +171,6 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
     return find("same_commands", worst, text)
 
 
-# one cause of several findings -----------------------------------------------------------------------------------------
-
-
 def _turned(m: Measurement, f: Finding) -> Measurement:
     return dataclasses.replace(m, measured=np.where(np.array(m.signals) == f.feature, -1.0, 1.0) * m.measured)
 

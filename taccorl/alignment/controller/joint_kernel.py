@@ -124,7 +124,7 @@ def _asked(
     come, to its ``integral``. ``kind`` is ``Drive.command``; ``supply``, ``on`` and ``added`` are as in ``simulate``."""
     if kind == TORQUE:
         none = 0.0 * p.kp
-        return on * (command + p.torque_ff + added), none, none
+        return on * (command + p.torque_ff), none, none
     if kind == VELOCITY:
         integral += 0.5 * p.speed_age * command
         asked = p.kd * (command - v + p.integral_action__rate_per_s * integral) + p.torque_ff + added
@@ -191,7 +191,8 @@ def simulate_all(
         couplings: N of (R · F,) torque [N·m] that must be held against the other joints' motion, linear in between.
         more: ``carrying``, (R · F,) torque [N·m] that the motor adds for gravity compensation besides that of the angle, linear
             in between; of each part the ``supply`` voltage divided by the one for which the gains are valid, the share of time
-            for which the motor is ``on`` and the torque [N·m] that the controller ``added`` to its law, (R · parts,) each;
+            for which the motor is ``on`` and the torque [N·m] that the controller ``added`` to its law, or that something
+            besides the motor adds to that of a ``TORQUE``, (R · parts,) each;
             ``start``, the angle [rad] that the encoder reports at rest; ``hold``; ``parts``, targets per row; ``step_s``, the
             physics step; ``start_speed`` [rad/s] with which it starts instead of at rest; ``every``, physics steps from one
             answer to the next, 0: those of a row.
@@ -304,6 +305,8 @@ def _simulated(
     torque = _asked(p, kind, until_now, until_now, q, v, integral, supply[0], on[0], added[0])[0]
     needed = weight + load(coupling, 0) + spring_stiffness * (q - spring_rest) + coulomb * asymmetry
     needed -= cogging_nm * sine_and_cosine(periods * q + phase)[0]
+    if kind == TORQUE:
+        needed -= added[0]
     holding = torque_scale * _of_direction(p, where(integral_rate > 0.0, needed, torque + carried))
     missing = needed - holding * (torque + carried)
     speeds = none + 1.0 if kind == VELOCITY else p.commands_speed  # 1: the integral is that of a speed's error
@@ -408,6 +411,8 @@ def _simulated(
         stiffness, damping = where(cut, 0.0, gain * stiffness), where(cut, 0.0, gain * damping)
 
         force = drawn - (viscous + drag * abs(v)) * v - spring_stiffness * (q - spring_rest)
+        if kind == TORQUE:
+            force += added[part]
         damping += viscous + 2.0 * drag * abs(v)
         stiffness += spring_stiffness
         if with_stop:

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
+from taccorl.alignment.controller.drive_law import FOLLOW_HZ
 from taccorl.alignment.controller.drive_numbers import Drive
 from taccorl.alignment.controller.joint_kernel import simulate_all
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -248,6 +249,11 @@ def _side_by_side(
         drive["effort_age"] -= case.waits_s
         if drive["integral_action__rate_per_s"] > 0.0:
             drive["start_nm"] = motion.start_nm / case.effort_scale
+        if held := motion.held_nm_per_rad:  # a spring about 0 and a damper more, on the motor's side
+            own = drive["cable_spring__stiffness_nm_per_rad"]
+            drive["cable_spring__stiffness_nm_per_rad"] += held
+            drive["cable_spring__rest_rad"] *= own / (own + held)
+            drive["viscous_friction__damping_nms_per_rad"] += held / (math.pi * FOLLOW_HZ)
         drive["effort_holds_weight"] = float(joint.effort_holds_weight)
         if drive["effort_after"] and late_s > 0.0:
             # A row's target arrives late_s after the row: the effort that it causes begins then, from the position at that time.

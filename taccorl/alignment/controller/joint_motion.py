@@ -78,6 +78,7 @@ class JointMotion(Surroundings):
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other
     recordings (``Measurement.gain_scale``)."""
     kd_scale: float = 1.0  # The same for K_d
+    held_nm_per_rad: float = 0.0  # Stiffness K that holds law torque; ``torque_ff_nm`` is then its K q + D q̇
     kp_known: bool = False  # True if the recording states the commanded K_p
     kd_known: bool = False  # True if the recording states the commanded K_d
     command_s: np.ndarray | None = None

@@ -70,6 +70,12 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
     if wanted == "effort":
         target, added = _followed(m, signal, joint, effort)
         kp_scale = kd_scale = holding_stiffness(m, signal)
+    held = 0.0
+    if wanted == "torque":
+        target, added = target + (0.0 if added is None else added), None
+        if m.held:
+            held = holding_stiffness(dataclasses.replace(m, effort=m.target), signal)
+            added = _held(m, j, held)
     start, start_speed = resting(m, j), 0.0
     if joint.keeps_times and not steps_at_once(m, j):
         start, start_speed = starting(measured, m.rate_hz) or (start, 0.0)
@@ -87,6 +93,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
         start_nm=float(np.nan_to_num(np.mean(effort[:START_ROWS]), nan=np.inf)),
         kp_scale=kp_scale,
         kd_scale=kd_scale,
+        held_nm_per_rad=held,
         kp_known=signal in m.kp,
         kd_known=signal in m.kd,
     )
@@ -126,6 +133,15 @@ def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray
     at = _smooth(m, signal)
     target = at + joint.gains.kd / joint.gains.kp * np.gradient(at, m.period_s)
     return target, 0.5 * (effort + np.append(effort[1:], effort[-1]))
+
+
+def _held(m: Measurement, j: int, stiffness: float) -> np.ndarray:
+    """(T,) K q + D q̇ [N·m] of a spring and damper that draw a model of law torque to the measured position q: from each row to
+    the next, the mean of both and their difference."""
+    seen = np.isfinite(m.measured[:, j])
+    q = np.interp(m.time_s, m.time_s[seen], m.measured[seen, j])
+    later = np.append(q[1:], q[-1])
+    return stiffness * (0.5 * (q + later) + (later - q) * m.rate_hz / (math.pi * FOLLOW_HZ))
 
 
 def _smooth(m: Measurement, signal: str, deriv: int = 0) -> np.ndarray:

@@ -158,9 +158,6 @@ class RigidJoint(ABC):
         return None
 
 
-# from MuJoCo -----------------------------------------------------------------------------------------------------------
-
-
 def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = None) -> Rigid:
     """Inertia and weight of a hinge with the other joints held at ``pose`` (nq,), qpos0 if not given.
 

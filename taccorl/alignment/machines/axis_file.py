@@ -185,9 +185,6 @@ def _values(effect: Effect) -> dict[str, Any]:
     return values
 
 
-# the file --------------------------------------------------------------------------------------------------------------
-
-
 def load_axis(path: Path) -> AxisConfig:
     """Load an axis file. Raises SpecError: a key or value is wrong; the message names file and line."""
     return _AxisDocument(AxisConfig, path).value
@@ -250,9 +247,6 @@ def _plain(value: Any) -> Any:
 def axis_digest(config: AxisConfig) -> str:
     """Digest of an axis, 16 hexadecimal digits; only equal axes have equal digests."""
     return hashlib.sha256(axis_text(config).encode()).hexdigest()[:16]
-
-
-# the model -------------------------------------------------------------------------------------------------------------
 
 
 class DrivenAxis(DriveJoint):

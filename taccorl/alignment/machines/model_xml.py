@@ -235,9 +235,6 @@ def _refuse_names(root: Element) -> None:
         raise TaccorlError(f"{one.place}: two <{one.tag}> have the name {name!r}, {between}; rename one")
 
 
-# URDF ------------------------------------------------------------------------------------------------------------------
-
-
 def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
     """Text of a URDF in which visual and collision shapes are blanks, so that every line stays where it is, and how many there
     were. Raises TaccorlError: the text is not UTF-8."""

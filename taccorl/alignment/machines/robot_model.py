@@ -108,9 +108,6 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     return RobotModel(path, model, joints, tuple(remarks))
 
 
-# reading ---------------------------------------------------------------------------------------------------------------
-
-
 def _spec(path: Path) -> tuple[mujoco.MjSpec, Element, list[str], dict[str, tuple[str, float]]]:
     """The model, the file's elements, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic> or an MJCF's
     <equality>."""
@@ -251,9 +248,6 @@ def _compiled(path: Path, spec: mujoco.MjSpec, root: Element) -> mujoco.MjModel:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-# what it says of joints ------------------------------------------------------------------------------------------------
 
 
 def _inertias(model: mujoco.MjModel) -> np.ndarray:

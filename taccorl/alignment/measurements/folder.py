@@ -178,6 +178,8 @@ def read_measurements(
             f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
         )
     found = [_with_note(m, index, folder, names if whole else None) for m in found]
+    held = not any(m.repeat_of for m in found)
+    found = [dataclasses.replace(m, held=held and "torque" in m.target_kinds) for m in found]
     # If the path is a single file, it is fitted, whatever ``use`` measurements.yaml states for it.
     named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
     every = index.validation_every * whole if validation_every is None else validation_every

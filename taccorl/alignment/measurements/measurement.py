@@ -108,6 +108,8 @@ class Measurement(Stated):
     instruction: str = ""  # Task text of the recording; empty if it has none
     start_ns: int = 0  # Time of row 0 on the recording's clock [ns]
     repeat_of: str | None = None  # Name of the measurement whose commands this one repeats; None if it is no repeat
+    held: bool = False
+    """True: models of law torque are held near the measured position, since no recording repeats another: replays would drift."""
     pressed: PressedObject | None = None
     """Known object between the fingers of one arm, if stated; the arm's pads are compared with the twin's for it."""
     time_error_s: float = 0.0

@@ -233,9 +233,6 @@ def _values(m: Measurement, kind: Kind) -> np.ndarray:
     return {"position": m.measured, "velocity": m.velocity, "effort": m.effort}[kind]
 
 
-# blocks ----------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Blocks:
     """Mean squares of blocks of one recording, scaled so that white noise of variance σ² gives σ² on average."""
@@ -342,9 +339,6 @@ def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
     known = np.isfinite(squares)
     enough = known.mean(axis=1) >= 0.5  # lost rows leave gaps everywhere
     return np.where(enough, np.where(known, squares, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
-
-
-# estimates -------------------------------------------------------------------------------------------------------------
 
 
 def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kind) -> list[Estimate | None]:

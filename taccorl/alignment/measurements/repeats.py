@@ -61,9 +61,10 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
     jitter_s = max(np.median(np.abs(np.diff(m.time_s) - m.period_s)) for m in (first, second))  # that of their stamps
     alike = max(same_share * motion, SAME_QUANTA, 2.0 * jitter_s * speed)
     if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > alike:
+        loop = "; torques of an outer loop never repeat: then remove it" * ("torque" in first.target_kinds)
         raise TaccorlError(
             f"{no_repeat}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
-            f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice"
+            f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice{loop}"
         )
     weights = _weights(share)
     columns = {"position": "measured", "velocity": "velocity", "effort": "effort"}

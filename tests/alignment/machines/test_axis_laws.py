@@ -173,6 +173,27 @@ def test_a_torque_accelerates_and_none_lets_the_axis_coast():
     assert found[-1] == pytest.approx(0.0625 + 0.25 * 99 / RATE_HZ, rel=0.01)
 
 
+def test_torques_of_an_outer_loop_are_replayed_near_the_measured_position_and_friction_shows():
+    """Commands of kp 2, kd 0.2 beside 0.005 N·m that the model lacks: alone they are 0.06 mrad with K = (20 π)² · 0.02, and drift
+    else. Friction of 0.05 N·m is ten times as much. The spring is no effort of the motor."""
+    axis, goals = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque"), 0.4 * np.sin(np.arange(800) / 60)
+    for friction_nm, least, most in ((0.0, 0.0, 2e-4), (0.05, 4e-4, 1.5e-3)):
+        q = v = 0.0
+        rows = list[tuple[float, float]]()
+        for goal in goals.tolist():
+            rows.append((q, asked := 2.0 * (goal - q) - 0.2 * v))
+            for _ in range(500):
+                v += DT_S * (asked - 0.005 - friction_nm * np.sign(v)) / 0.02
+                q += DT_S * v
+        measured, torques = np.array(rows).T
+        made = {"target_kinds": ("torque",), "effort": torques}
+        free, held = (of_signal("m", RATE_HZ, torques, measured, "servo", held=x, **made) for x in (False, True))
+        assert np.abs(answer(axis, free).reported - measured).max() > 0.1
+        found = answer(axis, held)
+        assert least < np.sqrt(np.mean((found.reported - measured) ** 2)) < most
+        assert found.effort[1:] == pytest.approx(torques[:-1])
+
+
 def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_recorded():
     """Off from 0.5 to 0.9 s: no duty, no back-EMF. Else the supply falls from 12 to 8 V: duty · 8 / 12, back-EMF as before.
     A row reads what its motor got until then."""

@@ -1,6 +1,7 @@
 """Folders of measurements, what is said of them, and how they are divided."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,7 +72,7 @@ def test_an_index_says_what_files_cannot(folder):
     found = read_measurements(folder)
     assert names(found.fit) == ["sweep_1.csv", "sweep_2.csv"]
     assert (names(found.validation), names(found.test)) == (["sweep_3.csv"], ["sweep_10.csv"])
-    assert found.fit[1].repeat_of == "sweep_1.csv"
+    assert found.fit[1].repeat_of == "sweep_1.csv" and not found.fit[0].held
     assert found.unlisted == ("sweep_1.csv",)
     (held,) = found.validation
     assert (held.kp, held.payload_kg) == ({"left_joint5": 40.0}, {"left": 0.5})
@@ -212,3 +213,12 @@ def test_a_recording_of_one_joint_becomes_one_of_the_robot():
         "left_gripper",
         "drive",
     ]
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_torques_are_held_where_nothing_repeats(tmp_path: Path, repeated: bool) -> None:
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text("t,servo.q,servo.tau_target\n0.0,0.1,0.0\n0.1,0.2,0.5\n0.2,0.3,0.0\n")
+    index = "recordings: {b.csv: {repeat_of: a.csv}}" if repeated else "recordings: {}"
+    (tmp_path / "measurements.yaml").write_text(index)
+    assert [m.held for m in read_measurements(tmp_path, units={"servo": "rad"}).all] == [not repeated] * 2
