@@ -74,7 +74,7 @@ def placed(
         else "payload: its mass is fitted to all joints that feel it; its place is the centre of mass of its body"
     )
     if TORQUE_FF.name not in d.base:
-        text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
+        text += f"; {TORQUE_FF.name} of {f.part} is as the file states it"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
     text += f"; in {' or '.join(ties)} a mass explains as much" if ties else ""
     of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())

@@ -33,6 +33,7 @@ from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.joint_problem import (
     EFFORT_SCALE,
     LOOP,
+    TORQUE_FF,
     measured_part,
     other_gain,
     recording_of,
@@ -107,7 +108,7 @@ class AxisProblem(WithoutMaps):
     @property
     def numbers(self) -> str:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-        names = [f.name for f in self.base if not f.held]
+        names = [f.name for f in self.base if not f.held and f.unless not in self.present]
         stated = self.axis.gains == "commanded" and self.axis.law != "pwm"
         near = f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)" * (stated and "kp" in names)
         if self.law_error <= 1.0:
@@ -162,7 +163,8 @@ class AxisProblem(WithoutMaps):
         found = [
             Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True)
         ] * (self.effort or not unknown)
-        found.append(Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force))
+        at = axis.torque_ff
+        found.append(dataclasses.replace(TORQUE_FF, unit=unit("N·m"), start=at, low=-most, high=most, scale=force))
         if self._weighed:
             weight = max(float(np.hypot(axis.weight_sin, axis.weight_cos)), heavy)
             for name in ("weight_sin", "weight_cos")[axis.unit == "m" :]:
@@ -212,13 +214,9 @@ class AxisProblem(WithoutMaps):
         position = self.axis.target_kind == "position"
         asked = [m.target if position else a.reported for m, a in zip(motions, answers, strict=True)]
         drive = {"drive_rad_per_nm": 1.0 / bare.loop_gains.kp} if bare.loop_gains.kp > 0.0 else {}
-        return seen_in(motions, answers, asked) | drive | self._waves(motions, inertias)
-
-    def _waves(self, motions: Sequence[JointMotion], inertias: Sequence[float]) -> dict[str, float]:
-        """Periodic forces; of a slide the grid of ``Cogging.starts``, which counts turns, is of no use."""
-        if self.axis.unit == "m":
-            return position_waves(motions, inertias, length=self.axis.scale.wave, least_span=0.0)
-        return position_waves(motions, inertias)
+        # Of a slide the grid of ``Cogging.starts``, which counts turns, is of no use.
+        of_slide = {"length": self.axis.scale.wave, "least_span": 0.0} if self.axis.unit == "m" else {}
+        return seen_in(motions, answers, asked) | drive | position_waves(motions, inertias, **of_slide)
 
 
 def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:

@@ -40,8 +40,9 @@ KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
 """K_p, if it is fitted, with the paper's bounds."""
 KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
 """K_d, if it is fitted, with the paper's bounds."""
-TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0)
-"""Bounds of the fitted T_ref [N·m], wider than the paper's ± 8: a stiff joint with an error of 10 mrad has 18."""
+TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0, unless="integral_action")
+"""Bounds of the fitted T_ref [N·m], wider than the paper's ± 8: a stiff joint with an error of 10 mrad has 18. An integral,
+which begins in balance, takes up any constant torque: beside it nothing determines T_ref."""
 WIDER = 100.0
 """Factor by which the bounds of K_p and K_d extend below the paper's, which are for stiff position drives."""
 _GAIN_LIKE = ("torque_scale", "direction_gain")

@@ -19,7 +19,7 @@ from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
 from taccorl.diagnosis.search.evidence import gain_of
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.fits import PROBED_BESIDE, STEPS, Fits, Model, best, model_of, refusal
-from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Values, with_held, with_scale
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Problem, with_held, with_scale
 from taccorl.diagnosis.search.result import Changed
 
 STATED = {
@@ -86,7 +86,7 @@ def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:
     kept, found = dict[str, float](), []
     for frees in groups:
         stated = {f.name: fits.given[f.name] for f in frees}
-        trial = model_of(fits.problem, _fitted_with(fits, model, kept | stated), fits.validation)
+        trial = model_of(fits.problem, _fitted(fits, with_held(fits.problem, kept | stated), model), fits.validation)
         if refusal(smaller, trial, config):
             kept, smaller = kept | stated, trial
         else:
@@ -122,8 +122,7 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     problem, answer = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees}), fits.model_of(model)
     if frees[0].name == "inertia" and (scaled := with_scale(problem)) is not None:
         problem = scaled
-        one = best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
-        if refusal(answer, model_of(problem, one, fits.validation), fits.config):
+        if refusal(answer, model_of(problem, _fitted(fits, problem, model), fits.validation), fits.config):
             return (EFFORT_SCALE,)
     if fits.added(model):
         return ()
@@ -133,9 +132,8 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 
 
-def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
-    """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
-    problem = with_held(fits.problem, stated)
+def _fitted(fits: Fits, problem: Problem, model: Fit) -> Fit:
+    """The hypothesis of ``model`` refitted as another ``problem``."""
     return best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
 
 

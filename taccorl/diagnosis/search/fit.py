@@ -93,10 +93,6 @@ class Fit:
         that lasts (``lasting_square``), as one, since it may hide as much again in the numbers. The square of ``moved`` is added.
         Directions that the data do not determine have a very large variance.
 
-        On surrogates with the right effects intervals from the first two alone contained the truth in 81 %, from all of it in 89
-        % of 446 numbers (185 cases, seeds 15000 on; docs/diagnosis.md has others): no twin is exact, and its errors differ
-        between recordings.
-
         Args:
             left_over: False: without the fourth estimate, as if a further effect were to explain the rest.
         """

@@ -23,7 +23,7 @@ from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.problems.joint_problem import measured_part
 from taccorl.diagnosis.problems.one_mass import OneMassProblem
-from taccorl.diagnosis.search.fit import Fit, best_fit
+from taccorl.diagnosis.search.fit import Fit, best_fit, fit
 from taccorl.diagnosis.search.problem import Recording, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
@@ -62,6 +62,13 @@ def test_cases_side_by_side_are_those_one_by_one(slide: Measurements):
         assert len({answer.tobytes() for answer in those}) == 11
         for case, answer in zip(cases, those, strict=True):
             np.testing.assert_array_equal(AxisProblem(AXIS, slide).simulate(*case, recording), answer)
+
+
+def test_beside_an_integral_which_takes_it_up_no_constant_force_is_fitted(slide: Measurements, problem: AxisProblem):
+    models = [fit(problem, problem.fit[:1], names, problem.start, 2) for names in ((), ("integral_action",))]
+    assert ["torque_ff" in [f.name for f in model.frees] for model in models] == [True, False]
+    integral = dataclasses.replace(AXIS, effects=(EffectEntry("integral_action", {"rate_per_s": 5.0}),))
+    assert "torque_ff" in problem.numbers and "torque_ff" not in AxisProblem(integral, slide).numbers
 
 
 def without_target(m: Measurement) -> Measurement:
@@ -562,9 +569,6 @@ def test_a_file_of_an_axis_is_strict(tmp_path: Path):
     again = tmp_path / "again.yaml"
     again.write_text(axis_text(axis))
     assert load_axis(again) == axis
-
-
-# a real drive ----------------------------------------------------------------------------------------------------------
 
 
 COLUMNS = """\
