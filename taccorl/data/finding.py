@@ -1,6 +1,7 @@
 """Findings of checks: stable name, severity, place, and a text with the remedy; and the list of all checks."""
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -80,7 +81,7 @@ def place(rows: tuple[int, int], fps: int) -> str:
     return f"rows {rows[0]} to {rows[1] - 1} ({rows[0] / fps:.2f} to {rows[1] / fps:.2f} s)"
 
 
-def listed(names: list[str], most: int = 4) -> str:
+def listed(names: Sequence[str], most: int = 4) -> str:
     """Text of the first ``most`` names, and the number of further ones."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

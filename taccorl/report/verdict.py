@@ -5,13 +5,15 @@ the findings; the terminal and the page show the same sentences.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
+from taccorl.data.finding import listed
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
-from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, Status, of_test
+from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, of_test
 from taccorl.report.evidence_words import (
     effect_class,
     excite_command,
@@ -37,13 +39,8 @@ Kind = Literal[
     "data_first",
 ]
 """What a verdict says: nothing is missing, numbers of the file are off, effects are missing or tie, more is than was found, …"""
-KINDS: Mapping[Status, Kind] = {
-    "not_converged": "not_converged",
-    "gains_moved": "gains_moved",
-    "nothing_missing": "nothing_missing",
-    "numbers_off": "numbers_off",
-}
-"""Status of a search → kind, where the status alone decides."""
+ALIKE: tuple[Kind, ...] = ("not_converged", "gains_moved", "nothing_missing", "numbers_off")
+"""Kinds that are a search's status of the same name."""
 FOUND: Mapping[Kind, str] = {
     "data_first": "{w.part}: settle the data before any effect is named: {w.first_fault}.",
     "not_converged": "{w.part}: the fit has not converged, so nothing follows from its error of {w.after:.2f} noise floors.",
@@ -65,6 +62,8 @@ UNCERTAIN: Mapping[Kind, str] = {
 }
 """Kind of low confidence → its first reason."""
 SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
+LATE: Mapping[str, str] = {"command_delay": "positions and efforts", "sensor_delay": "positions"}
+"""Effect → columns that, logged as late as its delay, look exactly like it."""
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
     "gains_moved": "First state the commanded gains (kp, kd) and check the time stamps.",
@@ -83,6 +82,7 @@ GONE = 0.2
 NEAR = 0.05
 """Least share of the validation squared error above the floor that an effect removes which a verdict calls near."""
 _MOST = 3  # names or reasons in one sentence
+_some = partial(listed, most=_MOST)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +204,9 @@ def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
         first, after = (max(d.errors[stage]["validation"], 1.0) ** 2 for stage in (d.baseline, "after"))
         most = d.standing_out or first - after >= SearchConfig().sure_gain * (first - 1.0)
         return "more" if added(d) and most else "something_else"
-    return KINDS.get(d.status) or ("ties" if any(d.rivals.get(name) for name in added(d)) else "effects")
+    if d.status in ALIKE:
+        return d.status
+    return "ties" if any(d.rivals.get(name) for name in added(d)) else "effects"
 
 
 @dataclass(frozen=True)
@@ -274,7 +276,7 @@ class _Words:
 
     @property
     def place(self) -> str:
-        """Effects of the file of whose strength the refit beside an added effect leaves less than ``GONE``, and ``SCALED``."""
+        """Effects of the file of which the refit beside an added effect leaves less than ``GONE``; ``SCALED``; ``LATE``."""
         found = []
         for c in self.d.changed if added(self.d) else ():
             cls = effect_class(c.effect) if c.effect else None
@@ -285,7 +287,8 @@ class _Words:
         place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
         number, factor = self.d.or_number
         off = SCALED if number == EFFORT_SCALE else f"{number} of the file is off by a factor of {factor:.4g}"
-        return place + f", or {off}" * bool(number)
+        late = "".join(f", or its {LATE[name]} are logged as late" for name in added(self.d) if name in LATE)
+        return place + f", or {off}" * bool(number) + late
 
     @property
     def sizes(self) -> str:
@@ -345,7 +348,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
         yield f"validation recordings keep {validation:.2f} of {first:.2f} floors, so little that no effect was looked for"
     words = {"": "", EFFORT_SCALE: "a wrong torque constant does as well"}
     also = words.get(d.or_number[0], "another gain does as well")
-    yield from filter(None, (also, unjudged(d, short), may_be_two(d)))
+    clock = "a clock that stamps readings late does as well" * bool({*LATE} & {*added(d)})
+    yield from filter(None, (also, clock, unjudged(d, short), may_be_two(d)))
     if d.one_pose:
         yield (
             f"{_some(tuple(d.one_pose))} found in one pose of the other joints, in which the weight of a tilted base or of a "
@@ -448,8 +452,3 @@ def _other_pose(d: Diagnosis) -> str:
         f"The same motions in another pose, with {_some(others)} elsewhere by 0.5 rad or more: {name} keeps its numbers there if "
         "it is what is missing, the torque of a weight does not."
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MOST} more" if len(names) > _MOST else ""
-    return ", ".join(names[:_MOST]) + more

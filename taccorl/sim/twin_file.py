@@ -127,9 +127,6 @@ def write_whole(path: Path, text: str) -> None:
         raise TaccorlError(f"{path}: cannot be written: {error}") from error
 
 
-# reading ---------------------------------------------------------------------------------------------------------------
-
-
 class EffectsDocument[T](Document[T]):
     """Strictly read YAML file with effects: ``Document`` extended by lists of effects, plug-ins and cameras."""
 
@@ -208,9 +205,6 @@ class EffectsDocument[T](Document[T]):
 
 def _is_required(field: dataclasses.Field) -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-
-
-# writing ---------------------------------------------------------------------------------------------------------------
 
 
 def _differences(value: Any, base: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -144,9 +144,6 @@ def test_names_from_files_are_text_and_no_html(tmp_path: Path):
     assert "default-src 'none'" in policy and "script-src" not in policy
 
 
-# with a diagnosis --------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, Path]:
     """The report on dry friction hidden in simulated sweeps."""

@@ -71,9 +71,6 @@ def now(sim: Simulation):
     return sim.task.look(sim)
 
 
-# where things begin ----------------------------------------------------------------------------------------------------
-
-
 def footprint(part: Part) -> BaseGeometry:
     """What a part that stands at the origin covers of the table."""
     outlines = []

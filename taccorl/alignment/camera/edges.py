@@ -63,8 +63,11 @@ def twin_edges(bodies: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) 
     pixels, depth, normals, owners = (np.concatenate(part) for part in zip(*parts, strict=True))
     length = np.linalg.norm(normals, axis=1)
     good = length > 1e-6
+    pixels, depth = pixels[good], depth[good]
+    across_m = (pixels[:, 0] - intrinsics.cx_px) / intrinsics.fx_px * depth
+    down_m = (pixels[:, 1] - intrinsics.cy_px) / intrinsics.fy_px * depth
     return TwinEdges(
-        points=_unproject(pixels[good], depth[good], intrinsics),
+        points=np.stack([across_m, -down_m, -depth], axis=1),
         normals=normals[good] / length[good, None],
         bodies=owners[good],
     )
@@ -79,11 +82,6 @@ def _beside(step: np.ndarray, axis: int) -> np.ndarray:
     """The larger of the steps before and after each along an axis; none beyond the ends."""
     wide = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in (0, 1)])
     return np.maximum(*(np.take(wide, range(k, k + step.shape[axis]), axis=axis) for k in (0, 2)))
-
-
-def _unproject(pixels: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-    x = (pixels[:, 0] - intrinsics.cx_px) / intrinsics.fx_px * depth_m
-    return np.stack([x, -(pixels[:, 1] - intrinsics.cy_px) / intrinsics.fy_px * depth_m, -depth_m], axis=1)
 
 
 class PictureEdges:

@@ -276,7 +276,8 @@ def plateaus(s: CellSet) -> Iterator[Finding]:
             continue
         first, last = np.quantile(x[on], (0.05, 0.95))
         gain = float(np.polyfit(x[~on], y[~on], 1)[0])
-        if gain * (last - first) > LONG * 2 * WIDTH * noise[k] and np.mean(on[x >= first]) > ALL:
+        flat = np.mean(y[on] < level + WIDTH * noise[k]) > ALL
+        if flat and gain * (last - first) > LONG * 2 * WIDTH * noise[k] and np.mean(on[x >= first]) > ALL:
             found.append((k, s.config.sign * y[on], float(first), float(last)))
     if not found:
         return

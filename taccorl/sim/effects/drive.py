@@ -25,9 +25,6 @@ POSES = 64
 """Number of random poses of the arm in which the inertia of its joints is computed."""
 
 
-# the controller's law -------------------------------------------------------------------------------------------------
-
-
 @effect("error_deadband", slot="law", needs=("target", "position"))
 class ErrorDeadband(JointEffect):
     """Dead band of the position error: τ = K_p d(q* − q) − K_d q̇ + T_ref with d(e) = e − w sign e beyond ± w, and 0 within.
@@ -161,9 +158,6 @@ def _least_inertia(spec: mujoco.MjSpec, names: list[str]) -> np.ndarray:
         mujoco.mj_solveM(model, data, answer, unit)
         least = np.minimum(least, 1.0 / answer[np.arange(len(dofs)), dofs])
     return least
-
-
-# the motor's torque ---------------------------------------------------------------------------------------------------
 
 
 class _ScaledTorque(JointEffect):

@@ -179,6 +179,10 @@ class PowerLawFriction(_LiveFriction):
     exponent: float = number("n", "1", None, 0.4, (0, 1), "a choice; 0.35 fits a real drive (EMPS, docs/your_robot.md)")
     asymmetry: float = number("a", "1", None, 0, (-0.9, 0.9))
 
+    @property
+    def reads_as(self) -> str:
+        return f"dry friction that the speed hardly changes, asymmetric by {self.asymmetry:.2g}" * (self.exponent < 0.1)
+
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         speed = live.of_joints("qvel", self.acts_on())
         grown = self.torque_nm * (np.abs(speed) / AT_RAD_PER_S) ** self.exponent * (speed != 0.0)

@@ -21,9 +21,6 @@ NOMINAL_C = 20.0
 """Temperature at which ``taxel_temperature`` does nothing [°C]; simulations have this temperature."""
 
 
-# mount and rubber -----------------------------------------------------------------------------------------------------
-
-
 class PadFrameEffect(TouchEffect):
     """Base of effects that move the frame of a pad's taxels in the finger, and the pad's box with it if the effect says so.
 
@@ -95,9 +92,6 @@ class PadCompliance(TouchEffect):
         for pad in self.pads:
             for joint in spec.joint(f"{pad}_spring").parent.joints:
                 joint.stiffness[0] *= self.stiffness_factor
-
-
-# one scan at a time ---------------------------------------------------------------------------------------------------
 
 
 class _ScanEffect(TouchEffect):
@@ -243,9 +237,6 @@ class TaxelTemperature(_ScanEffect):
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         warmer = self._above_nominal_k[:, None, None, None].astype(own.dtype)
         return own + warmer * (own.dtype.type(self.gain_per_k) * own + own.dtype.type(self.zero_per_k))
-
-
-# single taxels --------------------------------------------------------------------------------------------------------
 
 
 @effect("dead_taxels", slot="taxel")

@@ -161,9 +161,6 @@ def test_only_some_joints_and_a_wrong_name():
     assert floor().words().startswith("0.2 mrad")
 
 
-# touch -------------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def presses() -> Measurements:
     return Measurements((made_press.press(0),), (made_press.press(1),))

@@ -20,9 +20,6 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-# regimes -----------------------------------------------------------------------------------------------------------------
-
-
 def test_reversals_are_where_the_velocity_changes_its_sign():
     time_s, position = swing(seconds=10.0, hz=0.5)  # reversals at 0.5, 1.5, … 9.5 s
     after = motions_of([trace(0 * position, position)])[0].after_reversal
@@ -89,9 +86,6 @@ def test_rows_that_were_not_measured_count_nowhere():
     assert sum(cells[r.name].n for r in REGIMES if r.group == "time") == len(position) - 300
 
 
-# along variables -----------------------------------------------------------------------------------------------------------
-
-
 def test_friction_shows_as_a_step_along_velocity_within_its_band():
     time_s, position = swing(seconds=40.0)
     size, velocity = 5e-3, np.cos(2 * np.pi * 0.5 * time_s)
@@ -142,9 +136,6 @@ def test_several_recordings_are_one_curve_and_a_still_joint_has_none():
     assert np.polyfit(found["position"].at, found["position"].middle, 1)[0] == pytest.approx(1e-3, rel=1e-6)
     still = np.full(2000, 0.3)
     assert [c.variable for c in curves(comparison(trace(1e-3 * still, still)), "left_joint5")] == ["time"]
-
-
-# touch -------------------------------------------------------------------------------------------------------------------
 
 
 def press(residual_while: str | None = None) -> TouchTrace:

@@ -33,9 +33,6 @@ def ways(found: Plan) -> dict[str, tuple[float, float]]:
     return {p.name: next(iter(p.ways.values())) for p in found.planned}
 
 
-# what tells apart ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_creep_shows_in_a_long_hold_and_a_lag_in_quick_taps():
     """In a hold of 8 s creep with τ = 3 s goes on, and no lag does. A lag of 30 ms is gone by then: creep that is over in 50 ms
@@ -77,9 +74,6 @@ def test_taxels_beside_the_object_count_where_a_rival_makes_them_read():
 def test_a_gain_map_that_nobody_knows_is_drawn():
     found = planned("taxel_gain_map", "taxel_saturation", of=("rod_across",))
     assert found.planned[0].worst > TELLS
-
-
-# limits ----------------------------------------------------------------------------------------------------------------
 
 
 def test_every_press_of_the_library_keeps_the_twin_s_limits_and_rests_at_both_ends():
@@ -137,9 +131,6 @@ def test_an_imagined_press_says_so_and_has_the_twin_s_noise():
     assert np.std(quiet) == pytest.approx(np.sqrt(2.0**2 + 1 / 12), rel=0.01)
     # 0.6 mm less what the nearest taxel lies beside the top: k_n δ in counts
     assert motion.measured.max() == pytest.approx(75 * 1200 * 6e-4, rel=0.2)
-
-
-# what cannot be asked --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -363,3 +363,11 @@ def test_smooth_saturation_and_hysteresis_are_no_plateau():
 
     for response in (saturated, lambda load: GAIN * play(load, 0.5)[:, None] * SHARE):
         assert not list(plateaus(CellSet(CONFIG, recorded(response).all)))  # pyright: ignore[reportArgumentType]
+
+
+def test_a_few_rows_of_the_hardest_press_are_no_plateau():
+    """Held at 7 N for 40 rows, and at 8 N for 8, fewer than are left out as outliers of 4000."""
+    load = np.concatenate([np.linspace(0, 6, 4000), np.full(40, 7.0), np.full(8, 8.0)])
+    noise = np.random.default_rng(0).normal(0, 1, (len(load), 6))
+    pressed = of_cells("one", RATE_HZ, load, np.round(50 + GAIN * load[:, None] * SHARE + noise), CONFIG.names)
+    assert not list(plateaus(CellSet(CONFIG, [pressed])))

@@ -42,9 +42,6 @@ def chirps():
     return tuple(recorded(NOMINAL, motion, seed, effort=True) for seed, motion in enumerate((CHIRP, AGAIN)))
 
 
-# what fixes the scale of the torques ----------------------------------------------------------------------------------
-
-
 def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_else_does(chirps):
     def pinned(recordings, gains: GainsAre = "fitted", effort=False, names=()):
         return JointProblem(NOMINAL, SIGNAL, Measurements(recordings), gains=gains, effort=effort).pinned_by(names)
@@ -57,9 +54,6 @@ def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_els
     assert pinned((loaded,)) == ("known weight",)
     assert pinned((recorded(NOMINAL, WIDE_TRIANGLE, 3),)) == (), "the arm's own weight is carried: nothing to be held"
     assert pinned((loaded,), names=("payload",)) == (), "an unknown mass beside it: the weight is not known"
-
-
-# which numbers are free ------------------------------------------------------------------------------------------------
 
 
 def test_commanded_gains_stay_fixed_where_every_recording_states_them(chirps):
@@ -117,9 +111,6 @@ def test_a_gain_twice_as_high_acts_whether_it_is_stated_or_only_its_factor():
     both = dataclasses.replace(stiffer, kp={SIGNAL: KP}, kd={SIGNAL: KD})
     motion = JointProblem(NOMINAL, SIGNAL, Measurements((both,))).fit[0].data
     assert (motion.kp_scale, motion.kd_scale) == (1.0, 1.0)
-
-
-# candidates ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_scale_of_all_torques_is_no_candidate_where_gains_are_fitted(chirps):
@@ -191,9 +182,6 @@ def test_an_effect_of_another_joint_is_not_present_here(chirps):
     assert JointProblem(twin, SIGNAL, Measurements(chirps)).present == ()
 
 
-# what residuals are counted in -----------------------------------------------------------------------------------------
-
-
 def test_a_repeated_motion_is_judged_by_its_own_noise_floor():
     """Chirps with 0.2 mrad of noise and steps with 0.8 mrad, both made twice; a triangle was made once."""
     loud = 4 * NOISE_RAD
@@ -213,9 +201,6 @@ def test_a_joint_that_was_never_measured_is_refused(chirps):
     blind = dataclasses.replace(chirps[0], measured=np.full_like(chirps[0].measured, np.nan))
     with pytest.raises(TaccorlError, match="left_joint5: its position was not measured in any recording"):
         JointProblem(NOMINAL, SIGNAL, Measurements((blind,)))
-
-
-# effort ----------------------------------------------------------------------------------------------------------------
 
 
 def test_effort_is_a_second_channel_and_its_scale_is_found(chirps):

@@ -58,9 +58,6 @@ def finding() -> JointFinding:
     return diagnose_joint(TwinConfig(), SIGNAL, sweeps(stated=False), search=ONE, without=WITHOUT)
 
 
-# which joints ----------------------------------------------------------------------------------------------------------
-
-
 def test_recordings_of_other_joints_are_left_out():
     own, other, both = (
         still("own", left_joint5=0.1),
@@ -94,9 +91,6 @@ def test_a_signal_that_a_recording_lacks_does_not_move_in_it():
 def test_a_joint_that_no_fit_recording_moves_is_refused():
     with pytest.raises(TaccorlError, match="right_joint1: no fit recording moves it"):
         diagnose_joint(TwinConfig(), "right_joint1", sweeps())
-
-
-# one joint -------------------------------------------------------------------------------------------------------------
 
 
 def test_the_friction_is_found_at_its_joint_with_fitted_gains(finding):
@@ -194,9 +188,6 @@ def test_a_worker_that_dies_or_fails_is_told_with_its_joint_and_what_to_do():
     for workers in (1, 2):
         with pytest.raises(TaccorlError, match=r"^no joint 'left_joint7'"):
             each(joint_number, {"one": "left_joint1", "other": "left_joint7"}, workers, print)
-
-
-# the twin that comes out -----------------------------------------------------------------------------------------------
 
 
 def test_the_mended_twin_is_at_the_floor_and_comes_back_from_its_file(finding, tmp_path):

@@ -60,9 +60,6 @@ def finding(measured: Measurements) -> PadFinding:
     return diagnose_arm(TwinConfig(), "left", measured, search=ONE, without=WITHOUT)
 
 
-# what is found ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_bent_law_is_found_with_its_numbers(finding: PadFinding):
     d = finding.diagnosis
     assert (finding.part, finding.pads) == ("left pads", ("left_a", "left_b"))
@@ -117,9 +114,6 @@ def test_pads_of_both_arms_are_found_and_each_by_itself(measured: Measurements):
     assert [e.acts_on() for e in twin.effects] == [["left_a", "left_b"], ["right_a", "right_b"]]
 
 
-# one sensor for all pads -----------------------------------------------------------------------------------------------
-
-
 def test_numbers_that_agree_are_averaged_by_their_intervals():
     fitted = {
         "left pads": ({"k_n": 1000.0, "k_d": 5.0}, {"k_n": (990.0, 1010.0), "k_d": (4.0, 6.0)}),
@@ -142,9 +136,6 @@ def test_numbers_that_do_not_agree_are_no_guess(finding: PadFinding):
         PiperTwin(TwinConfig()).with_additions(
             [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in (finding, other)]
         )
-
-
-# which recordings ------------------------------------------------------------------------------------------------------
 
 
 def test_a_press_is_no_sweep_of_its_arm_s_joints_and_of_the_other_s_it_is():
@@ -200,9 +191,6 @@ def test_of_an_arm_that_presses_nothing_known_there_is_nothing_to_say():
     said = "right pads: no fit recording states what the pads pressed; state `pressed`"
     with pytest.raises(TaccorlError, match=said):
         diagnose_arm(TwinConfig(), "right", Measurements((made(0),)))
-
-
-# words -----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
