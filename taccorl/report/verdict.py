@@ -63,7 +63,7 @@ UNCERTAIN: Mapping[Kind, str] = {
 """Kind of low confidence → its first reason."""
 SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
 LATE: Mapping[str, str] = {"command_delay": "positions and efforts", "sensor_delay": "positions"}
-"""Effect → columns that, logged as late as its delay, look exactly like it."""
+"""Effect → columns that, logged late by its delay, look exactly like it."""
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
     "gains_moved": "First state the commanded gains (kp, kd) and check the time stamps.",
@@ -287,7 +287,7 @@ class _Words:
         place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
         number, factor = self.d.or_number
         off = SCALED if number == EFFORT_SCALE else f"{number} of the file is off by a factor of {factor:.4g}"
-        late = "".join(f", or its {LATE[name]} are logged as late" for name in added(self.d) if name in LATE)
+        late = "".join(f", or its {LATE[name]} are logged late by as much" for name in added(self.d) if name in LATE)
         return place + f", or {off}" * bool(number) + late
 
     @property

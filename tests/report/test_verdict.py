@@ -131,7 +131,7 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
 
 def test_a_delay_is_said_to_look_like_columns_that_are_logged_late(one):
     v = verdict(PART, changed(one, effects=(make_effect("command_delay", delay_s=0.012),)))
-    assert "or its positions and efforts are logged as late" in v.finding and v.level == "moderate"
+    assert "or its positions and efforts are logged late by as much" in v.finding and v.level == "moderate"
 
 
 def test_a_gain_of_a_few_tenths_of_a_floor_is_a_doubt(one):
