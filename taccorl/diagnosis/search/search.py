@@ -317,13 +317,13 @@ class Beam:
         self, answer: Model, standing: Sequence[Place], recordings: Sequence[Recording]
     ) -> tuple[tuple[str, float], ...]:
         """(effect, error that it leaves [floors]) at the worst of the regimes that stand out, the least first."""
-        found = []
+        found = {}
         for worst in standing[:1]:
-            own = [r for r in recordings if r.name == worst.recording]
+            own = [r for r in recordings if r.name == worst.recording]  # both parts of one whose rows were split
             for name, m in self._beside(answer).items():
                 at = places(self.fits.problem, m.fit, own, self.config.little)
-                found += [(name, p.error) for p in at if p.words() == worst.words()]
-        return tuple(sorted(found, key=lambda item: item[1]))
+                found[name] = max(p.error for p in at if p.words() == worst.words())
+        return tuple(sorted(found.items(), key=lambda item: item[1]))
 
     def ties(self, answer: Model) -> list[Model]:
         """Fitted models with other effects that the result is not clearly better than."""
