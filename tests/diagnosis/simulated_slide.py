@@ -1,5 +1,6 @@
 """Recordings that tests simulate with equations of their own; those of a slide with dry friction whose numbers are known here."""
 
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 
@@ -11,10 +12,22 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.problems.axis_problem import AxisProblem
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.search import diagnose
+from taccorl.sim.effects import effects
 
 MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 4e4, 2800.0
 NOISE_M, NOISE_N = 2e-5, 2.0
 AXIS = AxisConfig(name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25)
+
+
+def one_round(axis: AxisConfig, measurements: Measurements, considered: Collection[str] = effects) -> Diagnosis:
+    """Search for one effect, of ``considered``."""
+    problem, one = AxisProblem(axis, measurements), SearchConfig(max_effects=1)
+    without = [name for name in problem.candidates if name not in considered]
+    way = {"start": problem.start, "present": problem.present, "without": without}
+    return diagnose(problem, problem.fit, problem.validation, problem.test, **way, config=one)
 
 
 def logged(

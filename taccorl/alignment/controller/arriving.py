@@ -38,8 +38,7 @@ def arriving(p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: f
     reached = where(lag_s > 0.0, 1.0 - decayed(held_s / max(lag_s, 1e-9))[0], 1.0)
     furthest, share = p.slew_limit__speed_rad_per_s * held_s, p.velocity_feedforward__share
     share = where((share != 0.0) & (p.kp > 0.0), share * p.kd * apart, 0.0)
-    first = 0.0 * share + sent[0]
-    lagging, goal, at, before = first, first, first, first
+    lagging = goal = at = before = 0.0 * share + sent[0]
     commands, chance = np.empty((count, LANES)), np.ones((1, LANES))
     for k in range(sent.size):
         lagging += (sent[k] - lagging) * reached

@@ -316,7 +316,8 @@ def _simulated(
     way = (0.0 if kind == VELOCITY else 1.0) * p.encoder_scale__factor
     of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
     if with_integral:
-        most, seen_nm = coulomb + static, p.start_nm + where(p.effort_holds_weight == 0.0, holding * carried, 0.0)
+        most = coulomb + static + p.power_law_friction__yield_nm
+        seen_nm = p.start_nm + where(p.effort_holds_weight == 0.0, holding * carried, 0.0)
         rubbed = where(p.start_nm < math.inf, min(max(needed - seen_nm, -most), most), 0.0)
         integral = where(integral_rate > 0.0, (missing - rubbed) / (holding * of_error), 0.0)
         torque += where(integral_rate > 0.0, (missing - rubbed) / holding, 0.0)
@@ -453,7 +454,7 @@ def _simulated(
         if with_power:
             grown = power_nm * power(abs(v) / AT_RAD_PER_S, exponent)
             one_sided = grown * (1.0 + where(v > 0.0, power_asymmetry, -power_asymmetry))
-            limit += where((power_nm > 0.0) & (v != 0.0), one_sided, 0.0)
+            limit += p.power_law_friction__yield_nm + where((power_nm > 0.0) & (v != 0.0), one_sided, 0.0)
 
         if ahead < 1.0 and has_weight:
             stiffness += where(weighs, gravity_sin * cosine - gravity_cos * sine, 0.0)

@@ -86,7 +86,7 @@ def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:
     kept, found = dict[str, float](), []
     for frees in groups:
         stated = {f.name: fits.given[f.name] for f in frees}
-        trial = model_of(fits.problem, _fitted(fits, with_held(fits.problem, kept | stated), model), fits.validation)
+        trial = _refitted(fits, model, with_held(fits.problem, kept | stated))
         if refusal(smaller, trial, config):
             kept, smaller = kept | stated, trial
         else:
@@ -122,7 +122,7 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     problem, answer = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees}), fits.model_of(model)
     if frees[0].name == "inertia" and (scaled := with_scale(problem)) is not None:
         problem = scaled
-        if refusal(answer, model_of(problem, _fitted(fits, problem, model), fits.validation), fits.config):
+        if refusal(answer, _refitted(fits, model, problem), fits.config):
             return (EFFORT_SCALE,)
     if fits.added(model):
         return ()
@@ -132,9 +132,10 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 
 
-def _fitted(fits: Fits, problem: Problem, model: Fit) -> Fit:
-    """The hypothesis of ``model`` refitted as another ``problem``."""
-    return best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
+def _refitted(fits: Fits, model: Fit, problem: Problem) -> Model:
+    """The hypothesis of ``model`` fitted to the same recordings as ``problem`` has it."""
+    found = best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
+    return model_of(problem, found, fits.validation)
 
 
 def of_refit(fits: Fits, answer: Model) -> list[str]:

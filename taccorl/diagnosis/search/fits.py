@@ -186,11 +186,8 @@ class Fits:
         return self.models[key]
 
     def without(self, model: Model, name: str, again: bool = False) -> Model:
-        """The model with one effect less, the others refitted.
-
-        Args:
-            again: it is refitted from where ``model`` ended, too, so that both had the same refits.
-        """
+        """The model with one effect less, the others refitted; ``again``: from where ``model`` ended, so that both had the same
+        refits, even if it was fitted before."""
         return self.whole(tuple(n for n in model.names if n != name), model.fit.values, again)
 
     def whole(self, names: Sequence[str], start: Values, again: bool = False) -> Model:
@@ -298,13 +295,14 @@ class Fits:
         if above_floor(model.squares) < 1.0 + self.config.min_gain:
             return model
         for c in chosen(self.problem, model.names):
-            typical = {f"{c.name}.{p.name}": p.typical for p in c.cls.parameters() if p.name in c.cls.optional}
+            open_ = [n for n, same in c.cls.optional.items() if same not in model.names]
+            typical = {f"{c.name}.{p.name}": p.typical for p in c.cls.parameters() if p.name in open_}
             if not typical or any(model.fit.values.get(n, 1.0) > 0.0 for n in typical) or c.frees[0].held:
                 continue
             self.progress(f"refitting with {' and '.join(typical)}")
             starts = [model.fit.values | {n: v * by for n, v in typical.items()} for by in FAINT]
             other = self.model_of(self.fitted(model.names, starts))
-            if not refusal(other, model, self.config):
+            if not refusal(other, model, self.config) and not self.flaw(other):
                 self.models[frozenset(model.names)] = model = other
         return model
 
@@ -488,11 +486,15 @@ class Fits:
 
 
 def _simpler_form(c: Candidate, values: Values) -> str:
-    """Text: the simpler effect that a fitted effect practically equals, and the parameter that shows it; empty if there is none.
-    Friction over speed**0.05 is dry friction, unless a parameter that is 0 by default, such as its asymmetry, exceeds 0.1."""
-    for simpler, name in c.cls.reduces_to.items():
-        near = {p.name: values.get(f"{c.name}.{p.name}", 0.0) for p in c.cls.parameters() if p.typical == 0.0}
-        near[name] = values[f"{c.name}.{name}"] - next(p.low for p in c.cls.parameters() if p.name == name)
-        if all(abs(value) <= NEARLY for value in near.values()):
-            return f"{simpler}: {name} {near[name]:.3g}"
-    return ""
+    """Text: what a fitted effect practically equals, and the parameter that shows it; empty if there is nothing simpler. Friction
+    over speed**0.05 is dry friction, over speed**0.95 with a yield torque dry and viscous friction, unless a parameter that is 0
+    by default, such as its asymmetry, exceeds 0.1."""
+    own = {p.name: values.get(f"{c.name}.{p.name}", 0.0) for p in c.cls.parameters()}
+    if any(abs(own[p.name]) > NEARLY for p in c.cls.parameters() if p.typical == 0.0):
+        return ""
+    ends = {p.name: (p.low, p.high) for p in c.cls.parameters()}
+    limits = [(simpler, name, ends[name][0]) for simpler, name in c.cls.reduces_to.items()]
+    for same in [same for n, same in c.cls.optional.items() if same and own[n] > 0.0]:
+        limits += [(f"{same} and {wide}", name, ends[name][1]) for wide, name in c.cls.equals_when_wide.items()]
+    found = [(words, name) for words, name, limit in limits if abs(own[name] - limit) <= NEARLY]
+    return " or ".join(f"{words}: {name} {own[name]:.3g}" for words, name in found)

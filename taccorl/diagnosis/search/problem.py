@@ -68,9 +68,8 @@ def free(p: Parameter, cls: type[Effect]) -> Free:
     optional = p.name in cls.optional
     start = 0.0 if optional else p.typical
     name = f"{cls.name}.{p.name}"
-    return Free(
-        name=name, unit=p.unit, start=start, low=low, high=p.high, log=one_sided, scale=scale, optional=optional
-    )
+    found = Free(name=name, unit=p.unit, start=start, low=low, high=p.high, log=one_sided, scale=scale)
+    return dataclasses.replace(found, optional=optional, unless=cls.optional.get(p.name, ""))
 
 
 def holding(frees: Sequence[Free], known: Sequence[str], stated: Mapping[str, float]) -> tuple[Free, ...]:

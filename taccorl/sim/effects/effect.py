@@ -161,8 +161,8 @@ class Effect:
     same_with_torque_ff: ClassVar[tuple[str, ...]] = ()
     """Names of effects that give the same positions in every motion if a constant torque (``torque_ff``) is fitted, too: only
     the motor's effort tells them apart."""
-    optional: ClassVar[tuple[str, ...]] = ()
-    """Parameters that may be absent while the effect is there. A search fits them only where that is clearly better."""
+    optional: ClassVar[dict[str, str]] = {}
+    """Parameter that may be absent → effect that states the same, or "". Fitted only where clearly better, not beside it."""
     fitted: ClassVar[bool] = True
     """Whether a search may fit the effect. False for effects that differ between recordings of the same motion: least squares
     cannot fit them, so that they are not candidates, and a twin keeps its own unchanged."""

@@ -86,7 +86,7 @@ class CoulombFriction(JointEffect):
     With x_p > 0 it has the bristles of ``presliding``, which bend before the joint slides."""
 
     same_with_torque_ff: ClassVar = ("asymmetric_friction",)
-    optional: ClassVar = ("presliding_rad",)
+    optional: ClassVar = {"presliding_rad": "presliding"}
     torque_nm: float = number(
         "F", "N·m", 0, 0.4, (0, 20),
         "0.2–0.8 N·m fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification); 0.3 in Menagerie’s PiPER",
@@ -167,17 +167,17 @@ class PositionDependentFriction(_LiveFriction):
 
 @effect("power_law_friction", slot="friction", needs="velocity")
 class PowerLawFriction(_LiveFriction):
-    """Friction of a lubricant that thins with the shear rate: τ = −F (1 + a sign q̇) (|q̇| / v₁)ⁿ sign q̇ with v₁ = 0.1 rad/s (0.1
-    m/s of a slide) and 0 < n < 1, between Coulomb friction (n = 0) and viscous friction (n = 1).
-
-    This is the law of Herschel and Bulkley (1926) for grease, without its yield stress, which ``coulomb_friction`` adds. With a >
-    0 friction is greater in the positive direction."""
+    """Friction of grease, which thins with the shear rate (Herschel and Bulkley 1926): τ = −(F_y + F (1 + a sign q̇) (|q̇| / v₁)ⁿ)
+    sign q̇ with v₁ = 0.1 rad/s (0.1 m/s of a slide) and 0 < n < 1; at rest any τ with |τ| ≤ F_y. The part F lies between Coulomb
+    (n = 0) and viscous friction (n = 1); with a > 0 it is greater in the positive direction."""
 
     reduces_to: ClassVar = {"coulomb_friction": "exponent"}
     equals_when_wide: ClassVar = {"viscous_friction": "exponent"}
+    optional: ClassVar = {"yield_nm": "coulomb_friction"}
     torque_nm: float = number("F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
-    exponent: float = number("n", "1", None, 0.4, (0, 1), "a choice; 0.35 fits a real drive (EMPS, docs/your_robot.md)")
+    exponent: float = number("n", "1", None, 0.4, (0, 1), "a choice; 0.7 fits a real drive (EMPS, docs/your_robot.md)")
     asymmetry: float = number("a", "1", None, 0, (-0.9, 0.9))
+    yield_nm: float = number("F_y", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
 
     @property
     def reads_as(self) -> str:
@@ -186,7 +186,7 @@ class PowerLawFriction(_LiveFriction):
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         speed = live.of_joints("qvel", self.acts_on())
         grown = self.torque_nm * (np.abs(speed) / AT_RAD_PER_S) ** self.exponent * (speed != 0.0)
-        return (grown * (1.0 + self.asymmetry * np.sign(speed)),)
+        return (self.yield_nm + grown * (1.0 + self.asymmetry * np.sign(speed)),)
 
 
 @effect("presliding", slot="friction", needs=("velocity", "dry_friction"))

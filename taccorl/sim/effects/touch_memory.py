@@ -152,7 +152,7 @@ class TaxelPlay(RememberingEffect):
     holds_scan: ClassVar = False
     only: ClassVar = ("cells",)
     elements: ClassVar = 8
-    optional: ClassVar = ("elastic", "spread")
+    optional: ClassVar = {"elastic": "", "spread": ""}
     half_width: float = number("w", "reading", 0, 0.2, (0, 3), "a choice: 2 % of the rated load of a sensor of cells")
     elastic: float = number("e", "1", 0, 0.5, (0, 0.95), "a choice; 0: the play carries all of the load")
     spread: float = number("u", "1", 0, 0.5, (0, 0.95), "a choice; 0: one play")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from made_rows import of_signal
 from scipy.linalg import expm
-from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N, logged, recorded_slide, simulated
+from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N, one_round, recorded_slide, simulated
 
 from taccorl.alignment.checks.telemetry import check_names
 from taccorl.alignment.controller.joint_recording import starting
@@ -167,9 +167,7 @@ def test_a_torque_limit_that_no_validation_recording_reaches_is_named():
         again = {"repeat_of": f"m{k - 1}"} if k in (1, 3) else {}
         made.append(of_signal(f"m{k}", 200.0, target, at, "base", effort=effort, **again))
     axis = AxisConfig(name="base", unit="rad", inertia=0.4, kp=400.0, kd=14.0, effort_limit=50.0)
-    problem = AxisProblem(axis, Measurements((*made[:2],), (*made[2:4],), (*made[4:],)))
-    one = SearchConfig(max_effects=1)
-    found = diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start, config=one)
+    found = one_round(axis, Measurements((*made[:2],), (*made[2:4],), (*made[4:],)))
     assert found.names == ("torque_saturation",) and found.baseline == "fitted"
     assert found.intervals["torque_saturation.torque_max_nm"] == pytest.approx((30, 30), rel=0.02)
 
@@ -199,12 +197,8 @@ def test_a_wrong_torque_constant_is_told_from_a_wrong_mass_where_friction_is_kno
     """Efforts read 1.2 times too large fit 1.2 times the mass, gains and friction as well, unless the friction is known."""
     friction = (EffectEntry("coulomb_friction", {"torque_nm": FRICTION_N}),)
     axis = dataclasses.replace(AXIS, inertia=mass_kg, effects=friction, known=known)
-    fit, validation = (
-        [dataclasses.replace(m, effort=scale * m.effort) for m in of] for of in (slide.fit, slide.validation)
-    )
-    problem = AxisProblem(axis, Measurements(tuple(fit), tuple(validation)))
-    way = {"start": problem.start, "present": problem.present, "without": [*problem.candidates]}
-    found = diagnose(problem, problem.fit, problem.validation, **way)
+    sides = [tuple(dataclasses.replace(m, effort=scale * m.effort) for m in of) for of in (slide.fit, slide.validation)]
+    found = one_round(axis, Measurements(*sides), considered=())
     assert found.status == "numbers_off" and {c.name: c.after for c in found.changed} == pytest.approx(off, rel=0.03)
     assert [c.instead for c in found.changed if c.name in ("inertia", "effort_scale")] == [instead]
     words = verdict("drive", found).finding
@@ -221,15 +215,13 @@ def test_a_log_without_target_needs_a_law_that_takes_none(slide: Measurements):
 def test_gains_that_nobody_knows_are_fitted_and_positions_alone_leave_the_inertia(slide: Measurements):
     """From a third of both gains; ratios to the inertia are what positions determine: K_p / J = 400 1/s², K_d / J = 28 1/s."""
     unknown = dataclasses.replace(AXIS, kp=KP / 3, kd=KD / 3, gains="fitted")
-    efforts = AxisProblem(unknown, slide)
-    found = best_fit(
-        efforts, efforts.fit, ("coulomb_friction",), [efforts.start | {"coulomb_friction.torque_nm": 10.0}], 30
-    )
+    efforts, friction, ten_n = AxisProblem(unknown, slide), ("coulomb_friction",), {"coulomb_friction.torque_nm": 10.0}
+    found = best_fit(efforts, efforts.fit, friction, [efforts.start | ten_n], 30)
     assert found.values["kp"] == pytest.approx(KP, rel=0.1) and found.values["kd"] == pytest.approx(KD, rel=0.1)
     silent = [dataclasses.replace(m, effort=np.full_like(m.effort, np.nan)) for m in slide.fit]
     alone = AxisProblem(unknown, Measurements(tuple(silent)))
     assert "inertia" not in {f.name for f in alone.base}
-    found = best_fit(alone, alone.fit, ("coulomb_friction",), [alone.start | {"coulomb_friction.torque_nm": 10.0}], 30)
+    found = best_fit(alone, alone.fit, friction, [alone.start | ten_n], 30)
     assert found.values["kp"] / AXIS.inertia == pytest.approx(KP / MASS_KG, rel=0.1)
     assert found.values["kd"] / AXIS.inertia == pytest.approx(KD / MASS_KG, rel=0.1)
 
@@ -242,8 +234,7 @@ def test_dry_friction_of_a_slide_is_found_in_newtons_beside_its_weight(slide: Me
         [dataclasses.replace(m, measured=m.measured - weight_n / KP, effort=m.effort + weight_n) for m in of]
         for of in (slide.fit, slide.validation)
     )
-    problem = AxisProblem(AXIS, Measurements(tuple(fit), tuple(validation)))
-    found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
+    found = one_round(AXIS, Measurements(tuple(fit), tuple(validation)))
     assert "coulomb_friction" in (found.rounds[0].added, *found.rounds[0].ties)
     assert found.errors["fitted"]["validation"] > 5.0
     assert found.errors["after"]["validation"] < 0.4 * found.errors["fitted"]["validation"]
@@ -273,13 +264,12 @@ def unbalanced(name: str, amplitude_rad: float, hz: float, seed: int, repeat_of:
             at += speed / rate_hz / parts
     rng = np.random.default_rng(seed)
     measured, effort = (np.array(rows)[rate_hz:] + rng.standard_normal((len(target), 2)) * (5e-5, 0.05)).T
-    return logged(name, ("table",), ("rad",), repeat_of, time_s=time_s, target=target, measured=measured, effort=effort)
+    return of_signal(name, rate_hz, target, measured, "table", effort=effort, repeat_of=repeat_of)
 
 
 def test_the_unknown_weight_of_a_turning_axis_is_found_and_no_spring_or_friction() -> None:
     fit = unbalanced("slow", 1.2, 0.3, 1), unbalanced("again", 1.2, 0.3, 2, repeat_of="slow")
-    problem = AxisProblem(TABLE, Measurements(fit, (unbalanced("held", 1.0, 0.45, 3),)))
-    found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
+    found = one_round(TABLE, Measurements(fit, (unbalanced("held", 1.0, 0.45, 3),)))
     assert found.names == ("unbalance",) and not found.rivals and found.status == "at_floor"
     assert found.errors["fitted"]["validation"] > 10.0 > 1.3 > found.errors["after"]["validation"]
     low, high = found.effects[0].interval["torque_nm"]
@@ -373,21 +363,21 @@ def of_a_sampled_loop(
 
 
 STIFF, DAMPED = 5e5, 1e4
+TIMED = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
 
 
 @pytest.mark.parametrize(("speed_rows", "late_s"), [(1, 0.0), (2, 0.5e-3)])
 def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows: int, late_s: float):
     """A drive that takes its speed as the mean of the last two position differences sees it half a loop period (0.5 ms) later
     than one that takes the last difference. The fit must find this delay and the simulated friction, 20 N + 150 N·s/m · v."""
-    axis = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
-    problem = AxisProblem(axis, Measurements((of_a_sampled_loop(speed_rows),)))
+    problem = AxisProblem(TIMED, Measurements((of_a_sampled_loop(speed_rows),)))
     names = ("coulomb_friction", "viscous_friction")
     start = problem.start | {"coulomb_friction.torque_nm": 10.0, "viscous_friction.damping_nms_per_rad": 100.0}
     found = best_fit(problem, problem.fit, names, [start], 30).values
     assert found["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.02)
     assert found["viscous_friction.damping_nms_per_rad"] == pytest.approx(150.0, rel=0.1)
     assert found["inertia"] == pytest.approx(MASS_KG, rel=0.02)  # timing to the first order of a loop's period
-    late = axis.with_numbers(found)
+    late = TIMED.with_numbers(found)
     assert late.speed_late_s == found["speed_late_s"] and "speed_late_s" in axis_text(late)
     if found["speed_late_s"] != pytest.approx(late_s, abs=1e-4):
         pytest.xfail("not reached: 0.396 ms for 0.5 ms, 0.1 ms was asked; the whole fit leaves 3.7 noise floors")
@@ -405,10 +395,8 @@ def test_the_period_of_a_loop_that_the_file_does_not_state_is_fitted_and_becomes
 @pytest.mark.parametrize("change", [{}, {"kp": 1.03 * STIFF}, {"kd": 0.9 * DAMPED}, {"effort_after_target": False}])
 def test_the_drive_stays_as_stated_where_its_efforts_are_those_of_its_law(change: dict[str, Any]):
     """Noise of 0.1 µm on the positions would be about 1 N of the law, ten floors of the efforts: it is left out."""
-    is_law, drive = not change, {"kp": STIFF, "kd": DAMPED, "loop_hz": 1000.0, "effort_after_target": True}
-    problem = AxisProblem(
-        dataclasses.replace(AXIS, **drive | change), Measurements((of_a_sampled_loop(2, position_m=0.0),))
-    )
+    axis, is_law = dataclasses.replace(TIMED, **change), not change
+    problem = AxisProblem(axis, Measurements((of_a_sampled_loop(2, position_m=0.0),)))
     own = {"kp", "kd", "target_late_s", "speed_late_s"}
     assert {f.name for f in problem.base} & own == (set() if is_law else own)
     assert ("command_delay" in problem.candidates) is not is_law
@@ -417,8 +405,7 @@ def test_the_drive_stays_as_stated_where_its_efforts_are_those_of_its_law(change
 def test_friction_of_grease_is_fitted_with_its_power_and_its_share_of_direction():
     """20 N (1 ∓ 0.2) (v / 0.1 m/s)^0.4 up and down, beside 150 N·s/m."""
     grease = lambda v: 20.0 * (abs(v) / 0.1) ** 0.4 * (0.8 if v > 0.0 else 1.2)  # noqa: E731
-    timed = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
-    level = dataclasses.replace(timed, known=("weight_cos",))
+    level = dataclasses.replace(TIMED, known=("weight_cos",))
     problem = AxisProblem(level, Measurements((of_a_sampled_loop(1, grease),)))
     start = {"torque_nm": 10.0, "exponent": 0.7, "asymmetry": 0.0}
     start = problem.start | {f"power_law_friction.{key}": value for key, value in start.items()}
@@ -427,6 +414,17 @@ def test_friction_of_grease_is_fitted_with_its_power_and_its_share_of_direction(
     assert found["power_law_friction.torque_nm"] == pytest.approx(20.0, rel=0.02)
     assert found["power_law_friction.exponent"] == pytest.approx(0.4, abs=0.02)
     assert found["power_law_friction.asymmetry"] == pytest.approx(-0.2, abs=0.03)  # torque_ff takes up a part
+
+
+@pytest.mark.parametrize(("exponent", "yield_n"), [(0.4, 12.0), (1.0, 0.0)])
+def test_a_yield_torque_is_a_number_of_grease_but_dry_friction_beside_viscous_is_none(exponent: float, yield_n: float):
+    """12 N + 20 N (v / 0.1 m/s)^n. At n = 1 the law with a yield torque would explain all of it, as one effect for two."""
+    friction = lambda v: 12.0 + 20.0 * (abs(v) / 0.1) ** exponent - 150.0 * abs(v)  # noqa: E731
+    fit_to, other = (of_a_sampled_loop(1, friction, seed) for seed in (5, 6))
+    considered = "coulomb_friction", "power_law_friction", "viscous_friction"
+    found = one_round(TIMED, Measurements((fit_to,), (other,)), considered)
+    assert found.names == ("power_law_friction",)
+    assert found.after.values["power_law_friction.yield_nm"] == pytest.approx(yield_n, rel=0.05)
 
 
 def test_a_recording_that_begins_in_motion_starts_at_its_speed():
@@ -583,7 +581,7 @@ signals: {drive: {q: {column: qm, unit: m}, q_target: {column: qg, unit: m}, tau
 @pytest.mark.skipif(not EMPS.is_dir(), reason=f"the EMPS benchmark is not at {EMPS}; see nonlinearbenchmark.org")
 def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: Path):
     """Janot, Gautier and Brunot 2019 identify 95.1 kg, 20.4 N of dry and 203 N·s/m of viscous friction, offset −3.16 N. With a
-    power of the speed instead of both less is left. All candidates are considered."""
+    yield force and a power of the speed instead less is left, 8 % of the other file's error. All candidates are considered."""
     for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
         (tmp_path / name).symlink_to(EMPS / name)
     (tmp_path / "columns.yaml").write_text(COLUMNS)
@@ -595,7 +593,9 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
     solved = solve("drive", problem, problem.fit, problem.validation, problem.test, SearchConfig(max_effects=1))
     found = solved.diagnosis
     assert found.names == ("power_law_friction",)
-    assert 0.2 < found.after.values["power_law_friction.exponent"] < 0.5
+    assert found.errors["after"]["test"] < 0.08 * found.errors["before"]["test"]
+    assert 0.5 < found.after.values["power_law_friction.exponent"] < 0.85
+    assert 10.0 < found.after.values["power_law_friction.yield_nm"] < 20.0
     start = problem.start | {"asymmetric_friction.torque_nm": 10.0, "asymmetric_friction.asymmetry": 0.0}
     start["viscous_friction.damping_nms_per_rad"] = 100.0
     theirs = best_fit(problem, problem.fit, ("asymmetric_friction", "viscous_friction"), [start], 30)
@@ -608,11 +608,11 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
         off = [problem.simulate(model.values, model.effects, r)[:, 1] - r.measured[:, 1] for r in recordings]
         return float(np.sqrt(np.nanmean(np.square(off))))
 
-    for held_out, most_n in ((problem.test, 4.0), (solved.validation, 3.2)):
-        assert force_n(found.after, held_out) < min(most_n, 0.15 * force_n(found.before, held_out))
+    for held_out, most_n in ((problem.test, 3.6), (solved.validation, 2.2)):
+        assert force_n(found.after, held_out) < min(most_n, 0.1 * force_n(found.before, held_out))
     assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"
-    if force_n(found.after, problem.test) > 3.6 or abs(found.after.values["inertia"] - 95.1) > 2.0:
-        pytest.xfail("not reached with the file's gains: 95.1 ± 2 kg, force errors of 3.6 N (test), 2.2 N (validation)")
+    if abs(found.after.values["inertia"] - 95.1) > 2.0:
+        pytest.xfail("not reached with the file's gains: 95.1 ± 2 kg")
 
 
 def of_a_soft_gear(name: str, hz: float, seed: int, repeat_of: str | None = None) -> Measurement:

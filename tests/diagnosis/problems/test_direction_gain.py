@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated_slide import logged
+from simulated_slide import logged, one_round
 
 from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.search import diagnose
+from taccorl.diagnosis.problems.axis_problem import axis_motion, simulated
+from taccorl.diagnosis.search.result import Diagnosis
 
 RATE_HZ, PARTS = 200, 50
 MASS_KG, KP, KD = 30.0, 12_000.0, 900.0
@@ -80,8 +79,7 @@ def found_in(axis: AxisConfig, force: Force, mass_kg: float, friction_n: tuple[f
     first = moved("first", force, mass_kg, (0.3, 1.1), 1, friction_n)
     again = moved("again", force, mass_kg, (0.3, 1.1), 2, friction_n, repeat_of="first")
     held = moved("held", force, mass_kg, (0.4, 0.9), 3, friction_n)
-    problem = AxisProblem(axis, Measurements((first, again), (held,)))
-    return diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
+    return one_round(axis, Measurements((first, again), (held,)))
 
 
 @pytest.mark.parametrize(

@@ -3,37 +3,22 @@
 import dataclasses
 
 import pytest
-from simulated_slide import AXIS, FRICTION_N, recorded_slide, simulated
+from simulated_slide import AXIS, FRICTION_N, one_round, recorded_slide, simulated
 
 from taccorl.alignment.machines.axis_file import AxisConfig, EffectEntry
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.search import diagnose
 
 DRY = dataclasses.replace(AXIS, effects=(EffectEntry("coulomb_friction", {"torque_nm": FRICTION_N}),))
 BRISTLES_M = 2e-4
 CONSIDERED = ("coulomb_friction", "power_law_friction", "stribeck_friction")
 
 
-def diagnosed(axis: AxisConfig, measurements: Measurements) -> Diagnosis:
-    problem = AxisProblem(axis, measurements)
-    return diagnose(
-        problem,
-        problem.fit,
-        problem.validation,
-        start=problem.start,
-        present=problem.present,
-        without=[name for name in problem.candidates if name not in CONSIDERED],
-        config=SearchConfig(max_effects=1),
-    )
-
-
 @pytest.mark.parametrize("axis", [AXIS, pytest.param(DRY, marks=pytest.mark.slow)])
 def test_bristles_are_found_with_the_friction_and_as_a_number_that_the_file_lacks(axis: AxisConfig):
     """Stribeck friction with bristles explains as much with two numbers more."""
     fit = [simulated(n, 0.02, 0.5, k, r, BRISTLES_M) for k, (n, r) in enumerate((("sine", None), ("again", "sine")))]
-    found = diagnosed(axis, Measurements(tuple(fit), (simulated("held", 0.025, 0.4, 3, None, BRISTLES_M),)))
+    made = Measurements(tuple(fit), (simulated("held", 0.025, 0.4, 3, None, BRISTLES_M),))
+    found = one_round(axis, made, CONSIDERED)
     assert found.names == ("coulomb_friction",) and found.errors["after"]["validation"] < 1.3
     assert found.after.values["coulomb_friction.presliding_rad"] == pytest.approx(BRISTLES_M, rel=0.1)
     low, high = found.intervals["coulomb_friction.presliding_rad"]
@@ -51,13 +36,14 @@ def test_bristles_are_fitted_where_rigid_friction_alone_is_at_the_floor(monkeypa
     monkeypatch.setattr("simulated_slide.FRICTION_N", 4.57)
     motions = {"sine": (0.0231, 0.438, None), "again": (0.0231, 0.438, "sine"), "other": (0.111, 0.701, None)}
     fit = [simulated(n, a, hz, k, r, BRISTLES_M) for k, (n, (a, hz, r)) in enumerate(motions.items())]
-    found = diagnosed(AXIS, Measurements(tuple(fit), (simulated("held", 0.0253, 0.824, 3, None, BRISTLES_M),)))
+    made = Measurements(tuple(fit), (simulated("held", 0.0253, 0.824, 3, None, BRISTLES_M),))
+    found = one_round(AXIS, made, CONSIDERED)
     assert found.names == ("coulomb_friction",)
     assert found.after.values["coulomb_friction.presliding_rad"] == pytest.approx(BRISTLES_M, rel=0.1)
 
 
 @pytest.mark.parametrize("axis", [AXIS, pytest.param(DRY, marks=pytest.mark.slow)])
 def test_friction_that_sticks_has_no_bristles(axis: AxisConfig):
-    found = diagnosed(axis, recorded_slide())
+    found = one_round(axis, recorded_slide(), CONSIDERED)
     assert found.names == ("coulomb_friction",) and found.after.values["coulomb_friction.presliding_rad"] == 0.0
     assert "coulomb_friction.presliding_rad" not in found.intervals

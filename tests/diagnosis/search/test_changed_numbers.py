@@ -69,7 +69,7 @@ class Bristled(Ripple):
     """A ripple that may have a slower bump of its own."""
 
     name: ClassVar = "bristled"
-    optional: ClassVar = ("bent",)
+    optional: ClassVar = {"bent": ""}
     bent: float = number("b", "1", 0, 1.0, (0, 50), "made up")
 
     def signal(self, t: np.ndarray, seed: int) -> np.ndarray:

@@ -63,7 +63,7 @@ LEANING = {"torque_nm": 0.5, "asymmetry": 0.3}
     [
         ("power_law_friction", POWER, 0.1, 0.8, 0.5 * 1.3, 0.01),  # four times the speed, twice the friction
         ("power_law_friction", POWER, 0.4, 0.8, 0.5 * 1.3 * 2, 0.01),
-        ("power_law_friction", POWER, -0.4, 0.8, -0.5 * 0.7 * 2, 0.01),
+        ("power_law_friction", POWER | {"yield_nm": 0.2}, -0.4, 0.8, -0.2 - 0.5 * 0.7 * 2, 0.01),
         ("asymmetric_friction", LEANING, 0.05, 1.0, 0.5 * 1.3, 0.01),
         ("asymmetric_friction", LEANING, -0.05, 1.0, -0.5 * 0.7, 0.01),
         ("stribeck_friction", STRIBECK, 0.02, 1.0, 0.5 + 0.5 * np.exp(-0.04), 0.02),
@@ -108,6 +108,7 @@ def balance(torque_nm: Callable[[float], float], goal: float) -> float:
         ),
         ({"coulomb_friction": {"torque_nm": 0.5}}, 0.02, lambda q: 0.5, 3e-5),  # it stops short by F / K_p, 3.31 mrad
         ({"coulomb_friction": {"torque_nm": 0.5}}, -0.02, lambda q: -0.5, 3e-5),
+        ({"power_law_friction": {"torque_nm": 0.01, "yield_nm": 0.5}}, -0.02, lambda q: -0.5, 3e-5),
     ],
 )
 def test_a_joint_rests_where_the_drive_balances_the_law(effects, offset, torque_nm, tolerance):
