@@ -92,15 +92,15 @@ class DriveLaw:
     def check_law(self, owner: str) -> None:
         """Check that the numbers fit the law. Raises TaccorlError, which begins with ``OWNER.KEY``: a number is wrong, is missing
         for the law, or is not used by it."""
-        check_numbers(owner, self, positive=("kp_factor", "kd_factor"), finite=("torque_ff",))
         stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
         unused = {"velocity": ("kp",), "torque": ("kp", "kd"), "effort": ("kp", "kd", "effort_limit")}
         foreign = (() if self.law == "pwm" else WINDING) + unused.get(self.law, ())
         for name in (name for name in foreign if name in stated):
-            text = f"law {self.law} does not use this number; remove it, or correct the law"
-            raise TaccorlError(f"{owner}.{name}: {text}")
-        check_numbers(owner, self, not_negative=[name for name in stated if name == "kd"])
-        check_numbers(owner, self, positive=[name for name in stated if name != "kd"])
+            raise TaccorlError(
+                f"{owner}.{name}: law {self.law} does not use this number; remove it, or correct the law"
+            )
+        positive = ["kp_factor", "kd_factor", *(name for name in stated if name != "kd")]
+        check_numbers(owner, self, finite=("torque_ff",), not_negative=["kd"] * ("kd" in stated), positive=positive)
         for name in NEEDED[self.law]:
             if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
                 raise TaccorlError(f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`")

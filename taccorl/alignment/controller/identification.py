@@ -278,8 +278,7 @@ class _GainSearch:
 
     def x_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest (P,) and highest (P,) coordinates x."""
-        (kp_low, kp_high), (kd_low, kd_high) = PAPER_BOUNDS["kp"], PAPER_BOUNDS["kd"]
-        least, most = PAPER_BOUNDS["torque_ff"]
+        (kp_low, kp_high), (kd_low, kd_high), (least, most) = (PAPER_BOUNDS[name] for name in Gains._fields)
         every = {
             "kp": (math.log(kp_low), math.log(kp_high)),
             "kd": (math.log(kd_low / max(kp_high, self.given.kp)), math.log(kd_high / min(kp_low, self.given.kp))),
@@ -326,10 +325,8 @@ class _GainSearch:
         """Least squares from ``start``, a point within the bounds, in at most so many evaluations; returns SciPy's result."""
         late_s = np.full(len(start) - len(self.free), _MOST_LATE_S)
         bounds = tuple(np.append(end, sign * late_s) for end, sign in zip(self.x_bounds(), (-1, 1), strict=True))
-        jacobian: Any = self.jacobian
-        return least_squares(
-            self.residual, start, jacobian, bounds, x_scale="jac", max_nfev=most, xtol=1e-10, ftol=1e-12
-        )
+        jac: Any = self.jacobian
+        return least_squares(self.residual, start, jac, bounds, x_scale="jac", max_nfev=most, xtol=1e-10, ftol=1e-12)
 
     def covariance(self, x: np.ndarray) -> np.ndarray:
         """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, and σ² that of the residuals times their correlation time; very

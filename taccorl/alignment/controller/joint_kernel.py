@@ -230,10 +230,10 @@ def _simulated(
     bend_rad = p.presliding__presliding_rad + p.coulomb_friction__presliding_rad
     viscous, drag = p.viscous_friction__damping_nms_per_rad, p.quadratic_drag__drag_nms2_per_rad2
     sliding_nm, stribeck_speed = p.stribeck_friction__torque_nm, p.stribeck_friction__stribeck_rad_per_s
-    power_nm, exponent = p.power_law_friction__torque_nm, p.power_law_friction__exponent
-    load_share, power_asymmetry = p.load_friction__share, p.power_law_friction__asymmetry
+    power_nm, yield_nm = p.power_law_friction__torque_nm, p.power_law_friction__yield_nm
+    exponent, power_asymmetry = p.power_law_friction__exponent, p.power_law_friction__asymmetry
     spot_nm, spot_angle = p.position_dependent_friction__torque_nm, p.position_dependent_friction__angle_rad
-    spot_width = p.position_dependent_friction__width_rad
+    spot_width, load_share = p.position_dependent_friction__width_rad, p.load_friction__share
     cogging_nm, periods, phase = p.cogging__torque_nm, p.cogging__periods, p.cogging__phase_rad
     spring_stiffness, spring_rest = p.cable_spring__stiffness_nm_per_rad, p.cable_spring__rest_rad
     stop_stiffness, stop_angle = p.end_stop__stiffness_nm_per_rad, p.end_stop__angle_rad
@@ -274,12 +274,12 @@ def _simulated(
     bristle_damping = BRISTLE_DAMPING_S * bristle
     bends = (bend_rad > 0.0) & (coulomb > 0.0)
     bending = where(bends, coulomb / bend_rad, 0.0)
-    newest_share = where(lag_s > 0.0, h / (lag_s + h), 1.0)
+    newest_share = where(lag_s > 0.0, ahead * h / (lag_s + ahead * h), 1.0)
     # Effects that no lane has are left out of the steps.
     with_bristle, with_bends, with_spot = holds(has_bristle), holds(bends), holds(spot_nm > 0.0)
     with_cogging, with_power, with_stop = holds(cogging_nm != 0.0), holds(power_nm > 0.0), holds(stop_stiffness > 0.0)
     with_integral, with_load = holds(integral_rate > 0.0), holds(load_share > 0.0)
-    with_given = with_load or holds(reverse_gain != 1.0)
+    with_given = (with_load and not midpoint) or holds(reverse_gain != 1.0)
     rubs = with_load or with_spot or with_power or holds((coulomb > 0.0) & (bend_rad <= 0.0))
 
     # Where it is when the encoder reports ``start``, and what is in balance there.
@@ -311,12 +311,14 @@ def _simulated(
     missing = needed - holding * (torque + carried)
     speeds = none + 1.0 if kind == VELOCITY else p.commands_speed  # 1: the integral is that of a speed's error
     of_speed = none + 1.0 if kind == VELOCITY else p.kd / where(p.kp > 0.0, p.kp, 1.0)
-    went = none + 1.0 if kind == VELOCITY else p.encoder_scale__factor * (of_speed + 0.5 * h)
     slow_went, late_went = speeds * of_speed * turned * slow_s, speeds * of_speed * (lost - 0.5 * p.speed_age)
     way = (0.0 if kind == VELOCITY else 1.0) * p.encoder_scale__factor
+    # Shares of a step: of what comes to the integral that is taken ahead, and of the way that what has come lacks.
+    along = where(speeds > 0.0, ahead * speeds, 0.5 * p.midpoint)
+    went = where(speeds > 0.0, 1.0 if kind == VELOCITY else way * (of_speed + 0.5 * h), 0.5 * p.midpoint * way * h)
     of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
     if with_integral:
-        most = coulomb + static + p.power_law_friction__yield_nm
+        most = coulomb + static + yield_nm
         seen_nm = p.start_nm + where(p.effort_holds_weight == 0.0, holding * carried, 0.0)
         rubbed = where(p.start_nm < math.inf, min(max(needed - seen_nm, -most), most), 0.0)
         integral = where(integral_rate > 0.0, (missing - rubbed) / (holding * of_error), 0.0)
@@ -390,8 +392,8 @@ def _simulated(
         strength *= _of_direction(p, given + carried)
         if with_integral:  # that of a speed is taken ahead as the position is, which is its other part
             came = h * (now - way * q)
-            integral += ahead * speeds * came
-            summed += ahead * speeds * came
+            integral += along * came
+            summed += along * came
         asked, stiffness, damping = _asked(p, kind, now, acts, q, v, summed, supply[part], on[part], added[part])
         by_controller = damping - on[part] * p.back_emf  # 0 while the duty is at its end
         if with_filter:
@@ -403,7 +405,8 @@ def _simulated(
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
         taken = strength * (by_controller * lost + stiffness * stiff_lost)
-        ruled = drawn + taken * acceleration
+        # Steps of second order ask whether the torque of their middle is within its limit.
+        ruled = drawn + taken * acceleration - 0.5 * h * p.midpoint * gain * (damping * acceleration + stiffness * v)
         limited = _limited(p, ruled, v)
         cut = limited != ruled
         ruled_inertia = whole_inertia - taken
@@ -447,14 +450,14 @@ def _simulated(
                 force -= BRISTLE_DAMPING_S * bending * (v - slips * v)
                 damping += BRISTLE_DAMPING_S * bending
         if with_load:
-            limit += load_share * abs(_limited(p, strength * (given + carried), v) + load_nm)
+            limit += load_share * abs((limited if midpoint else _limited(p, strength * (given + carried), v)) + load_nm)
         if with_spot:
             off = (q - spot_angle) / spot_width
             limit += where(spot_nm > 0.0, spot_nm * decayed(off * off)[0], 0.0)
         if with_power:
             grown = power_nm * power(abs(v) / AT_RAD_PER_S, exponent)
             one_sided = grown * (1.0 + where(v > 0.0, power_asymmetry, -power_asymmetry))
-            limit += p.power_law_friction__yield_nm + where((power_nm > 0.0) & (v != 0.0), one_sided, 0.0)
+            limit += yield_nm + where((power_nm > 0.0) & (v != 0.0), one_sided, 0.0)
 
         if ahead < 1.0 and has_weight:
             stiffness += where(weighs, gravity_sin * cosine - gravity_cos * sine, 0.0)
@@ -484,16 +487,16 @@ def _simulated(
             v_next = v + h * a1
             gear += h * (gear_v + into * h * a2)
             gear_v += h * a2
-        at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next  # of the step
-        torque += newest_share * (at_end - torque)
+        acceleration = (v_next - v) / h
+        later = controller_damping * acceleration + controller_stiffness * (v + ahead * h * acceleration)
+        torque += newest_share / ahead * (asked - ahead * h * later - torque)
         moved = h * (ahead * v_next + (1.0 - ahead) * v)
         if with_bends:
             over = moved if midpoint else h * v
             kept = decayed(abs(over) / where(bends, bend_rad, 1.0))[0]
             bent = where(bends, kept * bent + (1.0 - kept) * math.copysign(bend_rad, over), 0.0)
         if with_integral:
-            integral += (1.0 - ahead * speeds) * came - speeds * went * moved
-        acceleration = (v_next - v) / h
+            integral += (1.0 - along) * came - went * moved
         if with_filter:
             late_v = where(fresh_share < 1.0, late_v + fresh_share / ahead * (moved / h - late_v), v_next)
         q += moved

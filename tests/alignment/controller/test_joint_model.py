@@ -33,11 +33,8 @@ STEP_S = TWIN.physics.timestep_s
 def _on_joints(name: str) -> bool:
     """An effect of arms or joints, and not of grippers only, that needs no other one."""
     cls = effects.get(name)
-    return (
-        "dry_friction" not in cls.needs
-        and issubclass(cls, ArmEffect)
-        and (not issubclass(cls, JointEffect) or "joint2" in cls.possible)
-    )
+    of_arms = issubclass(cls, ArmEffect) and (not issubclass(cls, JointEffect) or "joint2" in cls.possible)
+    return of_arms and "dry_friction" not in cls.needs
 
 
 KNOWN = [name for name in effects if _on_joints(name) and effects.get(name)().drive() is not None]
@@ -97,14 +94,10 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
         away_nm = np.abs(quick.effort - exact.effort)[100:].max()
         assert away_nm < (1e-2 if name in NEAR_EFFORT else 1e-4) * np.ptp(exact.effort)
     if name in ("torque_saturation", "torque_speed_limit"):
-        most_nm = IN_REACH[signal]["torque_max_nm"]
-        assert np.abs(model.motor_nm(motion, quick)).max() == pytest.approx(most_nm, rel=0.1 * (name in NEAR_EFFORT)), (
-            "reached"
-        )
+        most_nm, reached = IN_REACH[signal]["torque_max_nm"], np.abs(model.motor_nm(motion, quick)).max()
+        assert reached == pytest.approx(most_nm, rel=0.1 * (name in NEAR_EFFORT))
     shown = np.abs(exact.reported - plain.reported).max()
-    assert shown > 1e-5 or name == "encoder_bias", (
-        "it shows, or the comparison means nothing; a bias does not, by its nature"
-    )
+    assert shown > 1e-5 or name == "encoder_bias", "it shows, or this means nothing; a bias does not, by its nature"
 
 
 def test_every_effect_of_joints_is_known_to_the_model() -> None:
@@ -158,24 +151,19 @@ def test_effects_called_the_same_beside_a_torque_ff_give_the_same_positions() ->
 def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
     signal, at = "left_joint5", {"arm": "left", "joints": ["joint5"]}
     model, motion = from_rest(signal)
-    dry, bristles = (
-        make_effect("coulomb_friction", torque_nm=0.3, **at),
-        make_effect("presliding", presliding_rad=1e-3, **at),
-    )
+    dry = make_effect("coulomb_friction", torque_nm=0.3, **at)
+    bristles = make_effect("presliding", presliding_rad=1e-3, **at)
     quick = model.simulate(motion, model.gains, [dry, bristles]).reported
     exact = in_mujoco(motion, signal, model.gains, [dry, bristles]).reported
     np.testing.assert_allclose(quick, exact, atol=1e-5)
     assert np.abs(quick - model.simulate(motion, model.gains, [dry]).reported).max() > 1e-4
-    np.testing.assert_array_equal(
-        model.simulate(motion, model.gains, [bristles]).reported, model.simulate(motion, model.gains).reported
-    )
+    alone, plain = (model.simulate(motion, model.gains, some).reported for some in ([bristles], []))
+    np.testing.assert_array_equal(alone, plain)
     own = make_effect("coulomb_friction", torque_nm=0.3, presliding_rad=1e-3, **at)
     np.testing.assert_array_equal(model.simulate(motion, model.gains, [own]).reported, quick)
     np.testing.assert_array_equal(in_mujoco(motion, signal, model.gains, [own]).reported, exact)
-    for twin, said in (
-        ([bristles, dry], "left_joint5: coulomb_friction comes after"),
-        ([own, bristles], "bristles of its own"),
-    ):
+    refused = {"left_joint5: coulomb_friction comes after": [bristles, dry], "bristles of its own": [own, bristles]}
+    for said, twin in refused.items():
         with pytest.raises(TaccorlError, match=said):
             Simulation(Bench(), TwinConfig(effects=twin))
 
@@ -220,21 +208,17 @@ def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_repo
 
 
 def test_an_effect_takes_the_place_of_the_config_s_own() -> None:
-    signal = "left_joint4"
-    motion = joint_motion(chirp(signal, 2.0), TWIN, signal)
+    model, motion = from_rest("left_joint4", 2.0)
     weak, strong = (make_effect("coulomb_friction", torque_nm=f) for f in (0.1, 2.0))
-    refitted = JointModel(TwinConfig(effects=[weak]), signal).simulate(motion, JointModel(TWIN, signal).gains, [strong])
-    plain = JointModel(TWIN, signal).simulate(motion, JointModel(TWIN, signal).gains, [strong])
-    np.testing.assert_array_equal(refitted.reported, plain.reported)
+    refitted = JointModel(TwinConfig(effects=[weak]), model.signal).simulate(motion, model.gains, [strong])
+    np.testing.assert_array_equal(refitted.reported, model.simulate(motion, model.gains, [strong]).reported)
 
 
 def test_of_an_effect_of_all_joints_the_model_takes_what_acts_on_its_own() -> None:
-    signal = "left_joint6"
-    motion = joint_motion(chirp(signal, 2.0), TWIN, signal)
-    gains = JointModel(TWIN, signal).gains
-    plain = JointModel(TWIN, signal).simulate(motion, gains)
-    other = JointModel(TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0, arm="right")]), signal)
-    np.testing.assert_array_equal(other.simulate(motion, gains).reported, plain.reported)
+    model, motion = from_rest("left_joint6", 2.0)
+    on_right = TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0, arm="right")])
+    other, plain = JointModel(on_right, model.signal), model.simulate(motion, model.gains)
+    np.testing.assert_array_equal(other.simulate(motion, model.gains).reported, plain.reported)
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -258,9 +242,8 @@ def test_rows_below_150_hz_are_sent_in_straight_lines_as_in_a_replay() -> None:
     # By hand: 30 Hz are five commands a row, on the line to the next row.
     line = np.interp(np.arange(90 * 5) + 1.0, 5 * np.arange(90), slow.target)
     fine = dataclasses.replace(slow, target=line, rate_hz=150.0, coupling_nm=np.zeros(450))
-    np.testing.assert_allclose(
-        model.simulate(slow, model.gains).reported, model.simulate(fine, model.gains).reported[::5], atol=1e-12
-    )
+    of_rows, of_commands = (model.simulate(one, model.gains).reported for one in (slow, fine))
+    np.testing.assert_allclose(of_rows, of_commands[::5], atol=1e-12)
 
 
 def test_row_k_is_before_command_k_acts() -> None:
@@ -332,9 +315,8 @@ def test_commanded_gains_scale_what_the_model_is_given() -> None:
     assert (motion.kp_scale, motion.kd_scale) == pytest.approx((2.0, 1.0))
     assert motion.kp_known and motion.kd_known
     model, plain = JointModel(TWIN, signal), dataclasses.replace(motion, kp_scale=1.0)
-    np.testing.assert_array_equal(
-        model.simulate(motion, model.gains).reported, model.simulate(plain, Gains(302.2, 17.1, 1.73)).reported
-    )
+    scaled, stated = model.simulate(motion, model.gains), model.simulate(plain, Gains(302.2, 17.1, 1.73))
+    np.testing.assert_array_equal(scaled.reported, stated.reported)
 
 
 def test_a_sliding_axis_follows_its_closed_form() -> None:
@@ -399,11 +381,8 @@ def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_cons
     inertia, kd, rate, load_nm, step_s = 0.1, 2.0, 10.0, 0.7, 1e-3
     law = {"integral_action__rate_per_s": rate, "command": VELOCITY, "effort_after": 1.0, "midpoint": 1.0}
     drive = Drive(0.0, kd, 0.0, inertia, **law)
-    goal = np.full(1500, 1.0)
-    still = np.zeros_like(goal)
-    angle, effort = simulate(
-        drive, np.append(0.0, goal[1:]), still + load_nm, still, still + 1, still + 1, still, 0.0, 1, 1, step_s, 0.0
-    )
+    goal, still, ones = np.append(0.0, np.ones(1499)), np.zeros(1500), np.ones(1500)
+    angle, effort = simulate(drive, goal, still + load_nm, still, ones, ones, still, 0.0, 1, 1, step_s, 0.0)
     time_s = step_s * np.arange(-1, 1499)
     lag, wave = 0.5 * kd / inertia, np.sqrt(kd * rate / inertia - (0.5 * kd / inertia) ** 2)
     assert (lag, wave) == pytest.approx((10.0, 10.0))  # so v = 1 − e^(−10 t) (cos 10 t − sin 10 t), and its integral:
@@ -412,20 +391,30 @@ def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_cons
     assert effort[-1] == pytest.approx(load_nm, abs=1e-4)
 
 
+def test_a_lag_of_the_torque_and_an_integral_follow_their_closed_form() -> None:
+    """J q̈ = τ, T τ̇ = K_p (e + r ∫ e dt) − K_d q̇ − τ with e = q* − q, of targets that are held for a step of 1 ms."""
+    inertia, kp, kd, lag_s, rate = 0.1, 400.0, 10.0, 4e-3, 3.0
+    speeds = np.array([-kp, -kd, -1.0, kp * rate, kp]) / lag_s
+    still, ones = np.zeros(5), np.ones(2000)
+    turn = expm(1e-3 * np.array([np.eye(5)[1], np.eye(5)[2] / inertia, speeds, [-1.0, 0.0, 0.0, 0.0, 1.0], still]))
+    goals, state, exact = 0.3 * np.sin(4e-3 * np.arange(2000)), np.zeros(5), list[float]()
+    for goal in goals:
+        exact.append(state[0])
+        state = turn @ np.append(state[:4], goal)
+    late = {"torque_lag__time_constant_s": lag_s, "integral_action__rate_per_s": rate, "midpoint": 1.0}
+    more = (0.0 * ones, 0.0 * ones, ones, ones, 0.0 * ones, 0.0, 1, 1, 1e-3, 0.0)
+    assert np.abs(simulate(Drive(kp, kd, 0.0, inertia, **late), goals, *more)[0] - exact).max() < 1e-5
+
+
 def test_a_joint_starts_in_balance() -> None:
     # Rest for ever with friction, bristles, integrator, gear and encoder at once: nothing moves until the command does.
     drive = Drive(150.0, 17.0, 1.0, 0.03, 0.01, gravity_sin=2.0, gravity_cos=0.5)
-    target = np.full(400, 0.3)
+    target, sticks = np.full(400, 0.3), {"stribeck_friction__torque_nm": 4.0, "stribeck_friction__stiction_share": 0.5}
     for change in (
         {"integral_action__rate_per_s": 1.0, "joint_compliance__compliance_rad_per_nm": 0.01},
         {"integral_action__rate_per_s": 1.0, "backlash__play_rad": 0.01},
         {"coulomb_friction__torque_nm": 5.0},
-        {
-            "stribeck_friction__torque_nm": 4.0,
-            "stribeck_friction__stiction_share": 0.5,
-            "encoder_scale__factor": 1.05,
-            "encoder_eccentricity__amplitude_rad": 0.01,
-        },
+        sticks | {"encoder_scale__factor": 1.05, "encoder_eccentricity__amplitude_rad": 0.01},
     ):
         # an integral has had for ever to take the error away
         start = 0.3 if "integral_action__rate_per_s" in change else 0.29

@@ -83,8 +83,9 @@ def test_structure_that_no_effect_explains_or_one_recording_alone_shows_is_calle
         found = diagnose(MadeProblem(Ripple, Bump, Square), one, other)
         assert (found.status, found.names) == ("something_else", ())
         assert all(row.verdict for row in found.rounds[0].evidence)
-    whole = {"all": (t >= 0.0, 1.0)}
-    parts = [[dataclasses.replace(r, name="split", regimes=whole) for r in of] for of in (fit, validation)]
+    parts = [
+        [dataclasses.replace(r, name="a", regimes={"all": (t >= 0.0, 1.0)}) for r in of] for of in (fit, validation)
+    ]
     nearest = diagnose(MadeProblem(Ripple, Bump, Square), *parts).nearest
     assert sorted(name for name, _ in nearest) == ["bump", "ripple", "square"], "each once, though both parts stand out"
 
