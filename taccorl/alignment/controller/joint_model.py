@@ -194,13 +194,12 @@ class JointModel:
         received_hz = self.joint.command_hz if self.joint.command_hz < math.inf else 1.0 / step_s
         parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
         late_s = self.joint.target_late_s if self.joint.follows_line else 0.0
+        own_times = late_s > 0.0 or motion.command_s is not None
         if self.joint.follows_line:
-            if late_s > 0.0 or motion.command_s is not None:
-                parts = round(steps)
-            parts = min(parts, round(steps))
+            parts = round(steps) if own_times else min(parts, round(steps))
         while round(steps) % parts:
             parts -= 1
-        if self.joint.follows_line and (parts > 1 or received > 1):
+        if self.joint.follows_line and (own_times or received > 1):
             held = 0.0 if self.joint.target_kind == "effort" else 0.5 / received  # no drive holds what was measured
             sent = _in_time(motion, late_s, received, parts, held)
         else:

@@ -313,8 +313,9 @@ def test_rows_after_the_last_measured_one_are_not_simulated_and_change_no_other(
     assert np.array_equal(both[0], part, equal_nan=True) and np.array_equal(both[1], whole)
 
 
-def test_targets_that_were_computed_for_one_delay_are_not_used_for_another(slide: Measurements):
-    problem = AxisProblem(dataclasses.replace(AXIS, kd=4.0 * KD), slide)  # three physics steps a row
+@pytest.mark.parametrize("kd", [KD, 4.0 * KD])  # one physics step a row, and three
+def test_targets_that_were_computed_for_one_delay_are_not_used_for_another(slide: Measurements, kd: float):
+    problem = AxisProblem(dataclasses.replace(AXIS, kd=kd), slide)
     starts = [problem.start | {"target_late_s": late_s} for late_s in (2e-4, 6e-4, 2e-4)]
     first, later, again = (problem.simulate(start, [], problem.fit[0])[:, 0] for start in starts)
     assert np.array_equal(first, again)
