@@ -391,7 +391,7 @@ def _record_next(
         return "The same motions with a known load (`payload_kg`), whose part of the inertia is known.", ""
     if w.instead:
         own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)
-        words = f"A wider motion, or another pose: {own} is the same there, the torque of {_some(w.instead)} is not."
+        words = f"A wider motion, or another pose: it leaves {own} as before, but not the torque of {_some(w.instead)}."
         return words, excite_command(part, apart) if len(apart) > 1 else ""
     if kind == "nothing_missing":
         hidden = [n for n in (can_tell.invisible if can_tell is not None else ()) if n not in d.present]

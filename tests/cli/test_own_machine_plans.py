@@ -236,7 +236,9 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said,
     words = ["taccorl", "diagnose", "'my sweeps'", f"--twin={twin}", "--until=noise_floor", "--columns=c.yaml"]
     words += ["--validation_every=3", "'--joints=[elbow,shoulder]'"]
     provenance = {"twin, SHA-256": load_machine(twin).digest(), "command": " ".join(words)}
-    (tmp_path / "d" / "report.json").write_text(json.dumps({"provenance": provenance, "diagnoses": diagnoses}))
+    verdicts = {part: {"finding": f"{part} lacks {name}"} for part, (name, _) in found.items()}
+    report = {"provenance": provenance, "diagnoses": diagnoses, "verdicts": verdicts}
+    (tmp_path / "d" / "report.json").write_text(json.dumps(report))
     found_by = f"--diagnosis={tmp_path / 'd'}"
     code, text = said("add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", found_by)
     both = tmp_path / "arm+viscous_friction+coulomb_friction.yaml"

@@ -26,7 +26,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core import types
 
 from taccorl.alignment.controller import arriving as _arriving
 from taccorl.alignment.controller import drive_numbers as _drive_numbers
@@ -37,12 +36,10 @@ from taccorl.alignment.controller.lanes import (
     LANES,
     compiled,
     decayed,
+    fields_as,
     holds,
-    intrinsic,
-    lanes,
     load,
     power,
-    row_of,
     sine_and_cosine,
     store,
     where,
@@ -58,19 +55,7 @@ _LIMIT_STIFFNESS = 1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE  # 1/sÂ
 _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
 _PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
 _COMMAND, _MIDPOINT, _EFFORT_AFTER, _SENSOR_DELAY = map(Drive._fields.index, _PLACES)
-
-
-@intrinsic
-def _fields(typingctx: Any, numbers: Any) -> Any:
-    """``Drive`` of lanes, from an array (fields of ``Drive``, LANES)."""
-    whole = types.NamedUniTuple(lanes, len(Drive._fields), Drive)
-
-    def build(context: Any, builder: Any, _: Any, values: Any) -> Any:
-        places = [context.get_constant(types.int64, k) for k in range(len(whole))]
-        rows = [row_of(context, builder, numbers, (values[0], place)) for place in places]
-        return context.make_tuple(builder, whole, rows)
-
-    return whole(numbers), build
+_fields = fields_as(Drive)
 
 
 @compiled

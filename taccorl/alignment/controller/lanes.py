@@ -128,15 +128,29 @@ def _place(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
     return builder.bitcast(place, _VECTOR.as_pointer())
 
 
-def row_of(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
-    """LLVM code that loads a row of an array (R, LANES): ``values``: the array, of Numba type ``array``, and the row."""
+def _row(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
     return builder.load(_place(context, builder, array, values), align=8)
 
 
 @intrinsic
 def load(typingctx: Any, rows: Any, row: Any) -> Any:
     """Row ``row`` of an array (R, LANES)."""
-    return lanes(rows, types.int64), lambda c, b, called, values: row_of(c, b, called.args[0], values)
+    return lanes(rows, types.int64), lambda c, b, called, values: _row(c, b, called.args[0], values)
+
+
+def fields_as(kind: Any) -> Callable[..., Any]:
+    """Function that makes of an array (fields, LANES) the named tuple ``kind`` of lanes."""
+    whole = types.NamedUniTuple(lanes, len(kind._fields), kind)
+
+    def fields(typingctx: Any, numbers: Any) -> Any:
+        def build(context: Any, builder: Any, _: Any, values: Any) -> Any:
+            places = [context.get_constant(types.int64, k) for k in range(len(whole))]
+            rows = [_row(context, builder, numbers, (values[0], place)) for place in places]
+            return context.make_tuple(builder, whole, rows)
+
+        return whole(numbers), build
+
+    return intrinsic(fields)
 
 
 @intrinsic

@@ -260,8 +260,11 @@ class Robot:
             names = [f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"]
             content["joints"][name] = _set(joint, names)
             if joint.effects:
+                # Of a payload also the place that is the default, which is one of the PiPER.
+                placed = [{"z_m": e.z_m} if isinstance(e, Payload) else {} for e in joint.effects]
+                entries = [effect_entry(e) | more for e, more in zip(joint.effects, placed, strict=True)]
                 content["joints"][name]["effects"] = [
-                    {k: v for k, v in effect_entry(e).items() if k not in ("arm", "joints")} for e in joint.effects
+                    {k: v for k, v in entry.items() if k not in ("arm", "joints")} for entry in entries
                 ]
         return _HEADER + yaml.safe_dump(
             content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
@@ -291,11 +294,11 @@ def load_robot(path: Path) -> Robot:
     if not config.joints:
         raise document.error("joints", f"the file names no joint; the model has {', '.join(rigid.joints)}")
     robot = Robot(config, rigid, path)
-    document.refuse(_rules(robot))
+    document.refuse(_rules(robot, document))
     return robot
 
 
-def _rules(robot: Robot) -> Rules:
+def _rules(robot: Robot, document: EffectsDocument) -> Rules:
     config, rigid = robot.config, robot.rigid
     bodies = {rigid.model.body(k).name: k for k in range(1, rigid.model.nbody)}
     for joint, drive in config.joints.items():
@@ -313,6 +316,9 @@ def _rules(robot: Robot) -> Rules:
             yield not drive.allows_effect(name), key, no_loop
             rotor = f"{name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of {joint}"
             yield name in NEED_ROTOR and drive.armature == 0.0, key, rotor
+            unplaced = name == "payload" and not document.has(f"{key}/z_m")
+            way_out = "payload: write z_m [m], along z of its body, from that body's centre of mass (x_m, y_m: else 0)"
+            yield unplaced, key, way_out
             link = getattr(effect, "link", "")
             is_moved = not link or (link in bodies and robot.moves_body(joint, bodies[link]))
             yield not is_moved, key, f"link: {joint} moves no body {link!r}; {nearest(link, bodies)}"

@@ -192,7 +192,7 @@ def _beyond_limits(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
     row = int(rows[np.argmax(beyond[rows])])
     text = (
         f"{axis.name} is at {q[row]:.4g} {axis.unit} at {m.time_s[row]:.3f} s, its limits are [{low:g}, {high:g}]; if the column "
-        f"is in another unit or offset, write its `unit:` and `factor:` in a columns file, else write "
+        f"is in another unit or offset, write its `unit:` (deg, mm …) and `factor:` in a columns file, else write "
         f"`limits: [{min(low, float(np.nanmin(q))):.4g}, {max(high, float(np.nanmax(q))):.4g}]`"
     )
     return [DataFinding("beyond_limits", "error", axis.name, text, (row, row + 1))]

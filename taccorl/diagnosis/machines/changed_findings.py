@@ -66,11 +66,17 @@ def placed(
     explains: ``stands_for``, joint → effects that alone explain as much there; and ``ties``, bodies where it does as well."""
     d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
     effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
+    known = cast(JointFinding, f).known
+    for old in [n for n in known.identifiable if n.name in ends]:
+        now = dataclasses.replace(old, low=ends[old.name][0], high=ends[old.name][1])
+        effects_ = [dataclasses.replace(e, evidence=e.evidence.replace(old.words(), now.words())) for e in effects_]
+        numbers = [tuple(now if n.name == now.name else n for n in of) for of in (known.identifiable, known.absolute)]
+        known = dataclasses.replace(known, identifiable=numbers[0], absolute=numbers[1])
     others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
-    known = [name for name in own if name in PAYLOAD_AT]
+    places = [name for name in own if name in PAYLOAD_AT]
     text = (
-        f"payload: its mass, {' and '.join(known)} are fitted to all joints that feel it and lack little besides"
-        if known
+        f"payload: its mass, {' and '.join(places)} are fitted to all joints that feel it and lack little besides"
+        if places
         else "payload: its mass is fitted to all joints that feel it; its place is the centre of mass of its body"
     )
     if TORQUE_FF.name not in d.base:
@@ -80,7 +86,7 @@ def placed(
     of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())
     number = ("", 1.0) if of_mass else d.or_number
     d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_number=number)
-    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
+    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d, known=known), text)
 
 
 def left_of(finding: Finding) -> float:

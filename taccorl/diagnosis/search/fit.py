@@ -129,13 +129,12 @@ class Fit:
 
     @property
     def at_an_end(self) -> tuple[Free, ...]:
-        """Numbers at an end of their range, without those that begin there and hardly moved."""
+        """Numbers at an end of their range, without those that begin at that end."""
 
-        def moved(f: Free) -> float:
-            return abs(f.coordinate(self.values[f.name]) - f.coordinate(f.start))
+        def end(f: Free) -> float:
+            return min((f.low, f.high), key=lambda end: abs(f.coordinate(self.values[f.name]) - f.coordinate(end)))
 
-        at = [f for f in self.frees if f.name in self.at_bound]
-        return tuple(f for f in at if f.start not in (f.low, f.high) or moved(f) >= 0.01)
+        return tuple(f for f in self.frees if f.name in self.at_bound and f.start != end(f))
 
     @property
     def fled(self) -> tuple[Free, ...]:

@@ -112,6 +112,11 @@ def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_jo
     twice = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, {held}}}").replace("100.0}", f"100.0, {held}}}")
     with pytest.raises(SpecError, match=r"elbow.*payload.*shoulder.*lower"):
         robot(tmp_path, twice)
+    with pytest.raises(SpecError, match=r"elbow → effects → 0: payload: write z_m"):
+        robot(
+            tmp_path,
+            compensated.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}").replace(", z_m: 0.0", ""),
+        )
     lighter = f"effort_limit: 100.0, {held.replace(f'{mass_kg}', '-0.96')}}}"
     too_light = compensated.replace("effort_limit: 100.0}", lighter)
     with pytest.raises(SpecError, match=r"elbow.*-0\.96 kg, and body lower.*-0\.95 kg or more"):  # of its 1 kg

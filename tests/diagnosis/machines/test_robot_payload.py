@@ -247,6 +247,8 @@ def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
         assert low <= value <= high and low <= getattr(payload, name) <= high, name
     low, high = payload.interval["mass_kg"]
     assert high - low < 0.03
+    (stated,) = [n for f in found if f.part == owner for n in f.known.identifiable if n.name == "payload.mass_kg"]
+    assert (stated.low, stated.high) == (low, high) and stated.words() in payload.evidence, "one interval everywhere"
 
     made = teaching(TEACH_MODEL.format(tip=""), (0.7, 1.0, 1.0))
     weak = diagnose_parts(robot, TEACH_JOINTS, made, search=one, without=without)

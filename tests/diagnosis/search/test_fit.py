@@ -235,3 +235,12 @@ def test_strengths_that_cannot_change_sign_are_searched_on_a_logarithmic_scale()
     assert both.value(both.coordinate(-2.5)) == pytest.approx(-2.5)
     assert one.value(one.coordinate(1e9)) == pytest.approx(one.high)
     assert one.value(9e9) == one.high
+
+
+@pytest.mark.parametrize(("start", "told"), [(0.0, ()), (1.0, ("size",))])
+def test_a_number_that_ends_where_its_range_begins_is_no_warning_if_it_began_there(start, told):
+    size = Free(name="size", unit="m", start=start, low=0.0, high=1.0, scale=1e-5)
+    ended = dataclasses.replace(
+        fit(Offset(), [record(0, gain=0.0)], (), {}), frees=(size,), values={"size": 1e-6}, at_bound=("size",)
+    )
+    assert tuple(f.name for f in ended.at_an_end) == told
