@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_310,
+    "taccorl/alignment": 14_316,
     "taccorl/cli": 4_881,
     "taccorl/data": 8_741,
     "taccorl/diagnosis": 11_438,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 55_596,
+    "tests": 55_598,
     "pipelines": 6_281,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -150,9 +150,15 @@ def check_motion(t: Trial) -> Iterator[Finding]:
     m = t.m
     if not t.moves.any():
         few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
+        way_out = ""
+        for name, own, target in zip(m.signals, m.measured.T, m.target.T, strict=True):
+            known = own[np.isfinite(own)]
+            went = np.ptp(known) if len(known) else 0.0
+            if went > least_motion(m, name) and went > 10.0 * np.ptp(target) > 0.0:
+                way_out = f"{name} moves further: are its targets in another unit (`unit:` of a columns file)? Else "
         text = (
             f"no command moves ({', '.join(f'{n} by less than {least_motion(m, n):.2g} {u}' for n, u in few)}{more}) in "
-            f"{m.time_s[-1]:.1f} s: record a sweep"
+            f"{m.time_s[-1]:.1f} s: {way_out}record a sweep"
         )
         yield find("no_motion", "", text)
         return

@@ -731,7 +731,9 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
 
 def test_a_sweep_that_never_moves_the_joint():
     m = sweep(0, joints=[4])
-    assert "record a sweep" in text_of(dataclasses.replace(m, target=np.tile(HOME, (m.num_rows, 1))), "no_motion")
+    assert "s: record a sweep" in text_of(dataclasses.replace(m, target=np.tile(HOME, (m.num_rows, 1))), "no_motion")
+    in_degrees = dataclasses.replace(m, target=HOME + np.deg2rad(m.target - HOME))
+    assert "joint5 moves further: are its targets in another unit" in text_of(in_degrees, "no_motion")
 
 
 def test_too_short(clean):
