@@ -6,8 +6,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_316,
-    "taccorl/cli": 4_881,
+    "taccorl/alignment": 14_319,
+    "taccorl/cli": 4_882,
     "taccorl/data": 8_741,
     "taccorl/diagnosis": 11_438,
     "taccorl/episodes": 4_172,
@@ -19,7 +19,7 @@ MOST_LINES = {
     "taccorl/rl": 2_472,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
-    "taccorl/sim": 9_259,
+    "taccorl/sim": 9_261,
     "taccorl/surrogate": 3_303,
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,

@@ -158,7 +158,8 @@ def _found(diagnosis: dict[str, Any]) -> list[str]:
 
 
 def _off(diagnosis: dict[str, Any]) -> list[str]:
-    """Numbers, of no effect, that a diagnosis of one part says are off in the file; not a scale of efforts, which no file has."""
+    """The file's own numbers, such as kd, that a diagnosis of one part says are off; no numbers of effects, and no scale of
+    efforts, which no file has."""
     from taccorl.diagnosis.search.problem import EFFORT_SCALE
 
     return [c["name"] for c in diagnosis.get("changed", ()) if "." not in c["name"] and c["name"] != EFFORT_SCALE]

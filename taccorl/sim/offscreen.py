@@ -162,8 +162,8 @@ class _Sheet:
         gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, mjr.offFBO)
 
     def read(self, count: int, mjr: mujoco.MjrContext) -> list[np.ndarray]:
-        """The first ``count`` cells, upright, in arrays (cells, rows, columns, 3): one for each row of the sheet. The next call
-        writes over them."""
+        """The pictures in the first ``count`` cells, upright: for each row of the sheet an array (cells, rows, columns, 3). They
+        are views of a buffer that the next call overwrites."""
         gl, (rows, columns), across = self._gl, self._cell, min(count, self._across)
         shape = (-(-count // across) * rows, across * columns, 3)
         pixels = self._pixels.reshape(-1)[: np.prod(shape)].reshape(shape)

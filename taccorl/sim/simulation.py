@@ -53,7 +53,7 @@ class Snapshot:
 
     @classmethod
     def joined(cls, parts: Sequence["Snapshot"]) -> "Snapshot":
-        """One snapshot of the rows of all ``parts``, in their order."""
+        """One snapshot that has the simulations of all ``parts``, one part after the other."""
 
         def join(values: list[Any]) -> Any:
             if isinstance(values[0], dict):

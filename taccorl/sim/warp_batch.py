@@ -43,7 +43,7 @@ class WarpSettings:
     """Contacts, and pairs of geoms close to each other, for which each world has room; worlds share the sum. The experts of the
     four tasks need up to 23."""
     constraints: int = 576
-    """Rows of the constraint solver for which each world has room. The experts need up to 94, a policy of the puzzle 283."""
+    """Rows of the constraint solver for which each world has room. Experts need up to 94, a learnt policy of the puzzle 283."""
 
     @classmethod
     def parse(cls, physics: str) -> "WarpSettings | None":

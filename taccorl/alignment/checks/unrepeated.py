@@ -88,7 +88,7 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
                 own.append(Pair(a.name, b.name, laid.time_s, later[:, a.column(signal)]))
         if moved and not any(np.isfinite(pair.difference).any() for own in differences.values() for pair in own):
             held = "; until then models of torque targets are held near the measured position" * group[0].held
-            why = "no recording without errors repeats another (repeat_of). Record one motion twice"
+            why = "of the recordings without errors none repeats another (repeat_of). Record one motion twice"
             yield name, not_judged("", what, why + held)
         for signal, own in differences.items():
             dropped = find_dropped(group, group[0].column(signal))

@@ -298,7 +298,8 @@ def _simulated(
     of_speed = none + 1.0 if kind == VELOCITY else p.kd / where(p.kp > 0.0, p.kp, 1.0)
     slow_went, late_went = speeds * of_speed * turned * slow_s, speeds * of_speed * (lost - 0.5 * p.speed_age)
     way = (0.0 if kind == VELOCITY else 1.0) * p.encoder_scale__factor
-    # Shares of a step: of what comes to the integral that is taken ahead, and of the way that what has come lacks.
+    # Of what is new in the integral, the share that is added before a step is solved; and the factor of the angle that the step
+    # moves, which is subtracted afterwards.
     along = where(speeds > 0.0, ahead * speeds, 0.5 * p.midpoint)
     went = where(speeds > 0.0, 1.0 if kind == VELOCITY else way * (of_speed + 0.5 * h), 0.5 * p.midpoint * way * h)
     of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
@@ -390,7 +391,7 @@ def _simulated(
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
         taken = strength * (by_controller * lost + stiffness * stiff_lost)
-        # Steps of second order ask whether the torque of their middle is within its limit.
+        # With steps of second order it is the torque in the middle of the step that is compared with its limit.
         ruled = drawn + taken * acceleration - 0.5 * h * p.midpoint * gain * (damping * acceleration + stiffness * v)
         limited = _limited(p, ruled, v)
         cut = limited != ruled

@@ -139,7 +139,7 @@ def load(typingctx: Any, rows: Any, row: Any) -> Any:
 
 
 def fields_as(kind: Any) -> Callable[..., Any]:
-    """Function that makes of an array (fields, LANES) the named tuple ``kind`` of lanes."""
+    """Compiled function that turns an array (fields, LANES) into a named tuple of the class ``kind``, lanes in each field."""
     whole = types.NamedUniTuple(lanes, len(kind._fields), kind)
 
     def fields(typingctx: Any, numbers: Any) -> Any:

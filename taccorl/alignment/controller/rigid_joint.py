@@ -43,7 +43,7 @@ class Rigid(NamedTuple):
 
 
 class PointMass(NamedTuple):
-    """An additional mass, rigidly fixed to a body, that gravity compensation leaves out. A point if ``spread_m2`` is 0."""
+    """A mass fixed to a body, of which the controller's gravity compensation knows nothing. ``spread_m2`` 0: a point."""
 
     mass_kg: float
     body: int  # Id of the body

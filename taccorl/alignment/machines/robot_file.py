@@ -260,7 +260,7 @@ class Robot:
             names = [f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"]
             content["joints"][name] = _set(joint, names)
             if joint.effects:
-                # Of a payload also the place that is the default, which is one of the PiPER.
+                # z_m of a payload is always written: its default is a place in the PiPER's hand, and robot files must state one.
                 placed = [{"z_m": e.z_m} if isinstance(e, Payload) else {} for e in joint.effects]
                 entries = [effect_entry(e) | more for e, more in zip(joint.effects, placed, strict=True)]
                 content["joints"][name]["effects"] = [

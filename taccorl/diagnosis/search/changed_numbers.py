@@ -133,7 +133,7 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
 
 
 def _refitted(fits: Fits, model: Fit, problem: Problem) -> Model:
-    """The hypothesis of ``model`` fitted to the same recordings as ``problem`` has it."""
+    """The effects of ``model`` refitted to the same recordings with the free and held numbers of another ``problem``."""
     found = best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
     return model_of(problem, found, fits.validation)
 

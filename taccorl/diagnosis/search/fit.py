@@ -129,7 +129,7 @@ class Fit:
 
     @property
     def at_an_end(self) -> tuple[Free, ...]:
-        """Numbers at an end of their range, without those that begin at that end."""
+        """Fitted numbers that ended at a limit of their range, except those whose start value was that same limit."""
 
         def end(f: Free) -> float:
             return min((f.low, f.high), key=lambda end: abs(f.coordinate(self.values[f.name]) - f.coordinate(end)))

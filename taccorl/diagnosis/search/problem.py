@@ -45,7 +45,7 @@ class Free:
     """True: the number may be absent while its effect is there (``Effect.optional``). It is fitted from starts above 0 only, and
     otherwise stays at 0."""
     unless: str = ""
-    """Effect that states the same or takes it up: where it is fitted, the number stays at ``start``."""
+    """Effect that describes the same, or that balances any value of this number: beside it the number is held at ``start``."""
 
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /

@@ -162,7 +162,8 @@ class Effect:
     """Names of effects that give the same positions in every motion if a constant torque (``torque_ff``) is fitted, too: only
     the motor's effort tells them apart."""
     optional: ClassVar[dict[str, str]] = {}
-    """Parameter that may be absent → effect that states the same, or "". Fitted only where clearly better, not beside it."""
+    """Parameter that a fit may leave out → effect of the same meaning, beside which it is left out, or "". Else it is fitted
+    where that is clearly better."""
     fitted: ClassVar[bool] = True
     """Whether a search may fit the effect. False for effects that differ between recordings of the same motion: least squares
     cannot fit them, so that they are not candidates, and a twin keeps its own unchanged."""

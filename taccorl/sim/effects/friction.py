@@ -181,7 +181,8 @@ class PowerLawFriction(_LiveFriction):
 
     @property
     def reads_as(self) -> str:
-        return f"dry friction that the speed hardly changes, asymmetric by {self.asymmetry:.2g}" * (self.exponent < 0.1)
+        sides = f", asymmetric by {self.asymmetry:.2g}" if self.asymmetry else ""
+        return f"dry friction that the speed hardly changes{sides}" if self.exponent < 0.1 else ""
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         speed = live.of_joints("qvel", self.acts_on())

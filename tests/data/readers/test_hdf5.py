@@ -269,7 +269,7 @@ def test_values_of_another_kind_are_refused_when_asked_for(tmp_path: Path) -> No
 
 
 def write_demos(path: Path, names: list[str], rows: list[int], **attributes: Any) -> Path:
-    """Write an HDF5 file with a group for each episode (``names``) of ``rows`` samples of a small arm; return its path."""
+    """Write an HDF5 file of a small arm: for each of ``names`` a group, an episode of as many samples as ``rows`` says."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         for k, (name, count) in enumerate(zip(names, rows, strict=True)):

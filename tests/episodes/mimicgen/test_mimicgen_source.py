@@ -105,7 +105,7 @@ def test_contact_begins_before_what_is_held_touches_its_mate():
 
 
 def moved(source: Source, *, mm: float = 0.0, deg: float = 0.0) -> Source:
-    """A copy of the demonstration in which the plug is displaced by ``mm`` along its x axis and rotated by ``deg`` about it."""
+    """A copy of the demonstration, its plug moved by ``mm`` [mm] along its x axis and turned by ``deg`` [°] about it."""
     pose, angle = np.eye(4), np.radians(deg)
     pose[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     pose[0, 3] = mm / 1e3

@@ -40,7 +40,7 @@ class ExpertContact:
     again. Its aiming error and tremor are drawn from the attempt's generator; the caller corrects the steady-state offset."""
 
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
-        """After a reset."""
+        """``sim``: one whose episode has just been reset. ``rng``: generator of the attempt."""
         self._expert = expert_of(sim.task)(sim, rng)
         self._expert.stand_by()
 

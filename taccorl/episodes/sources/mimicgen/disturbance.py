@@ -80,7 +80,7 @@ class Exact:
     touch is remembered."""
 
     def __init__(self, sim: Simulation) -> None:
-        """After a reset."""
+        """``sim``: one whose episode has just been reset."""
         self._sim, self._touching = sim, Touching(sim)
         self._have_met = np.zeros(len(sim.task.mating), bool)
 
