@@ -150,12 +150,14 @@ def share(rows: Rows) -> str:
 def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
-    mixed = _grouped([{"stage": "", **r} for r in rows if "real" in r], "scored_in", "real", "sim_weight", "stage")
+    mixed = _grouped(
+        [{"stage": "", "beta": 1} | r for r in rows if "real" in r], "scored_in", "real", "sim_weight", "stage", "beta"
+    )
     plain = [row for row in seen if PLAIN.items() <= row.items() and not {"sources", "corrected"} & row.keys()]
     own = _grouped(plain, "task", "sensors")
     harder = [row for row in seen if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])]
     cells = _grouped(harder, "task", "pictures", "demonstrations", "difficulty", "executed", "sensors")
-    table_1, table_2, table_3, table_4, table_5, table_6 = [], [], [], [], [], []
+    table_1, table_2, table_3, table_4, table_5, table_6, table_7 = [], [], [], [], [], [], []
     for k, task in enumerate(TASKS):
         for sensors, text in SENSORS.items():
             paper = "; ".join(f"{stage[k]} %" for stage in PAPER[sensors].values())
@@ -176,11 +178,13 @@ def page(rows: Rows) -> str:
             table_4.append((robot, text, share(of["nominal"]), share(of["mended"]), gain(of)))
     for robot, real in sorted({key[:2] for key in mixed}):
         name = robot.rpartition("_")[0]
-        weights = [mixed[robot, real, *cell] for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))]
+        weights = [mixed[robot, real, *cell, 1] for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))]
         n = max(row["demonstrations"] for row in itertools.chain(*weights))
         alone = transfer(seen).get((name, n), {})
         shares = [*weights, alone.get("nominal", []), alone.get("mended", [])]
         table_6.append((f"{name}: {real}, {n}", *map(share, shares)))
+        betas = (("start", 1), ("ppo", 0), *(([*STAGES][-1], beta) for beta in (0.1, 1, 5)))
+        table_7.append((name, *(share(mixed[robot, real, 0.95, *cell]) for cell in betas)))
     return f"""# The paper's tables, by simulation
 
 Written by `python -m pipelines.paper_tables` of `docs/results.jsonl` (commit, seed, scenes). **Simulated**: a small π0.5 from
@@ -226,8 +230,13 @@ The paper, of a robot: {PAPER_REAL}.
 
 {_table("surrogate: its, the twin's | α = 0 | 0.5 | 0.95 | … after PPO, anchored | 1: nominal twin | mended twin", table_6)}
 
-**Not run**: PPO after other policies, with exploration noise and from base; β; Table 2 in other surrogates and after PPO;
-other cells that say so.
+### β: weight of the anchor on the surrogate's demonstrations
+
+A co-trained policy (α = 0.95), post-trained in the nominal twin, all for the same time, scored in the surrogate.
+
+{_table("surrogate | before PPO | β = 0 | 0.1 | 1 | 5", table_7)}
+
+**Not run**: PPO after other policies, with exploration noise and from base; Table 2 in other surrogates; other cells that say so.
 """
 
 

@@ -14,7 +14,7 @@ fi
 if [ -e /dev/shm/warp_env.sh ]; then . /dev/shm/warp_env.sh; else . /dev/shm/env.sh; fi
 export OMP_NUM_THREADS=4
 tasks=(${TASKS:-assembly_1}) policies=${POLICIES:-/dev/shm/policies} out=${RESULTS:-/dev/shm/learn_physics}
-end=$1 half=$(($(env -u OMP_NUM_THREADS nproc) / 2)) parts=${*:2}
+end=$1 half=${HALF:-$(($(env -u OMP_NUM_THREADS nproc) / 2))} parts=${*:2}
 parts=${parts:-adapters bench scores ppo}
 mkdir -p $out
 now() { echo $(($(date +%s) - $(cat /dev/shm/t0))); }

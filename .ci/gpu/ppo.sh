@@ -4,8 +4,8 @@
 # setsid bash .ci/gpu/ppo.sh SURROGATE SECOND > /dev/shm/job.log 2>&1 < /dev/null &
 # PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
 # clock; then start and result are scored in the surrogate. `TASK=assembly_2 bash .ci/gpu/ppo.sh nominal SECOND`: of $POLICIES/nominal,
-# in the nominal twin alone. RUNS="nominal_1000 ppo_anchored,nominal_2000 ppo_anchored": other policies of $POLICIES, whose names begin
-# with that of their twin.
+# in the nominal twin alone. RUNS="nominal_1000 ppo_anchored,nominal_2000 ppo_anchored 5": other policies of $POLICIES, whose names begin
+# with that of their twin, 5: weight of the anchor. FIRST, THREADS, DONE: first core, number of cores, file of the end, beside another such job.
 if [ "$1" = pack ]; then
   mkdir -p outputs/ppo_{1,2,3}
   ln -sfn "$(realpath "$2")" outputs/ppo_1/nominal && ln -sfn "$(realpath "$3")" outputs/ppo_1/mended
@@ -23,9 +23,9 @@ else
   scored_in=(--twin="$robot") runs=("nominal ppo" "nominal ppo_anchored" "mended ppo" "mended ppo_anchored")
 fi
 if [ -n "${RUNS:-}" ]; then IFS=, read -ra runs <<<"$RUNS"; fi
-threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
+threads=${THREADS:-$(env -u OMP_NUM_THREADS nproc)} gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
 scored=${SCORED:-192} demonstrations=${DEMONSTRATIONS:-50} options=(${OPTIONS:-})
-quarter=$((threads / gpus))
+each=$((threads / (${#runs[@]} > gpus ? ${#runs[@]} : gpus)))
 since() { echo "$1 $(($(date +%s) - $(cat /dev/shm/t0)))" >>/dev/shm/times; }
 since start
 if [ -e /dev/shm/ppo ]; then mkdir -p "$policies" && cat /dev/shm/ppo/* | python3 -c "import sys, tarfile, zstandard
@@ -38,40 +38,42 @@ demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), '$task', Path('$robot
     --scored_in=["$robot"] --out=/dev/shm/anchor --workers="$threads" >/dev/shm/made_anchor.log 2>&1
   since "anchor made: $?"
 fi
-improve() { # NUMBER TWIN STAGE
-  out=/dev/shm/learn_ppo/$task/policy_$2_$3 twin=() first=$(($1 % gpus * quarter))
-  local cores=$first-$((first + quarter - 1))
+improve() { # NUMBER TWIN STAGE [BETA]
+  local beta=${4:-1} first=$((${FIRST:-0} + $1 * each))
+  local cores=$first-$((first + each - 1))
+  out=/dev/shm/learn_ppo/$task/policy_$2_$3${4:+_$4} twin=()
   if [[ "$2" = mended* ]]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
   if [ "$3" = ppo_anchored ]; then
-    anchor=(--anchor.dataset="$(echo /dev/shm/anchor/$task/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store)
+    anchor=(--anchor.dataset="$(echo /dev/shm/anchor/$task/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store --anchor.weight="$beta")
   else
-    anchor=(--anchor.weight=0)
+    beta=0 anchor=(--anchor.weight=0)
   fi
   export CUDA_VISIBLE_DEVICES=$(($1 % gpus))
   mkdir -p "$(dirname "$out")"
   taskset -c "$cores" timeout -s TERM $((end - $(date +%s) + $(cat /dev/shm/t0))) python3 -m taccorl.cli.main post-train \
-    --config_path=configs/post_train/small.yaml --policy.path="$policies/$2" --env.task="$task" --env.shards="$quarter" \
+    --config_path=configs/post_train/small.yaml --policy.path="$policies/$2" --env.task="$task" --env.shards="$each" \
     --save_freq=5 --keep_checkpoints=1 --rerun=false "${twin[@]}" "${anchor[@]}" "${options[@]}" --out="$out" >"$out.log" 2>&1
-  since "$2 $3 ended: $?"
+  since "$2 $3 ${4:-} ended: $?"
   for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
     stage=$([ "$scored_of" = "$policies/$2" ] && echo start || echo "$3")
     score=$out/score_${scored}_train_8_clear_nothing_$stage
     if [ "$3" = ppo ] || [ "$scored_of" != "$policies/$2" ]; then
       OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task="$task" \
-        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=$(((quarter + 1) / 2)) --failures=0 \
+        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=$(((each + 1) / 2)) --failures=0 \
         --out="$score" >"$score.log" 2>&1
-      since "$2 $3 scored: $?"
-      python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" <<'P'
+      since "$2 $3 ${4:-} scored: $?"
+      python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" "$beta" <<'P'
 import json, re, sys
 from pathlib import Path
 
 from pipelines.learn import named
 
-learnt, robot, score, stage = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
+learnt, robot, score, stage, beta = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
 name = Path(learnt["dataset"]["root"]).name
 of, twin, real = re.fullmatch(r"train_(\d+)_20_steps(?:_(?!and_)(.*?))?(?:_and_train_(\d+)_20_steps_.*)?", name).groups()
 about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin or "", "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
 about |= {"real": int(real), "sim_weight": learnt["policy"]["sim_weight"]} if real else {}
+about |= {} if stage == "start" else {"beta": float(beta)}
 (Path(score) / "settings.json").write_text(json.dumps(about | {"stage": stage}))
 P
     fi
@@ -81,4 +83,4 @@ for k in "${!runs[@]}"; do
   improve "$k" ${runs[k]} &
 done
 wait
-if [ -n "$robot" ]; then touch /dev/shm/done; fi # the nominal one runs beside learn.sh
+if [ -n "$robot" ]; then touch "${DONE:-/dev/shm/done}"; fi # the nominal one runs beside learn.sh
