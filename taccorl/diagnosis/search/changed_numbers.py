@@ -46,14 +46,16 @@ OF_LOOP = ("loop_s", "speed_delay_s")
 """Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 
 
-def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Changed, ...]:
+def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[tuple[Changed, ...], Fit]:
     """Numbers of the file whose refit explains a part of the error of the twin as it was: before an effect was added, unless the
     added ones bring them back into their 95 % intervals or near the file's value; and beside the added ones. ``names``: effects
-    that may be missing."""
+    that may be missing. Also ``model``; where a part of a group is off, refitted with the file's values of all that may stay."""
     found: dict[str, Changed] = {}
+    before = _off(fits, fits.first)[0] if fits.added(model) else []
+    beside, model = _off(fits, model)
     intervals = model.intervals()
-    for fit in (fits.first, model) if fits.added(model) else (model,):
-        for frees, without in _off(fits, fit):
+    for fit, off in ((fits.first, before), (model, beside)):
+        for frees, without in off:
             ends = {f.name: intervals.get(f.name, 2 * (model.values.get(f.name, f.start),)) for f in frees}
             moved = [f for f in frees if not ends[f.name][0] <= fits.given[f.name] <= ends[f.name][1]]
             change = {f.name: abs(model.values[f.name] - fits.given[f.name]) for f in moved}
@@ -73,15 +75,16 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
                     name=name, before=before, after=after, unit=unit, without=without, alone=alone, instead=instead
                 )
                 found.setdefault(name, own)
-    return tuple(found.values())
+    return tuple(found.values()), model
 
 
-def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:
-    """Groups of numbers whose change in ``model`` meets the criteria, each with the validation error [floors] without it."""
+def _off(fits: Fits, model: Fit) -> tuple[list[tuple[list[Free], float]], Fit]:
+    """Groups of numbers whose change in ``model`` meets the criteria, each with the validation error [floors] without it; and, if
+    a number of such a group can return alone, the fit without all that can, else ``model``."""
     as_it_was, smaller = fits.model_of(fits.as_it_was), fits.model_of(model)
     groups, config = _groups(fits, model), fits.config
     if not groups or as_it_was.error <= config.floor or refusal(smaller, as_it_was, config):
-        return []
+        return [], model
     fits.progress("which numbers of the file are off")
     kept, found = dict[str, float](), []
     for frees in groups:
@@ -91,7 +94,14 @@ def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:
             kept, smaller = kept | stated, trial
         else:
             found.append((frees, trial.error))
-    return found
+    answer = model
+    for frees, _ in found:
+        for f in [*frees] if len(frees) > 1 and frees[0].name in STATED else []:
+            trial = _refitted(fits, model, with_held(fits.problem, kept | {f.name: fits.given[f.name]}))
+            if refusal(smaller, trial, config):
+                kept[f.name], smaller, answer = fits.given[f.name], trial, trial.fit
+                frees.remove(f)
+    return found, answer
 
 
 def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
@@ -119,7 +129,8 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
 def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]) -> tuple[str, ...]:
     """Effects of which each, with ``frees`` as the file has them, explains as much as ``model``, where none was added; instead of
     an inertia ``EFFORT_SCALE`` alone, if it does."""
-    problem, answer = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees}), fits.model_of(model)
+    own, answer = {f.name for f in model.frees} - {f.name for f in frees}, fits.model_of(model)
+    problem = with_held(fits.problem, {f.name: fits.given[f.name] for f in fits.problem.base if f.name not in own})
     if frees[0].name == "inertia" and (scaled := with_scale(problem)) is not None:
         problem = scaled
         if refusal(answer, _refitted(fits, model, problem), fits.config):

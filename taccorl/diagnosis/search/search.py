@@ -101,13 +101,13 @@ def diagnose(
     steps = beam.steps(answer)
     rivals = beam.rivals(answer, steps)
     rounds = beam.rounds(answer, steps, rivals)
-    model, first = answer.fit, fits.first
+    first = fits.first
+    changed, model = changed_numbers(fits, answer.fit, beam.names)
     stages = {"before": fits.as_it_was, "fitted": first, "after": model}
     errors = {stage: fits.errors(one.values, one.effects, test) for stage, one in stages.items()}
     without_it = {
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
     }
-    changed = changed_numbers(fits, model, beam.names)
     if fits.problem is problem:  # the scale was fitted anyway, beside gains that are stated
         changed = tuple(c for c in changed if c.name != EFFORT_SCALE or abs(np.log(c.after)) > np.log(SCALE_OFF))
     tied = other is not None and fits.added(answer) and refusal(answer, other.base, fits.config)
