@@ -16,6 +16,7 @@ from mujoco.batch import MODEL_FIELDS, Batch
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.extras import OnUse, require
+from taccorl.sim.rendering import TABLE
 
 mjw: Any = OnUse("mujoco_warp")
 wp: Any = OnUse("warp")
@@ -94,9 +95,14 @@ def check_supported(model: mujoco.MjModel) -> None:
 
 def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
     """``model`` without the flag that MuJoCo Warp does not know (it never resets a diverged world by itself), and with the one by
-    which its boxes collide as in MuJoCo C (``mjc_BoxBox``); without it their normals are those of another algorithm."""
+    which its boxes collide as in MuJoCo C (``mjc_BoxBox``); without it their normals are those of another algorithm. The table is
+    a plane, without edges: of a cylinder 1 … 10 µm deep in so large a box MuJoCo Warp 4.0.0 finds no contact in 7 % of 20 000
+    poses, and in 6 of them one 0.9 m deep, which throws the part off."""
     model, flags = copy.copy(model), mujoco.mjtDisableBit
     model.opt.disableflags = model.opt.disableflags & ~int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_NATIVECCD)
+    if (table := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, TABLE)) >= 0:
+        model.geom_pos[table, 2] += model.geom_size[table, 2]
+        model.geom_type[table], model.geom_rbound[table] = mujoco.mjtGeom.mjGEOM_PLANE, 0.0
     return model
 
 
@@ -386,6 +392,9 @@ class _Worlds:
         # ``forward`` sets no flag for the first two buffers.
         few = {"constraints": found & int(kinds.NEFC | kinds.NJMAX_NNZ)}
         few["contacts"] = found & ~few["constraints"]
+        if found & kinds.EPA_HORIZON:
+            self._data.overflow.zero_()
+            return f"physics=warp: the contact of two convex shapes is not found, and no setting helps; {_WAY_OUT}"
         for name, flag in few.items():
             have = getattr(self._settings, name)
             if flag or needed[name] > have:
