@@ -19,13 +19,13 @@ MOST_LINES = {
     "taccorl/rl": 2_472,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
-    "taccorl/sim": 9_261,
+    "taccorl/sim": 9_270,
     "taccorl/surrogate": 3_303,
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_548,
-    "tests": 55_630,
-    "pipelines": 6_290,
+    "tests": 55_649,
+    "pipelines": 6_291,
 }
 MOST_LINES_OF_A_FILE = 500
 
