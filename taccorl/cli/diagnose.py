@@ -127,11 +127,13 @@ def _report(
 ) -> "Report":
     """With the comparisons that show what refitted numbers removed, and what effects did."""
     from taccorl.report.report import Report
+    from taccorl.report.verdict import added
 
+    some = any(added(f.diagnosis) for f in found)  # else the twin as it was is the reference
     return Report(
         title=f"What {beside.comparison.twin} lacks, from {config.measurements.name}",
         comparison=beside.comparison,
-        refitted=machine.refitted(found).compare(measurements, name="refitted twin"),
+        refitted=machine.refitted(found).compare(measurements, name="refitted twin") if some else None,
         after=mended.compare(measurements, name="corrected twin"),
         found=found,
         options=[shlex.quote(word) for word in (f"--measurements={config.measurements}", *_given(config))],
