@@ -1,8 +1,8 @@
 """Teleoperation of the twin by leader arms, with MuJoCo's viewer: ``taccorl collect --source.type=leader``.
 
-The person's actions are written to an action file at once (teleop_actions.py). The episode is then made by executing that file
-again: it is as exact as an expert's, and nothing is lost when rendering or encoding fails. The same command continues where the
-last one ended: a finished demonstration of a scene is executed again, not requested again.
+A finished demonstration is written to an action file (teleop_actions.py). The episode is then made by executing that file again:
+it is as exact as an expert's, and nothing is lost when rendering or encoding fails. The same command continues where the last one
+ended: a finished demonstration of a scene is executed again, not requested again.
 """
 
 import copy
@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from taccorl.episodes.attempt import Actions, Source, outcome_of
-from taccorl.episodes.sources.teleop_actions import ActionLog, find_finished, give_time, replay, scene_of
+from taccorl.episodes.attempt import Actions, Source
+from taccorl.episodes.sources.teleop_actions import find_finished, give_time, replay, scene_of, write_actions
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
@@ -42,10 +42,6 @@ class Command(enum.Enum):
 
     def __init__(self, key: str, code: int, meaning: str) -> None:
         self.key, self.code, self.meaning = key, code, meaning
-
-
-class _WindowClosed(TaccorlError):
-    """The person has closed the window."""
 
 
 class ViewerWindow:
@@ -81,7 +77,7 @@ class ViewerWindow:
         time.sleep(max(0.0, self._next_s - now_s))
         self._next_s += 1 / CONTROL_HZ
         if not self._viewer.is_running():
-            raise _WindowClosed("the window was closed. Run the same command again to continue.")
+            raise TaccorlError("the window was closed. Run the same command again to continue.")
         mujoco.mj_setState(self._model, self._data, sim.batch.state[0], mujoco.mjtState.mjSTATE_INTEGRATION)
         self._viewer.sync(state_only=True)
         if self._said != list(lines):
@@ -203,20 +199,13 @@ class LeaderSource(Source):
 
     def _demonstrate(self, session: _Session, folder: Path, seed: int) -> None:
         """Until the person has finished the scene, however often that takes."""
-        finished = False
-        while not finished:
+        actions = None
+        while actions is None:
             session.sim.reset([seed])
             give_time(session.sim, self.time_limit_s)
             self._wait_for_begin(session)
-            with ActionLog(folder, session.sim) as log:
-                try:
-                    finished = self._drive(session, log)
-                except (_WindowClosed, KeyboardInterrupt) as error:
-                    raise TaccorlError(
-                        f"stopped in the middle of an attempt; its {log.num_actions} actions are in {log.path}. Run the same "
-                        "command again to continue."
-                    ) from error
-                log.end("finished" if finished else "discarded", outcome_of(session.sim))
+            actions = self._drive(session)
+        write_actions(folder, session.sim, actions)
 
     def _wait_for_begin(self, session: _Session) -> None:
         lines = [session.sim.task.instruction, f"{Command.GO.key}: begin"]
@@ -225,11 +214,10 @@ class LeaderSource(Source):
             session.device.read()  # a wrong unit is an error before the attempt begins
             session.window.tick(session.sim, lines)
 
-    def _drive(self, session: _Session, log: ActionLog) -> bool:
-        """One attempt in real time; False if it is to be done again."""
+    def _drive(self, session: _Session) -> list[np.ndarray] | None:
+        """Actions of one attempt in real time; None if it is to be done again."""
         sim, window = session.sim, session.window
-        hands = LeaderHands(sim, session.device)
-        action, watched, done = None, 0, False
+        hands, actions, watched, done = LeaderHands(sim, session.device), list[np.ndarray](), 0, False
         while not sim.judge.success[0] and watched < _AFTER_S * CONTROL_HZ:
             failure = str(sim.judge.failure[0])
             lines = [sim.task.instruction, *hands.lines]
@@ -238,17 +226,16 @@ class LeaderSource(Source):
             window.tick(sim, lines)
             asked, commands = hands.read(), window.commands()
             if Command.DISCARD in commands:
-                return False
+                return None
             done = done or Command.GO in commands
             if failure:  # nothing moves any more until the person has said what is to become of it
                 if done:
-                    return True
+                    return actions
                 continue
-            action = asked if not done or action is None else action
+            actions.append(actions[-1] if done and actions else asked)
             watched += done
-            log.append(action)
-            sim.step(action[None].astype(np.float64))
-        return True
+            sim.step(actions[-1][None].astype(np.float64))
+        return actions
 
 
 class LeaderHands:
