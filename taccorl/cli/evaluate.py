@@ -393,7 +393,7 @@ def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> 
         rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
         rrds[-1].parent.mkdir(exist_ok=True)
         assert one.episode is not None, "it was executed again"
-        save_episode(one.episode, rrds[-1], native=True)
+        save_episode(one.episode, rrds[-1])
     write({config.out / "report.html": found.html(list(zip(failed, rrds, strict=True)))})
     files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]
     return Section(text=[*notes, f"wrote {config.out}: {', '.join(files)}"])

@@ -29,7 +29,6 @@ def main(argv: list[str]) -> int:
         from taccorl.rl import run_settings
 
         config = parse(PostTrainConfig, [*argv, *run_settings.stored_options(config.out, given_names(argv))])
-    import functools
     import logging
     import shutil
 
@@ -38,9 +37,8 @@ def main(argv: list[str]) -> int:
     from taccorl.views.episode import save_episode
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    save = functools.partial(save_episode, native=True)
     try:
-        folder = post_train(config, lambda text: print(text, flush=True), save if config.rerun else None)
+        folder = post_train(config, lambda text: print(text, flush=True), save_episode if config.rerun else None)
     finally:
         for left in (config.out / "checkpoints").glob(".*.unfinished"):  # of a checkpoint that a signal ended
             shutil.rmtree(left, ignore_errors=True)

@@ -90,7 +90,6 @@ def run(config: ViewConfig, given: Collection[str] = ()) -> int:
             other = stack.enter_context(_other(config, config.against, whole))
             shown = Pair(episode, part_of(other, config.start_s, config.end_s), cast("Align", config.align))
             _note_other_touch(other, "against")
-        _note_codecs(config, shown)
         for option in ("sheet", "against"):
             if getattr(config, option) is not None:
                 _note_other_touch(episode, option)
@@ -212,19 +211,6 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
         yield episodes[number]
 
 
-def _note_codecs(config: ViewConfig, shown: "Shown") -> None:
-    from taccorl.data.episode import Episode
-    from taccorl.views.video import codec_of
-    from taccorl.views.viewer import can_decode
-
-    episodes = (shown,) if isinstance(shown, Episode) else shown.episodes
-    videos = [video for episode in episodes for video in episode.videos.values()]
-    codecs = sorted(c for c in {codec_of(video) for video in videos} if not can_decode(c))
-    if config.save is not None and codecs:
-        video = f"{', '.join(codecs)} video"
-        print(f"note: the Rerun program needs ffmpeg for {video} and finds none: saved as JPEG pictures")
-
-
 def _write(config: ViewConfig, shown: "Shown") -> bool:
     """Was a file asked for?"""
     if config.save is not None:
@@ -232,7 +218,7 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
         from taccorl.views.pair_view import save_shown
 
         with Bars(1, "reading the episode") as bars:
-            save_shown(shown, config.save, native=True, progress=bars.update)
+            save_shown(shown, config.save, progress=bars.update)
         command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(config.save)])
         print(f"wrote {config.save}: look at it with {command}")
     if config.sheet is not None:
@@ -251,14 +237,14 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
 
 
 @contextlib.contextmanager
-def _as_file(shown: "Shown", *, native: bool = False) -> Iterator[Path]:
+def _as_file(shown: "Shown") -> Iterator[Path]:
     """The view as a Rerun file that is there while the context lasts."""
     from taccorl.cli.progress import Bars
     from taccorl.views.pair_view import save_shown
 
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         with Bars(1, "reading the episode") as bars:
-            save_shown(shown, Path(folder) / "episode.rrd", native=native, progress=bars.update)
+            save_shown(shown, Path(folder) / "episode.rrd", progress=bars.update)
         yield Path(folder) / "episode.rrd"
 
 
@@ -279,5 +265,5 @@ def _open_window(shown: "Shown") -> None:
     from taccorl.views.viewer import open_window, require_screen
 
     require_screen()
-    with _as_file(shown, native=True) as rrd:
+    with _as_file(shown) as rrd:
         open_window(rrd)

@@ -1,6 +1,6 @@
 """Write an episode for Rerun, column by column: pictures, touch, states, commands, events and provenance.
 
-    /observation/images/<camera>     pictures: the dataset's own mp4 packets, or JPEG where there is no mp4 (a recording)
+    /observation/images/<camera>     pictures as JPEG, which every viewer decodes
     /observation/tactile/<pad>       heatmaps, counts above baseline, one fixed colour scale
     /touch_values/<feature>/<pad>    heatmaps of touch of unknown layout and unit, one colour scale for an episode
     /observation/state/<group>, /action/<group>, and every other feature of a few numbers
@@ -34,23 +34,20 @@ from taccorl.views.part import part_of
 from taccorl.views.provenance import provenance
 from taccorl.views.rrd import EpisodeLog, Progress, no_progress, recording_to
 from taccorl.views.touch import OtherTouch, Pad, contact_gate, other_touch_of, pads_of
-from taccorl.views.video import Clip, cut
-from taccorl.views.viewer import can_decode
 
 JPEG_QUALITY = 90
 PICTURES_AT_ONCE = 64  # rows; more would only hold more decoded pictures
 EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65A30DFF)
 
 
-def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = False) -> None:
+def log_episode(log: EpisodeLog, *, at_s: float | None = None) -> None:
     """Log all data of the episode; missing features are left out. ``at_s``: log only those pictures and pads that are shown at
-    this time [s], so that a program that draws one picture need not load a long recording. ``native``: the log is for the
-    Rerun program on this machine; a video that it cannot decode is logged as JPEG pictures. Raises DatasetError: a video file
+    this time [s], so that a program that draws one picture need not load a long recording. Raises DatasetError: a video file
     differs from the dataset's description."""
     episode, pads = log.episode, pads_of(log.episode)
     seen = log if at_s is None else at_one_time(log, at_s)
     log_page(log)
-    log_pictures(seen, native=native)
+    log_pictures(seen)
     for key in vector_keys(episode):
         _log_vector(log, key)
     if pads:
@@ -63,15 +60,13 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = Fa
     log_figure(log, pads)
 
 
-def save_episode(
-    episode: Episode, rrd: Path, *, at_s: float | None = None, native: bool = False, progress: Progress = no_progress
-) -> None:
-    """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as in
-    ``log_episode``. Raises OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full."""
+def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, progress: Progress = no_progress) -> None:
+    """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``. Raises OutputError: ``rrd``
+    exists and was not written by taccorl, or the disk is full."""
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
         rec.send_recording_name(episode.name)
-        log_episode(EpisodeLog(rec, episode, progress=progress), at_s=at_s, native=native)
+        log_episode(EpisodeLog(rec, episode, progress=progress), at_s=at_s)
 
 
 def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
@@ -87,29 +82,10 @@ def log_page(log: EpisodeLog) -> None:
     log.static("provenance", rr.TextDocument(provenance(log.episode), media_type=rr.MediaType.MARKDOWN))
 
 
-def log_pictures(log: EpisodeLog, *, native: bool) -> None:
-    """Log the pictures of all cameras; arguments and errors as ``log_episode``."""
-    episode = log.episode
-    clips = {key: cut(episode.videos[key], episode.spec.fps) for key in episode.picture_keys if key in episode.videos}
-    if native:
-        clips = {key: clip for key, clip in clips.items() if can_decode(clip.codec)}
-    for key, clip in clips.items():
-        _log_video(log, key, clip)
-    _log_jpegs(log, [key for key in episode.picture_keys if key not in clips])
-
-
-def _log_video(log: EpisodeLog, key: str, clip: Clip) -> None:
-    asset = rr.AssetVideo(contents=clip.mp4, media_type="video/mp4")
-    path = f"observation/images/{short_name(key)}"
-    log.static(path, asset)
-    frames_ns = asset.read_frame_timestamps_nanos()[clip.first_frame :][: log.episode.num_rows]
-    log.send(path, rr.VideoFrameReference.columns_nanos(frames_ns))
-
-
-def _log_jpegs(log: EpisodeLog, keys: list[str]) -> None:
-    if not keys:
-        return
-    for batch in itertools.batched(enumerate(log.episode.pictures()), PICTURES_AT_ONCE):
+def log_pictures(log: EpisodeLog) -> None:
+    """Log the pictures of all cameras; errors as ``log_episode``."""
+    keys = log.episode.picture_keys
+    for batch in itertools.batched(enumerate(log.episode.pictures()) if keys else (), PICTURES_AT_ONCE):
         for key in keys:
             blobs = [_jpeg(pictures[key]) for _, pictures in batch]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))

@@ -50,33 +50,26 @@ TOUCH_KINDS = {"sum": "touch sum of active taxels [counts]", "peak": "touch peak
 
 
 def save_shown(
-    shown: Episode | Pair,
-    rrd: Path,
-    *,
-    at_s: float | None = None,
-    native: bool = False,
-    progress: Progress = no_progress,
+    shown: Episode | Pair, rrd: Path, *, at_s: float | None = None, progress: Progress = no_progress
 ) -> None:
     """Write an episode or a pair and its blueprint as one .rrd file; arguments and errors as ``save_episode``."""
     if isinstance(shown, Episode):
-        save_episode(shown, rrd, at_s=at_s, native=native, progress=progress)
+        save_episode(shown, rrd, at_s=at_s, progress=progress)
         return
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, pair_blueprint(shown, at_s=at_s)) as rec:
         rec.send_recording_name(shown.name)
-        _log_pair(rec, shown, at_s, native, progress)
+        _log_pair(rec, shown, at_s, progress)
 
 
-def _log_pair(
-    rec: rr.RecordingStream, pair: Pair, at_s: float | None, native: bool, progress: Progress = no_progress
-) -> None:
+def _log_pair(rec: rr.RecordingStream, pair: Pair, at_s: float | None, progress: Progress = no_progress) -> None:
     rec.log("pair", rr.TextDocument(page_of(pair), media_type=rr.MediaType.MARKDOWN), static=True)
     places = _places(pair)
     for k, (episode, pads) in enumerate(zip(pair.episodes, pair.pads, strict=True)):
         log = EpisodeLog(rec, episode, ROOTS[k], pair.begins_s[k], progress)
         seen = log if at_s is None else at_one_time(log, at_s)
         log_page(log)
-        log_pictures(seen, native=native)
+        log_pictures(seen)
         for curve, key, i in elements_of(episode):
             path = _entity(key, curve)
             name = f"{NAMES[k]} action" if key == "action" else NAMES[k]

@@ -23,7 +23,7 @@ def screenshot(shown: Episode | Pair, png: Path, *, progress: Callable[[str], No
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd, drawn = Path(folder) / "episode.rrd", Path(folder) / "drawn.png"
         progress(f"writing {shown.num_rows} rows for the viewer")
-        save_shown(shown, rrd, at_s=best_time_s(shown), native=True)
+        save_shown(shown, rrd, at_s=best_time_s(shown))
         progress(f"drawing with the Rerun program, at most {PICTURE_TIMEOUT_S:.0f} s")
         if (why_not := picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)) is not None:
             install = "apt-get install mesa-vulkan-drivers libvulkan1"

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -76,12 +75,6 @@ def served(rrd: Path) -> Iterator[str]:
         finally:
             process.terminate()
             process.wait(timeout=10)
-
-
-def can_decode(codec: str) -> bool:
-    """Whether the Rerun program (not a browser) can decode such a video on this machine. It decodes AV1 itself, other codecs
-    with ffmpeg."""
-    return codec == "av1" or shutil.which("ffmpeg") is not None
 
 
 def _program() -> str:
