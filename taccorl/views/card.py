@@ -44,7 +44,7 @@ def write_card(root: Path) -> Path | None:
         temp.unlink(missing_ok=True)  # of a run that died
         return None
     dataset = Dataset(root)
-    text, sheet = card_text(dataset), draw_sheet(dataset.episode(0))[0]
+    text, sheet = card_text(dataset), draw_sheet(dataset.episode(0))
     if sheet.width > SHEET_WIDTH_PX:
         size = SHEET_WIDTH_PX, round(sheet.height * SHEET_WIDTH_PX / sheet.width)
         sheet = sheet.resize(size, Image.Resampling.LANCZOS)
