@@ -80,6 +80,49 @@ class Listed:
         return ()
 
 
+class Needed:
+    """Schedule of the numbers 0, 1, … until the plan has its successes. An attempt is started when it is needed even if all that
+    run succeed: the attempts follow from the plan alone, whatever their order of ending and number at the same time.
+    """
+
+    def __init__(self, plan: "Plan", at_once: int = 1, advice: "Callable[[Made], str] | None" = None) -> None:
+        """``at_once``: number of attempts that may run at the same time. ``advice``: as ``Plan.advice``, in place of it."""
+        self._plan, self._advice = plan, advice or plan.advice
+        self._unjudged = plan.many + at_once - 1
+        """Most attempts to start before it is known whether they are hopeless."""
+        self._made: dict[int, Made] = {}
+        self._started = self._successes = 0
+        self._in_order: Counter[str] = Counter()
+        """Outcomes of the attempts before the first whose outcome is unknown."""
+
+    def first(self) -> range:
+        """Attempts to begin with."""
+        plan, running = self._plan, self._started - len(self._made)
+        number = plan.episodes - self._successes - running
+        if self._in_order.total() < plan.many:
+            number = min(number, self._unjudged - self._started)
+        if not plan.repeatable:
+            number = min(number, 1 - running)  # a person's attempts follow one another
+        started, self._started = self._started, self._started + max(number, 0)
+        return range(started, self._started)
+
+    def after(self, item: int, made: Made) -> range:
+        """Numbers of the attempts to start now that attempt ``item`` has ended. Raises TaccorlError: an automatic demonstrator
+        fails so often that the task or the twin must be faulty. There is no limit for a person."""
+        plan, self._made[item] = self._plan, made
+        self._successes += made.success
+        while (num := self._in_order.total()) in self._made:
+            self._in_order[self._made[num].entry["outcome"]] += 1
+            tried, successes = num + 1, self._in_order["success"]
+            if plan.repeatable and tried >= plan.many and successes < plan.least * tried:
+                kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(self._in_order.items()))
+                first = next(made for _, made in sorted(self._made.items()) if not made.success)
+                raise TaccorlError(
+                    f"{plan.task}: {tried - successes} of {tried} failed ({kinds}); {self._advice(first)}"
+                )
+        return self.first()
+
+
 class Opened(NamedTuple):
     """What a process makes once for all attempts of a plan."""
 
@@ -147,6 +190,10 @@ class Plan(abc.ABC):
     """What an attempt is called in lines of progress."""
     dataset: ClassVar[Stage]
     """Stage that publishes the dataset."""
+    many: ClassVar[int] = 20
+    """Number of attempts after which a success rate means something."""
+    least: ClassVar[float] = 0.25
+    """Share of successes below which so many attempts are hopeless."""
     counts_errors: ClassVar[bool] = False
     """True: an attempt that raises an error is counted as a failure; False: the error ends the run."""
 
@@ -251,9 +298,13 @@ class Plan(abc.ABC):
         """Number of successes after which attempts do not count; None: all attempts count."""
         return self.episodes
 
-    @abc.abstractmethod
     def schedule(self, at_once: int) -> Schedule:
         """Which attempts are made, if ``at_once`` of them may run at the same time."""
+        return Needed(self, at_once)
+
+    def advice(self, failed: Made) -> str:
+        """End of the message of the error if attempts are hopeless, the first of which is ``failed``."""
+        return "nothing was written"
 
     @property
     @abc.abstractmethod
@@ -353,10 +404,6 @@ def seed_of(root: int, words: str, k: int) -> int:
     """
     sequence = np.random.SeedSequence(root, spawn_key=(zlib.crc32(words.encode()), k))
     return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(2))
-
-
-def successes(entries: Sequence[Entry]) -> int:
-    return sum(entry["outcome"] == "success" for entry in entries)
 
 
 def outcomes(entries: Sequence[Entry]) -> dict[str, int]:

@@ -17,10 +17,10 @@ from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
 from taccorl.episodes.attempt import Attempt, Source, Targets, outcome_of
-from taccorl.episodes.plan import Listed, Made
+from taccorl.episodes.plan import Listed, Made, Needed
 from taccorl.episodes.produce import produce
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec
-from taccorl.episodes.sources.collect import CollectPlan, Needed, attempt, collect_recordings
+from taccorl.episodes.sources.collect import CollectPlan, attempt, collect_recordings
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.stage import Artefact
@@ -162,7 +162,7 @@ FATE = ["success", "rim", "rim", "success", "rim", "success", "success", "never 
 def test_no_attempt_is_run_that_may_not_be_needed_in_whatever_order_they_end(at_once):
     """4 successes of FATE are 0, 3, 5, 6: attempt 6 is started when 5 have ended, whose successes are 0, 3, 5 at most."""
     for seed in range(20):
-        rng, needed = np.random.default_rng(seed), Needed(CollectPlan(task="assembly_1", episodes=4), "", at_once)
+        rng, needed = np.random.default_rng(seed), Needed(CollectPlan(task="assembly_1", episodes=4), at_once)
         waiting, running, ended = list(needed.first()), [], []
         assert waiting == [0, 1, 2, 3]
         while waiting or running:
@@ -177,20 +177,22 @@ def test_no_attempt_is_run_that_may_not_be_needed_in_whatever_order_they_end(at_
 
 
 def test_of_many_attempts_at_once_no_more_are_started_than_show_whether_it_is_hopeless():
-    needed = Needed(CollectPlan(task="assembly_1", episodes=1000), "", at_once=30)
+    needed = Needed(CollectPlan(task="assembly_1", episodes=1000), at_once=30)
     assert needed.first() == range(49)  # when 20 have ended, 29 are enough for 30 processes but for one
     for k in range(20, 49):
         assert not needed.after(k, made("success"))
     for k in range(19):
         assert not needed.after(k, made("rim" if k < 10 else "success"))
     assert needed.after(19, made("success")) == range(49, 1010)  # 10 of the first 49 failed, 961 successes are missing
-    hopeless = Needed(CollectPlan(task="assembly_1", episodes=1000), "the end", at_once=30)
+    hopeless = Needed(
+        CollectPlan(task="assembly_1", episodes=1000), at_once=30, advice=lambda made: f"see {made.entry}"
+    )
     assert hopeless.first() == range(49)
     for k in range(4):
         hopeless.after(k, made("success"))
     for k in range(19, 4, -1):
         hopeless.after(k, made("rim"))
-    with pytest.raises(TaccorlError, match=r"16 of 20 failed \(rim, success\); the end"):
+    with pytest.raises(TaccorlError, match=r"16 of 20 failed \(16 rim, 4 success\); see {'outcome': 'rim'}"):
         hopeless.after(4, made("rim"))
 
 
@@ -308,7 +310,7 @@ class Idle(Source):
 
 def test_a_hopeless_demonstrator_is_stopped(tmp_path):
     plan = CollectPlan(task="assembly_1", source=Idle(), images=False, episodes=30)
-    with pytest.raises(TaccorlError, match=r"20 of 20 failed \(unfinished\)"):
+    with pytest.raises(TaccorlError, match=r"20 of 20 failed \(20 unfinished\)"):
         produce(plan, tmp_path / "x", Store(tmp_path / "store"), lambda _: None)
     assert not (tmp_path / "x").exists()
 

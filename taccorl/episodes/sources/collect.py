@@ -3,7 +3,6 @@ format of the robot's drivers. Every attempt is a function of the plan and its o
 """
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from taccorl.data.finding import listed
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Attempt, Entry, Source, act
-from taccorl.episodes.plan import Made, Plan, Step, seed_of
+from taccorl.episodes.plan import Made, Needed, Plan, Step, seed_of
 from taccorl.episodes.produce import Progress, in_order, said
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec, told_origin
 from taccorl.episodes.sources.expert import ExpertSource
@@ -28,7 +27,6 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.surrogate.twin_recording import write_twin_mcap
 
-_MANY = 20  # attempts after which a success rate means something
 _DEMONSTRATION = Stage("demonstration", version=4)
 
 
@@ -46,21 +44,11 @@ class CollectPlan(Plan):
     def repeatable(self) -> bool:
         return self.source.repeatable
 
-    def hopeless(self, attempts: int, successes: int) -> bool:
-        """True if an automatic demonstrator fails so often (fewer than a quarter of at least 20 ``attempts`` are ``successes``)
-        that the task or the twin must be faulty. There is no limit for a person.
-        """
-        return self.repeatable and attempts >= _MANY and successes < attempts / 4
-
     def attempt_seed(self, k: int) -> int:
         return seed_of(self.seed, self.task, k)
 
-    def schedule(self, at_once: int) -> "Needed":
-        return Needed(
-            self,
-            f"nothing was written. To view a failure: taccorl collect --task={self.task} --keep_failures=true",
-            at_once,
-        )
+    def advice(self, failed: Made) -> str:
+        return f"nothing was written. To view a failure: taccorl collect --task={self.task} --keep_failures=true"
 
     def config(self, item: int) -> dict[str, Any]:
         source = {"type": self.source.get_choice_name(type(self.source)), **dataclasses.asdict(self.source)}
@@ -115,7 +103,7 @@ def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print)
     sim = plan.make()
     spec = row_spec(sim, pictures=False, executed=True)
     origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
-    needed, written = Needed(plan, f"the recordings made so far are in {out}"), list[Path]()
+    needed, written = Needed(plan, advice=lambda _: f"the recordings made so far are in {out}"), list[Path]()
 
     def record(k: int) -> Entry:
         done = attempt(plan, sim, spec, k, dense=True)
@@ -133,43 +121,3 @@ def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print)
 
     in_order(record, needed.first(), on_done)
     return written
-
-
-class Needed:
-    """Schedule of the numbers 0, 1, … until the plan has its successes. An attempt is started when it is needed even if all that
-    run succeed: the attempts follow from the plan alone, whatever their order of ending and number at the same time.
-    """
-
-    def __init__(self, plan: CollectPlan, advice: str, at_once: int = 1) -> None:
-        """``advice``: end of the message of the error. ``at_once``: number of attempts that may run at the same time."""
-        self._plan, self._advice = plan, advice
-        self._unjudged = _MANY + at_once - 1
-        """Most attempts to start before it is known whether they are hopeless."""
-        self._outcomes: dict[int, str] = {}
-        self._started = self._successes = 0
-        self._in_order: Counter[str] = Counter()
-        """Outcomes of the attempts before the first whose outcome is unknown."""
-
-    def first(self) -> range:
-        """Attempts to begin with."""
-        plan, running = self._plan, self._started - len(self._outcomes)
-        number = plan.episodes - self._successes - running
-        if self._in_order.total() < _MANY:
-            number = min(number, self._unjudged - self._started)
-        if not plan.repeatable:
-            number = min(number, 1 - running)  # a person's attempts follow one another
-        started, self._started = self._started, self._started + max(number, 0)
-        return range(started, self._started)
-
-    def after(self, item: int, made: Made) -> range:
-        """Numbers of the attempts to start now that attempt ``item`` has ended. Raises TaccorlError: the attempts are hopeless
-        (``CollectPlan.hopeless``)."""
-        self._outcomes[item] = made.entry["outcome"]
-        self._successes += made.success
-        while (num := self._in_order.total()) in self._outcomes:
-            self._in_order[self._outcomes[num]] += 1
-            successes = self._in_order["success"]
-            if self._plan.hopeless(num + 1, successes):
-                kinds, failed = ", ".join(sorted(self._in_order)), num + 1 - successes
-                raise TaccorlError(f"{self._plan.task}: {failed} of {num + 1} failed ({kinds}); {self._advice}")
-        return self.first()

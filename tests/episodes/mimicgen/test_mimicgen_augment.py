@@ -4,23 +4,19 @@ import os
 import shutil
 import signal
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
 from taccorl.episodes.attempt import read_json
-from taccorl.episodes.plan import Made
 from taccorl.episodes.produce import produce
-from taccorl.episodes.sources.mimicgen import augment as module
-from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, Rounds, attempt_episode
+from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, attempt_episode
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec, with_options
 from taccorl.errors import InTheWayError, TaccorlError
 from taccorl.lineage.engines import LocalEngine, RayEngine
 from taccorl.lineage.processes import Failed
-from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
@@ -158,26 +154,10 @@ def test_an_attempt_that_hung_is_counted_with_the_limit(plan, tmp_path):
     assert report["entries"][0]["reason"] == "no end after 600 s; the worker process was killed"
 
 
-def test_rounds_are_the_same_in_whatever_order_attempts_end(plan):
-    """Every third succeeds, and a round has as many attempts as successes are missing: 6, 4, 2, 2, 1, 1."""
-    ends, found = [], []
-    for seed in range(2):
-        rounds, rng, made = Rounds(plan(episodes=6)), np.random.default_rng(seed), []
-        todo = list(rounds.first())
-        while todo:
-            k = todo.pop(rng.integers(len(todo)))
-            made.append(k)
-            outcome = {"attempt": k, "outcome": "success" if k % 3 == 0 else "dropped"}
-            todo += rounds.after(k, Made(Artefact(Path(), ""), outcome))
-        found.append(sorted(made))
-        ends.append(made)
-    assert found[0] == found[1] == list(range(16)) and ends[0] != ends[1]
-
-
 def test_what_hardly_ever_succeeds_is_stopped(plan, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_HUNDRED", 4)
+    monkeypatch.setattr(AugmentPlan, "many", 4)
     monkeypatch.setattr("taccorl.episodes.sources.mimicgen.attempt.Attempts.run", lambda self, k: 1 / 0)
-    with pytest.raises(TaccorlError, match=r"assembly_2: 0 of 4 attempts succeeded, nothing was written.*'error': 4"):
+    with pytest.raises(TaccorlError, match=r"assembly_2: 4 of 4 failed \(4 error\); nothing was written.*taccorl view"):
         produce(plan(), tmp_path / "new", Store(tmp_path / "store"), quiet)
     assert not (tmp_path / "new").exists()
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from taccorl.data.episode import Episode
 from taccorl.episodes.attempt import Attempt, Entry, read_json
-from taccorl.episodes.plan import Made, Plan, Step, outcomes, successes
+from taccorl.episodes.plan import Made, Plan, Step
 from taccorl.episodes.recorder import row_spec, told_origin
 from taccorl.episodes.sources.mimicgen.attempt import Attempts, attempt_seeds
 from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation, read_sources
@@ -32,10 +32,6 @@ from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
-# Attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end.
-_ROUND = 20
-_HOPELESS = 0.05  # of a hundred attempts
-_HUNDRED = 100
 _ATTEMPT = Stage("mimicgen", version=5)
 _ROWS = Stage("mimicgen_rows", version=3)
 
@@ -52,6 +48,8 @@ class AugmentPlan(Plan):
     """Number of successful episodes to generate, in the plan's twin, which may differ from that of the sources."""
 
     dataset: ClassVar[Stage] = Stage("augmented", version=4, manifest=DATASET_MANIFEST)
+    many: ClassVar[int] = 100
+    least: ClassVar[float] = 0.05
     counts_errors: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -78,8 +76,8 @@ class AugmentPlan(Plan):
     def actor_config(self) -> Any:
         return [self.config(0), self.inputs(0)[0].digest]
 
-    def schedule(self, at_once: int) -> "Rounds":
-        return Rounds(self)
+    def advice(self, failed: Made) -> str:
+        return f"nothing was written. To view one: taccorl view {shlex.quote(str(failed.artefact.path))}"
 
     def config(self, item: int) -> dict[str, Any]:
         own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "videos": self.stored_as == "video"}
@@ -127,42 +125,6 @@ class AugmentPlan(Plan):
         report = super().report(entries)
         report["entries"] = [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries]
         return report | {"grips": grips_report(self.opened().actor.pool.sources)}
-
-
-class Rounds:
-    """Schedule of the attempts of an ``AugmentPlan``: the next round follows from the rounds before it alone."""
-
-    def __init__(self, plan: AugmentPlan) -> None:
-        self._plan = plan
-        self._before: list[Made] = []
-        """Attempts of the rounds before."""
-        self._round: dict[int, Made | None] = {}
-        """Attempts of the present round in order; None: it has not ended."""
-
-    def first(self) -> list[int]:
-        """Attempts of the next round, ascending; none if there are enough successes."""
-        plan, entries = self._plan, [made.entry for made in self._before]
-        missing = plan.episodes - successes(entries)
-        # Never fewer than are missing, so none of them is in vain but for the few at the end.
-        num = min(max(missing, min(_ROUND, plan.episodes // 10)), _HUNDRED) if missing > 0 else 0
-        self._round = dict.fromkeys(range(len(entries), len(entries) + num))
-        return list(self._round)
-
-    def after(self, item: int, made: Made) -> list[int]:
-        """The next round when the present one has ended. Raises TaccorlError: hardly any attempt succeeds."""
-        self._round[item] = made
-        ended = [made for made in self._round.values() if made is not None]
-        if len(ended) < len(self._round):
-            return []
-        self._before += ended
-        num, entries = len(self._before), [made.entry for made in self._before]
-        if num >= _HUNDRED and (good := successes(entries)) < _HOPELESS * num:
-            failed = next(made.artefact.path for made in self._before if not made.success)
-            raise TaccorlError(
-                f"{self._plan.task}: {good} of {num} attempts succeeded, nothing was written. Failures: "
-                f"{outcomes(entries)}. To view one: taccorl view {shlex.quote(str(failed))}"
-            )
-        return self.first()
 
 
 def demonstration_of(folder: Path) -> Demonstration:
