@@ -6,30 +6,21 @@ Letters: n episodes; a both succeed, b only the first, c only the second, d neit
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 from scipy.stats import binomtest
 
 from taccorl.errors import TaccorlError
 
-Z = NormalDist().inv_cdf(0.975)
-"""Standard normal quantile of all intervals, which are of 95 %."""
-
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a share, without continuity correction: (low, high) in 0 … 1.
-
-    (p + z²/2n ± z √(p q / n + z²/4n²)) / (1 + z²/n), with p = successes / n and q = 1 − p. (0, 1) if n is 0. Raises
+    """Wilson's 95 % score interval of a share, without continuity correction: (low, high) in 0 … 1; (0, 1) if n is 0. Raises
     TaccorlError: not 0 ≤ successes ≤ n."""
     if not 0 <= successes <= n:
         raise TaccorlError(f"Wilson's interval: {successes} successes of {n} episodes")
     if n == 0:
         return 0.0, 1.0
-    z, p = Z, successes / n
-    middle, scale = p + z**2 / (2 * n), 1 + z**2 / n
-    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    # At p = 0 and p = 1 one end is exact; rounding would leave 1e-17 there.
-    return (middle - half) / scale if successes else 0.0, (middle + half) / scale if successes < n else 1.0
+    found = binomtest(successes, n).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def told_rate(successes: int, n: int) -> str:
