@@ -16,6 +16,7 @@ from typing import Any
 
 from taccorl.alignment.checks.unrepeated import check_repeatability
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.touch.motion import touch_motion
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.touch_problem import TouchProblem
 from taccorl.diagnosis.search.identifiable import identifiable_numbers, identified_value
@@ -149,10 +150,12 @@ def run_touch(job: Job) -> dict[str, Any]:
     """As ``run``, for pads of one arm that press known objects."""
     began = time.process_time()
     case = draw_touch_case(job.hidden, job.seed, strength=job.strength)
-    motions = touch_recordings(case).motions(case.twin)
+    made = touch_recordings(case)
+    sides = made.fit, made.validation, made.test
+    motions = [[touch_motion(m, case.twin, m.pressed) for m in side if m.pressed is not None] for side in sides]
     recorded = time.process_time()
-    problem = TouchProblem([m for side in motions.values() for m in side], case.twin)
-    fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
+    problem = TouchProblem([m for side in motions for m in side], case.twin)
+    fit_to, validation, test = problem.recordings(*motions)
     config = SearchConfig(max_effects=len(job.hidden) + 1)
     found = diagnose(problem, fit_to, validation, test, start=problem.start, without=job.without, config=config)
     done = time.process_time()

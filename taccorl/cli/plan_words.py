@@ -1,14 +1,14 @@
 """Words of a plan of recordings by the kind of its part: entries of plan.yaml, and facts about each motion or press."""
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
 from taccorl.alignment.machines.cells_file import LOADS
+from taccorl.alignment.measurements.presses import RADIUS_M
 from taccorl.diagnosis.experiment_design.loads import CellsPart
 from taccorl.diagnosis.experiment_design.motions import EFFORT_SHARE, JointPart
 from taccorl.diagnosis.experiment_design.plan import Part, Plan, Planned
-from taccorl.diagnosis.experiment_design.presses import RADIUS_M, PadsPart
+from taccorl.diagnosis.experiment_design.presses import PadsPart
 from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW
 from taccorl.report.planned import WAY, Words
 
@@ -93,13 +93,12 @@ def _of_joint(part: JointPart) -> Words:
 def _of_pads(part: PadsPart) -> Words:
     def entry(p: Planned) -> dict[str, Any]:
         target, *_ = p.columns.values()
-        pressed = {k: v for k, v in dataclasses.asdict(p.item.pressed(part.arm)).items() if v is not None}
         return {
             "seconds": round(len(target) / part.rate_hz, 1),
             "depth_m": round(float(p.item.penetration_m().max()), 6),
             "range_m": [round(float(target.min()), 6), round(float(target.max()), 6)],
             "peak_force_n": round(p.peak, 1),
-            "pressed": {k: list(v) if isinstance(v, tuple) else v for k, v in pressed.items()},
+            "pressed": p.item.pressed(part.arm).entry(),
         }
 
     def row(p: Planned) -> tuple[str, ...]:

@@ -183,4 +183,4 @@ def _presses(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig
             else touch_case_of(robot, secret, arm)
         )
         made = write_touch_recordings(case, out, bars.update)
-    return f"{len(made.pressed)} recordings of the {case.arm} pads, which press known objects,"
+    return f"{len(made.all)} recordings of the {case.arm} pads, which press known objects,"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera
+from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera, without_effects
 from taccorl.alignment.camera.episode import all_pictures, camera_frames, joint_rows
 from taccorl.alignment.camera.light import camera_light
 from taccorl.alignment.camera.timing import camera_latency
@@ -298,7 +298,7 @@ def _exposure(
     camera: str, config: TwinConfig, frames: CameraFrames, had: Sequence[Effect]
 ) -> tuple[Effect, list[FittedNumber], str]:
     """Effect, its numbers, and how well the grey values match, for a camera whose pose in ``config`` is fitted."""
-    light = camera_light(frames, _without(config, camera, ("camera_exposure",)), camera)
+    light = camera_light(frames, without_effects(config, camera, ("camera_exposure",)), camera)
     ends = {"gain": light.gain_interval, "gamma": light.gamma_interval, "blur_px": light.blur_interval_px}
     made = make_effect(
         "camera_exposure", cameras=[camera], gain=light.gain, gamma=light.gamma, blur_px=light.blur_px, interval=ends
@@ -330,7 +330,7 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
             new = next(c for c in a.twin.cameras if c.name == camera)
             config.cameras = [new if c.name == camera else c for c in config.cameras]
             gone = ("camera_pose", *(e.name for e in a.effects))
-            config = _without(config, camera, gone)
+            config = without_effects(config, camera, gone)
             config.effects = [*config.effects, *(e for e in a.effects if not e.is_absent)]
     of_pads = {
         a.part: ({n.name: n.value for n in a.numbers}, {n.name: (n.low, n.high) for n in a.numbers})
@@ -343,17 +343,6 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
         except TaccorlError as error:
             why = f"the pads are as they were: {error}"
     return config, why
-
-
-def _without(config: TwinConfig, camera: str, names: Sequence[str]) -> TwinConfig:
-    """The twin without its effects ``names`` on this camera; entries that name several cameras keep the others."""
-    kept = []
-    for effect in config.effects:
-        if effect.name not in names or camera not in effect.acts_on():
-            kept.append(effect)
-        elif others := [c for c in effect.acts_on() if c != camera]:
-            kept.append(dataclasses.replace(effect, cameras=others))
-    return dataclasses.replace(config, effects=kept)
 
 
 def _plain(value: Any) -> Any:

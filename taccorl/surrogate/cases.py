@@ -220,10 +220,7 @@ def draw_case(
     for name, k in zip(effect_names, kinds, strict=True):
         wanted = math.exp(rng.uniform(*np.log(SEVERITY_FLOORS))) if strength is None else strength
         if name in NOT_FITTED:  # as often as it happens, whatever that leaves
-            severity = math.exp(rng.uniform(*np.log(k.severity(scale))))
-            where = selectors(name, signal)
-            values = k.values(severity, scale, {})
-            hidden.append(Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where))
+            hidden.append(_hidden(name, signal, math.exp(rng.uniform(*np.log(k.severity(scale)))), scale, {}))
             continue
         hidden.append(_as_strong_as(wanted, refit, name, k, scale, k.shape(rng, scale)))
     left = refit.left_floors([h.change for h in hidden])
@@ -352,13 +349,18 @@ class _Refit:
         return math.sqrt(2 * found.cost)
 
 
+def _hidden(name: str, signal: str, severity: float, scale: Scale, shape: Values) -> Hidden:
+    """The effect of this severity and shape at ``signal``, within the bounds of the registry."""
+    k, where = kind(name), selectors(name, signal)
+    values = within_bounds(name, k.values(severity, scale, shape))
+    return Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where)
+
+
 def _as_strong_as(wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale, shape: Values) -> Hidden:
     """The effect at the severity, of those that a robot could have, that leaves ``wanted`` floors, or is nearest to it."""
 
     def of(severity: float) -> Hidden:
-        values = within_bounds(name, k.values(severity, scale, shape))
-        where = selectors(name, refit.case.signal)
-        return Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where)
+        return _hidden(name, refit.case.signal, severity, scale, shape)
 
     return of(find_severity(wanted, k.severity(scale), lambda severity: refit.left_floors([of(severity).change])))
 

@@ -8,8 +8,6 @@ that they are simulated.
 Letters in shapes: M milliseconds, T rows, K cells, R × C the grid.
 """
 
-import csv
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable
@@ -18,17 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.signal import fftconvolve, lfilter
+from scipy.signal import fftconvolve
 
 from taccorl.alignment.machines.cell_model import of_file
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import LOADS, CellsConfig, Load, Reading, save_cells
-from taccorl.alignment.measurements.folder import INDEX, Measurements
-from taccorl.alignment.measurements.table_files import origin_lines
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.presses import Knots, in_turn
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, nearest
+from taccorl.surrogate.robot import coloured
 from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread
-from taccorl.surrogate.writing import PRESSES, seal
+from taccorl.surrogate.writing import PRESSES, write_tables
 
 ORIGIN = "simulated force cells"  # Text of the origin of every file
 SENSOR = "taxel.yaml"  # Name of the cells file
@@ -54,7 +53,6 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
 """Name of a hidden effect → function that draws its parameters, in the units of the registry; a reading of 10 is the rated
 load."""
 OF_GRIDS = ("taxel_crosstalk", "taxel_ghosting")  # Effects that only neighbouring cells can show
-Knots = tuple[tuple[float, float], ...]  # (time [s], share of the rated load), connected by straight lines
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -67,14 +65,9 @@ def _either(rng: np.random.Generator, low: float, high: float) -> float:
     return float(rng.choice([-1.0, 1.0])) * _between(rng, low, high)
 
 
-def _presses(*each: tuple[float, float, float], rest_s: float = 3.0) -> Knots:
+def _presses(*each: tuple[float, float, float]) -> Knots:
     """Presses one after the other: (share of the rated load, seconds of loading and unloading, seconds of hold)."""
-    now, knots = rest_s, [(0.0, 0.0), (rest_s, 0.0)]
-    for share, ramp_s, hold_s in each:
-        knots += [(now + ramp_s, share), (now + ramp_s + hold_s, share), (now + 2 * ramp_s + hold_s, 0.0)]
-        now += 2 * ramp_s + hold_s + rest_s
-        knots.append((now, 0.0))
-    return tuple(knots)
+    return in_turn(*each, rest_s=3.0, before_s=3.0)
 
 
 _LOOPS: Knots = (
@@ -201,8 +194,7 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
         repeat_of="presses" if name == "presses_again" else None,
         temperature_c=20.0 + warm_k[rows],
     )
-    even = measured.resampled(rate_hz)
-    return dataclasses.replace(even, temperature_c=np.interp(even.time_s, measured.time_s, measured.temperature_c))
+    return measured.resampled(rate_hz)
 
 
 def write_cells(case: CellsCase, folder: Path) -> int:
@@ -213,35 +205,31 @@ def write_cells(case: CellsCase, folder: Path) -> int:
     FOLDER/taxel.yaml                                        the sensor as known to its user; not of a user's own file
 
     Returns number of recordings. Raises FileExistsError: the folder exists."""
-    config = case.config()
-    presses = folder / PRESSES
-    folder.mkdir(parents=True)
-    presses.mkdir()
-    kind, unit = LOADS[config.load.unit][0], config.reading.unit
-    load = [kind] if config.load.shared else [f"{name}.{kind}" for name in config.names]
-    for name in RECORDINGS:
-        m = record(case, name)
-        columns = [m.time_s, *m.target.T[: len(load)], *m.measured.T, m.temperature_c]
-        with (presses / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-            file.write(origin_lines(m.origin))
-            writer = csv.writer(file)
-            writer.writerow(["t", *load, *(f"{cell}.reading" for cell in config.names), "temperature_c"])
-            writer.writerows([[f"{x:.6g}" for x in row] for row in zip(*columns, strict=True)])
-    uses = [f"  {name}.csv: {{use: {use}}}" for name, (use, _) in RECORDINGS.items() if name != "presses_again"]
-    uses.append("  presses_again.csv: {use: fit, repeat_of: presses.csv}")
-    columns = ["time: {column: t, unit: s}", "temperature: {column: temperature_c}"]
-    columns += ["domain: surrogate", f"origin: {ORIGIN}"]
-    columns += [f"load: {{column: {kind}, unit: {config.load.unit}}}"] if config.load.shared else []
-    columns.append("cells:")
-    for cell in config.names:
-        own = "" if config.load.shared else f", load: {{column: {cell}.{kind}, unit: {config.load.unit}}}"
-        columns.append(f"  {cell}: {{reading: {{column: {cell}.reading, unit: {unit}}}{own}}}")
-    (presses / "columns.yaml").write_text("\n".join(columns) + "\n", encoding="utf-8")
-    text = ["columns: columns.yaml", "recordings:", *uses]
-    (presses / INDEX).write_text("\n".join(text) + "\n", encoding="utf-8")
+    config, made = case.config(), simulated(case)
+    kind, unit, shared = LOADS[config.load.unit][0], config.reading.unit, config.load.shared
+    load = [kind] if shared else [f"{name}.{kind}" for name in config.names]
+
+    def of(column: str, unit: str) -> dict[str, str]:
+        return {"column": column, "unit": unit}
+
+    spec: dict[str, Any] = {"time": of("t", "s"), "temperature": {"column": "temperature_c"}}
+    spec |= {"domain": "surrogate", "origin": ORIGIN} | ({"load": of(kind, config.load.unit)} if shared else {})
+    own = {name: {} if shared else {"load": of(f"{name}.{kind}", config.load.unit)} for name in config.names}
+    spec["cells"] = {name: {"reading": of(f"{name}.reading", unit)} | pressed for name, pressed in own.items()}
+
+    def table(m: CellMeasurement) -> dict[str, np.ndarray]:
+        readings = {f"{cell}.reading": own for cell, own in zip(config.names, m.measured.T, strict=True)}
+        return {
+            "t": m.time_s,
+            **dict(zip(load, m.target.T, strict=False)),
+            **readings,
+            "temperature_c": m.temperature_c,
+        }
+
+    truth = {"data": ORIGIN, "seed": case.seed, "hidden": case.hidden, "values": case.values}
+    write_tables(folder, PRESSES, spec, made, table, truth)
     if case.sensor is None:
         save_cells(config, folder / SENSOR)
-    seal(folder, {"data": ORIGIN, "seed": case.seed, "hidden": case.hidden, "values": case.values})
     return len(RECORDINGS)
 
 
@@ -298,8 +286,7 @@ def _rounded(load: np.ndarray) -> np.ndarray:
 
 
 def _coloured(rng: np.random.Generator, rows: int, cells: int) -> np.ndarray:
-    """(T, K) of standard deviation 1 that is correlated over 0.1 s."""
-    keep = math.exp(-1 / (0.1 * RATE_HZ))
+    """(T, K) of standard deviation 1 that is correlated over 0.1 s, from 0 on."""
     drawn = rng.standard_normal((rows, cells))
     drawn[0] = 0.0
-    return lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], drawn, axis=0)
+    return coloured(drawn, math.exp(-1 / (0.1 * RATE_HZ)))

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from taccorl.alignment.measurements.folder import Measurements, split
 from taccorl.alignment.measurements.measurement import Measurement
@@ -19,7 +18,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.surrogate.cases import Case
 from taccorl.surrogate.plant import COMMAND_MS
-from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD
+from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD, coloured
 
 ORIGIN = "robot simulated apart from the twin, not a robot"  # Text of the origin of every recording
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
@@ -99,9 +98,7 @@ def _noisy(
     size[ROBOT.gripper_indices] = grippers
     noise = rng.standard_normal(values.shape)
     if colour_s > 0.0:
-        keep = math.exp(-1.0 / (colour_s * RATE_HZ))
-        noise[0] /= math.sqrt(1.0 - keep**2)
-        noise = math.sqrt(1.0 - keep**2) * np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
+        noise = coloured(noise, math.exp(-1.0 / (colour_s * RATE_HZ)))
     return values + size * noise
 
 

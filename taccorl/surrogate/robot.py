@@ -168,6 +168,10 @@ def free_inertia(pose: np.ndarray, joint: int) -> float:
 def _disturbance(rng: np.random.Generator, milliseconds: int, sizes_nm: np.ndarray) -> np.ndarray:
     """(M, 6) N·m of standard deviations ``sizes_nm`` (6,), in straight lines' worth of ``DISTURBANCE_HZ``."""
     keep = math.exp(-2 * math.pi * DISTURBANCE_HZ * 1e-3)
-    white = rng.standard_normal((milliseconds, ROBOT.num_joints))
-    white[0] /= math.sqrt(1 - keep**2)
-    return sizes_nm * math.sqrt(1 - keep**2) * lfilter([1.0], [1.0, -keep], white, axis=0)
+    return sizes_nm * coloured(rng.standard_normal((milliseconds, ROBOT.num_joints)), keep)
+
+
+def coloured(white: np.ndarray, keep: float) -> np.ndarray:
+    """``white`` noise (T, …) of variance 1 with the correlation ``keep`` between neighbouring rows and the same variance."""
+    share = math.sqrt(1 - keep**2)
+    return np.asarray(lfilter([share], [1.0, -keep], np.concatenate([white[:1] / share, white[1:]]), axis=0))

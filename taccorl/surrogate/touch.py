@@ -13,16 +13,16 @@ Letters in shapes: M milliseconds, T frames, K taxels near the object, P = 2 pad
 import dataclasses
 import math
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
-from taccorl.alignment.measurements.pressed import PressedObject, indenter
-from taccorl.alignment.touch.motion import TouchMotion, touch_motion
+from taccorl.alignment.measurements.presses import AWAY_M, FRAME_S, RADIUS_M, Knots, Press, pad_presses
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -33,8 +33,6 @@ from taccorl.surrogate.hidden import Hidden, hidden_in, within_bounds
 from taccorl.surrogate.recordings import ORIGIN
 from taccorl.surrogate.touch_hidden import EXACT_TOUCH, MILLISECOND, board, material, spread, touch_kind
 
-RADIUS_M = {"sphere": 0.012, "rod": 0.008}  # Shape of the object → its radius [m]
-FRAME_S = 0.01  # Time between two frames of the pads [s]
 NOISE_COUNT, MAX_COUNT, RESTING_COUNT = 1.3, 255, (10, 40)
 """Noise of a taxel, upper end of the converter, and range of the resting counts [counts]."""
 ROOM_ERROR_M, ROOM_ERROR_S = 8e-6, 0.5
@@ -44,39 +42,10 @@ K_N_PER_M, K_D_S = (600.0, 2000.0), (0.002, 0.02)  # Range of k_n [reading per m
 SEVERITY_FLOORS = (1.5, 15.0)  # Range from which the strength of a hidden effect is drawn [floors]
 COUNTS = 75.0  # per reading of 1
 FRAMES_A_ROW = 5  # of the problem that judges: its floor is counted in means over so many
-AWAY_M = -1e-3  # Penetration while nothing is pressed [m]: a distance at each pad
 _NEAR_M = 1.2e-3  # taxels that stay further off take no part
 
 
-@dataclass(frozen=True, kw_only=True)
-class Press:
-    """One recording to be made: an object at a position, and a depth over time."""
-
-    name: str
-    knots: tuple[tuple[float, float], ...]  # (time [s], penetration [m]), connected by straight lines
-    shape: str = "sphere"  # Shape of the object, a key of ``RADIUS_M``
-    x_m: float = 0.0  # Position of the object's centre along x of the TCP's frame [m]
-    z_m: float = 0.0
-    """Position of the object's centre along z of the TCP's frame [m]; the rod lies across the pads, along x."""
-    wiggle_m: float = 0.0
-    """Amplitude of a vibration at 2.3 Hz, with 0.6 of it at 5.1 Hz, that is added to the penetration [m]."""
-    repeat_of: str | None = None  # Name of the press that it repeats; None if it is no repeat
-
-
-def _presses(
-    depths_m: tuple[float, ...], rises_s: tuple[float, ...], hold_s: float, before_s: float, after_s: float
-) -> tuple[tuple[float, float], ...]:
-    """Each depth at each speed."""
-    knots, at = [(0.0, AWAY_M), (before_s, AWAY_M)], before_s
-    for depth in depths_m:
-        for rise in rises_s:
-            knots += [(at + rise, depth), (at + rise + hold_s, depth), (at + 2 * rise + hold_s, AWAY_M)]
-            at += 2 * rise + hold_s + 0.5
-            knots.append((at, AWAY_M))
-    return (*knots, (at + after_s, AWAY_M))
-
-
-def _ramp(peaks_m: tuple[float, float, float], hold_s: float) -> tuple[tuple[float, float], ...]:
+def _ramp(peaks_m: tuple[float, float, float], hold_s: float) -> Knots:
     """Up and down with inner loops, then a hold."""
     one, two, three = peaks_m
     way = [(0.0, AWAY_M), (2.5, AWAY_M), (6.0, one), (7.5, 0.5 * one), (9.0, two), (11.0, 0.2 * two), (13.0, 0.7 * two)]
@@ -86,16 +55,16 @@ def _ramp(peaks_m: tuple[float, float, float], hold_s: float) -> tuple[tuple[flo
 
 _TASK = ((0, AWAY_M), (2.5, AWAY_M), (2.9, 6.5e-4), (7, 7e-4), (7.2, AWAY_M), (8.5, AWAY_M), (8.8, 9.5e-4))
 _TASK_END = ((14.0, 5e-4), (14.3, AWAY_M), (16.5, AWAY_M))
-_PRESS = Press(name="press", knots=_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8, 10.0, 10.0), x_m=0.001, z_m=0.003)
+_PRESS = Press(name="press", knots=pad_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8, before_s=10.0, after_s=10.0))
 FIT = (
     _PRESS,
     dataclasses.replace(_PRESS, name="press_again", repeat_of="press"),
     Press(name="ramp_and_hold", knots=_ramp((9e-4, 1e-3, 8e-4), 4.0), x_m=-0.004, z_m=-0.010),
-    Press(name="rod", knots=_presses((3e-4, 7e-4), (0.15, 0.6), 0.6, 2.5, 2.5), shape="rod", z_m=0.012),
+    Press(name="rod", knots=pad_presses((3e-4, 7e-4), (0.15, 0.6), 0.6), shape="rod", x_m=0.0, z_m=0.012),
 )
 # Near to places that were fitted to: what is known of a taxel counts, and not how many of them were never pressed.
 VALIDATION = (
-    Press(name="held_press", knots=_presses((9e-4, 4e-4, 7e-4), (0.1, 0.5), 0.6, 2.5, 2.5), x_m=0.0, z_m=0.002),
+    Press(name="held_press", knots=pad_presses((9e-4, 4e-4, 7e-4), (0.1, 0.5), 0.6), x_m=0.0, z_m=0.002),
     Press(name="held_ramp", knots=_ramp((7e-4, 9e-4, 6e-4), 3.0), x_m=-0.0035, z_m=-0.0095),
 )
 TEST = (Press(name="test_task", knots=(*_TASK, *_TASK_END), x_m=0.0015, z_m=0.0035, wiggle_m=5e-5),)
@@ -140,20 +109,6 @@ class TouchCase:
         """(4, R, C) resting counts of all pads, in the order of ``ROBOT.pads``."""
         low, high = RESTING_COUNT
         return np.random.default_rng([self.seed, 77]).uniform(low, high, (len(ROBOT.pads), *ROBOT.pad.shape))
-
-
-@dataclass(frozen=True)
-class TouchRecordings(Measurements):
-    """Recordings with the object that was pressed in each."""
-
-    pressed: dict[str, PressedObject] = field(default_factory=dict)  # Name of a recording → pressed object
-
-    def motions(self, config: TwinConfig) -> dict[str, list[TouchMotion]]:
-        """fit, validation, test → matched contact replays, in the form for ``TouchProblem``."""
-        return {
-            use: [touch_motion(m, config, self.pressed[m.name]) for m in getattr(self, use)]
-            for use in ("fit", "validation", "test")
-        }
 
 
 def draw_touch_case(
@@ -206,21 +161,18 @@ def touch_case_of(config: TwinConfig, seed: int, arm: str | None = None) -> Touc
     return dataclasses.replace(plain, k_n=k_n, k_d=k_d, hidden=hidden, twin=TwinConfig())
 
 
-def touch_recordings(case: TouchCase) -> TouchRecordings:
+def touch_recordings(case: TouchCase) -> Measurements:
     """Simulate all recordings of these pads. The same case gives the same numbers, bit for bit."""
     fit, validation, test = (tuple(record_touch(case, press) for press in presses) for presses in _USES.values())
-    pressed = {press.name: pressed_object(case, press) for presses in _USES.values() for press in presses}
-    return TouchRecordings(fit, validation, test, pressed=pressed)
+    return Measurements(fit, validation, test)
+
+
+def pressed_notes(case: TouchCase) -> dict[str, dict[str, Any]]:
+    """Name of a recording → its entry ``pressed`` of measurements.yaml."""
+    return {press.name: press.pressed(case.arm).entry() for presses in _USES.values() for press in presses}
 
 
 _USES = {"fit": FIT, "validation": VALIDATION, "test": TEST}
-
-
-def pressed_object(case: TouchCase, press: Press) -> PressedObject:
-    """The pressed object as a user would state it."""
-    position, rod = (press.x_m, 0.0, press.z_m), press.shape == "rod"
-    shape, turn = ("rod", (0.0, math.pi / 2, 0.0)) if rod else ("sphere", (0.0, 0.0, 0.0))
-    return indenter(shape, RADIUS_M[press.shape], case.arm, length_m=0.04, position_m=position, rpy_rad=turn)
 
 
 def record_touch(case: TouchCase, press: Press) -> Measurement:
@@ -255,17 +207,14 @@ def record_touch(case: TouchCase, press: Press) -> Measurement:
         origin=Origin("surrogate", f"{ORIGIN}; {case.arm} pads"),
         instruction=f"press a {press.shape}: {press.name}",
         repeat_of=press.repeat_of,
+        pressed=press.pressed(case.arm).made(),
     )
 
 
 def _penetration(press: Press) -> tuple[np.ndarray, np.ndarray]:
     """(M,) s and m; corners rounded over 60 ms, as a finger of some inertia does."""
-    knots = np.array(press.knots)
-    time_s = np.arange(round(knots[-1, 0] / MILLISECOND)) * MILLISECOND
-    line = np.interp(np.arange(-30, len(time_s) + 30) * MILLISECOND, knots[:, 0], knots[:, 1])
-    depth = np.convolve(line, np.ones(61) / 61, mode="valid")
-    wiggle = press.wiggle_m * (np.sin(2 * np.pi * 2.3 * time_s) + 0.6 * np.sin(2 * np.pi * 5.1 * time_s))
-    return time_s, depth + wiggle
+    depth = press.penetration_m(1 / MILLISECOND, 61)
+    return np.arange(len(depth)) * MILLISECOND, depth
 
 
 def _depth(case: TouchCase, press: Press, side: float, penetration_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

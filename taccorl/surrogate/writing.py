@@ -10,11 +10,10 @@ Surrogate pads are written in the same way; their measurements.yaml states the p
 import base64
 import dataclasses
 import json
-import math
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,19 +22,18 @@ import yaml
 
 from taccorl.alignment.measurements.folder import INDEX, Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.alignment.measurements.table_files import origin_lines
 from taccorl.data.origin import labelled
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.shapes import Capsule, Cylinder
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
 from taccorl.surrogate import drivers
 from taccorl.surrogate.cases import Case
 from taccorl.surrogate.driver_messages import UINT8_ARRAY
 from taccorl.surrogate.recordings import robot_recordings
-from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
-from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
+from taccorl.surrogate.touch import TouchCase, pressed_notes, touch_recordings
+from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH
 
 SWEEPS, PRESSES, TWIN, TRUTH = "sweeps", "presses", "twin.yaml", "sealed_truth.json"
 """Names of the folders and files in the output folder."""
@@ -109,7 +107,8 @@ def write_recordings(cases: Sequence[Case], folder: Path, progress: Progress | N
     folder holds other files."""
     uses = _uses(robot_recordings(cases))
     truth: dict[str, object] = {"joints": [c.truth() for c in cases]} if len(cases) > 1 else cases[0].truth()
-    _write(Path(folder), partial(_fill, truth=truth, twin=cases[0].twin, uses=uses, pressed={}, progress=progress))
+    with _beside(Path(folder)) as part:
+        _fill(part, truth, cases[0].twin, uses, {}, progress)
     return len(uses)
 
 
@@ -117,26 +116,26 @@ def _uses(made: Measurements) -> list[tuple[str, Measurement]]:
     return [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
 
 
-def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress | None = None) -> TouchRecordings:
+def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress | None = None) -> Measurements:
     """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording. Raises TaccorlError:
     the folder holds other files."""
     made = touch_recordings(case)
     uses = [(use, _commanded(m, case.arm)) for use, m in _uses(made)]
-    pressed = {name: _pressed(of) for name, of in made.pressed.items()}
-    fill = partial(_fill, truth=case.truth(), twin=case.twin, uses=uses, pressed=pressed, progress=progress)
-    _write(Path(folder), fill)
+    with _beside(Path(folder)) as part:
+        _fill(part, case.truth(), case.twin, uses, pressed_notes(case), progress)
     return made
 
 
-def _write(folder: Path, fill: Callable[[Path], None]) -> None:
-    """All of it beside ``folder`` first, then in its place: half a robot never stands there. Raises TaccorlError: the folder
-    holds something that is no surrogate's, or there is no room."""
+@contextmanager
+def _beside(folder: Path) -> Iterator[Path]:
+    """A folder beside ``folder`` to write into, which then takes its place: half a robot never stands there. Raises
+    TaccorlError: the folder holds something that is no surrogate's, or there is no room."""
     if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
         raise TaccorlError(f"{folder}: it contains files that are not of a surrogate robot; give another --out=")
     part = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
     try:
-        fill(part)
+        yield part
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
         raise TaccorlError(
@@ -169,9 +168,38 @@ def _fill(
     notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
     for name, of in pressed.items():
         notes[files[name]]["pressed"] = of
-    text = yaml.safe_dump({"recordings": notes}, sort_keys=False, default_flow_style=None, width=120)
-    (recordings / INDEX).write_text(text, encoding="utf-8")
+    _write_yaml(recordings / INDEX, {"recordings": notes})
     save_twin(twin, folder / TWIN)
+
+
+def write_tables(
+    folder: Path,
+    kind: str,
+    columns: Mapping[str, Any],
+    made: Measurements,
+    table: Callable[[Any], Mapping[str, np.ndarray]],
+    truth: dict[str, object],
+) -> None:
+    """Write recordings as CSV files into FOLDER/KIND, with a columns file and a measurements.yaml, and the sealed truth.
+    ``columns``: content of the columns file. ``table``: function of a measurement that returns its columns, name → (T,). Raises
+    FileExistsError: the folder exists."""
+    folder.mkdir(parents=True)
+    (folder / kind).mkdir()
+    notes: dict[str, dict[str, str]] = {}
+    for use, m in _uses(made):
+        own, path = table(m), folder / kind / f"{m.name}.csv"
+        header = origin_lines(m.origin) + ",".join(own)
+        values = np.column_stack([*own.values()])
+        np.savetxt(path, values, fmt="%.8g", delimiter=",", header=header, comments="", encoding="utf-8")
+        notes[path.name] = {"use": use} | ({"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {})
+    _write_yaml(folder / kind / "columns.yaml", columns)
+    _write_yaml(folder / kind / INDEX, {"columns": "columns.yaml", "recordings": notes})
+    seal(folder, truth)
+
+
+def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
+    text = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+    path.write_text(text, encoding="utf-8")
 
 
 def _commanded(m: Measurement, arm: str) -> Measurement:
@@ -183,16 +211,6 @@ def _commanded(m: Measurement, arm: str) -> Measurement:
     return dataclasses.replace(m, target=target)
 
 
-def _pressed(of: PressedObject) -> dict[str, Any]:
-    """As measurements.yaml has it. Surrogate rods lie across the pads."""
-    (solid,) = of.solids
-    assert isinstance(solid, Capsule | Cylinder)
-    found = {"shape": "sphere", "radius_m": solid.radius_m, "arm": of.arm, "position_m": of.pose[:3, 3].tolist()}
-    if isinstance(solid, Cylinder):
-        found |= {"shape": "rod", "length_m": 2 * solid.half_height_m, "rpy_rad": [0.0, math.pi / 2, 0.0]}
-    return found
-
-
 def draw_touch_secret(seed: int) -> tuple[str, ...]:
     """Names of the effects that the pads of this seed hide: one of the registry, with a probability of 10 % none, of 15 % one
     from outside of it."""
@@ -200,8 +218,7 @@ def draw_touch_secret(seed: int) -> tuple[str, ...]:
     fate = rng.random()
     if fate < 0.1:
         return ()
-    outside = [name for name in TOUCH_KINDS if name not in REGISTERED_TOUCH]
-    return (str(rng.choice(outside if fate < 0.25 else REGISTERED_TOUCH)),)
+    return (str(rng.choice(OUTSIDE_TOUCH if fate < 0.25 else REGISTERED_TOUCH)),)
 
 
 def seal(folder: Path, truth: dict[str, object]) -> None:

@@ -283,7 +283,11 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench, said, tmp_path)
     ("old", "new", "message"),
     [
         ("inertia: 40.0", "inertia: 4.0", "Write `inertia: "),
-        ("limits: [-0.15, 0.15]", "limits: [0.0, 0.05]", "its limits are [0, 0.05]"),
+        (
+            "limits: [-0.15, 0.15]",
+            "limits: [0.0, 0.05]",
+            "its limits in drive.yaml are [0, 0.05]. Write the `unit:` of slide.q",
+        ),
         ("name: slide", "name: sled", "did you mean"),
         ("name: slide", "name: ' '", "the name is blank"),
         (

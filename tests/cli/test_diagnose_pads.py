@@ -20,11 +20,12 @@ from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate import touch
 
 VERB = ""
-DEPTHS = touch._presses((3e-4, 6e-4, 1e-3), (0.12, 0.5), 0.4, 2.5, 2.0)
-FIT = touch.Press(name="press", knots=DEPTHS, x_m=0.001, z_m=0.003)
+DEPTHS = touch.pad_presses((3e-4, 6e-4, 1e-3), (0.12, 0.5), 0.4, after_s=2.0)
+HELD = touch.pad_presses((8e-4, 4e-4), (0.1, 0.4), 0.5, after_s=2.0)
+FIT = touch.Press(name="press", knots=DEPTHS)
 SHORT = {
     "fit": (FIT, dataclasses.replace(FIT, name="again", repeat_of="press")),
-    "validation": (touch.Press(name="held", knots=touch._presses((8e-4, 4e-4), (0.1, 0.4), 0.5, 2.5, 2.0), z_m=0.002),),
+    "validation": (touch.Press(name="held", knots=HELD, x_m=0.0, z_m=0.002),),
     "test": (),
 }
 CONSIDERED = ("taxel_saturation", "taxel_creep", "baseline_drift", "touch_lag")

@@ -10,11 +10,11 @@ from made_traces import comparison, trace
 
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
-from taccorl.diagnosis.machines.machine import PartFinding
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.diagnosis.search.solve import PartFinding
 from taccorl.report.diagnosed import _to_add, brief
 from taccorl.report.evidence_words import evidence_words, excite_command, may_be_two, may_stand_in, unit_words, unjudged
 from taccorl.report.report import Report

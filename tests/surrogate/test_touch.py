@@ -30,7 +30,7 @@ def through(name: str, reading: np.ndarray, **values: float) -> np.ndarray:
 def replayed(case: TouchCase, press: touch.Press, hidden=()) -> tuple[np.ndarray, np.ndarray]:
     """Counts that the twin with the true k_n, k_d says, and those that were recorded."""
     twin = TwinConfig(sensor=FlexiTacConfig(normal_stiffness_per_m=case.k_n, normal_damping_s_per_m=case.k_d))
-    motion = touch_motion(record_touch(case, press), twin, touch.pressed_object(case, press))
+    motion = touch_motion(record_touch(case, press), twin, press.pressed(case.arm).made())
     model = TouchModel(twin)
     return model.counts(motion, model.simulate(motion, case.k_n, case.k_d, hidden)), motion.measured.astype(float)
 
@@ -106,10 +106,9 @@ def test_the_same_seed_gives_the_same_pads_and_recordings_bit_for_bit():
 def test_recordings_are_what_the_touch_problem_takes():
     case = draw_touch_case([], 5)
     made = touch_recordings(case)
-    motions = made.motions(case.twin)
-    assert [len(motions[use]) for use in ("fit", "validation", "test")] == [4, 2, 1]
+    assert [len(side) for side in (made.fit, made.validation, made.test)] == [4, 2, 1]
     assert made.fit[1].repeat_of == made.fit[0].name
-    for motion in (m for use in motions.values() for m in use):
+    for motion in (touch_motion(m, case.twin, m.pressed) for m in made.all):
         assert motion.pads == tuple(case.pads)
         assert motion.undisturbed().mean() > 0.05
     press = made.fit[0]

@@ -17,7 +17,7 @@ from taccorl.errors import SpecError, TaccorlError
 from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate import touch, writing
 from taccorl.surrogate.drivers import START_UNIX_NS
-from taccorl.surrogate.touch import TouchCase, TouchRecordings, draw_touch_case
+from taccorl.surrogate.touch import TouchCase, draw_touch_case
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 from taccorl.surrogate.writing import PRESSES, TRUTH, TWIN, draw_touch_secret, reveal, write_touch_recordings
 
@@ -25,7 +25,7 @@ KNOTS = ((0.0, -1e-3), (2.0, -1e-3), (2.3, 8e-4), (3.0, 8e-4), (3.3, -1e-3), (4.
 BALL = touch.Press(name="ball", knots=KNOTS, x_m=0.001, z_m=0.003)
 AGAIN = touch.Press(name="again", knots=KNOTS, x_m=0.001, z_m=0.003, repeat_of="ball")
 SIZES = ("radius_m", "half_height_m")
-ROD = touch.Press(name="rod", knots=KNOTS, shape="rod", z_m=0.012)
+ROD = touch.Press(name="rod", knots=KNOTS, shape="rod", x_m=0.0, z_m=0.012)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def case() -> TouchCase:
 
 
 @pytest.fixture(scope="module")
-def written(case: TouchCase, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TouchRecordings]:
+def written(case: TouchCase, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Measurements]:
     """Three short presses instead of seven long ones."""
     folder = tmp_path_factory.mktemp("pads") / "made"
     with pytest.MonkeyPatch.context() as patch:
@@ -43,7 +43,7 @@ def written(case: TouchCase, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 
 @pytest.fixture(scope="module")
-def read(written: tuple[Path, TouchRecordings]) -> Measurements:
+def read(written: tuple[Path, Measurements]) -> Measurements:
     return read_measurements(written[0] / PRESSES)
 
 
@@ -68,7 +68,7 @@ def test_frames_and_stamps_are_read_back_as_they_were_made(written, read):
 
 def test_what_was_pressed_is_read_back(case, read):
     for m, press in zip(read.all, (BALL, AGAIN, ROD), strict=True):
-        meant = touch.pressed_object(case, press)
+        meant = press.pressed(case.arm).made()
         assert m.pressed is not None and (m.pressed.arm, m.pressed.frame) == ("right", "tcp")
         np.testing.assert_allclose(m.pressed.pose, meant.pose, atol=1e-12)
         (solid,), (true,) = m.pressed.solids, meant.solids

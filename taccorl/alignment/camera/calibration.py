@@ -13,6 +13,7 @@ Letters in shapes: F frames.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -113,14 +114,19 @@ class CameraFit:
         on this camera are removed. Raises TaccorlError: the calibration is not valid."""
         if self.problems:
             raise TaccorlError(f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera")
-        kept = []
-        for effect in config.effects:
-            if effect.name != "camera_pose" or self.camera.name not in effect.acts_on():
-                kept.append(effect)
-            elif others := [name for name in effect.acts_on() if name != self.camera.name]:
-                kept.append(dataclasses.replace(effect, cameras=others))
         cameras = [self.camera if camera.name == self.camera.name else camera for camera in config.cameras]
-        return dataclasses.replace(config, cameras=cameras, effects=kept)
+        return dataclasses.replace(without_effects(config, self.camera.name, ("camera_pose",)), cameras=cameras)
+
+
+def without_effects(config: TwinConfig, camera: str, names: Sequence[str]) -> TwinConfig:
+    """The twin without its effects ``names`` on this camera; entries that name several cameras keep the others."""
+    kept = []
+    for effect in config.effects:
+        if effect.name not in names or camera not in effect.acts_on():
+            kept.append(effect)
+        elif others := [c for c in effect.acts_on() if c != camera]:
+            kept.append(dataclasses.replace(effect, cameras=others))
+    return dataclasses.replace(config, effects=kept)
 
 
 def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> CameraFit:

@@ -67,7 +67,8 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
             if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
                 return
             swapped = _swapped(m, *pair)
-            if any(beyond_limits(robot, swapped, n) for n in pair):  # it is their unit that is wrong
+            limits = {n: robot.rigid.joints[n].limits for n in pair}
+            if any(beyond_limits(swapped, n, limits[n], "") for n in pair):  # it is their unit that is wrong
                 return
             old, new = _replay_error(robot, m, name), _replay_error(robot, swapped, other[name])
             rows.append((name, m.name, _noise(m, name), old, new))

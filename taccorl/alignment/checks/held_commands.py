@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 
 from taccorl.alignment.checks.first_order import beside
 from taccorl.alignment.measurements.measurement import Measurement
@@ -199,7 +199,9 @@ def _fitted(
 
     def answer(x: np.ndarray, drive: np.ndarray) -> np.ndarray:
         late = np.interp(np.arange(len(drive)) - x[2], np.arange(len(drive)), drive, left=drive[0] * (x[2] <= 0))
-        return np.asarray(lfilter(*_second_order(math.exp(x[0]), math.exp(x[1]), period_s), late))
+        omega, zeta = math.exp(x[0]), math.exp(x[1])
+        numerator, denominator, _ = cont2discrete(([omega**2], [1.0, 2.0 * zeta * omega, omega**2]), period_s)
+        return np.asarray(lfilter(np.ravel(numerator), denominator, late))
 
     def residual(x: np.ndarray) -> np.ndarray:
         return beside(measured[seen], answer(x, u)[seen])[0]
@@ -212,16 +214,6 @@ def _fitted(
     solution = np.linalg.lstsq(design[seen], measured[seen], rcond=None)[0]
     commanded = np.column_stack([answer(best, target - target[0]), np.ones(len(u))])
     return measured - commanded @ solution, solution[0] * answer(best, impulse)[LEAD_ROWS:]
-
-
-def _second_order(omega: float, zeta: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator of ω² / (s² + 2 ζ ω s + ω²) behind a zero-order hold."""
-    root = np.sqrt(complex(zeta**2 - 1.0 + 1e-9))
-    s = omega * (-zeta + root), omega * (-zeta - root)
-    z = np.exp(s[0] * period_s), np.exp(s[1] * period_s)
-    first = 1.0 + ((s[1] * z[0] - s[0] * z[1]) / (s[0] - s[1])).real
-    whole = ((1 - z[0]) * (1 - z[1])).real
-    return np.array([0.0, first, whole - first]), np.array([1.0, -(z[0] + z[1]).real, (z[0] * z[1]).real])
 
 
 def _whitening(left: np.ndarray) -> np.ndarray:

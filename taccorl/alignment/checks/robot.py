@@ -1,7 +1,8 @@
 """Check that a recording and a robot file match: limits of position and effort, inertia, missing columns."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -12,6 +13,7 @@ from taccorl.alignment.checks.trial import write
 from taccorl.alignment.checks.wiring import velocity_gain
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
@@ -44,12 +46,12 @@ def check_robot(
     all recordings; by default in this one."""
     if fits is None:
         fits = {name: law_fit(robot.config.joints[name], [whole], name) for name in moved if name in m.signals}
-    found = _missing(robot, m)
+    found = pose_unknown([name for name in robot.units if name not in m.signals], "at the model's zero pose")
     factors: dict[str, float] = {}
     of_efforts: list[Finding] = []
     for name in robot.config.joints:
         if name in m.signals:
-            wrong = beyond_limits(robot, m, name)
+            wrong = beyond_limits(m, name, robot.rigid.joints[name].limits, robot.rigid.path.name)
             fit = fits[name] if name in moved else None
             known = _factor(robot.config.joints[name], whole, name, fit)
             if known is not None and not wrong and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
@@ -57,7 +59,9 @@ def check_robot(
                 continue
             wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
             if name in moved and not wrong:
-                wrong = _wrong_inertia(robot, whole, name, known or 1.0, fit)
+                model = JointModel(robot, name)
+                words = partial(_inertia_words, robot, whole, model)
+                wrong = wrong_inertia(model, whole, fit, words, known or 1.0)
             of_efforts += [f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")]
             found += [f for f in wrong if f not in of_efforts]
     if len(factors) > 1:  # one cause: what is left of these comes back once the unit is written
@@ -96,28 +100,25 @@ def _factor(law: DriveLaw, m: Measurement, name: str, fit: LawFit | None) -> flo
 
 
 @check("warning", "pose_unknown")
-def _missing(robot: Robot, m: Measurement) -> list[Finding]:
-    lacking = [name for name in robot.units if name not in m.signals]
-    if not lacking:
-        return []
+def pose_unknown(lacking: Sequence[str], pose: str, feature: str = "") -> list[Finding]:
+    """Finding on joints that a recording lacks. ``pose``: text that says where they are taken to stand."""
     text = (
-        f"it lacks {listed(lacking)}: they are taken to stand at the model's zero pose, and inertia and weight of what moves "
-        "follow from that; add their columns, constant ones will do"
+        f"it lacks {listed(lacking, 6)}: they are taken to stand {pose}, and inertia and weight of what moves follow from that; "
+        "add their columns, constant ones will do"
     )
-    return [find("pose_unknown", "", text)]
+    return [find("pose_unknown", feature, text)] if lacking else []
 
 
 @check("error", "beyond_limits")
-def beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
-    facts, j = robot.rigid.joints[name], m.column(name)
-    if facts.limits is None:
-        return []
-    (low, high), q = facts.limits, m.measured[:, j]
+def beyond_limits(m: Measurement, name: str, limits: tuple[float, float] | None, file: str) -> list[Finding]:
+    """Finding on positions beyond ``limits`` of signal ``name``, which ``file`` states [rad, m]; empty if there are none."""
+    j = m.column(name)
+    (low, high), q, unit = limits or (-math.inf, math.inf), m.measured[:, j], m.units[j]
     beyond = np.nan_to_num(np.maximum(q - high, low - q), nan=-1.0)
     row = int(np.argmax(beyond))
-    if beyond[row] <= BEYOND * (high - low):
+    if limits is None or beyond[row] <= BEYOND * (high - low):
         return []
-    if facts.unit == "rad" and abs(q[row]) > 2 * np.pi:
+    if unit == "rad" and abs(q[row]) > 2 * np.pi:
         speed = velocity_gain(m, j, j)
         has_speed = np.isfinite(m.velocity[:, j]).any() and (speed is None or speed > DEGREES**0.5)
         qd = f" (`deg/s` for {name}.qd)" * bool(has_speed)
@@ -125,8 +126,8 @@ def beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     else:
         way_out = f"Write the `unit:` of {name}.q and {name}.q_target in a columns file, `factor: -1` if their sign is reversed"
     text = (
-        f"{name} is at {q[row]:.4g} {facts.unit} at {m.time_s[row]:.3f} s, its limits in the model are {low:.4g} … {high:.4g}. "
-        f"{way_out}; or correct the range in {robot.rigid.path.name}"
+        f"{name} is at {q[row]:.4g} {unit} at {m.time_s[row]:.3f} s, its limits in {file} are [{low:.4g}, {high:.4g}]. "
+        f"{way_out}; or correct these, [{min(low, float(np.nanmin(q))):.4g}, {max(high, float(np.nanmax(q))):.4g}] hold all of it"
     )
     return [find("beyond_limits", name, text, (row, row + 1))]
 
@@ -183,14 +184,23 @@ def in_degrees(ratio: float, signal: str, unit: str) -> str:
 
 
 @check("error", "wrong_inertia")
-def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: LawFit | None) -> list[Finding]:
-    """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
+def wrong_inertia(
+    model: JointModel,
+    m: Measurement,
+    fit: LawFit | None,
+    words: Callable[[JointMotion, float, float], str],
+    factor: float = 1.0,
+) -> list[Finding]:
+    """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant.
+    ``fit``: law of the efforts. ``words``: function of the motion, the inertia that it shows and the stated one [kg·m², kg] that
+    returns the text of the finding."""
+    name = model.signal
     j = m.column(name)
-    q, torque = m.measured[:, j], m.effort[:, j] / factor
+    q, torque, is_off = m.measured[:, j], m.effort[:, j] / factor, m.enabled.size and not m.enabled[:, j].all()
     rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
-    if not m.has_effort()[j] or not np.isfinite([q, torque, m.target[:, j]]).all() or m.num_rows < 4 * rows:
+    known = m.has_effort()[j] and np.isfinite([q, torque, m.target[:, j]]).all() and not is_off
+    if not known or m.num_rows < 4 * rows:
         return []
-    model = JointModel(robot, name)
     motion = motion_of(m, name, model.joint)
     v, a = (savgol_filter(q, rows, 2, deriv=d, delta=m.period_s) for d in (1, 2))
     others = np.column_stack([v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q)])
@@ -207,17 +217,23 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: 
     size = float(np.linalg.norm(a) * np.linalg.norm(left[1]))
     if size == 0.0 or float(a @ left[1]) / size < INERTIA_SURE:
         return []
-    known, seen = model.inertia_kgm2(motion), seen[1]
-    if 1 / INERTIA_OFF <= seen / known <= INERTIA_OFF:
+    stated = model.inertia_kgm2(motion)
+    if 1 / INERTIA_OFF <= seen[1] / stated <= INERTIA_OFF:
         return []
+    return [find("wrong_inertia", name, words(motion, seen[1], stated))]
+
+
+def _inertia_words(
+    robot: Robot, m: Measurement, model: JointModel, motion: JointMotion, seen: float, known: float
+) -> str:
+    name = model.signal
     nearest = min(robot.rigid.joints.values(), key=lambda f: abs(np.log(max(f.inertia + f.armature, 1e-9) / seen))).name
     hint = f" That is the size of {nearest}: are columns exchanged?" if nearest != name else ""
-    unit, rotor = "kg·m²" if m.units[j] == "rad" else "kg", model.joint.rigid(motion, []).rotor_inertia
+    unit, rotor = "kg·m²" if model.unit == "rad" else "kg", model.joint.rigid(motion, []).rotor_inertia
     if seen > known and rotor == 0.0:  # a small joint is mostly rotor
         hint = f" It has no rotor: a motor behind a gear adds its own, here `rotor_inertia: {seen - known:.3g}`.{hint}"
-    text = (
+    return (
         f"effort and acceleration of {name} say {seen:.3g} {unit}, the model with its rotor {known:.3g}: {seen / known:.2g} "
-        f"times.{hint}{in_degrees(seen / known, name, m.units[j])} Else its effort is in another unit: write {_line(m, name)}, "
-        f"or rotor_inertia and gear of {name} in {robot.path.name}"
+        f"times.{hint}{in_degrees(seen / known, name, model.unit)} Else its effort is in another unit: write "
+        f"{_line(m, name)}, or rotor_inertia and gear of {name} in {robot.path.name}"
     )
-    return [find("wrong_inertia", name, text)]

@@ -19,6 +19,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.measurements.correlation import independent_rows
 from taccorl.alignment.measurements.measurement import UNITS
 from taccorl.errors import TaccorlError
 
@@ -329,14 +330,14 @@ class _GainSearch:
         return least_squares(self.residual, start, jac, bounds, x_scale="jac", max_nfev=most, xtol=1e-10, ftol=1e-12)
 
     def covariance(self, x: np.ndarray) -> np.ndarray:
-        """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, and σ² that of the residuals times their correlation time; very
-        large where J is singular."""
+        """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, and σ² that of the residuals times their number for each
+        independent one (``independent_rows``); very large where J is singular."""
         parts, jacobian = self.parts(x), self.jacobian(x)
         residual, norms = np.concatenate(parts), np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30)
         _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
         half = right / np.maximum(singular, 1e-12)[:, None] / norms
-        variance = float(residual @ residual) / max(len(residual) - len(norms), 1) * correlation_time(parts)
-        return half.T @ half * variance
+        variance = float(residual @ residual) / max(len(residual) - len(norms), 1)
+        return half.T @ half * variance * len(residual) / independent_rows([part[:, None] for part in parts])
 
     def weigh(self, x: np.ndarray) -> None:
         """Set the noise of both channels to the RMS residuals at ``x`` (P,)."""
@@ -349,18 +350,3 @@ class _GainSearch:
 
 def _finite(values: np.ndarray) -> np.ndarray:
     return np.nan_to_num(values, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
-
-
-def correlation_time(parts: Sequence[np.ndarray]) -> float:
-    """Number of rows after which residuals are independent, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the largest over ``parts``.
-    ``parts``: residuals (R,) of one recording and channel each."""
-    longest = 1.0
-    for part in parts:
-        centred = part - part.mean()
-        size = 2 ** math.ceil(math.log2(2 * len(part)))
-        rho = np.fft.irfft(np.abs(np.fft.rfft(centred, size)) ** 2, size)[: len(part)]
-        if rho[0] > 0:
-            rho /= rho[0]
-            end = int(np.argmax(rho <= 0.0)) or len(rho)
-            longest = max(longest, 1.0 + 2.0 * float(rho[1:end].sum()))
-    return longest

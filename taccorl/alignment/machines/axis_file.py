@@ -261,6 +261,10 @@ class DrivenAxis(DriveJoint):
         self.facts = {**self.facts, "speed_age": self.speed_delay_s, "speed_delay__delay_s": late_s}
         self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
 
+    def joint(self, signal: str) -> "DrivenAxis":
+        """Itself: an axis is a machine with one joint."""
+        return self
+
     def timestep_s(self, motion: JointMotion) -> float:
         return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)
 

@@ -8,7 +8,7 @@ the load (creep, lag, delay, hysteresis); other effects act on the whole load, a
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -141,6 +141,11 @@ def of_file(config: CellsConfig) -> Calibration | None:
     return Calibration(np.array(config.gain) * config.load_of_reading, np.array(config.offset))
 
 
+def by_cell(config: CellsConfig, numbers: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """``KEY_CELL`` → number of each cell; ``numbers``: ``gain`` or ``offset`` → K numbers, or none."""
+    return {f"{key}_{cell}": x for key, own in numbers.items() for cell, x in zip(config.names, own, strict=False)}
+
+
 def file_numbers(config: CellsConfig, calibration: Calibration) -> dict[str, list[float]]:
     """Keys ``gain`` and ``offset`` of a cells file, each with K numbers; gains are per unit of the load. With places the gain is
     that of the place where the cell responds most."""
@@ -158,11 +163,8 @@ def thinned(m: CellMeasurement) -> CellMeasurement:
     whole = m.num_rows // size * size
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1) if values.size else values
+        return values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1)
 
-    columns = {
-        name: mean(getattr(m, name))
-        for name in ("time_s", "target", "measured", "velocity", "effort", "temperature_c", "position_mm")
-    }
+    columns = {name: mean(getattr(m, name)) for name in ("time_s", *m.columns)}
     columns["place"] = m.place[:whole:size]
     return dataclasses.replace(m, **columns)

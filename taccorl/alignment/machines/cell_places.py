@@ -13,10 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from taccorl.alignment.machines.cell_tables import CellMeasurement
+from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
@@ -29,13 +28,13 @@ def with_places(config: CellsConfig, measurements: Measurements) -> Measurements
     """``measurements`` with the place of every row; unchanged if the cells file has no ``same_place_mm``, or they have places.
     Raises TaccorlError: a recording has no position, no press of the fit recordings stays at its place, or there are more than
     ``MOST_PLACES`` places."""
-    if config.same_place_mm is None or all(m.place.size for m in _cells(measurements.all)):
+    if config.same_place_mm is None or all(m.place.size for m in cells_of(measurements.all)):
         return measurements
-    lacking = [m.name for m in _cells(measurements.all) if not m.position_mm.size]
+    lacking = [m.name for m in cells_of(measurements.all) if not m.position_mm.size]
     if lacking:
         raise TaccorlError(f"{lacking[0]}: has no position of the probe, but {config.name} has same_place_mm")
     places: list[np.ndarray] = []
-    found = [press for m in _cells(measurements.fit) for press in presses(config, m)]
+    found = [press for m in cells_of(measurements.fit) for press in presses(config, m)]
     for _, _, at, moved in found:
         if moved <= config.same_place_mm and _nearest(at, places, config.same_place_mm) < 0:
             places.append(at)
@@ -50,7 +49,7 @@ def with_places(config: CellsConfig, measurements: Measurements) -> Measurements
             f"several times, or write a larger same_place_mm than {config.same_place_mm:g} mm in the cells file"
         )
     sides = {
-        side: tuple(_placed(config, m, places) for m in _cells(getattr(measurements, side)))
+        side: tuple(_placed(config, m, places) for m in cells_of(getattr(measurements, side)))
         for side in ("fit", "validation", "test")
     }
     for m in (m for side in sides.values() for m in side if (m.place < 0).all()):
@@ -96,10 +95,6 @@ def _placed(config: CellsConfig, m: CellMeasurement, places: Sequence[np.ndarray
         same = config.same_place_mm or 0.0
         place[begin:until] = _nearest(at, places, same) if moved <= same else -1
     return dataclasses.replace(m, place=place, num_places=max(len(places), 1))
-
-
-def _cells(measurements: Sequence[Measurement]) -> list[CellMeasurement]:
-    return [m for m in measurements if isinstance(m, CellMeasurement)]
 
 
 def _nearest(at: np.ndarray, places: Sequence[np.ndarray], same_mm: float) -> int:

@@ -18,7 +18,7 @@ comes to an even grid by straight lines between its rows.
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -275,6 +275,15 @@ class CellMeasurement(Measurement):
     """(T,) number of the place that is pressed, −1 in rows that are not used; empty if not known (``cell_places``)."""
     num_places: int = 0  # Number P of places of the sensor; 0 while ``place`` is empty
 
+    @property
+    def columns(self) -> list[str]:
+        return [*super().columns, *(name for name in ("temperature_c", "position_mm") if getattr(self, name).size)]
+
+
+def cells_of(measurements: Iterable[Measurement]) -> list[CellMeasurement]:
+    """Those of ``measurements`` that are of a sensor of cells."""
+    return [m for m in measurements if isinstance(m, CellMeasurement)]
+
 
 def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:
     """Read a table as a measurement of the sensor, in the units of the cells file. Raises RecordingError: a column is missing, a
@@ -345,16 +354,9 @@ def _even(m: CellMeasurement) -> CellMeasurement:
         raise RecordingError(
             f"{m.source}: no row for {steps[gap]:.2f} s after {m.time_s[gap]:.2f} s; split the table there into two files"
         )
-    even = m.resampled(1.0 / period)
-
-    def also(column: np.ndarray) -> np.ndarray:
-        return np.interp(even.time_s, m.time_s, column)
-
-    temperature = also(m.temperature_c) if m.temperature_c.size else m.temperature_c
-    position = np.column_stack([also(c) for c in m.position_mm.T]) if m.position_mm.size else m.position_mm
     text = (
         f"rows were not even (steps {1e3 * steps.min():.2f} … {1e3 * steps.max():.2f} ms): brought to {1 / period:.6g} Hz by "
         "straight lines. Log the driver's own stamps to avoid it"
     )
     finding = Finding("resampled", "warning", "time", text)
-    return dataclasses.replace(even, temperature_c=temperature, position_mm=position, findings=(*m.findings, finding))
+    return dataclasses.replace(m.resampled(1.0 / period), findings=(*m.findings, finding))

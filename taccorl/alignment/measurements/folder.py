@@ -75,6 +75,10 @@ class PressedNote:
         """The object as a ``PressedObject``, for ``touch_motion``."""
         return indenter(**{name: value for name, value in vars(self).items() if value is not None})
 
+    def entry(self) -> dict[str, Any]:
+        """The note as YAML values."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in vars(self).items() if v is not None}
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingNote(Stated):

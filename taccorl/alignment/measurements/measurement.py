@@ -143,6 +143,11 @@ class Measurement(Stated):
         return [name for name in ("load", "torque_ff", "supply_v", "enabled") if getattr(self, name).size]
 
     @property
+    def columns(self) -> list[str]:
+        """Names of the fields besides times that have an entry for each row, (T, …)."""
+        return ["target", "measured", "velocity", "effort", *self.extra_columns]
+
+    @property
     def num_rows(self) -> int:
         """T."""
         return len(self.time_s)
@@ -223,8 +228,8 @@ class Measurement(Stated):
             raise TaccorlError(f"{self.name}: its time does not increase: it cannot be resampled to {rate_hz:g} Hz")
         time_s = self.time_s[0] + np.arange(int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1) / rate_hz
         columns = {
-            name: np.column_stack([np.interp(time_s, self.time_s, c) for c in getattr(self, name).T])
-            for name in ("target", "measured", "velocity", "effort", *self.extra_columns)
+            name: np.apply_along_axis(lambda column: np.interp(time_s, self.time_s, column), 0, getattr(self, name))
+            for name in self.columns
         }
         if self.enabled.size:
             columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)

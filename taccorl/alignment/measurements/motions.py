@@ -135,7 +135,7 @@ def _fade(time_s: np.ndarray, seconds: float) -> np.ndarray:
     return share**2 * (3 - 2 * share)
 
 
-def _motion(name: str, moved: Callable[[Room], np.ndarray], off: float = 0.0) -> Motion:
+def between_rests(name: str, moved: Callable[[Room], np.ndarray], off: float = 0.0) -> Motion:
     """Motion about a middle that is off by ``off`` times the sweep's amplitude; ``moved``: room → (T,) [rad], without rests."""
     still = np.zeros(round(REST_S * RATE_HZ))
 
@@ -149,34 +149,34 @@ def _steps(levels: tuple[float, ...], hold_s: float = 1.0) -> Callable[[Room], n
     return lambda room: steps(np.array(levels) * room.sweep_rad, hold_s, room.speed_rad_per_s)
 
 
-CHIRP = _motion("chirp", lambda r: chirp(SWEEP_S, SLOW_HZ, FAST_HZ, r.sweep_rad, r.speed_rad_per_s))
+CHIRP = between_rests("chirp", lambda r: chirp(SWEEP_S, SLOW_HZ, FAST_HZ, r.sweep_rad, r.speed_rad_per_s))
 AGAIN = dataclasses.replace(CHIRP, name="chirp_again", repeat_of="chirp")
-WIDE_TRIANGLE = _motion("wide_triangle", lambda r: triangle(14.0, r.wide_rad))
+WIDE_TRIANGLE = between_rests("wide_triangle", lambda r: triangle(14.0, r.wide_rad))
 STIFFER_CHIRP = dataclasses.replace(CHIRP, name="chirp_2x_gain", gain=2.0)
 LOADED_CHIRP = dataclasses.replace(CHIRP, name="chirp_payload", payload_kg=KNOWN_KG)
-STEPS = _motion("steps", _steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0)))
-SMALL_CHIRP = _motion("small_chirp", lambda r: chirp(6.0, 0.2, 4.0, r.small_rad, r.speed_rad_per_s))
+STEPS = between_rests("steps", _steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0)))
+SMALL_CHIRP = between_rests("small_chirp", lambda r: chirp(6.0, 0.2, 4.0, r.small_rad, r.speed_rad_per_s))
 PACK = (WIDE_TRIANGLE, STEPS, SMALL_CHIRP, STIFFER_CHIRP, LOADED_CHIRP)
 """Motions of the fit recordings besides the chirp and its repeat."""
-HELD_STEPS = _motion("held_steps", _steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0)), -0.2)
+HELD_STEPS = between_rests("held_steps", _steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0)), -0.2)
 """Motion that is recorded twice as well: with dry friction a robot repeats its steps worse than its chirp."""
 VALIDATION = (
-    _motion("held_chirp", lambda r: chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad, r.speed_rad_per_s), -0.3),
-    _motion("held_triangle", lambda r: triangle(12.0, 0.8 * r.wide_rad, 2)),
+    between_rests("held_chirp", lambda r: chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad, r.speed_rad_per_s), -0.3),
+    between_rests("held_triangle", lambda r: triangle(12.0, 0.8 * r.wide_rad, 2)),
     HELD_STEPS,
     dataclasses.replace(HELD_STEPS, name="held_steps_again", repeat_of="held_steps"),
 )
 """Motions of the validation recordings."""
 TEST = (
-    _motion("test_multisine", lambda r: multisine(10.0, 1.2 * r.sweep_rad, 5, r.speed_rad_per_s)),
-    _motion("test_multisine_far", lambda r: multisine(8.0, 0.7 * r.sweep_rad, 9, r.speed_rad_per_s), 0.4),
+    between_rests("test_multisine", lambda r: multisine(10.0, 1.2 * r.sweep_rad, 5, r.speed_rad_per_s)),
+    between_rests("test_multisine_far", lambda r: multisine(8.0, 0.7 * r.sweep_rad, 9, r.speed_rad_per_s), 0.4),
 )
 """Motions of the test recordings."""
 LIBRARY = (
     CHIRP,
     *PACK,
-    _motion("slow_triangle", lambda r: triangle(30.0, 0.5 * r.wide_rad)),
-    _motion("holds", _steps((0.3, -0.3, 0.8, -0.8, 0.0), hold_s=4.0)),
+    between_rests("slow_triangle", lambda r: triangle(30.0, 0.5 * r.wide_rad)),
+    between_rests("holds", _steps((0.3, -0.3, 0.8, -0.8, 0.0), hold_s=4.0)),
     dataclasses.replace(STEPS, name="steps_2x_gain", gain=2.0),
     dataclasses.replace(WIDE_TRIANGLE, name="triangle_payload", payload_kg=KNOWN_KG),
 )

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from taccorl.alignment.controller.identification import Estimate
+from taccorl.alignment.measurements.correlation import Rows, block_sums, rate_of
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.errors import TaccorlError
@@ -25,7 +26,6 @@ from taccorl.sim.twin import TwinConfig
 
 QUANTILE = 0.999  # Share of the readings without contact that lie below λ_noise
 MIN_FRAMES = 50  # Least number of frames without contact for a noise level: half a second
-BLOCK_S = 0.5  # Time after which residuals count as independent in the intervals [s]
 _NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
 _MIN_IN_CONTACT = 20  # frames
 _STIFFNESS_PER_M, _DAMPING_S_PER_M = (1.0, 1e6), (0.0, 1e4)
@@ -149,8 +149,11 @@ def calibrate_touch(
     low_x, high_x = np.array([_STIFFNESS_PER_M, _DAMPING_S_PER_M]).T / scale
     first = np.clip(start / scale, low_x, high_x)
     solved = least_squares(stacked, first, jac=slopes, bounds=(low_x, high_x), x_scale="jac")  # pyright: ignore[reportArgumentType]
-    times = [motion.time_s.mean(axis=1) for motion in fit]
-    covariance = _block_covariance(solved.jac, left(solved.x), times) * np.outer(scale, scale)
+    curvature = np.linalg.pinv(solved.jac.T @ solved.jac)
+    layout = [Rows(np.isfinite(own), rate_of(m.time_s[:, 0])) for own, m in zip(left(solved.x), fit, strict=True)]
+    # If residuals of one block of time hang together in any way (sandwich).
+    pulls = block_sums(solved.jac * solved.fun[:, None], layout) @ curvature
+    covariance = pulls.T @ pulls * np.outer(scale, scale)
     value, std = solved.x * scale, np.sqrt(np.diag(covariance))
     low, high = value - 1.96 * std, value + 1.96 * std
     threshold = noise.threshold_count
@@ -177,20 +180,6 @@ def _trouble(status: int, value: np.ndarray, std: np.ndarray) -> str:
     if value[1] <= std[1]:
         said.append("k_d is no more than its error: readings come late or the presses are too slow to show it")
     return "; ".join(said)
-
-
-def _block_covariance(jacobian: np.ndarray, residuals: Sequence[np.ndarray], times: Sequence[np.ndarray]) -> np.ndarray:
-    """(2, 2) of the estimates, if residuals of one block of time hang together in any way (sandwich)."""
-    curvature = np.linalg.pinv(jacobian.T @ jacobian)
-    meat, at = np.zeros((2, 2)), 0
-    for left, time_s in zip(residuals, times, strict=True):
-        rows = slice(at, at + left.size)
-        at += left.size
-        scores = (jacobian[rows] * left.reshape(-1, 1)).reshape(len(left), -1, 2).sum(axis=1)
-        block = ((time_s - time_s[0]) / BLOCK_S).astype(int)
-        sums = np.stack([np.bincount(block, scores[:, k]) for k in range(2)], axis=1)
-        meat += sums.T @ sums
-    return curvature @ meat @ curvature
 
 
 def _pads(motions: Sequence[TouchMotion]) -> tuple[str, ...]:

@@ -5,12 +5,19 @@ whole twin follows the commands. Touch is a matched contact replay (``taccorl.al
 measured poses, in an object whose pose is known.
 """
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.telemetry import MOVED
+from taccorl.alignment.controller.arm_joint import HasJoints
+from taccorl.alignment.controller.drive_law import FOLLOWED, DriveLaw
+from taccorl.alignment.controller.joint_model import JointModel, with_more_lead, with_other_numbers
+from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor, touch_floor
@@ -87,6 +94,69 @@ def compare(
         split=measurements.record(),
         clock=beside_onsets(clock),
         left_out=tuple(left_out),
+    )
+
+
+def compare_joints(
+    machine: HasJoints,
+    laws: Mapping[str, DriveLaw],
+    measurements: Measurements,
+    whole: Callable[[Measurement], Measurement],
+    *,
+    name: str,
+    file: str,
+    effects: tuple[str, ...],
+    uncertain: Sequence[str],
+    progress: Callable[[str, int, int], None],
+) -> Comparison:
+    """As ``compare``, for a machine whose joints have the ``laws`` of its ``file``: each is simulated alone.
+
+    Args:
+        whole: function that returns a recording with all signals of the machine.
+        uncertain: joints whose drives have numbers that ``diagnose`` fits.
+    """
+    uses: list[tuple[Use, Measurement]] = [(use, whole(m)) for use in USES for m in getattr(measurements, use)]
+    every = [m for _, m in uses]
+    traces, clock, held, replayed, left = [], {}, set(), [], []
+    for k, m in enumerate(every):
+        progress(m.name, k, len(uses))
+        moved = moving(m.with_position_targets(m.measured))
+        known = [s for s in m.signals if s in laws and (s in moved or len(laws) == 1)]
+        held |= {s for s in moved if s not in laws}
+        replayed.append((known, response := replay_joints(machine, m, known)))
+        followed = FOLLOWED * np.array([m.target_kind(s) == "effort" for s in m.signals])
+        left.append(dataclasses.replace(m, effort=m.effort - followed * np.nan_to_num(response.effort)))
+    left *= any("effort" in m.target_kinds for m in every)
+    floors: dict[Kind, dict[str, SignalFloor]] = {"position": noise_floor(every)}
+    floors["effort"] = noise_floor(every, "effort", left)
+    levels = {signal: floor.value for signal, floor in floors["position"].items()}
+    for (use, m), (known, response) in zip(uses, replayed, strict=True):
+        positions = m.with_position_targets(np.nan_to_num(response.reported))
+        response.reported[:, [m.column(s) for s in known if laws[s].law == "effort"]] = np.nan  # held where measured
+        own = traces_of(positions, use, dataclasses.replace(response, measurement=positions), floors)
+        traces += [t for t in own if t.signal in known]
+        if not (known := [s for s in known if laws[s].law != "effort"]):
+            continue
+        commanded = m.with_position_targets(np.zeros(m.target.shape)).only(known)
+
+        def with_more[T](change: Callable[[JointModel, JointMotion], T], signal: str, m: Measurement = m) -> T:
+            model = JointModel(machine, signal)
+            return change(model, motion_of(m, signal, model.joint))
+
+        changed, rivals = partial(with_more, with_other_numbers), partial(with_more, with_more_lead)
+        reported, fitted = response.reported[:, [m.column(s) for s in known]], [s for s in known if s in uncertain]
+        clock[m.name] = tuple(check_against_twin(commanded, reported, levels, fitted, changed, rivals))
+    progress("", len(uses), len(uses))
+    if not traces:
+        why = f"no position of a joint that {file} names was measured in motion"
+        raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: {why}")
+    return Comparison(
+        twin=name,
+        effects=effects,
+        traces=tuple(traces),
+        split=measurements.record(),
+        clock=beside_onsets(clock),
+        left_out=tuple(f"{s}: {file} does not name it under joints" for s in sorted(held)),
     )
 
 

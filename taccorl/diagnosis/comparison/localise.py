@@ -188,6 +188,26 @@ class Cell:
         return self.share_of_error / self.share_of_time
 
 
+def cell_of(
+    signal: str, kind: Kind | Literal["touch"], regime: str, inside: np.ndarray, total: float, rows: float, floor: float
+) -> Cell | None:
+    """The error of a regime from its finite squared residuals ``inside`` (n,), of a signal with so many ``rows`` and the sum
+    ``total``. None if it holds fewer rows than ``LEAST_SHARE``."""
+    if len(inside) < max(LEAST_SHARE * rows, 1):
+        return None
+    rmse = float(np.sqrt(np.mean(inside)))
+    return Cell(
+        signal=signal,
+        kind=kind,
+        regime=regime,
+        rmse=rmse,
+        ratio=rmse / floor,
+        share_of_error=float(np.sum(inside)) / total if total > 0 else 0.0,
+        share_of_time=len(inside) / rows,
+        n=len(inside),
+    )
+
+
 def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
     """One cell for every signal of this kind and regime with at least 1 % of the rows; all recordings together."""
     cells = []
@@ -198,24 +218,8 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
         floor = motions[0].trace.floor.value
         for regime in REGIMES:
             inside = np.concatenate([s[regime.rows(m)] for s, m in zip(squares, motions, strict=True)])
-            n = int(np.isfinite(inside).sum())
-            if n < LEAST_SHARE * rows or n == 0:
-                continue
-            rmse = float(np.sqrt(np.nanmean(inside)))
-            share = float(np.nansum(inside)) / total if total > 0 else 0.0
-            cells.append(
-                Cell(
-                    signal=signal,
-                    kind=kind,
-                    regime=regime.name,
-                    rmse=rmse,
-                    ratio=rmse / floor,
-                    share_of_error=share,
-                    share_of_time=n / rows,
-                    n=n,
-                )
-            )
-    return cells
+            cells.append(cell_of(signal, kind, regime.name, inside[np.isfinite(inside)], total, rows, floor))
+    return [cell for cell in cells if cell]
 
 
 def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:

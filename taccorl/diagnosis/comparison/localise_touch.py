@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from taccorl.data.timing import runs
-from taccorl.diagnosis.comparison.localise import LEAST_SHARE, Cell
+from taccorl.diagnosis.comparison.localise import Cell, cell_of
 from taccorl.diagnosis.comparison.replays import CONTACT_COUNTS
 from taccorl.diagnosis.comparison.result import TouchTrace
 
@@ -88,21 +88,5 @@ def touch_heat_map(traces: Sequence[TouchTrace]) -> list[Cell]:
         if count == 0:
             continue
         floor = float(np.sqrt(np.mean(np.concatenate(floor_squares))))
-        for name, own in parts.items():
-            if len(own) < LEAST_SHARE * count:
-                continue
-            rmse = float(np.sqrt(own.mean()))
-            share = float(own.sum()) / total if total > 0 else 0.0
-            cells.append(
-                Cell(
-                    signal=pad,
-                    kind="touch",
-                    regime=name,
-                    rmse=rmse,
-                    ratio=rmse / floor,
-                    share_of_error=share,
-                    share_of_time=len(own) / count,
-                    n=len(own),
-                )
-            )
-    return cells
+        cells += [cell_of(pad, "touch", name, own, total, count, floor) for name, own in parts.items()]
+    return [cell for cell in cells if cell]

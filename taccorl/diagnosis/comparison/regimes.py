@@ -16,8 +16,8 @@ from taccorl.alignment.measurements.folder import Use
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, laid_pairs
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.comparison.along import variable_unit
-from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
+from taccorl.diagnosis.comparison.along import VARIABLES, variable_unit
+from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, motions_of
 from taccorl.diagnosis.comparison.result import USES, Trace
 from taccorl.diagnosis.search.problem import Recording
 from taccorl.diagnosis.search.result import SearchConfig
@@ -109,7 +109,7 @@ def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
 
 def with_regimes(
     sides: Sequence[Sequence[Recording]], measurements: Sequence[Measurement], floor: SignalFloor
-) -> list[list[Recording]]:
+) -> list[Sequence[Recording]]:
     """``sides`` (fit, validation, test) of a joint or axis, each recording with the rows of its regimes and the noise of
     positions there: by repeats of a motion, and ``EXACT`` of the tracking error, which no equations have more exactly (arms
     without an effect kept 0.3 % of it in steps). As they are if ``floor`` is that of efforts. ``measurements``: those that the
@@ -171,17 +171,12 @@ def _row(
 
 
 def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
-    unit = motions[0].trace.position_unit
-    variables: dict[str, Callable[[Motion], np.ndarray]] = {
-        "position": lambda m: bridged(m.trace.position),
-        "velocity": lambda m: m.velocity,
-        "commanded acceleration": lambda m: m.acceleration,
-    }
+    unit, variables = motions[0].trace.position_unit, {v.name: v for v in VARIABLES}
     found = []
-    for name, values in variables.items():
+    for name in ("position", "velocity", "commanded acceleration"):
         ranges: dict[Use, tuple[float, float]] = {}
         for use in USES:
-            own = [values(m) for m in motions if m.trace.use == use]
+            own = [variables[name].values(m) for m in motions if m.trace.use == use]
             if own:
                 low, high = np.quantile(np.concatenate(own), INNER)
                 ranges[use] = (float(low), float(high))

@@ -7,29 +7,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from taccorl.alignment.measurements.motions import RATE_HZ, REST_S, Motion, Room, steps, triangle
+from taccorl.alignment.measurements.motions import Motion, between_rests, steps, triangle
 
 _SLEW_S = 0.02
 """Time over which the speed of targets is taken: a shorter excess over a limit hardly moves a joint. A choice."""
 _LEVELS = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 1.0, -1.0, 0.0])
-
-
-def _to_levels(name: str, jump: bool) -> Motion:
-    def target(room: Room) -> np.ndarray:
-        speed = np.inf if jump else room.speed_rad_per_s
-        still = np.zeros(round(REST_S * RATE_HZ))
-        return room.middle_rad + np.concatenate([still, steps(_LEVELS * room.wide_rad, 1.0, speed), still])
-
-    return Motion(name=name, target=target)
-
-
-JUMPS = _to_levels("limit_jumps", jump=True)
-"""Targets in steps to the levels of ``_to_levels``: the largest motor torque at a given joint speed."""
-RAMPS = _to_levels("limit_ramps", jump=False)
-"""Targets that go to the levels of ``_to_levels`` at the largest speed of the joint: the largest speed of targets."""
-ENDS = Motion(
-    name="to_the_ends", target=lambda r: r.middle_rad + np.pad(triangle(14.0, r.wide_rad), round(REST_S * RATE_HZ))
-)
+JUMPS = between_rests("limit_jumps", lambda r: steps(_LEVELS * r.wide_rad, 1.0, np.inf))
+"""Targets in steps to ``_LEVELS``: the largest motor torque at a given joint speed."""
+RAMPS = between_rests("limit_ramps", lambda r: steps(_LEVELS * r.wide_rad, 1.0, r.speed_rad_per_s))
+"""Targets that go to ``_LEVELS`` at the largest speed of the joint: the largest speed of targets."""
+ENDS = between_rests("to_the_ends", lambda r: triangle(14.0, r.wide_rad))
 """A slow triangle over the whole range."""
 AIMED: Mapping[str, tuple[Motion, ...]] = {
     **dict.fromkeys(("torque_saturation", "torque_speed_limit", "slew_limit"), (JUMPS, RAMPS)),

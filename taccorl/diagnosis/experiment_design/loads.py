@@ -25,9 +25,10 @@ import numpy as np
 
 from taccorl.alignment.machines.cell_model import Calibration, calibrated, readings, responses
 from taccorl.alignment.machines.cell_places import with_places
-from taccorl.alignment.machines.cell_tables import CellMeasurement
+from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of
 from taccorl.alignment.machines.cells_file import LOADS, CellsConfig
 from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.presses import Knots, in_turn
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
 from taccorl.diagnosis.machines.cells import CellsMachine
@@ -40,9 +41,6 @@ REST_S = 3.0
 """Time without load before and after each press [s]."""
 SPEED_S = 0.05
 """The speed of existing recordings is the largest change of a load in this time [s]: noise of the load cell is no speed."""
-
-Knots = tuple[tuple[float, float], ...]
-"""(time [s], share of the highest load), connected by straight lines."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +68,7 @@ class LoadProfile:
 
 def _presses(*each: tuple[float, float, float], rest_s: float = REST_S) -> Knots:
     """Presses one after the other: (share of the highest load, seconds of loading and unloading, seconds of hold)."""
-    now, knots = rest_s, [(0.0, 0.0), (rest_s, 0.0)]
-    for share, ramp_s, hold_s in each:
-        for duration_s, end in ((ramp_s, share), (hold_s, share), (ramp_s, 0.0), (rest_s, 0.0)):
-            now += duration_s
-            knots.append((now, end))
-    return tuple(knots)
+    return in_turn(*each, rest_s=rest_s, before_s=rest_s)
 
 
 _THREE = ((1 / 3, 0.05, 3.0), (2 / 3, 0.05, 3.0), (1.0, 0.05, 3.0))
@@ -119,7 +112,7 @@ def load_range(
 
     Raises TaccorlError: the load is beyond the rated one, or the span does not begin at 0."""
     unit, rated = config.load.unit, config.load.rated
-    cells = [m for m in measurements.all if isinstance(m, CellMeasurement)]
+    cells = cells_of(measurements.all)
     if span and (len(span) != 2 or span[0] != 0 or not 0 < span[1] <= rated):
         raise TaccorlError(
             f"--span={list(span)}: a press begins without load and ends at most at the rated {rated:g} {unit}: "

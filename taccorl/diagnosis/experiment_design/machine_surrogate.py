@@ -19,20 +19,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from taccorl.alignment.measurements.folder import INDEX, Measurements
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, PACK, TEST, VALIDATION, Motion
-from taccorl.alignment.measurements.table_files import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.motions import EFFORT_NOISE_SHARE, Ground
-from taccorl.diagnosis.machines.machine import Addition, Machine, RecordedProblem
+from taccorl.diagnosis.machines.machine import Addition, Machine
 from taccorl.diagnosis.search.fit import fit, rms
 from taccorl.diagnosis.search.problem import Candidate, Recording, Values
+from taccorl.diagnosis.search.solve import RecordedProblem
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
-from taccorl.surrogate.writing import SWEEPS, seal
+from taccorl.surrogate.robot import coloured
+from taccorl.surrogate.writing import SWEEPS, write_tables
 
 ORIGIN = "simulated by the equations of the twin (taccorl surrogate --twin)"
 NOISE_SHARE = 2e-4
@@ -210,11 +210,9 @@ def _recorded(
 ) -> Measurement:
     j, rows = planned.column(ground.part), planned.num_rows
     peak, keep = float(np.abs(effort).max()), math.exp(-1.0 / (ground.rate_hz * DISTURBANCE_S))
-    kicks = math.sqrt(1 - keep**2) * rng.standard_normal(rows)
+    kicks, load = rng.standard_normal(rows), np.zeros_like(planned.target)
     kicks[0] = 0.0
-    load = np.zeros_like(planned.target)
-    for k in range(1, rows):
-        load[k, j] = keep * load[k - 1, j] + DISTURBANCE_SHARE * peak * kicks[k]
+    load[:, j] = DISTURBANCE_SHARE * peak * coloured(kicks, keep)
     answered, efforts = ground.answered(dataclasses.replace(planned, load=load))
     measured = answered.measured.copy()
     measured[:, j] += NOISE_SHARE * ground.room.wide_rad * rng.standard_normal(rows)
@@ -235,31 +233,16 @@ def write_machine(case: MachineSurrogate, folder: Path) -> Measurements:
     """Write the recordings of a case as tables, and what is hidden in a sealed file. Raises FileExistsError: the folder
     exists."""
     made, part = recordings(case), case.ground.part
-    sweeps = folder / SWEEPS
-    folder.mkdir(parents=True)
-    sweeps.mkdir()
     drive = case.ground.machine.drive(part)
-    slide = drive.unit == "m"
     target = "qd_target" if drive.target_kind == "velocity" else "q_target"
     units = {"q": drive.unit, target: drive.unit + ("/s" if target == "qd_target" else "")}
-    units |= {"tau": "N" if slide else "Nm"} if case.ground.has_effort else {}
+    units |= {"tau": "N" if drive.unit == "m" else "Nm"} if case.ground.has_effort else {}
     columns = {key: {"column": f"{part}.{key}", "unit": unit} for key, unit in units.items()}
     spec = {"time": {"column": "t", "unit": "s"}, "domain": "surrogate", "origin": ORIGIN, "signals": {part: columns}}
-    _write_yaml(sweeps / "columns.yaml", spec)
-    notes: dict[str, dict[str, Any]] = {}
-    for use in ("fit", "validation", "test"):
-        for m in getattr(made, use):
-            j = m.column(part)
-            values = {"q": m.measured, target: m.target, "tau": m.effort}
-            header = origin_lines(m.origin) + ",".join(["t", *(f"{part}.{key}" for key in units)])
-            table = np.column_stack([m.time_s, *(values[key][:, j] for key in units)])
-            np.savetxt(sweeps / f"{m.name}.csv", table, fmt="%.8g", delimiter=",", header=header, comments="")
-            notes[f"{m.name}.csv"] = {"use": use} | ({"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {})
-    _write_yaml(sweeps / INDEX, {"columns": "columns.yaml", "recordings": notes})
-    seal(folder, case.truth())
+
+    def table(m: Measurement) -> dict[str, np.ndarray]:
+        values = {"q": m.measured, target: m.target, "tau": m.effort}
+        return {"t": m.time_s} | {f"{part}.{key}": values[key][:, m.column(part)] for key in units}
+
+    write_tables(folder, SWEEPS, spec, made, table, case.truth())
     return made
-
-
-def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    text = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
-    path.write_text(text, encoding="utf-8")

@@ -16,16 +16,15 @@ Letters in shapes: T rows or frames, P pads, R × C taxels.
 """
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.alignment.measurements.folder import Measurements, PressedNote
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
+from taccorl.alignment.measurements.presses import AWAY_M, FRAME_S, Press, pad_presses
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.data.origin import Origin
@@ -44,88 +43,21 @@ from taccorl.sim.robot import RobotConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
-RADIUS_M = {"sphere": 0.012, "rod": 0.008}
-"""Shape of the object → its radius [m]."""
-ROD_LENGTH_M = 0.04
-"""Length of the rod [m]."""
 FINGER_SPEED_M_PER_S = 0.05
 """Highest speed of each finger [m/s]: a choice, no rating is published."""
-AWAY_M = -1e-3
-"""Penetration while nothing is pressed [m]: a distance of a millimetre at each pad."""
-REST_S = 2.5
-"""Rest before and after each press [s]."""
-FRAME_S = 0.01
-"""Time between two frames of the pads [s]."""
-SMOOTH_ROWS = 13
-"""Number of rows over which corners are rounded (65 ms), because fingers have inertia."""
 GAIN_SPREAD = 0.1
 """Standard deviation of the taxels' gains for a gain map that is not known: a choice."""
 
-Knots = tuple[tuple[float, float], ...]
-"""(time [s], penetration into each pad [m]) of the corners of a press."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Press:
-    """A press that could be recorded: object, position, and depth over time."""
-
-    name: str
-    knots: Knots
-    """(time [s], penetration into each pad [m]), connected by straight lines; negative is a distance to the pad."""
-    shape: str = "sphere"
-    """Shape of the object, a key of ``RADIUS_M``."""
-    x_m: float = 0.001
-    """Position of the object's centre along x of the TCP's frame [m]."""
-    z_m: float = 0.003
-    """Position of the object's centre along z of the TCP's frame [m], not at the centre of a taxel; a rod lies across the pads,
-    along x."""
-
-    def pressed(self, arm: str) -> PressedNote:
-        """Entry ``pressed`` of measurements.yaml for the press."""
-        place = {"arm": arm, "radius_m": RADIUS_M[self.shape], "position_m": (self.x_m, 0.0, self.z_m)}
-        if self.shape == "sphere":
-            return PressedNote(shape="sphere", **place)
-        return PressedNote(shape="rod", length_m=ROD_LENGTH_M, rpy_rad=(0.0, round(math.pi / 2, 4), 0.0), **place)
-
-    def penetration_m(self) -> np.ndarray:
-        """Penetration (T,) into each pad at 200 Hz [m]; negative values are distances to the pad."""
-        time_s, depth_m = np.array(self.knots).T
-        rows = np.arange(-(SMOOTH_ROWS // 2), round(time_s[-1] * RATE_HZ) + SMOOTH_ROWS // 2) / RATE_HZ
-        return np.convolve(np.interp(rows, time_s, depth_m), np.ones(SMOOTH_ROWS) / SMOOTH_ROWS, mode="valid")
-
-    def opening_m(self) -> np.ndarray:
-        """(T,) opening between the fingers at 200 Hz [m]."""
-        return 2 * (RADIUS_M[self.shape] - self.penetration_m())
-
-
-def _presses(
-    depths_m: Sequence[float],
-    rises_s: Sequence[float],
-    hold_s: float,
-    *,
-    before_s: float = REST_S,
-    between_s: float = 0.5,
-    after_s: float = REST_S,
-) -> Knots:
-    """Each depth at each speed."""
-    knots, at = [(0.0, AWAY_M), (before_s, AWAY_M)], before_s
-    for depth, rise in itertools.product(depths_m, rises_s):
-        knots += [(at + rise, depth), (at + rise + hold_s, depth), (at + 2 * rise + hold_s, AWAY_M)]
-        at += 2 * rise + hold_s + between_s
-        knots.append((at, AWAY_M))
-    return (*knots, (at + after_s, AWAY_M))
-
-
 _LOOPS = ((2.5, AWAY_M), (6.0, 9e-4), (7.5, 4.5e-4), (9.0, 1e-3), (11.0, 2e-4), (13.0, 7e-4), (15.0, AWAY_M))
 LIBRARY = (
-    Press(name="press_hold_release", knots=_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8)),
-    Press(name="deep_presses", knots=_presses((4e-4, 1e-3, 1.6e-3), (0.4,), 0.6)),
+    Press(name="press_hold_release", knots=pad_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8)),
+    Press(name="deep_presses", knots=pad_presses((4e-4, 1e-3, 1.6e-3), (0.4,), 0.6)),
     Press(name="slow_ramp", knots=((0.0, AWAY_M), *_LOOPS, (17.5, AWAY_M))),
-    Press(name="long_hold", knots=_presses((8e-4,), (0.3,), 8.0, after_s=5.0)),
-    Press(name="quick_taps", knots=_presses((1e-3,) * 12, (0.06,), 0.08, between_s=0.3)),
-    Press(name="light_touches", knots=_presses((5e-5, 1e-4, 2e-4, 3e-4), (0.8,), 0.5)),
-    Press(name="rod_across", knots=_presses((3e-4, 7e-4), (0.15, 0.6), 0.6), shape="rod", x_m=0.0, z_m=0.012),
-    Press(name="rests", knots=_presses((6e-4,), (0.3,), 0.8, before_s=10.0, after_s=10.0)),
+    Press(name="long_hold", knots=pad_presses((8e-4,), (0.3,), 8.0, after_s=5.0)),
+    Press(name="quick_taps", knots=pad_presses((1e-3,) * 12, (0.06,), 0.08, between_s=0.3)),
+    Press(name="light_touches", knots=pad_presses((5e-5, 1e-4, 2e-4, 3e-4), (0.8,), 0.5)),
+    Press(name="rod_across", knots=pad_presses((3e-4, 7e-4), (0.15, 0.6), 0.6), shape="rod", x_m=0.0, z_m=0.012),
+    Press(name="rests", knots=pad_presses((6e-4,), (0.3,), 0.8, before_s=10.0, after_s=10.0)),
 )
 """Presses from which ``taccorl excite --pads`` chooses."""
 

@@ -11,6 +11,7 @@ import numpy as np
 from taccorl.alignment.checks.cell_set import CellSet
 from taccorl.alignment.checks.cells import LOADED, check_cells, warnings_of_all
 from taccorl.alignment.machines.cell_model import (
+    by_cell,
     calibrated,
     file_numbers,
     of_file,
@@ -20,22 +21,13 @@ from taccorl.alignment.machines.cell_model import (
     within_ends,
 )
 from taccorl.alignment.machines.cell_places import with_places
-from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
+from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of, load_cell_columns, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, CellNumbers, Comparison, TouchTrace
-from taccorl.diagnosis.machines.machine import (
-    Addition,
-    Counted,
-    Finding,
-    GainsAre,
-    Machine,
-    machines,
-    numbers_of,
-    solved,
-)
+from taccorl.diagnosis.machines.machine import Addition, Counted, Finding, GainsAre, Machine, machines, numbers_of
 from taccorl.diagnosis.problems.cells_problem import (
     CellsProblem,
     median_reading,
@@ -45,6 +37,7 @@ from taccorl.diagnosis.problems.cells_problem import (
 )
 from taccorl.diagnosis.problems.numbers_of_cells import numbers_apart
 from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.diagnosis.search.solve import solved
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -81,12 +74,8 @@ class CellsMachine(Machine):
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         c = self.config
         units = {"gain": f"{c.reading.unit}/{c.load.unit}", "offset": c.reading.unit}
-        own = {
-            f"{key}_{cell}": (value, unit)
-            for key, unit in units.items()
-            for cell, value in zip(c.names, getattr(c, key), strict=False)
-        }
-        return own | numbers_of(c.effects)
+        own = by_cell(c, {key: getattr(c, key) for key in units})
+        return {name: (x, units[name.split("_")[0]]) for name, x in own.items()} | numbers_of(c.effects)
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -117,7 +106,7 @@ class CellsMachine(Machine):
         return with_places(self.config, found)
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        return check_cells(self.config, _cells(measurements.all), [m.name for m in measurements.fit])
+        return check_cells(self.config, cells_of(measurements.all), [m.name for m in measurements.fit])
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
         return (self.config.name,)
@@ -136,7 +125,7 @@ class CellsMachine(Machine):
         fit_to = prepared_all(config, measurements.fit)
         calibration = of_file(config)
         if calibration is None:
-            raw = _cells(measurements.fit)
+            raw = cells_of(measurements.fit)
             fitted = calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
             calibration = without_dead(fitted, CellSet(config, raw).dead, median_reading(raw))
         floor = reading_floor(config, prepared_all(config, measurements.all))
@@ -149,15 +138,13 @@ class CellsMachine(Machine):
         touches = []
         total = len(measurements.all)
         for use in USES:
-            for m in map(thinned, _cells(getattr(measurements, use))):
+            for m in map(thinned, cells_of(getattr(measurements, use))):
                 progress(m.name, len(touches), total)
                 zero = calibration.offset
                 simulated = readings(config, responses(config, m), calibration)
                 if m.place.size:  # rows at no known place are not compared
                     rows = m.place >= 0
-                    kept = {
-                        name: getattr(m, name)[rows] for name in ("time_s", "target", "measured", "velocity", "effort")
-                    }
+                    kept = {name: getattr(m, name)[rows] for name in ("time_s", *m.columns)}
                     m, simulated = dataclasses.replace(m, **kept, place=m.place[rows]), simulated[rows]
                 shape = (m.num_rows, 1, *config.shape)
                 loaded = np.asarray((m.target > LOADED * config.load.rated).any(axis=1, keepdims=True))
@@ -199,14 +186,12 @@ class CellsMachine(Machine):
         unit, load = self.config.load.unit, self.config.load_of_reading
         remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
         d = _with_numbers(problem, found.diagnosis)
-        of_cells = warnings_of_all(self.config, _cells(measurements.fit), _cells(measurements.all))
+        of_cells = warnings_of_all(self.config, cells_of(measurements.fit), cells_of(measurements.all))
         of_effects = (*_of_whole_load(problem, d), *numbers_apart(problem, found.diagnosis))
         d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *of_effects, *d.remarks))
         return dataclasses.replace(found, diagnosis=d, remark=remark)
 
-    def effect(
-        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
-    ) -> Effect | None:
+    def effect(self, name: str, part: str, values: Mapping[str, Any]) -> Effect | None:
         if name in registry and "cells" not in registry.get(name).kinds():
             return None
         return make_cells_effect(name, **{k: v for k, v in values.items() if k != "pads"})
@@ -220,8 +205,7 @@ class CellsMachine(Machine):
         if made is None:
             known = [name for name in registry if "cells" in registry.get(name).kinds()]
             raise TaccorlError(f"{name} is not an effect of a sensor of cells; {nearest(name, known)}")
-        own = {key: getattr(self.config, key) for key in ("gain", "offset") if getattr(self.config, key)}
-        numbers = {f"{key}_{cell}": x for key in own for cell, x in zip(self.config.names, own[key], strict=True)}
+        numbers = by_cell(self.config, {key: getattr(self.config, key) for key in ("gain", "offset")})
         return [Addition(part, [made], numbers, {})]
 
     def with_additions(self, additions: Sequence[Addition]) -> "CellsMachine":
@@ -240,14 +224,10 @@ class CellsMachine(Machine):
         return CellsMachine(config, self.name)
 
 
-def _cells(measurements: Sequence[Any]) -> list[CellMeasurement]:
-    return [m for m in measurements if isinstance(m, CellMeasurement)]
-
-
 def _cut_words(config: CellsConfig, measurements: Measurements) -> list[str]:
     """How many readings were at an end of the converter, recording by recording."""
     words = []
-    for m in _cells(measurements.all):
+    for m in cells_of(measurements.all):
         share = float(np.mean(~within_ends(config, m)))
         if share > 0:
             words.append(f"{m.name}: {share:.1%} of the readings are at an end of the converter; they say nothing")

@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import cast
 
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
 from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF
-from taccorl.diagnosis.problems.joints import JointFinding
+from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects.load import Payload
@@ -16,10 +16,10 @@ TILT = "unbalance: a base that leans by "
 """Beginning of a remark on the tilt that one joint alone suggests."""
 
 
-def remarked(f: Finding, text: str) -> Finding:
+def remarked[FindingT: Finding](f: FindingT, text: str) -> FindingT:
     """The finding with one more remark about its result."""
     d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
-    return dataclasses.replace(cast(Any, f), diagnosis=d)
+    return dataclasses.replace(f, diagnosis=d)
 
 
 def payloads(findings: Sequence[Finding]) -> list[Finding]:
@@ -37,7 +37,7 @@ def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
 def without_tilt(f: Finding) -> Finding:
     """The finding without the remark on the tilt that it alone suggests."""
     remarks = tuple(text for text in f.diagnosis.remarks if not text.startswith(TILT))
-    return dataclasses.replace(cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks))
+    return dataclasses.replace(f, diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks))
 
 
 def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
@@ -56,7 +56,7 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     offers = tuple(o for o in d.offers if "payload" not in o.added)
     changed = tuple(dataclasses.replace(c, instead=without(c.instead)) for c in d.changed)
     d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers, changed=changed)
-    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
+    return remarked(dataclasses.replace(f, diagnosis=d), text)
 
 
 def placed(
@@ -66,7 +66,7 @@ def placed(
     explains: ``stands_for``, joint → effects that alone explain as much there; and ``ties``, bodies where it does as well."""
     d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
     effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
-    known = cast(JointFinding, f).known
+    known = cast(Known, f.known)
     for old in [n for n in known.identifiable if n.name in ends]:
         now = dataclasses.replace(old, low=ends[old.name][0], high=ends[old.name][1])
         effects_ = [dataclasses.replace(e, evidence=e.evidence.replace(old.words(), now.words())) for e in effects_]
@@ -86,7 +86,7 @@ def placed(
     of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())
     number = ("", 1.0) if of_mass else d.or_number
     d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_number=number)
-    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d, known=known), text)
+    return remarked(dataclasses.replace(f, diagnosis=d, known=known), text)
 
 
 def left_of(finding: Finding) -> float:

@@ -8,7 +8,6 @@ A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
@@ -20,12 +19,11 @@ from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.data.finding import listed
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.problems.joints import JointFinding, each
-from taccorl.diagnosis.problems.pads import PadFinding
-from taccorl.diagnosis.search.identifiable import Known
-from taccorl.diagnosis.search.problem import Progress, Recording, Stopped, no_progress
+from taccorl.diagnosis.problems.joints import each
+from taccorl.diagnosis.search.problem import Progress, Stopped, no_progress
 from taccorl.diagnosis.search.result import SearchConfig
-from taccorl.diagnosis.search.solve import Found, Startable, solve
+from taccorl.diagnosis.search.solve import PartFinding as Finding
+from taccorl.diagnosis.search.solve import PartProblem, RecordedProblem, solved
 from taccorl.errors import TaccorlError, nearest
 from taccorl.plugins import Registry
 from taccorl.sim.effects.effect import Effect
@@ -34,28 +32,6 @@ Counted = Callable[[str, int, int], None]
 """Function that is called with (recording, number of recordings done, number in all)."""
 GainsAre = Literal["auto", "commanded", "fitted"]
 """Treatment of gains. ``auto``: gains that every recording states stay fixed, others are fitted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartFinding(Found):
-    """Finding about an axis or a sensor of cells: result of the search, and texts about it for reports."""
-
-    part: str
-    """Name of the part in tables and reports."""
-    noise: str
-    """The noise floors of the compared channels with their units, as text for reports."""
-    numbers: str
-    """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-    measured: str
-    """Text that names the channels whose errors are minimised and reported, such as positions."""
-    known: Known | None = None
-    """Numbers that the recordings identify; None for parts for which they are not computed."""
-    remark: str = ""
-    """Text on what the search could not decide; empty if there is nothing."""
-
-
-type Finding = PartFinding | JointFinding | PadFinding
-"""Finding about one part of a machine; all have the fields of ``PartFinding``."""
 
 
 class Addition(NamedTuple):
@@ -68,25 +44,6 @@ class Addition(NamedTuple):
     """Always fitted numbers that were refitted with the effects; empty: they are not changed."""
     intervals: Mapping[str, Sequence[float]]
     """Name of a number → (low, high) of its 95 % interval."""
-
-
-class RecordedProblem(Startable, Protocol):
-    """A search problem together with its recordings."""
-
-    fit: Sequence[Recording]
-    validation: Sequence[Recording]
-    """Recordings by whose error effects are chosen; empty if none is marked."""
-    test: Sequence[Recording]
-
-
-class PartProblem(RecordedProblem, Protocol):
-    """A search problem together with its recordings, and texts about them."""
-
-    noise: str
-    numbers: str
-    """Text that states which numbers are always fitted."""
-    measured: str
-    """Text that names the channels."""
 
 
 class Drive(NamedTuple):
@@ -291,14 +248,11 @@ class Machine(ABC):
     # effects ---------------------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def effect(
-        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
-    ) -> Effect | None:
+    def effect(self, name: str, part: str, values: Mapping[str, Any]) -> Effect | None:
         """Make the effect of that name at one part; None if it cannot act there.
 
         Args:
             values: its parameters, interval and evidence, and other fields if a report states them.
-            base: always fitted numbers of the diagnosis that fitted it.
 
         Raises:
             TaccorlError: the effect or a parameter is unknown, or a value is out of bounds.
@@ -318,8 +272,11 @@ class Machine(ABC):
         """
         if not joints and len(self.units) > 1:
             raise TaccorlError(f"{name}: which {self.part_word}? --joints={next(iter(self.units))}")
+        return self._by_hand(name, self.select(tuple(self.units), joints, pads), values)
+
+    def _by_hand(self, name: str, parts: Sequence[str], values: Mapping[str, float]) -> list[Addition]:
         found = []
-        for part in self.select(tuple(self.units), joints, pads):
+        for part in parts:
             effect = self.effect(name, part, {**values, "evidence": "by hand"})
             if effect is None:
                 raise TaccorlError(f"{name} cannot act on {part}")
@@ -373,30 +330,6 @@ class Machine(ABC):
 def numbers_of(effects: Iterable[Effect]) -> dict[str, tuple[float, str]]:
     """``EFFECT.PARAMETER`` → (value, unit) of these effects."""
     return {f"{e.name}.{p.name}": (getattr(e, p.name), p.unit) for e in effects for p in e.parameters()}
-
-
-def solved(
-    part: str,
-    problem: PartProblem,
-    search: SearchConfig | None = None,
-    without: Sequence[str] = (),
-    progress: Progress = no_progress,
-) -> PartFinding:
-    """Call ``solve`` for a problem that holds its recordings.
-
-    Args:
-        part: name of the part.
-        without: effects that are left out of the search.
-        progress: function that is called with a text about the present step.
-
-    Raises:
-        TaccorlError: nothing was measured in the validation rows.
-    """
-    found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without, progress)
-    recordings = {use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")}
-    stated = {"noise": problem.noise, "numbers": problem.numbers, "measured": problem.measured}
-    judged = {"diagnosis": found.diagnosis, "can_tell": found.can_tell, "rows_split": found.rows_split}
-    return PartFinding(part=part, recordings=recordings, **stated, **judged)
 
 
 machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnosis.machines")

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
+from taccorl.alignment.checks.robot import pose_unknown
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.measurements.folder import Measurements
@@ -96,7 +97,7 @@ class PiperTwin(Machine):
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
         """Check recordings for faults specific to the PiPER, such as a table without an arm's other joints: inertia and weight
         are then those of the rest pose. Returns recording → findings."""
-        return {m.name: _pose_unknown(m) for m in measurements.all}
+        return {m.name: [f for arm in ROBOT.arms for f in _pose_unknown(m, arm)] for m in measurements.all}
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
         found = [*joints.swept_joints(measurements), *map(pads.part_of, pads.pressed_arms(measurements))]
@@ -135,13 +136,10 @@ class PiperTwin(Machine):
         options.pop("gains", None)  # of joints alone
         return pads.diagnose_arm(self.config, part.removesuffix(" pads"), measurements, **options)
 
-    def effect(
-        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
-    ) -> Effect | None:
-        """Make an effect at one part. An effect on pads acts on the pads whose zero offsets are among the numbers in ``base``."""
+    def effect(self, name: str, part: str, values: Mapping[str, Any]) -> Effect | None:
         if {"arm", "joints", "pads"} & {*values}:  # as a report has it: it says itself where it acts
             return make_effect(name, **values)
-        where = selectors(effects.get(name), part) if part in _SIGNALS else {"pads": pads.pads_of(base or {})}
+        where = selectors(effects.get(name), part) if part in _SIGNALS else None
         return None if where is None else make_effect(name, **where, **values)
 
     def by_hand(
@@ -158,13 +156,7 @@ class PiperTwin(Machine):
             raise TaccorlError(f"{name} is an effect of joints; remove --pads")
         if not joints:
             raise TaccorlError(f"{name}: which joints? --joints=left_joint5, or joint5 for both arms")
-        found = []
-        for signal in _joints_named(joints, _SIGNALS):
-            made = self.effect(name, signal, {**values, "evidence": "by hand"})
-            if made is None:
-                raise TaccorlError(f"{name} cannot act on {signal}")
-            found.append(Addition(signal, [made], {}, {}))
-        return found
+        return self._by_hand(name, _joints_named(joints, _SIGNALS), values)
 
     def with_additions(self, additions: Sequence[Addition]) -> "PiperTwin":
         """Add effects and numbers. k_n and k_d are common to all pads, so that values of several arms' pads must agree."""
@@ -307,15 +299,6 @@ def _arms_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
     return [arm for arm in known if not names or arm in names]
 
 
-def _pose_unknown(m: Measurement) -> list[DataFinding]:
-    found = []
-    for arm in ROBOT.arms:
-        there = [j for j in ROBOT.joints if f"{arm}_{j}" in m.signals]
-        if there and len(there) < len(ROBOT.joints):
-            lacking = ", ".join(f"{arm}_{j}" for j in ROBOT.joints if j not in there)
-            text = (
-                f"it lacks {lacking}: they are taken to stand as on the bench, and inertia and weight of what moves follow from "
-                "that; add their columns, constant ones will do"
-            )
-            found.append(DataFinding("pose_unknown", "warning", f"{arm} arm", text))
-    return found
+def _pose_unknown(m: Measurement, arm: str) -> list[DataFinding]:
+    lacking = [f"{arm}_{j}" for j in ROBOT.joints if f"{arm}_{j}" not in m.signals]
+    return pose_unknown(lacking * (len(lacking) < len(ROBOT.joints)), "as on the bench", f"{arm} arm")

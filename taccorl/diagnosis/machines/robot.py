@@ -2,32 +2,26 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
-from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_of_all
 from taccorl.alignment.checks.robot import check_robot
-from taccorl.alignment.controller.drive_law import FOLLOWED
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
-from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
-from taccorl.alignment.measurements.folder import Measurements, Use
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.comparison.compare import moving, traces_of
-from taccorl.diagnosis.comparison.replays import replay_joints
-from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
+from taccorl.diagnosis.comparison.compare import compare_joints
+from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.diagnosis.machines.changed_findings import (
     TILT,
     left_of,
@@ -135,58 +129,17 @@ class RobotMachine(Machine):
         return found
 
     def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
-        uses: list[tuple[Use, Measurement]] = [(u, self._whole(m)) for u in USES for m in getattr(measurements, u)]
-        every = [m for _, m in uses]
-        traces, clock, held, replayed, left = [], {}, set(), [], []
-        for k, m in enumerate(every):
-            progress(m.name, k, len(uses))
-            moved = moving(m.with_position_targets(m.measured))
-            known = [s for s in moved if s in self.robot.config.joints]
-            held |= {s for s in moved if s not in self.robot.config.joints}
-            replayed.append((known, response := replay_joints(self.robot, m, known)))
-            followed = FOLLOWED * np.array([m.target_kind(s) == "effort" for s in m.signals])
-            left.append(dataclasses.replace(m, effort=m.effort - followed * np.nan_to_num(response.effort)))
-        left *= any("effort" in m.target_kinds for m in every)
-        floors: dict[Kind, dict[str, SignalFloor]] = {"position": noise_floor(every)}
-        floors["effort"] = noise_floor(every, "effort", left)
-        levels = {signal: floor.value for signal, floor in floors["position"].items()}
-        for (use, m), (known, response) in zip(uses, replayed, strict=True):
-            positions = m.with_position_targets(np.nan_to_num(response.reported))
-            held_there = [m.column(s) for s in known if self.robot.config.joints[s].law == "effort"]
-            response.reported[:, held_there] = np.nan
-            traces += [
-                t
-                for t in traces_of(positions, use, dataclasses.replace(response, measurement=positions), floors)
-                if t.signal in known
-            ]
-            known = [s for s in known if self.robot.config.joints[s].law != "effort"]
-            if known:
-                commanded = m.with_position_targets(np.zeros(m.target.shape))
-                uncertain = [s for s in known if self.robot.config.joints[s].is_uncertain]
-                at = [m.column(s) for s in known]
-
-                def with_more[T](change: Callable[[JointModel, JointMotion], T], signal: str, m: Measurement = m) -> T:
-                    model = JointModel(self.robot, signal)
-                    return change(model, motion_of(m, signal, model.joint))
-
-                changed, rivals = partial(with_more, with_other_numbers), partial(with_more, with_more_lead)
-                reported = response.reported[:, at]
-                clock[m.name] = tuple(
-                    check_against_twin(commanded.only(known), reported, levels, uncertain, changed, rivals)
-                )
-        progress("", len(uses), len(uses))
-        if not traces:
-            raise TaccorlError(
-                f"{', '.join(m.name for m in every)}: nothing to compare: no joint of the robot file moved"
-            )
-        left_out = [f"{s}: {self.robot.path.name} does not name it under joints" for s in sorted(held)]
-        return Comparison(
-            twin=name,
+        laws = self.robot.config.joints
+        return compare_joints(
+            self.robot,
+            laws,
+            measurements,
+            self._whole,
+            name=name,
+            file=self.robot.path.name,
             effects=self.effects,
-            traces=tuple(traces),
-            split=measurements.record(),
-            clock=beside_onsets(clock),
-            left_out=tuple(left_out),
+            uncertain=[s for s, law in laws.items() if law.is_uncertain],
+            progress=progress,
         )
 
     def diagnose(self, part: str, measurements: Measurements, **options: Any) -> Finding:
@@ -203,7 +156,7 @@ class RobotMachine(Machine):
             found = dataclasses.replace(found, remark=text)
         if found.diagnosis.status == "something_else" and not self.robot.config.joints[part].rotor_inertia:
             text = f"{' and '.join(NEED_ROTOR)} were not tried: {self.robot.path.name} has no rotor_inertia of {part}"
-            found = cast(JointFinding, remarked(found, text))
+            found = remarked(found, text)
         others = self._in_one_pose(part, measurements)
         lacked = [n for n in found.diagnosis.names if n in OF_POSITION and n not in found.diagnosis.present]
         if others and lacked:
@@ -461,9 +414,7 @@ class RobotMachine(Machine):
 
     # effects ---------------------------------------------------------------------------------------------------------
 
-    def effect(
-        self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None
-    ) -> Effect | None:
+    def effect(self, name: str, part: str, values: Mapping[str, Any]) -> Effect | None:
         joint = self.robot.joint(part)
         if joint.selectors(effects.get(name)) is None:
             return None

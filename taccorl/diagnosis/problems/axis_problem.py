@@ -28,16 +28,18 @@ from taccorl.alignment.controller.lanes import LANES
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.joint_problem import (
     EFFORT_SCALE,
     LOOP,
     TORQUE_FF,
+    floor_words,
+    floors_of,
     measured_part,
     other_gain,
     recording_of,
     seen_in,
+    unexplained,
     unlike_rows,
     whole_rows,
 )
@@ -77,7 +79,8 @@ class AxisProblem(WithoutMaps):
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
         kinds = ("position", "effort") if self.effort else ("position",)
         self._kinds: tuple[Literal["position", "effort"], ...] = ("effort",) if axis.law == "effort" else kinds
-        self.floors = [noise_floor(everything, kind)[axis.name] for kind in self._kinds]
+        left = [unexplained(JointModel(DrivenAxis(axis)), m) for m in everything if axis.law == "effort"]
+        self.floors = floors_of(everything, axis.name, effort=self.effort, unexplained=left)[-len(self._kinds) :]
         self.floor_values = np.array([f.value for f in self.floors])
         if self.effort and self.floors[0].lower_bound and axis.law in ("impedance", "cascade"):
             # Without repeats an encoder's resolution is no floor: the loop answers an error of the force by one of the position.
@@ -103,7 +106,7 @@ class AxisProblem(WithoutMaps):
     @property
     def noise(self) -> str:
         """Text of the noise floors: of the position, and of the effort if it is a channel."""
-        return "; effort ".join(f.words() for f in self.floors)
+        return floor_words(self.floors)
 
     @property
     def numbers(self) -> str:

@@ -18,6 +18,7 @@ from taccorl.alignment.checks.cell_set import CellSet
 from taccorl.alignment.checks.cells import LOADED
 from taccorl.alignment.machines.cell_model import (
     Calibration,
+    by_cell,
     calibrated,
     file_numbers,
     loads,
@@ -27,13 +28,13 @@ from taccorl.alignment.machines.cell_model import (
     within_ends,
 )
 from taccorl.alignment.machines.cell_places import with_places
-from taccorl.alignment.machines.cell_tables import CellMeasurement
+from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs, residue_floor
 from taccorl.alignment.measurements.repeats import overlay
-from taccorl.diagnosis.problems.touch_problem import MAX_CHANNELS, touch_candidate
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, split_rows
+from taccorl.diagnosis.problems.touch_problem import FIXED, MAX_CHANNELS
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, split_rows
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import CELLS, Effect
@@ -68,7 +69,7 @@ class CellsProblem(WithoutMaps):
     def __init__(self, config: CellsConfig, measurements: Measurements) -> None:
         self.config = dataclasses.replace(config, effects=[])
         measurements = with_places(config, measurements)
-        places = max((m.num_places for m in measurements.all if isinstance(m, CellMeasurement)), default=0)
+        places = max((m.num_places for m in cells_of(measurements.all)), default=0)
         self.numbers = "gain and offset of each cell fitted" + (
             f", a gain for each of {places} places" if places else ""
         )
@@ -77,7 +78,7 @@ class CellsProblem(WithoutMaps):
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
         load = np.concatenate([m.target for m in sides[0]])
         self._load_noise = _own_noise([(m.target, m.rate_hz) for m in sides[0]])
-        fit_to = [m for m in measurements.fit if isinstance(m, CellMeasurement)]
+        fit_to = cells_of(measurements.fit)
         self.dead = CellSet(config, fit_to).dead
         """(K,) bool: cells that are loaded and hardly respond. They are not compared."""
         self._level = median_reading(fit_to)
@@ -104,7 +105,7 @@ class CellsProblem(WithoutMaps):
             *(["temperature"] if all(m.temperature_c.size for side in sides for m in side) else []),
         ]
         self.candidates: dict[str, Candidate] = {
-            name: touch_candidate(cls, seen, [CELLS])
+            name: candidate(cls, seen, pads=[CELLS], **FIXED.get(name, {}))
             for name in registry
             if (cls := registry.get(name)).fitted and "cells" in cls.kinds() and cls.works_with(gives)
         }
@@ -169,12 +170,8 @@ class CellsProblem(WithoutMaps):
         with ``same_place_mm``."""
         if self.config.same_place_mm is not None:
             return {}  # a gain for each place; the file cannot hold them
-        told = file_numbers(self.config, without_dead(self._calibrated(effects)[0], self.dead, self._level))
-        return {
-            f"{key}_{name}": x
-            for key in ("gain", "offset")
-            for name, x in zip(self.config.names, told[key], strict=True)
-        }
+        own = without_dead(self._calibrated(effects)[0], self.dead, self._level)
+        return by_cell(self.config, file_numbers(self.config, own))
 
 
 def without_dead(calibration: Calibration, dead: np.ndarray, level: np.ndarray) -> Calibration:

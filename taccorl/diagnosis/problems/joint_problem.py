@@ -21,7 +21,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion, first_rows
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
+from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -128,7 +128,7 @@ class JointProblem(WithoutMaps):
         self._first = int(self.model.joint.target_kind == "effort")  # then the position is the input, and no channel
         if self._first and not self.effort:
             raise TaccorlError(f"{signal}: law effort needs the effort of every recording")
-        left = [self._unexplained(m, own) for m in everything if self._first]
+        left = [unexplained(self.model, m, own) for m in everything if self._first]
         self.floors = floors_of(everything, signal, effort=self.effort, unexplained=left)[self._first :]
         """Noise floors over all recordings; a recording whose motion was repeated has its own."""
         root = motions(everything)
@@ -155,6 +155,26 @@ class JointProblem(WithoutMaps):
             delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
             self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
         self.base = holding(self.base, self.known, {f.name: f.start for f in self.base} | self.start)
+
+    @property
+    def noise(self) -> str:
+        """Text of the noise floors, with their units."""
+        return floor_words(self.floors)
+
+    @property
+    def numbers(self) -> str:
+        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
+        known = f"; known: {', '.join(self.known)}" * bool(self.known)
+        if self.model.joint.winding:
+            return f"gains as the file states them, stall torque and back-EMF fitted{known}"
+        if self._first:
+            return f"driven by the recorded effort{known}"
+        return ("commanded gains" if self.commanded else "gains fitted (not stated by the recordings)") + known
+
+    @property
+    def measured(self) -> str:
+        """Text that names the channels whose errors are minimised and reported, such as positions."""
+        return "efforts" if self._first else "angles and efforts together" if self.effort else "angles"
 
     @property
     def inertia_kgm2(self) -> float:
@@ -267,12 +287,6 @@ class JointProblem(WithoutMaps):
         found = [dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found]
         return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
 
-    def _unexplained(self, m: Measurement, own: Sequence[Effect]) -> Measurement:
-        """``m`` with what the twin, with its effects ``own``, leaves of the joint's effort."""
-        motion, effort = motion_of(m, self.signal, self.model.joint), m.effort.astype(float)
-        effort[:, m.column(self.signal)] -= FOLLOWED * self.model.simulate(motion, self.model.gains, own).effort
-        return dataclasses.replace(m, effort=effort)
-
     def _recording(self, m: Measurement) -> Recording:
         kinds, motion = ("position", "effort"), motion_of(m, self.signal, self.model.joint)
         return recording_of(m, self.signal, motion, kinds[self._first : 1 + self.effort], self._floor_values(m))
@@ -300,6 +314,12 @@ class JointProblem(WithoutMaps):
         }
 
 
+def floor_words(floors: Sequence[SignalFloor]) -> str:
+    """Text of the noise floors of a joint or axis: of its position, and of its effort if that is a channel."""
+    least = f", at least {EXACT:.1%} of its changes" * (len(floors) > 1)
+    return "; effort ".join(f.words() for f in floors) + least
+
+
 def seen_in(
     motions: Sequence[JointMotion], answers: Sequence[JointResponse], asked: Sequence[np.ndarray]
 ) -> dict[str, float]:
@@ -315,6 +335,13 @@ def seen_in(
         "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
         "duration_s": max(float(m.time_s[-1]) for m in motions),
     }
+
+
+def unexplained(model: JointModel, m: Measurement, own: Sequence[Effect] = ()) -> Measurement:
+    """``m`` with what ``model``, with the effects ``own``, leaves of the joint's effort."""
+    motion, effort = motion_of(m, model.signal, model.joint), m.effort.astype(float)
+    effort[:, m.column(model.signal)] -= FOLLOWED * model.simulate(motion, model.gains, own).effort
+    return dataclasses.replace(m, effort=effort)
 
 
 def recording_of(

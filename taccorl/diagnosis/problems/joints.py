@@ -11,12 +11,12 @@ import numpy as np
 from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor
+from taccorl.alignment.measurements.noise_floor import SignalFloor
 from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
 from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import Found, solve
+from taccorl.diagnosis.search.solve import PartFinding, solved
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import Done, Failed, run_in_processes
 from taccorl.robots import ROBOT
@@ -46,55 +46,13 @@ class Leaned:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointFinding(Found):
-    """Finding about one joint: result of the search, noise floors, and numbers that the recordings identify."""
+class JointFinding(PartFinding):
+    """Finding about one joint."""
 
-    signal: str
     floors: tuple[SignalFloor, ...]
     """Noise floor of the angle, and of the effort if it was used."""
-    commanded: bool
-    """True: gains are the commanded ones; False: they were fitted."""
-    known: Known
-    """Numbers that the recordings identify, and the range of those that they do not."""
-    held: tuple[str, ...] = ()
-    """Numbers and effects that the file marks as known."""
-    remark: str = ""
-    """Text about the result that is no doubt; empty if there is none."""
     leaned: Leaned | None = None
     """What a corrected file has instead, if one tilt of the base explains several joints; None otherwise."""
-
-    @property
-    def part(self) -> str:
-        """Name of the part in tables and reports."""
-        return self.signal
-
-    @property
-    def noise(self) -> str:
-        """The noise floors of the compared channels with their units, as text for reports."""
-        least = f", at least {EXACT:.1%} of its changes" * (len(self.floors) > 1)
-        return "; effort ".join(f.words() for f in self.floors) + least
-
-    @property
-    def numbers(self) -> str:
-        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-        known = f"; known: {', '.join(self.held)}" * bool(self.held)
-        if "stall_nm" in self.diagnosis.base:
-            return f"gains as the file states them, stall torque and back-EMF fitted{known}"
-        if self._of_effort:
-            return f"driven by the recorded effort{known}"
-        return ("commanded gains" if self.commanded else "gains fitted (not stated by the recordings)") + known
-
-    @property
-    def measured(self) -> str:
-        """Text that names the channels whose errors are minimised and reported, such as positions."""
-        if len(self.floors) > 1:
-            return "angles and efforts together"
-        return "efforts" if self._of_effort else "angles"
-
-    @property
-    def _of_effort(self) -> bool:
-        """Whether the recorded effort is the input (law effort), so that there is no other channel."""
-        return [floor.kind for floor in self.floors] == ["effort"]
 
 
 def swept_joints(measurements: Measurements) -> tuple[str, ...]:
@@ -150,19 +108,10 @@ def diagnose_joint(
     if not own.fit:
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
-    solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without, progress)
-    known = known_numbers(problem, solved.diagnosis)
-    return JointFinding(
-        signal=signal,
-        known=known,
-        diagnosis=with_intervals(solved.diagnosis, known),
-        can_tell=solved.can_tell,
-        floors=tuple(problem.floors),
-        commanded=problem.commanded,
-        recordings={use: tuple(m.name for m in getattr(own, use)) for use in ("fit", "validation", "test")},
-        rows_split=solved.rows_split,
-        held=tuple(problem.known),
-    )
+    found = solved(signal, problem, search, without, progress)
+    known = known_numbers(problem, found.diagnosis)
+    told = vars(found) | {"known": known, "diagnosis": with_intervals(found.diagnosis, known)}
+    return JointFinding(**told, floors=tuple(problem.floors))
 
 
 def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:

@@ -5,21 +5,19 @@ twin has one k_n and one k_d for all of its pads; effects act on the pads in whi
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import repeat_pairs
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.diagnosis.comparison.replays import matched_contact
-from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem, odd_cells
+from taccorl.diagnosis.problems.touch_problem import GainStatistics, TouchProblem, odd_cells
 from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.problem import Progress, Recording, no_progress, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import Found, solve
+from taccorl.diagnosis.search.solve import PartFinding, solved
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.pads import TaxelGainMap
@@ -31,60 +29,9 @@ Range = tuple[float, float]
 """(low, high)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PadFinding(Found):
-    """Finding about the pads of one arm: result of the search, and noise floor."""
-
-    arm: str
-    pads: tuple[str, ...]
-    """Names of the pads that came near the objects."""
-    floor_count: float
-    """Noise floor of a row, the mean of ``FRAMES_A_ROW`` frames [counts]: median over the simulated taxels."""
-    lower_bound: bool
-    """True: no press was recorded twice, so that the floor lacks the variation between repeats."""
-    gains: GainStatistics | None = None
-    """Statistics of differing taxel gains that could not be validated, because no validation recording presses the fitted
-    taxels; None otherwise."""
-    not_shared: tuple[str, ...] = ()
-
-    @property
-    def part(self) -> str:
-        """Name of the part in tables and reports: ``left pads``."""
-        return part_of(self.arm)
-
-    @property
-    def remark(self) -> str:
-        """Text on what the search could not decide, and the press that would show it, or the cells that a found map of gains has
-        as dead or odd; empty if there is nothing."""
-        if self.gains:
-            return gain_words(self.gains, self.not_shared)
-        maps = [e for e in self.diagnosis.effects if isinstance(e, TaxelGainMap) and len(e.gains) > 1]
-        named = [odd_cells(np.reshape(e.gains, (len(e.pads), *ROBOT.pad.shape)), e.pads) for e in maps]
-        return f"{TaxelGainMap.name}: {named[0]}" if any(named) else ""
-
-    @property
-    def noise(self) -> str:
-        """Text of the noise floor."""
-        bound = "; a lower bound: record a press twice" if self.lower_bound else ""
-        return f"{self.floor_count:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames (the median taxel{bound})"
-
-    @property
-    def numbers(self) -> str:
-        """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-        return "k_n, k_d and each pad's zero fitted"
-
-    measured = f"means of {FRAMES_A_ROW} frames"
-    known = None
-
-
 def part_of(arm: str) -> str:
     """Name of the part for the pads of an arm: ``left pads``."""
     return f"{arm} pads"
-
-
-def pads_of(base: Mapping[str, float]) -> list[str]:
-    """Names of the pads whose zero offsets (``zero_PAD``) are among the fitted numbers ``base``."""
-    return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
 
 
 def presses(m: Measurement, arm: str) -> bool:
@@ -105,7 +52,7 @@ def diagnose_arm(
     search: SearchConfig | None = None,
     without: Sequence[str] = (),
     progress: Progress = no_progress,
-) -> PadFinding:
+) -> PartFinding:
     """Search for the effect that is missing in the pads of one arm, in the recordings that state what they pressed.
 
     Args:
@@ -126,25 +73,16 @@ def diagnose_arm(
     every = [motion for some in motions.values() for motion in some]
     _check_pads(every)
     problem = TouchProblem(every, config)
-    fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
-    floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
-    solved = solve(part_of(arm), problem, fit_to, validation, test, search, without, progress)
+    problem.recordings(motions["fit"], motions["validation"], motions["test"])
+    found = solved(part_of(arm), problem, search, without, progress)
     gains = None
-    if not solved.rows_split:
-        found = solved.diagnosis
-        gains = unjudged_gains(problem, found, solved.fit_to, solved.validation, search or SearchConfig())
-    return PadFinding(
-        gains=gains,
-        not_shared=tuple(problem.not_shared),
-        arm=arm,
-        pads=problem.pads,
-        diagnosis=solved.diagnosis,
-        can_tell=solved.can_tell,
-        floor_count=floor_count,
-        lower_bound=not repeat_pairs(m for some in uses.values() for m in some),
-        recordings={use: tuple(m.name for m in some) for use, some in uses.items()},
-        rows_split=solved.rows_split,
-    )
+    if not found.rows_split:
+        gains = unjudged_gains(problem, found.diagnosis, problem.fit, problem.validation, search or SearchConfig())
+    if gains is not None:
+        return dataclasses.replace(found, remark=gain_words(gains, problem.not_shared))
+    maps = [e for e in found.diagnosis.effects if isinstance(e, TaxelGainMap) and len(e.gains) > 1]
+    named = [odd_cells(np.reshape(e.gains, (len(e.pads), *ROBOT.pad.shape)), e.pads) for e in maps]
+    return dataclasses.replace(found, remark=f"{TaxelGainMap.name}: {named[0]}" if any(named) else "")
 
 
 def unjudged_gains(

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 
 from taccorl.alignment.measurements.noise_floor import repeat_pairs
@@ -37,7 +36,7 @@ FRAMES_A_ROW = 5
 """Number of frames per row (50 ms): a delay of a fifth of it still changes the mean at the edge of a press."""
 _SELDOM = 5  # of the rows in which nothing happens one in so many is kept
 _SIGNAL = 1.3  # a taxel reads something if its RMS in contact is so many times its noise
-_FIXED = {
+FIXED: dict[str, dict[str, float]] = {
     "taxel_power_law": {"reference": 1.0},  # another reference is another k_n
     "taxel_gain_map": {"share": 1.0},  # the map itself is estimated
 }
@@ -126,10 +125,15 @@ class TouchProblem(WithoutMaps):
     """
 
     known = ()
+    numbers = "k_n, k_d and each pad's zero fitted"
+    measured = f"means of {FRAMES_A_ROW} frames"
+    fit: Sequence[Recording]
+    validation: Sequence[Recording]
+    test: Sequence[Recording]
 
     def __init__(self, motions: Sequence[TouchMotion], config: TwinConfig) -> None:
-        self.noise = noise_level(motions)
-        self.pads = self.noise.pads
+        self._level = noise_level(motions)
+        self.pads = self._level.pads
         shown = [e for e in config.effects if _shows(type(e)) and not e.is_absent and {*e.acts_on()} & {*self.pads}]
         own = [e for e in shown if {*e.acts_on()} == {*self.pads}]
         self.present = tuple(effect.name for effect in own)
@@ -140,6 +144,7 @@ class TouchProblem(WithoutMaps):
         self.floor_count = np.maximum(self._still_count, repeated.taxel_count)
         """(P, R, C) noise floor of a row of each taxel [counts], with the variation between repeats, if any."""
         self._touched_count = repeated.touched_count
+        self._lower_bound = not repeat_pairs(m.measurement for m in motions)
         self.not_shared: list[str] = []
         """Validation recordings that press hardly any taxel which a fit recording presses (``recordings``)."""
         sensor = self._model.sensor
@@ -169,7 +174,7 @@ class TouchProblem(WithoutMaps):
         """Start values of a search: the twin's own numbers."""
 
     def _candidate(self, cls: type[Effect]) -> Candidate:
-        found = touch_candidate(cls, self.seen, list(self.pads))
+        found = candidate(cls, self.seen, pads=list(self.pads), **FIXED.get(cls.name, {}))
         return dataclasses.replace(found, num_maps=self._num_gains) if cls is TaxelGainMap else found
 
     def recordings(
@@ -180,11 +185,16 @@ class TouchProblem(WithoutMaps):
         (``not_shared``)."""
         known = np.any([_pressed(m) for m in fit], axis=0)
         self.not_shared = [m.name for m in validation if (_pressed(m) & known).sum() < FEWEST_SHARED]
-        return (
-            [self.recording(m) for m in fit],
-            [self.recording(m, known) for m in validation],
-            [self.recording(m, known) for m in test],
-        )
+        self.fit = [self.recording(m) for m in fit]
+        self.validation, self.test = ([self.recording(m, known) for m in side] for side in (validation, test))
+        return self.fit, self.validation, self.test
+
+    @property
+    def noise(self) -> str:
+        """Text of the noise floor of the fit recordings' rows."""
+        count = float(np.median(np.concatenate([r.floor for r in self.fit])))
+        bound = "; a lower bound: record a press twice" * self._lower_bound
+        return f"{count:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames (the median taxel{bound})"
 
     def recording(self, motion: TouchMotion, known: np.ndarray | None = None) -> Recording:
         """A motion in the form for the search.
@@ -215,8 +225,8 @@ class TouchProblem(WithoutMaps):
 
     def _taxels(self, motion: TouchMotion, happens: np.ndarray, known: np.ndarray | None) -> np.ndarray:
         """Flat numbers of those that the object comes near or that read something; evenly taken if they are too many."""
-        signal = np.square(motion.measured[happens] - self.noise.mean_count).mean(axis=0) ** 0.5
-        matters = motion.near(3e-4).any(axis=0) | (signal > _SIGNAL * self.noise.std_count)
+        signal = np.square(motion.measured[happens] - self._level.mean_count).mean(axis=0) ** 0.5
+        matters = motion.near(3e-4).any(axis=0) | (signal > _SIGNAL * self._level.std_count)
         if known is not None and (_pressed(motion) & known).sum() >= FEWEST_SHARED:
             matters &= (known | ~_pressed(motion)).reshape(matters.shape)
         found = np.flatnonzero(matters)
@@ -277,9 +287,9 @@ class TouchProblem(WithoutMaps):
             reading = model.simulate(chosen.motion, *numbers)
         zero = np.array([base[f"zero_{pad}"] for pad in self.pads])[taxels // chosen.motion.layout.num_taxels]
         low = -chosen.motion.baseline.reshape(-1)[taxels].astype(float)
-        seen = reading.reshape(len(reading), -1)
-        numbers = float(model.sensor.gain_count), zero, low, low + model.spec.max_count
-        return _row_counts(seen, places, chosen.rows if all_frames else np.arange(len(chosen.rows)), *numbers)
+        seen = reading.reshape(len(reading), -1)[:, places].astype(float)
+        counts = _rows(np.clip(model.sensor.gain_count * seen + zero, low, low + model.spec.max_count))
+        return counts[chosen.rows] if all_frames else counts
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
@@ -357,20 +367,6 @@ def odd_cells(gains: np.ndarray, pads: Sequence[str]) -> str:
     return "; ".join(named)
 
 
-def touch_candidate(cls: type[Effect], seen: Mapping[str, float], pads: list[str]) -> Candidate:
-    """An effect on readings as a candidate, without parameters that are equivalent to other numbers.
-
-    Args:
-        seen: facts of the recordings for start values (``Effect.starts``).
-        pads: names of the pads on which it acts.
-    """
-    found = candidate(cls, seen, pads=pads, **_FIXED.get(cls.name, {}))
-    fixed = {f"{cls.name}.{p}" for p in _FIXED.get(cls.name, {})}
-    frees = tuple(f for f in found.frees if f.name not in fixed)
-    starts = tuple({k: v for k, v in start.items() if k not in fixed} for start in found.starts) if frees else ({},)
-    return dataclasses.replace(found, frees=frees, starts=starts)
-
-
 def _shows(cls: type[Effect]) -> bool:
     """Whether an effect changes what pads read in a matched replay, by numbers that can be fitted."""
     if not issubclass(cls, TouchEffect) or issubclass(cls, BoardEffect) or "pads" not in cls.kinds():
@@ -382,25 +378,6 @@ def _rows(frames: np.ndarray) -> np.ndarray:
     """Means of ``FRAMES_A_ROW`` frames (T, …) → rows; frames left over at the end fall away."""
     whole = len(frames) // FRAMES_A_ROW * FRAMES_A_ROW
     return frames[:whole].reshape(-1, FRAMES_A_ROW, *frames.shape[1:]).mean(axis=1, dtype=float)
-
-
-@numba.njit(cache=True)
-def _row_counts(
-    reading: np.ndarray,
-    places: np.ndarray,
-    rows: np.ndarray,
-    gain_count: float,
-    zero: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
-    """(S, C) means of g r + zero, cut to low … high frame by frame: rows (S,) and columns ``places`` (C,) of readings (T, K)."""
-    counts = np.zeros((len(rows), len(places)))
-    for s in range(len(rows)):
-        for frame in range(rows[s] * FRAMES_A_ROW, (rows[s] + 1) * FRAMES_A_ROW):
-            for c in range(len(places)):
-                counts[s, c] += min(max(gain_count * reading[frame, places[c]] + zero[c], low[c]), high[c])
-    return counts / FRAMES_A_ROW
 
 
 def _still_floor(motions: Sequence[TouchMotion]) -> np.ndarray:

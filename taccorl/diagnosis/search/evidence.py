@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.diagnosis.search.correlation import block_of_rows, rate_of
-from taccorl.diagnosis.search.fit import Fit, residuals
+from taccorl.alignment.measurements.correlation import block_sums
+from taccorl.diagnosis.search.fit import Fit, layout_of, stacked
 from taccorl.diagnosis.search.problem import Problem, Recording
 
 
@@ -30,16 +30,9 @@ class Blocks:
 
 def block_squares(problem: Problem, model: Fit, recordings: Sequence[Recording]) -> Blocks:
     """Squared residuals of ``recordings`` in blocks of ``correlation.BLOCK_S``, all channels of a block together."""
-    sums, counts = [], []
-    for recording in recordings:
-        squares = np.square(residuals(problem, model.values, model.effects, recording))
-        seen = np.isfinite(squares)
-        edges = np.flatnonzero(np.diff(block_of_rows(len(squares), rate_of(recording.time_s)), prepend=-1))
-        sums.append(np.add.reduceat(np.where(seen, squares, 0.0).sum(1), edges))
-        counts.append(np.add.reduceat(seen.sum(1), edges))
-    total, count = np.concatenate(sums), np.concatenate(counts)
-    total, count = total[count > 0], count[count > 0]
-    return Blocks(total / count, count / max(int(count.sum()), 1))
+    squares, layout = np.square(stacked(problem, model.values, model.effects, recordings)), layout_of(recordings)
+    total, count = block_sums(squares, layout), block_sums(np.ones(len(squares)), layout)
+    return Blocks(total / count, count / max(len(squares), 1))
 
 
 def standard_score(blocks: Blocks) -> float:

@@ -13,7 +13,14 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from taccorl.diagnosis.search.correlation import Rows, block_sums, independent_rows, lasting_square, rate_of, unstacked
+from taccorl.alignment.measurements.correlation import (
+    Rows,
+    block_sums,
+    independent_rows,
+    lasting_square,
+    rate_of,
+    unstacked,
+)
 from taccorl.diagnosis.search.problem import Case, Free, Problem, Recording, Values, chosen
 from taccorl.sim.effects.effect import Effect
 
@@ -281,6 +288,11 @@ def _entries(recording: Recording) -> _Entries:
     return _Entries(np.flatnonzero(measured), recording.measured[measured], floors[measured])
 
 
+def layout_of(recordings: Sequence[Recording]) -> tuple[Rows, ...]:
+    """Rows and channels of each recording in the stacked residuals."""
+    return tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s), r.short_noise) for r in recordings)
+
+
 def fit(
     problem: Problem,
     recordings: Sequence[Recording],
@@ -300,7 +312,6 @@ def fit(
         prior: mean and standard deviation of each coordinate, whose squared distance is added to the squared residuals; none: no
             prior. It is not part of the result's residuals and derivatives.
     """
-    layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s), r.short_noise) for r in recordings)
     candidates = chosen(problem, names)
     every = (*problem.base, *(f for c in candidates for f in c.frees))
     absent = [f.name for f in every if f.optional and start.get(f.name, f.start) <= 0.0]
@@ -312,6 +323,7 @@ def fit(
     inside = 1e-6 * (high - low)
     first = np.clip(first, low + inside, high - inside)
     newest: dict[bytes, np.ndarray] = {}
+    layout = layout_of(recordings)
 
     def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
         values = held | {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}

@@ -39,7 +39,6 @@ def settled(
     present: Sequence[str],
     fitted_to: Sequence[Recording],
     validation: Sequence[Recording],
-    most: int = 40,
 ) -> Fit:
     """``model`` with numbers that the recordings do not determine back near where they began, or ``model`` itself if it has none,
     or the errors would rise.
@@ -56,7 +55,7 @@ def settled(
     weights = variances / np.diag(inverse_of(model.jacobian.T @ model.jacobian))
     means = [f.coordinate(began.get(f.name, f.start)) for f in model.frees]
     prior = list(zip(means, deviations / np.sqrt(weights), strict=True))
-    found = fit(problem, fitted_to, model.names, model.values, most, FINE, prior=prior)
+    found = fit(problem, fitted_to, model.names, model.values, step=FINE, prior=prior)
     before, after = (
         rms(stacked(problem, m.values, m.effects, validation)) if validation else 0.0 for m in (model, found)
     )

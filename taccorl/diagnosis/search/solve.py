@@ -10,6 +10,7 @@ import numpy as np
 
 from taccorl.diagnosis.search.fit import residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.known_numbers import limits_of_known
 from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
@@ -35,10 +36,32 @@ class Startable(Problem, Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class Found:
-    """Result of the search for one part of any kind."""
+class RecordedProblem(Startable, Protocol):
+    """A search problem together with its recordings."""
 
+    fit: Sequence[Recording]
+    validation: Sequence[Recording]
+    """Recordings by whose error effects are chosen; empty if none is marked."""
+    test: Sequence[Recording]
+
+
+class PartProblem(RecordedProblem, Protocol):
+    """A search problem together with its recordings, and texts about them, as in ``PartFinding``."""
+
+    @property
+    def noise(self) -> str: ...
+    @property
+    def numbers(self) -> str: ...
+    @property
+    def measured(self) -> str: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartFinding:
+    """Finding about one part of a machine: result of the search, and texts about it for reports."""
+
+    part: str
+    """Name of the part in tables and reports."""
     diagnosis: Diagnosis
     can_tell: Identifiability
     """Effects that the fit recordings can show and separate, independent of the measured values."""
@@ -46,6 +69,16 @@ class Found:
     """fit, validation, test → names."""
     rows_split: bool
     """True if no recording was marked for validation, so that the last rows of each recording served as validation rows."""
+    noise: str
+    """The noise floors of the compared channels with their units, as text for reports."""
+    numbers: str
+    """Text that states which numbers are always fitted, and from where the other numbers are taken."""
+    measured: str
+    """Text that names the channels whose errors are minimised and reported, such as positions."""
+    known: Known | None = None
+    """Numbers that the recordings identify; None for parts for which they are not computed."""
+    remark: str = ""
+    """Text on what the search could not decide; empty if there is nothing."""
 
 
 class Solved(NamedTuple):
@@ -105,6 +138,30 @@ def solve(
         limits = limits_of_known(problem, problem.known, found, fit_to, validation, search or SearchConfig())
         found = dataclasses.replace(found, remarks=(*found.remarks, *limits))
     return Solved(found, can_tell, fit_to, validation, rows_split)
+
+
+def solved(
+    part: str,
+    problem: PartProblem,
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+    progress: Progress = no_progress,
+) -> PartFinding:
+    """Call ``solve`` for a problem that holds its recordings.
+
+    Args:
+        part: name of the part.
+        without: effects that are left out of the search.
+        progress: function that is called with a text about the present step.
+
+    Raises:
+        TaccorlError: nothing was measured in the validation rows.
+    """
+    found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without, progress)
+    recordings = {use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")}
+    stated = {"noise": problem.noise, "numbers": problem.numbers, "measured": problem.measured}
+    judged = {"diagnosis": found.diagnosis, "can_tell": found.can_tell, "rows_split": found.rows_split}
+    return PartFinding(part=part, recordings=recordings, **stated, **judged)
 
 
 def _of_loop(problem: Problem, found: Diagnosis, recordings: Sequence[Recording]) -> list[str]:

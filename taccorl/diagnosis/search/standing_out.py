@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from taccorl.diagnosis.search.correlation import independent_rows
+from taccorl.alignment.measurements.correlation import independent_rows
 from taccorl.diagnosis.search.fit import Fit, residuals
 from taccorl.diagnosis.search.problem import Problem, Recording
 

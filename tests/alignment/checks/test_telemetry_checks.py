@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from made_rows import of_signal, play
 from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
-from scipy.signal import lfilter, lsim
+from scipy.signal import cont2discrete, lfilter, lsim
 
 from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, onset_delay, pure_shift
-from taccorl.alignment.checks.held_commands import _second_order
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import check_measurement, check_measurements, check_names
 from taccorl.alignment.checks.trial import Trial
@@ -126,7 +125,8 @@ def test_lead_names_joint_time_and_way_out(clean):
 
 def resonant(motion: np.ndarray, rate_hz: float, zeta: float = 0.1) -> Measurement:
     """ω = 20 rad/s, with noise."""
-    seen = lfilter(*_second_order(20.0, zeta, 1 / rate_hz), motion - motion[0]) + motion[0]
+    b, a, _ = cont2discrete(([400.0], [1.0, 40.0 * zeta, 400.0]), 1 / rate_hz)
+    seen = lfilter(np.ravel(b), a, motion - motion[0]) + motion[0]
     noise = 1e-4 * np.random.default_rng(0).standard_normal(len(motion))
     return of_signal("made", rate_hz, motion, seen + noise, "table", source=Path("a.csv"))
 

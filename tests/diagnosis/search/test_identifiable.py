@@ -12,7 +12,7 @@ from one_joint import AxisJoint
 
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.rigid_joint import Gains
-from taccorl.diagnosis.search.correlation import Rows
+from taccorl.alignment.measurements.correlation import Rows
 from taccorl.diagnosis.search.fit import FINE, Fit, fit
 from taccorl.diagnosis.search.identifiable import (
     OVER_KP,

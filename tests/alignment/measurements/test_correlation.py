@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from taccorl.diagnosis.search.correlation import Rows, block_of_rows, block_sums, independent_rows, unstacked
+from taccorl.alignment.measurements.correlation import Rows, block_of_rows, block_sums, independent_rows, unstacked
 
 
 def coloured(num_rows: int, num_channels: int, keep: float, seed: int = 0) -> np.ndarray:
