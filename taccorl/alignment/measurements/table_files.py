@@ -204,8 +204,9 @@ def _number(cell: str, path: Path, line: int, column: str, decimal: str = "point
     try:
         value = float(own.replace(",", ".") if decimal == "comma" else own)
     except ValueError:
-        comma = "; write `decimal: comma` in a columns file" if "," in own and _is_number(own.replace(",", ".")) else ""
-        what = f"{cell!r} is no number{comma}" if own else "is empty; leave the row out"
+        comma = "," in own and _is_number(own.replace(",", "."))
+        way = "write `decimal: comma` in a columns file" if comma else "correct the cell, or leave the row out"
+        what = f"{cell!r} is no number; {way}" if own else "is empty; leave the row out"
         raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
     if not math.isfinite(value):
         raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; {_CUT}")
