@@ -25,7 +25,7 @@ MOST_LINES = {
     "taccorl/training": 1_557,
     "taccorl/views": 2_345,
     "tests": 55_489,
-    "pipelines": 6_294,
+    "pipelines": 6_297,
 }
 MOST_LINES_OF_A_FILE = 500
 

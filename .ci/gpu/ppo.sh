@@ -62,18 +62,20 @@ improve() { # NUMBER TWIN STAGE [BETA]
         --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=$(((each + 1) / 2)) --failures=0 \
         --out="$score" >"$score.log" 2>&1
       since "$2 $3 ${4:-} scored: $?"
-      python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" "$beta" <<'P'
+      python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" "$beta" "$out.log" <<'P'
 import json, re, sys
 from pathlib import Path
 
 from pipelines.learn import named
 
-learnt, robot, score, stage, beta = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
+learnt, robot, score, stage, beta, log = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
 name = Path(learnt["dataset"]["root"]).name
 of, twin, real = re.fullmatch(r"train_(\d+)_20_steps(?:_(?!and_)(.*?))?(?:_and_train_(\d+)_20_steps_.*)?", name).groups()
 about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin or "", "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
 about |= {"real": int(real), "sim_weight": learnt["policy"]["sim_weight"]} if real else {}
 about |= {} if stage == "start" else {"beta": float(beta)}
+noise = re.search(r"over (\d+) episodes: ([\d.]+)% without noise, ([\d.]+)% with", Path(log).read_text())
+about |= {"noise": dict(zip(("n", "without", "with"), map(float, noise.groups())))} if noise and stage != "start" else {}
 (Path(score) / "settings.json").write_text(json.dumps(about | {"stage": stage}))
 P
     fi
