@@ -6,16 +6,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_535,
+    "taccorl/alignment": 14_549,
     "taccorl/cli": 4_867,
-    "taccorl/data": 8_741,
-    "taccorl/diagnosis": 10_989,
+    "taccorl/data": 8_742,
+    "taccorl/diagnosis": 11_045,
     "taccorl/episodes": 4_047,
     "taccorl/evaluation": 1_874,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_067,
     "taccorl/policies": 3_462,
-    "taccorl/report": 2_512,
+    "taccorl/report": 2_511,
     "taccorl/rl": 2_472,
     "taccorl/robot_plugin": 2_678,
     "taccorl/robots": 338,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_345,
-    "tests": 55_489,
+    "tests": 55_518,
     "pipelines": 6_297,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -177,8 +177,7 @@ def _change(c: Changed, d: Diagnosis) -> str:
     if c.name == "loop_hz":
         low, high = (1.0 / end if end > 0.0 else math.inf for end in reversed(d.intervals["loop_s"]))
     edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
-    if c.name == "stall_nm" and not any(o.name == "back_emf" for o in d.changed):
-        edit += f": as of {c.after / c.before:.4g} times the supply's voltage"
+    edit += f" or, as well, {' or '.join(c.ties)}" * bool(c.ties)
     edit += f": a constant {'force' if c.unit == 'N' else 'torque'}, which may be a weight" * (c.name == "torque_ff")
     edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (c.name == EFFORT_SCALE)
     edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))

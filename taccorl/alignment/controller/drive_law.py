@@ -194,14 +194,22 @@ class DriveLaw:
         states a factor (``kp_factor``, ``kd_factor``) is that of the drive's own setting."""
         units = dict(zip(("kp", "kd"), GAIN_UNITS.get(self.law, ("N·m/rad", "N·m·s/rad")), strict=True))
         units |= {name: "steps" for name in units if getattr(self, f"{name}_factor") != 1.0}
-        units |= {"torque_ff": "N·m", "torque_nm_per_a": "N·m/A", "emf_v_s_per_rad": "V·s/rad"}
+        units |= {
+            "supply_v": "V",
+            "resistance_ohm": "Ω",
+            "torque_ff": "N·m",
+            "torque_nm_per_a": "N·m/A",
+            "emf_v_s_per_rad": "V·s/rad",
+        }
         return {name: (getattr(self, name), unit) for name, unit in units.items() if getattr(self, name) is not None}
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
         """Convert fitted values, by parameter name, into values of this class's fields. ``base``: those of ``torque_ff`` [N·m],
-        ``kp`` and ``kd`` (as in ``loop_gains``), ``stall_nm`` and ``back_emf`` that were fitted. Returns field → value in the
-        unit of the file; only fields that follow from ``base``."""
+        ``kp`` and ``kd`` (as in ``loop_gains``), ``stall_nm`` and ``back_emf``, or of fields of the motor in place of these two.
+        Returns field → value in the unit of the file; only fields that follow from ``base``."""
         new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
+        if self.law == "pwm" and (of_motor := {name: base[name] for name in WINDING if name in base}):
+            return new | of_motor
         if self.law == "pwm" and {"stall_nm", "back_emf"} & {*base}:
             volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
             new["torque_nm_per_a"] = base.get("stall_nm", self.stall_nm) * ohms / volts

@@ -299,7 +299,9 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
     own = stated(header)
     time_s = own.time.quantity(columns[own.time.column]) * TIME_S[own.time.unit]
     if len(time_s) < 2:
-        raise RecordingError(f"{path}: {len(time_s)} rows, too few for a measurement; record it again, or remove the file")
+        raise RecordingError(
+            f"{path}: {len(time_s)} rows, too few for a measurement; record it again, or remove the file"
+        )
     steps = np.diff(time_s)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 2

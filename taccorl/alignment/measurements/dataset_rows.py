@@ -110,7 +110,9 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
     first = 1 if episode.spec.action_time == "next_row" else 0
     target, measured = action[: len(action) - first], state[first:]
     if len(measured) < 2:
-        raise TaccorlError(f"{episode.name}: {len(state)} rows, too few for a measurement; delete it with lerobot-edit-dataset")
+        raise TaccorlError(
+            f"{episode.name}: {len(state)} rows, too few for a measurement; delete it with lerobot-edit-dataset"
+        )
     time_s = np.arange(len(measured)) / episode.spec.fps
     touch = None
     if TACTILE in episode.arrays:

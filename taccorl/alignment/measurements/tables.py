@@ -289,7 +289,9 @@ def measurement_of_columns(
     neither on nor off."""
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
-        raise RecordingError(f"{path}: {len(time_s)} rows, too few for a measurement; record it again, or remove the file")
+        raise RecordingError(
+            f"{path}: {len(time_s)} rows, too few for a measurement; record it again, or remove the file"
+        )
     shape = (len(time_s), len(spec.signals))
     nothing = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
     values = {key: np.full(shape, nothing.get(key, np.nan)) for key in _CONVERSIONS}

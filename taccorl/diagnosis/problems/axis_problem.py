@@ -6,8 +6,9 @@ effort was recorded, the gains are also fitted, within ``GAINS_WITHIN`` of the c
 cent outweighs the friction of a fast drive. They stay, and so do the delays, if the recorded efforts are those of the file's
 law, row by row, to the noise floor: a fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted
 within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file states it, because positions determine ratios
-only. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The
-delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. Unless both gains and
+only. For law ``pwm`` stall torque and back-EMF are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets;
+without efforts a supply, resistance or torque constant that explains as much alone is named instead (``of_file``). The delay of
+targets is fitted up to ``TIMING_S``, since a cycle of the drive's loop is visible in the data. Unless both gains and
 efforts are unknown, so is the delay of a speed that the drive filters, or the period of its loop where the file states no
 ``loop_hz``. The scale of efforts is fitted in place of the inertia where that decides.
 """
@@ -20,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from taccorl.alignment.checks.effort_time import law_error
-from taccorl.alignment.controller.drive_law import WINDING_WITHIN
+from taccorl.alignment.controller.drive_law import WINDING, WINDING_WITHIN
 from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel, JointResponse, Numbers, simulate_each
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -100,6 +101,12 @@ class AxisProblem(WithoutMaps):
         alone = axis.law == "impedance" and axis.gains == "commanded" and not self.effort
         if alone and axis.kd and "kd" not in axis.known:
             self.other_gain: Free | None = other_gain(axis.loop_gains.kd, axis.scale.unit_of("N·m·s/rad"))
+        if axis.law == "pwm" and not self.effort and not {"stall_nm", "back_emf"} & {*axis.known}:
+            self.of_file = tuple(
+                Free(name=n, unit=unit, start=at, low=at / WINDING_WITHIN, high=at * WINDING_WITHIN, log=True)
+                for n, (at, unit) in axis.numbers.items()
+                if n in WINDING
+            )
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.start)
 

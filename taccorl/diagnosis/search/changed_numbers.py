@@ -11,6 +11,7 @@ A number of the drive may have moved because an effect is missing that acts alik
 constant torque: effects that do as well in its place are named with it (``Changed.instead``).
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +20,7 @@ from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
 from taccorl.diagnosis.search.evidence import gain_of
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.fits import PROBED_BESIDE, STEPS, Fits, Model, best, model_of, refusal
-from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Problem, with_held, with_scale
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Problem, Values, with_held, with_scale
 from taccorl.diagnosis.search.result import Changed
 
 STATED = {
@@ -42,6 +43,8 @@ REFIT_WORSE = 1.3
 GAINS_MOVED = 2.0
 """Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
 wrong unit of time, or gains other than the commanded ones."""
+NEAR = (1.0, 0.7, 1.4)
+"""Multiples of the file's value from which few numbers are fitted: from far away, the delay of targets may take them up."""
 OF_LOOP = ("loop_s", "speed_delay_s")
 """Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 
@@ -49,42 +52,54 @@ OF_LOOP = ("loop_s", "speed_delay_s")
 def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[tuple[Changed, ...], Fit]:
     """Numbers of the file whose refit explains a part of the error of the twin as it was: before an effect was added, unless the
     added ones bring them back into their 95 % intervals or near the file's value; and beside the added ones. ``names``: effects
-    that may be missing. Also ``model``; where a part of a group is off, refitted with the file's values of all that may stay."""
+    that may be missing. Also ``model``; where few numbers explain as much (``_fewest``), the fit of those."""
     found: dict[str, Changed] = {}
-    before = _off(fits, fits.first)[0] if fits.added(model) else []
-    beside, model = _off(fits, model)
+    given = fits.given | {f.name: f.start for f in fits.problem.of_file}
+    fewest = _fewest(fits, model, given) if fits.problem.of_file else None
+    before = _off(fits, fits.first) if fits.added(model) and fewest is None else []
+    beside, model, ties = (_off(fits, model), model, ()) if fewest is None else fewest
     intervals = model.intervals()
     for fit, off in ((fits.first, before), (model, beside)):
         for frees, without in off:
             ends = {f.name: intervals.get(f.name, 2 * (model.values.get(f.name, f.start),)) for f in frees}
-            moved = [f for f in frees if not ends[f.name][0] <= fits.given[f.name] <= ends[f.name][1]]
-            change = {f.name: abs(model.values[f.name] - fits.given[f.name]) for f in moved}
-            first = {f.name: abs(fit.values[f.name] - fits.given[f.name]) for f in moved}
-            least = {name: max(NEGLIGIBLE * abs(fits.given[name]), BACK * more) for name, more in first.items()}
+            moved = [f for f in frees if not ends[f.name][0] <= given[f.name] <= ends[f.name][1]]
+            change = {f.name: abs(model.values[f.name] - given[f.name]) for f in moved}
+            first = {f.name: abs(fit.values[f.name] - given[f.name]) for f in moved}
+            least = {name: max(NEGLIGIBLE * abs(given[name]), BACK * more) for name, more in first.items()}
             moved = [f for f in moved if fit is model or change[f.name] > least[f.name]]
             of_drive = "." not in frees[0].name
             instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
-                name, before, after, unit = f.name, float(fits.given[f.name]), float(model.values[f.name]), f.unit
+                name, before, after, unit = f.name, float(given[f.name]), float(model.values[f.name]), f.unit
                 if name in OF_LOOP and model.values["loop_s"] < SHORTEST_STEP_S:
                     continue  # faster than the model's own steps
                 if name in OF_LOOP:
                     name, before, after, unit = "loop_hz", np.inf, 1.0 / max(model.values["loop_s"], 1e-9), "Hz"
                 alone = fit is not model
                 own = Changed(
-                    name=name, before=before, after=after, unit=unit, without=without, alone=alone, instead=instead
+                    name=name,
+                    before=before,
+                    after=after,
+                    unit=unit,
+                    without=without,
+                    alone=alone,
+                    instead=instead,
+                    ties=ties,
                 )
                 found.setdefault(name, own)
     return tuple(found.values()), model
 
 
-def _off(fits: Fits, model: Fit) -> tuple[list[tuple[list[Free], float]], Fit]:
-    """Groups of numbers whose change in ``model`` meets the criteria, each with the validation error [floors] without it; and, if
-    a number of such a group can return alone, the fit without all that can, else ``model``."""
+Off = list[tuple[list[Free], float]]
+"""Groups of numbers, each with the validation error [floors] with their values of the file."""
+
+
+def _off(fits: Fits, model: Fit) -> Off:
+    """Groups of numbers whose change in ``model`` meets the criteria."""
     as_it_was, smaller = fits.model_of(fits.as_it_was), fits.model_of(model)
     groups, config = _groups(fits, model), fits.config
     if not groups or as_it_was.error <= config.floor or refusal(smaller, as_it_was, config):
-        return [], model
+        return []
     fits.progress("which numbers of the file are off")
     kept, found = dict[str, float](), []
     for frees in groups:
@@ -94,14 +109,42 @@ def _off(fits: Fits, model: Fit) -> tuple[list[tuple[list[Free], float]], Fit]:
             kept, smaller = kept | stated, trial
         else:
             found.append((frees, trial.error))
-    answer = model
-    for frees, _ in found:
-        for f in [*frees] if len(frees) > 1 and frees[0].name in STATED else []:
-            trial = _refitted(fits, model, with_held(fits.problem, kept | {f.name: fits.given[f.name]}))
-            if refusal(smaller, trial, config):
-                kept[f.name], smaller, answer = fits.given[f.name], trial, trial.fit
-                frees.remove(f)
-    return found, answer
+    return found
+
+
+def _fewest(fits: Fits, model: Fit, given: Values) -> tuple[Off, Fit, tuple[str, ...]] | None:
+    """The fewest numbers of the file, at most two, that explain as much as ``model`` while all others are as in the file; their
+    fit with its effects, and texts of those that do as well as the last. None: it takes more."""
+    every = [f for f in fits.problem.base if f.name in STATED] + [
+        f for n in fits.present for f in fits.problem.candidates[n].frees
+    ]
+    groups, timing = [[f] for f in fits.problem.of_file], given.keys() - {f.name for f in every}
+    for _, together in itertools.groupby(every, lambda f: f.name.rpartition(".")[0] or STATED[f.name]):
+        if (frees := [f for f in together if not f.held]) and frees[0].name not in ("stall_nm", "back_emf"):
+            groups.append(frees)
+
+    def trial(*taken: list[Free]) -> Model:
+        free = {f.name: given[f.name] for frees in taken for f in frees}
+        problem = with_held(fits.problem, {f.name: given[f.name] for f in every if f.name not in free})
+        problem.base += tuple(f for f in fits.problem.of_file if f.name in free)
+        begun = given | {n: v for n, v in model.values.items() if n in timing or n not in given}
+        near = [model.values | given | {n: k * v for n, v in free.items()} for k in NEAR]
+        return _refitted(fits, model, problem, [begun, *near])
+
+    answer, taken, tried, smaller = fits.model_of(model), list[list[Free]](), list[tuple[Model, list[Free]]](), trial()
+    before, own = smaller, list[Free]()
+    while not refusal(answer, smaller, fits.config):
+        if len(taken) == 2:
+            return None
+        fits.progress("which number of the file is off")
+        before, tried = smaller, [(trial(*taken, frees), frees) for frees in groups if frees not in taken]
+        smaller, own = min(tried, key=lambda pair: pair[0].error)
+        taken.append(own)
+    if not taken:
+        return [], smaller.fit, ()
+    as_good = [(m, f) for m, frees in tried for f in frees if frees is not own and refusal(answer, m, fits.config)]
+    ties = tuple(f"{f.name} {given[f.name]:.4g} → {m.fit.values[f.name]:.4g} {f.unit}" for m, f in as_good)
+    return [(frees, before.error if frees is own else trial(own).error) for frees in taken], smaller.fit, ties
 
 
 def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
@@ -143,9 +186,9 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 
 
-def _refitted(fits: Fits, model: Fit, problem: Problem) -> Model:
+def _refitted(fits: Fits, model: Fit, problem: Problem, starts: Sequence[Values] = ()) -> Model:
     """The effects of ``model`` refitted to the same recordings with the free and held numbers of another ``problem``."""
-    found = best_fit(problem, fits.fit_to, model.names, [model.values, model.values | fits.given], STEPS)
+    found = best_fit(problem, fits.fit_to, model.names, starts or [model.values, model.values | fits.given], STEPS)
     return model_of(problem, found, fits.validation)
 
 

@@ -177,6 +177,9 @@ class Problem(Protocol):
     takes ``loop_waits_s``, how long a row's target waits for the next period, beside the numbers of ``base``."""
     other_gain: Free | None
     """Gain of the file that is not fitted, but whose wrong value would look like an effect: the search tries it, too."""
+    of_file: tuple[Free, ...]
+    """Numbers of the file of which a wrong one alone may explain what ``base``, whose numbers have a common factor that nothing
+    tells, explains by many; ``simulate`` takes them in place of those that follow from them. Empty: there is no such factor."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
@@ -213,6 +216,7 @@ class WithoutMaps:
     at_once = 1
     loop_s = 0.0
     other_gain: Free | None = None
+    of_file: tuple[Free, ...] = ()
 
     def simulate(
         self: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording

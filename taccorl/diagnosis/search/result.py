@@ -140,6 +140,8 @@ class Changed:
     instead: tuple[str, ...] = ()
     """Effects of which each explains as much while the number stays as the file has it, those with the fewest numbers first;
     sought for numbers of the drive where no effect was added."""
+    ties: tuple[str, ...] = ()
+    """Other numbers of the file with their changes, as text, each of which does as well in place of this one."""
 
     @property
     def was(self) -> str:

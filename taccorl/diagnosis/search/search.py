@@ -460,11 +460,12 @@ def _described(fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: 
     as_it_was, after = fits.error(fits.as_it_was), fits.error(model)
     stage = "fitted" if fits.added(model) and (fits.base.error <= as_it_was or 0.9 * as_it_was < after) else "before"
     before = fits.base.error if stage == "fitted" else as_it_was
+    how = ", ".join(model.names) if fits.added(model) else "numbers of the file refitted"
     for effect in model.effects:
         prefix = f"{effect.name}."
         effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
         effect.evidence = (
-            f"validation error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
+            f"validation error {before:.2f} to {after:.2f} noise floors with {how}; recordings "
             f"{', '.join(r.name for r in fits.validation)}"
         )
         if effect.name in test_without:
