@@ -216,6 +216,7 @@ class Document[T]:
             return text
         digits = f"at most {MOST_DIGITS} digits" if len(text) > MOST_DIGITS else "plain digits only"
         hint = {str: "; put it in quotes", int: f"; {digits}", float: "; plain decimal digits only"}.get(kind, "")
+        hint += ", without quotes" * (not plain and kind in (int, float))
         raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
 
 

@@ -134,7 +134,6 @@ def solve(
     )
     found = dataclasses.replace(found, remarks=(*_of_loop(problem, found, (*fit_to, *validation)), *found.remarks))
     if problem.known:
-        progress("what the known numbers cost")
         limits = limits_of_known(problem, problem.known, found, fit_to, validation, search or SearchConfig())
         found = dataclasses.replace(found, remarks=(*found.remarks, *limits))
     return Solved(found, can_tell, fit_to, validation, rows_split)

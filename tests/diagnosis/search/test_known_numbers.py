@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_problem import Hidden, MadeProblem, record
+from made_problem import Bump, Hidden, MadeProblem, Ripple, record
 from simulated_slide import AXIS, FRICTION_N, MASS_KG, recorded_slide
 
 from taccorl.alignment.machines.axis_file import EffectEntry, axis_text, load_axis
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
-from taccorl.diagnosis.search.problem import holding
+from taccorl.diagnosis.search.problem import Stopped, holding
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
@@ -39,6 +39,22 @@ def test_a_wrong_known_mass_is_named_with_the_mass_that_the_recordings_have():
     (remark,) = d.remarks
     assert "inertia 80 kg" in remark and "`known`" in remark
     assert float(remark.split("with inertia ")[1].split(" ")[0]) == pytest.approx(MASS_KG, rel=0.01)
+
+
+def test_a_stop_after_an_effect_was_added_keeps_it_beside_known_numbers():
+    """The known gain is right; of ripple and bump the ripple is there when the user stops."""
+    problem: Any = MadeProblem(Ripple, Bump)
+    problem.start, problem.present, problem.known = {"gain": 3.0, "offset": 0.0}, (), ("gain",)
+    problem.base = holding(problem.base, problem.known, problem.start)
+    recordings = [record(k, Ripple(strength=1.0), Bump(strength=1.0), noise=0.1) for k in range(2)]
+    said = [""]
+
+    def progress(text: str) -> None:
+        said.append(text)
+        if any(one.startswith("ripple, validation error") for one in said):
+            raise Stopped
+
+    assert solve("made", problem, recordings[:1], recordings[1:], (), progress=progress).diagnosis.names == ("ripple",)
 
 
 @pytest.mark.parametrize(("stated", "names", "num"), [(2.0, ("hidden",), 1), (3.0, (), 0)])
