@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_345,
-    "tests": 55_518,
+    "tests": 55_524,
     "pipelines": 6_297,
 }
 MOST_LINES_OF_A_FILE = 500

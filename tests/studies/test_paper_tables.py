@@ -33,12 +33,18 @@ def test_cells_are_what_was_counted():
     assert {key: [*of] for key, of in transfer(moved).items()} == {("late", 9): ["nominal", "mended", "randomised"]}
     assert transfer(after := [row | {"stage": "ppo"} for row in moved]) == {}
     assert "| late | after | 0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* | +14; p = 2e-05 |" in page(after)
-    assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96* | not run |" in page(rows[:1])
-    assert "| 100 % (96 … 100) of 96*; of 9 demonstrations |" in page([ROW | {"stage": "ppo", "successes": 96}])
+    assert "| puzzle | cameras and touch | 16 %; 4 %; 71 % | 0 % (0 … 4) of 96* | not run | not run |" in page(rows[:1])
+    loud = {"stage": "ppo", "successes": 96, "noise": {"n": 128.0, "without": 90.6, "with": 50.0}}
+    assert "| 90.6 → 50 % of 128 | 100 % (96 … 100) of 96*; of 9 demonstrations |" in page([ROW | loud])
     beside = [*moved, moved[1] | {"twin": "", "real": 5, "sim_weight": 0.5}]
     assert len(transfer(beside)["late", 9]["nominal"]) == 1
     alone = "0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* |"
     assert f"| late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | not run | {alone}" in page(beside)
+    imitated = moved[1] | {"twin": "", "real": 5, "sim_weight": 0.95}
+    anchored, start = imitated | {"stage": "ppo_anchored", "beta": 5.0}, imitated | {"stage": "start", "successes": 96}
+    assert "| late | 50 % (43 … 57) of 192* | not run | not run | not run | 14 % (10 … 20) of 192* |" in page(
+        [imitated, anchored, start]
+    )
     grip = ROW | {"task": "assembly_1", "demonstrations": 100}
     many = grip | {"demonstrations": 1000, "successes": 48}
     told = page([grip, many | {"sources": 10}, many | {"corrected": 300, "successes": 96}, grip | {"stage": "ppo"}])
@@ -48,7 +54,7 @@ def test_cells_are_what_was_counted():
         "| each its own grip for 300, then corrections | not run | not run | 100 % (96 … 100) of 96* | not run |"
         in told
     )
-    assert "| assembly_1 | cameras and touch | 47 %; 92 % | 0 % (0 … 4) of 96* |" in told
+    assert "| assembly_1 | cameras and touch | 47 %; 35 %; 92 % | 0 % (0 … 4) of 96* |" in told
 
 
 @pytest.mark.parametrize(
