@@ -6,18 +6,18 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_549,
+    "taccorl/alignment": 14_555,
     "taccorl/cli": 4_867,
     "taccorl/data": 8_742,
-    "taccorl/diagnosis": 11_045,
-    "taccorl/episodes": 4_047,
+    "taccorl/diagnosis": 11_048,
+    "taccorl/episodes": 4_048,
     "taccorl/evaluation": 1_874,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_067,
     "taccorl/policies": 3_462,
     "taccorl/report": 2_511,
     "taccorl/rl": 2_472,
-    "taccorl/robot_plugin": 2_678,
+    "taccorl/robot_plugin": 2_679,
     "taccorl/robots": 338,
     "taccorl/sim": 9_270,
     "taccorl/surrogate": 3_259,

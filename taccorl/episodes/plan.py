@@ -107,8 +107,9 @@ class Needed:
         return range(started, self._started)
 
     def after(self, item: int, made: Made) -> range:
-        """Numbers of the attempts to start now that attempt ``item`` has ended. Raises TaccorlError: an automatic demonstrator
-        fails so often that the task or the twin must be faulty. There is no limit for a person."""
+        """Take the result of attempt ``item``, which has ended, and return the numbers of the attempts to start now. Raises
+        TaccorlError: an automatic demonstrator fails so often that the task or the twin must be faulty; for a person there is no
+        limit."""
         plan, self._made[item] = self._plan, made
         self._successes += made.success
         while (num := self._in_order.total()) in self._made:

@@ -40,7 +40,7 @@ Kind = Literal[
 ]
 """What a verdict says: nothing is missing, numbers of the file are off, effects are missing or tie, more is than was found, …"""
 ALIKE: tuple[Kind, ...] = ("not_converged", "gains_moved", "nothing_missing", "numbers_off")
-"""Kinds of a verdict that follow from the search's status alone and have its name."""
+"""Kinds of verdict that are named after a status of the search, and follow from this status alone."""
 FOUND: Mapping[Kind, str] = {
     "data_first": "{w.part}: settle the data before any effect is named: {w.first_fault}.",
     "not_converged": "{w.part}: the fit has not converged, so nothing follows from its error of {w.after:.2f} noise floors.",
@@ -63,7 +63,7 @@ UNCERTAIN: Mapping[Kind, str] = {
 """Kind of low confidence → its first reason."""
 SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
 LATE: Mapping[str, str] = {"command_delay": "positions and efforts", "sensor_delay": "positions"}
-"""Effect → columns: if their time stamps are late by its delay, the recording looks exactly as with the effect."""
+"""Effect of a delay → columns of the recording. If these were logged late by the delay, the recording would look the same."""
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
     "gains_moved": "First state the commanded gains (kp, kd) and check the time stamps.",

@@ -162,8 +162,9 @@ class SurrogateBody:
         now_s = self.ticks * self.TICK_S
         every = round(self._physics * PAD_HZ / JOINT_HZ)
         passed = self.ticks - self._since + np.arange(every, self._physics + 1, every)[:, None, None] / self._physics
-        line = self._from + np.minimum(passed * self.TICK_S * CONTROL_HZ, 1.0) * (self._goal - self._from)
-        self._target = line[-1, 0]
+        share = np.minimum(passed * self.TICK_S * CONTROL_HZ, 1.0)
+        line = self._from + share * (self._goal - self._from)
+        self._target = self._goal if share[-1, 0, 0] == 1.0 else line[-1, 0]
 
         def see(step: int) -> None:
             states.append((now_s + step * self.sim.config.physics.timestep_s, self._state()))

@@ -52,8 +52,8 @@ def draw_sheet(episode: Episode) -> Image.Image:
 
 
 def choose_instants(episode: Episode) -> tuple[int, ...]:
-    """Return at most ``NUM_INSTANTS`` rows, ascending, spread evenly from first to last; the one nearest to the strongest touch
-    is replaced by the row of the strongest touch."""
+    """Choose at most ``NUM_INSTANTS`` rows of an episode, evenly spread, in ascending order. If there is touch, the row with the
+    strongest touch takes the place of the chosen row nearest to it."""
     num = min(NUM_INSTANTS, episode.num_rows)
     rows = np.unique(np.linspace(0, episode.num_rows - 1, num).round().astype(int))
     pads = pads_of(episode)

@@ -175,7 +175,7 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     assert thread is not None
     thread.join()
     assert until(lambda: not server._clients)
-    np.testing.assert_allclose(server.body._goal, server.body._target, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(server.body._goal, server.body._target)
     assert server.body._goal.any(), "it holds where it has come to, and not the zeros of the command"
     facts = second.connect(10.0)
     assert facts["origin"]["domain"] == "surrogate" and facts["seed"] == 1  # a new scene for a new client

@@ -119,7 +119,7 @@ class CameraFit:
 
 
 def without_effects(config: TwinConfig, camera: str, names: Sequence[str]) -> TwinConfig:
-    """The twin without its effects ``names`` on this camera; entries that name several cameras keep the others."""
+    """Copy of ``config`` without the effects ``names`` on ``camera``; one that acts on several cameras stays on the others."""
     kept = []
     for effect in config.effects:
         if effect.name not in names or camera not in effect.acts_on():

@@ -191,9 +191,14 @@ def wrong_inertia(
     words: Callable[[JointMotion, float, float], str],
     factor: float = 1.0,
 ) -> list[Finding]:
-    """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant.
-    ``fit``: law of the efforts. ``words``: function of the motion, the inertia that it shows and the stated one [kg·m², kg] that
-    returns the text of the finding."""
+    """Finding that the efforts show another inertia than the file states; empty if they agree to ``INERTIA_OFF``. The inertia is
+    the factor of the acceleration in a least-squares fit of effort / ``factor`` by acceleration, velocity, its sign, sine and
+    cosine of the angle, and a constant.
+
+    Args:
+        fit: law that the recorded efforts follow.
+        words: function of (motion, fitted inertia, stated inertia [kg·m², kg]) that returns the text of the finding.
+    """
     name = model.signal
     j = m.column(name)
     q, torque, is_off = m.measured[:, j], m.effort[:, j] / factor, m.enabled.size and not m.enabled[:, j].all()

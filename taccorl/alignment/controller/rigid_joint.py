@@ -43,7 +43,7 @@ class Rigid(NamedTuple):
 
 
 class PointMass(NamedTuple):
-    """A mass fixed to a body, of which the controller's gravity compensation knows nothing. ``spread_m2`` 0: a point."""
+    """A mass rigidly fixed to a body, which the controller's gravity compensation leaves out; a point if ``spread_m2`` is 0."""
 
     mass_kg: float
     body: int  # Id of the body

@@ -262,7 +262,7 @@ class DrivenAxis(DriveJoint):
         self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
 
     def joint(self, signal: str) -> "DrivenAxis":
-        """Itself: an axis is a machine with one joint."""
+        """The axis itself, which is its only joint (interface ``HasJoints``)."""
         return self
 
     def timestep_s(self, motion: JointMotion) -> float:

@@ -44,7 +44,8 @@ def pad_presses(
     between_s: float = 0.5,
     after_s: float = REST_S,
 ) -> Knots:
-    """Each depth at each speed."""
+    """Corners of presses to each of ``depths_m`` [m] within each of ``rises_s`` [s], each held for ``hold_s`` [s]. ``before_s``,
+    ``between_s``, ``after_s``: rest before the first press, between two, after the last [s]."""
     each = ((depth, rise, hold_s) for depth in depths_m for rise in rises_s)
     return in_turn(*each, rest_s=between_s, away=AWAY_M, before_s=before_s, after_s=after_s)
 
@@ -61,7 +62,7 @@ class Press:
     """Position of the object's centre along z of the TCP's frame [m], not at the centre of a taxel; a rod lies across the pads,
     along x."""
     wiggle_m: float = 0.0
-    """Amplitude of a vibration at 2.3 Hz, with 0.6 of it at 5.1 Hz, that is added to the penetration [m]."""
+    """Amplitude a of a vibration that is added to the penetration [m]: a sin(2π · 2.3 Hz t) + 0.6 a sin(2π · 5.1 Hz t)."""
     repeat_of: str | None = None  # Name of the press that it repeats; None if it is no repeat
 
     def pressed(self, arm: str) -> PressedNote:

@@ -44,7 +44,8 @@ GAINS_MOVED = 2.0
 """Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
 wrong unit of time, or gains other than the commanded ones."""
 NEAR = (1.0, 0.7, 1.4)
-"""Multiples of the file's value from which few numbers are fitted: from far away, the delay of targets may take them up."""
+"""Multiples of the file's value that are start values in fits of one or two numbers. From one start far from the solution a fit
+may end with a wrong delay of the targets instead."""
 OF_LOOP = ("loop_s", "speed_delay_s")
 """Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 
@@ -91,7 +92,7 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[tuple
 
 
 Off = list[tuple[list[Free], float]]
-"""Groups of numbers, each with the validation error [floors] with their values of the file."""
+"""Groups of numbers, each with the validation error [noise floors] if the group has the values of the file."""
 
 
 def _off(fits: Fits, model: Fit) -> Off:
@@ -113,8 +114,9 @@ def _off(fits: Fits, model: Fit) -> Off:
 
 
 def _fewest(fits: Fits, model: Fit, given: Values) -> tuple[Off, Fit, tuple[str, ...]] | None:
-    """The fewest numbers of the file, at most two, that explain as much as ``model`` while all others are as in the file; their
-    fit with its effects, and texts of those that do as well as the last. None: it takes more."""
+    """Search for the fewest numbers of the file, at most two, whose fit explains as much as ``model`` with all others as in the
+    file. Returns these numbers, the fit, and a text for each number that does as well in place of the last one; None if
+    more than two are needed. ``given``: values of the file."""
     every = [f for f in fits.problem.base if f.name in STATED] + [
         f for n in fits.present for f in fits.problem.candidates[n].frees
     ]

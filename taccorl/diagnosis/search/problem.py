@@ -45,7 +45,7 @@ class Free:
     """True: the number may be absent while its effect is there (``Effect.optional``). It is fitted from starts above 0 only, and
     otherwise stays at 0."""
     unless: str = ""
-    """Effect that describes the same, or that balances any value of this number: beside it the number is held at ``start``."""
+    """Name of an effect that makes this number superfluous: in a fit with that effect the number is held at ``start``."""
 
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
@@ -178,8 +178,9 @@ class Problem(Protocol):
     other_gain: Free | None
     """Gain of the file that is not fitted, but whose wrong value would look like an effect: the search tries it, too."""
     of_file: tuple[Free, ...]
-    """Numbers of the file of which a wrong one alone may explain what ``base``, whose numbers have a common factor that nothing
-    tells, explains by many; ``simulate`` takes them in place of those that follow from them. Empty: there is no such factor."""
+    """Further numbers of the file, fitted one or two at a time where the recordings determine only ratios of the numbers of
+    ``base``: supply, resistance and torque constant of a motor whose effort was not logged. ``simulate`` uses them in place
+    of the numbers of ``base`` that follow from them. Empty for other problems."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.

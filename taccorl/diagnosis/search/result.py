@@ -141,7 +141,7 @@ class Changed:
     """Effects of which each explains as much while the number stays as the file has it, those with the fewest numbers first;
     sought for numbers of the drive where no effect was added."""
     ties: tuple[str, ...] = ()
-    """Other numbers of the file with their changes, as text, each of which does as well in place of this one."""
+    """Texts, each of another number of the file and its change that explain as much in place of this one."""
 
     @property
     def was(self) -> str:

@@ -146,7 +146,7 @@ def solved(
     without: Sequence[str] = (),
     progress: Progress = no_progress,
 ) -> PartFinding:
-    """Call ``solve`` for a problem that holds its recordings.
+    """Search for the effect that is missing in one part (``solve``), with the recordings that ``problem`` holds.
 
     Args:
         part: name of the part.
