@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_555,
+    "taccorl/alignment": 14_556,
     "taccorl/cli": 4_867,
     "taccorl/data": 8_742,
     "taccorl/diagnosis": 11_048,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_345,
-    "tests": 55_524,
+    "tests": 55_526,
     "pipelines": 6_297,
 }
 MOST_LINES_OF_A_FILE = 500

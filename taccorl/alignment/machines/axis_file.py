@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal
 
 import yaml
 
-from taccorl.alignment.controller.drive_law import DriveJoint, DriveLaw
+from taccorl.alignment.controller.drive_law import WINDING, DriveJoint, DriveLaw
 from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Rigid
 from taccorl.alignment.measurements.measurement import Measurement
@@ -84,6 +84,7 @@ class AxisConfig(DriveLaw):
     effects: tuple[EffectEntry, ...] = ()  # Effects beyond inertia, weight and control law; empty if there are none
     FITTED: ClassVar[tuple[str, ...]] = (
         *DriveLaw.FITTED,
+        *WINDING,
         *("inertia", "weight_sin", "weight_cos", "target_late_s", "speed_late_s"),
     )
 

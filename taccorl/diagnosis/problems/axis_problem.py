@@ -105,7 +105,7 @@ class AxisProblem(WithoutMaps):
             self.of_file = tuple(
                 Free(name=n, unit=unit, start=at, low=at / WINDING_WITHIN, high=at * WINDING_WITHIN, log=True)
                 for n, (at, unit) in axis.numbers.items()
-                if n in WINDING
+                if n in WINDING and n not in axis.known
             )
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.start)

@@ -674,6 +674,8 @@ def test_a_wrong_number_of_a_servo_is_named_alone_though_positions_tell_no_commo
     axis = AxisConfig(name="servo", unit="rad", inertia=0.006, law="pwm", kp=6.0, kd=0.15, **numbers)
     fit_to = (of_a_servo("one", 1.0, 1, **true), of_a_servo("two", 2.0, 2, **true))
     problem = AxisProblem(axis, Measurements(fit_to, (of_a_servo("other", 1.5, 3, **true),)))
+    known = AxisProblem(dataclasses.replace(axis, known=("supply_v",)), Measurements(fit_to))
+    assert [f.name for f in known.of_file] == [f.name for f in problem.of_file if f.name != "supply_v"]
     without = {*problem.candidates} - {"viscous_friction", "quadratic_drag", "command_lag"}
     found = diagnose(problem, problem.fit, problem.validation, without=sorted(without))
     assert found.names == ("quadratic_drag",) * (name == "drag") and found.errors["after"]["validation"] < 1.1
