@@ -41,18 +41,19 @@ fi
 improve() { # NUMBER TWIN STAGE [BETA]
   local beta=${4:-1} first=$((${FIRST:-0} + $1 * each))
   local cores=$first-$((first + each - 1))
-  out=/dev/shm/learn_ppo/$task/policy_$2_$3${4:+_$4} twin=()
+  out=/dev/shm/learn_ppo/$task/policy_$2_$3${4:+_$4} twin=() more=()
   if [[ "$2" = mended* ]]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
   if [ "$3" = ppo_anchored ]; then
     anchor=(--anchor.dataset="$(echo /dev/shm/anchor/$task/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store --anchor.weight="$beta")
   else
     beta=0 anchor=(--anchor.weight=0)
   fi
-  export CUDA_VISIBLE_DEVICES=$(($1 % gpus))
+  if [ "$3" = noise ]; then more=(--iterations=1); fi
+  export CUDA_VISIBLE_DEVICES=$((${GPU:-0} + $1 % gpus))
   mkdir -p "$(dirname "$out")"
   taskset -c "$cores" timeout -s TERM $((end - $(date +%s) + $(cat /dev/shm/t0))) python3 -m taccorl.cli.main post-train \
     --config_path=configs/post_train/small.yaml --policy.path="$policies/$2" --env.task="$task" --env.shards="$each" \
-    --save_freq=5 --keep_checkpoints=1 --rerun=false "${twin[@]}" "${anchor[@]}" "${options[@]}" --out="$out" >"$out.log" 2>&1
+    --save_freq=5 --keep_checkpoints=1 --rerun=false "${twin[@]}" "${anchor[@]}" "${options[@]}" "${more[@]}" --out="$out" >"$out.log" 2>&1
   since "$2 $3 ${4:-} ended: $?"
   for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
     stage=$([ "$scored_of" = "$policies/$2" ] && echo start || echo "$3")
@@ -71,7 +72,8 @@ from pipelines.learn import named
 learnt, robot, score, stage, beta, log = json.loads(Path(sys.argv[1]).read_text()), *sys.argv[2:]
 name = Path(learnt["dataset"]["root"]).name
 of, twin, real = re.fullmatch(r"train_(\d+)_20_steps(?:_(?!and_)(.*?))?(?:_and_train_(\d+)_20_steps_.*)?", name).groups()
-about = {"sensors": "touch", "demonstrations": int(of), "seed": learnt["seed"], "twin": twin or "", "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
+sensors = "touch" if learnt["policy"]["tactile"] else "cameras"
+about = {"sensors": sensors, "demonstrations": int(of) * (learnt["steps"] > 1), "seed": learnt["seed"], "twin": twin or "", "scored_in": named(Path(robot)) if robot else "", "steps": learnt["steps"]}
 about |= {"real": int(real), "sim_weight": learnt["policy"]["sim_weight"]} if real else {}
 about |= {} if stage == "start" else {"beta": float(beta)}
 noise = re.search(r"over (\d+) episodes: ([\d.]+)% without noise, ([\d.]+)% with", Path(log).read_text())

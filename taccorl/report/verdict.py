@@ -179,6 +179,7 @@ def _change(c: Changed, d: Diagnosis) -> str:
     edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
     edit += f" or, as well, {' or '.join(c.ties)}" * bool(c.ties)
     edit += f": a constant {'force' if c.unit == 'N' else 'torque'}, which may be a weight" * (c.name == "torque_ff")
+    edit += ": the effect speed_delay, which add-effect writes" * (c.name == "speed_delay_s")
     edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (c.name == EFFORT_SCALE)
     edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))
     ends = f"{clean(low, high - low)} … {clean(high, high - low)}"

@@ -33,9 +33,14 @@ def test_cells_are_what_was_counted():
     assert {key: [*of] for key, of in transfer(moved).items()} == {("late", 9): ["nominal", "mended", "randomised"]}
     assert transfer(after := [row | {"stage": "ppo"} for row in moved]) == {}
     assert "| late | after | 0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* | +14; p = 2e-05 |" in page(after)
-    assert "| puzzle | cameras and touch | 16 %; 4 %; 71 % | 0 % (0 … 4) of 96* | not run | not run |" in page(rows[:1])
+    puzzle = "| puzzle | cameras and touch | 16 %; 4 %; 0 %; 71 % |"
+    assert f"{puzzle} 0 % (0 … 4) of 96* | not run | not run | not run |" in page(rows[:1])
     loud = {"stage": "ppo", "successes": 96, "noise": {"n": 128.0, "without": 90.6, "with": 50.0}}
-    assert "| 90.6 → 50 % of 128 | 100 % (96 … 100) of 96*; of 9 demonstrations |" in page([ROW | loud])
+    after = "100 % (96 … 100) of 96*; of 9 demonstrations |"
+    assert f"{puzzle} not run | 90.6 → 50 % of 128 | not run | {after}" in page([ROW | loud])
+    untrained, fewer = ROW | {"stage": "ppo", "demonstrations": 0}, ROW | {"stage": "start", "demonstrations": 8}
+    told = page([ROW | loud, untrained, fewer, fewer | loud | {"stage": "noise"}])
+    assert f"{puzzle} not run | 90.6 → 50 % of 128 | 0 % (0 … 4) of 96* | {after}" in told
     beside = [*moved, moved[1] | {"twin": "", "real": 5, "sim_weight": 0.5}]
     assert len(transfer(beside)["late", 9]["nominal"]) == 1
     alone = "0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* |"
@@ -54,7 +59,7 @@ def test_cells_are_what_was_counted():
         "| each its own grip for 300, then corrections | not run | not run | 100 % (96 … 100) of 96* | not run |"
         in told
     )
-    assert "| assembly_1 | cameras and touch | 47 %; 35 %; 92 % | 0 % (0 … 4) of 96* |" in told
+    assert "| assembly_1 | cameras and touch | 47 %; 35 %; 0 %; 92 % | 0 % (0 … 4) of 96* |" in told
 
 
 @pytest.mark.parametrize(

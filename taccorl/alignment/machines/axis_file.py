@@ -73,8 +73,8 @@ class AxisConfig(DriveLaw):
     """Delay from the time of a target's row until it acts [s], including transport and reading of the position. ``diagnose``
     fits up to 3 ms of it; a longer delay is an effect."""
     speed_late_s: float = 0.0
-    """Delay of the speed in the drive's loop [s] beyond that of a difference of two samples: its filter. ``diagnose`` fits up to
-    two periods of the loop; without efforts up to 3 ms, if those are more."""
+    """Delay of the speed in the drive's loop [s] beyond that of a difference of two samples: its filter. Write minus half a
+    period if the drive measures the speed. ``diagnose`` fits up to two periods; without efforts up to 3 ms, if that is more."""
     limits: tuple[float, float] | None = None  # Lowest and highest position [rad]
     force_unit_n: float | None = None
     """Torque of this axis [N·m] that corresponds to 1 N·m at a joint of a small arm; the bounds of effects are multiplied by it.
@@ -91,11 +91,7 @@ class AxisConfig(DriveLaw):
     def __post_init__(self) -> None:
         plain_name(self.name, "axis.name")
         check_numbers("axis", self, positive=("inertia",))
-        check_numbers(
-            "axis",
-            self,
-            not_negative=("payload_kg", "lever_m", "arm_kg", "rotor_inertia", "target_late_s", "speed_late_s"),
-        )
+        check_numbers("axis", self, not_negative=("payload_kg", "lever_m", "arm_kg", "rotor_inertia", "target_late_s"))
         if self.rotor_inertia > self.inertia:
             raise TaccorlError(
                 f"axis.rotor_inertia: {self.rotor_inertia:g} is greater than inertia, {self.inertia:g}, of which it is a part; "
@@ -104,6 +100,11 @@ class AxisConfig(DriveLaw):
         check_numbers("axis", self, finite=("weight_sin", "weight_cos", "hangs_at_rad"))
         optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
+        if not self.speed_late_s >= (newest := -0.5 / self.loop_hz if self.loop_hz else 0.0):
+            raise TaccorlError(
+                f"axis.speed_late_s: is {self.speed_late_s:g}, and no speed is newer than {newest:g}, minus half a period of the "
+                "loop (loop_hz); correct it"
+            )
         self.check_law("axis")
         self.check_known("axis", {e.name: [p.name for p in registry.get(e.name).parameters()] for e in self.effects})
         if self.gains == "fitted" and not (self.gain_names and self.law != "pwm"):

@@ -196,7 +196,7 @@ class AxisProblem(WithoutMaps):
         if axis.kd and axis.law != "effort" and (self.effort or not unknown):
             at = axis.speed_late_s
             high = max(FILTER_PERIODS / (axis.loop_hz or math.inf), at, 0.0 if self.effort else TIMING_S)
-            late = Free(name="speed_late_s", unit="s", start=at, low=0.0, high=high, scale=1e-4)
+            late = Free(name="speed_late_s", unit="s", start=at, low=min(at, 0.0), high=high, scale=1e-4)
             found.append(late if axis.loop_hz else LOOP)
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
         found += [

@@ -31,9 +31,13 @@ STATED = {
     "weight_cos": "weight",
     "stall_nm": "winding",
     "back_emf": "winding",
+    "speed_delay_s": "speed_age",
+    "speed_late_s": "speed_age",
+    "position_age_s": "position_age",
+    "target_late_s": "target_age",
 }
 """Always fitted number that a file can state → group of numbers that are judged together. Not here: gains that nobody knows and
-that are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
+that are fitted, and numbers of cells, pads and recordings, whose refit is expected."""
 NEGLIGIBLE = 0.01
 """If, with the added effects, a number is fitted within this share of the file's value, its change is not reported. A choice."""
 BACK = 0.1
@@ -70,11 +74,12 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[tuple
             moved = [f for f in moved if fit is model or change[f.name] > least[f.name]]
             of_drive = "." not in frees[0].name
             instead = _instead(fits, model, frees, names) if of_drive else ()
-            for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
+            rate = "loop_s" in model.values and frees[0].name in OF_LOOP
+            for f in frees if rate else moved or (frees if fit is model else []):
                 name, before, after, unit = f.name, float(given[f.name]), float(model.values[f.name]), f.unit
-                if name in OF_LOOP and model.values["loop_s"] < SHORTEST_STEP_S:
+                if rate and model.values["loop_s"] < SHORTEST_STEP_S:
                     continue  # faster than the model's own steps
-                if name in OF_LOOP:
+                if rate:
                     name, before, after, unit = "loop_hz", np.inf, 1.0 / max(model.values["loop_s"], 1e-9), "Hz"
                 alone = fit is not model
                 own = Changed(
@@ -155,10 +160,12 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     names = {f.name for f in model.frees}
     stated = STATED | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
     stated |= {} if fits.problem.other_gain is None else {fits.problem.other_gain.name: "gain"}
+    # Of a drive whose gains are not known, constant torque and delay of the speed are not either.
+    unknown = {"torque_ff", *(("speed_delay_s",) if "loop_s" not in names else ())} if "kp" in names else ()
     groups: dict[str, list[Free]] = {}
     for f in model.frees:
         effect, _, _ = f.name.rpartition(".")
-        own = stated.get(f.name) if not ("kp" in names and f.name == "torque_ff") else None
+        own = stated.get(f.name) if f.name not in unknown else None
         if group := effect if effect in fits.present else own:
             groups.setdefault(group, []).append(f)
     index, covariance = {f.name: k for k, f in enumerate(model.frees)}, model.covariance()

@@ -18,8 +18,7 @@ def test_no_file_is_the_nominal_twin_and_a_file_without_kind_is_a_twin_of_the_pi
     nominal, twin = load_machine(None), load_machine(TWIN)
     assert isinstance(nominal, PiperTwin) and isinstance(twin, PiperTwin)
     assert (nominal.name, twin.name) == ("nominal twin", "twin")
-    assert twin.digest() == twin_digest(load_twin(TWIN))
-    assert tuple(nominal.units) == ROBOT.action_names
+    assert twin.digest() == twin_digest(load_twin(TWIN)) and tuple(nominal.units) == ROBOT.action_names
     assert nominal.units["left_joint1"] == "rad" and nominal.units["right_gripper"] == "m"
 
 

@@ -123,8 +123,8 @@ def test_friction_hidden_under_each_law_is_recovered_beside_commanded_gains(law:
 @pytest.mark.parametrize(("stated", "gains"), [(True, "commanded"), (False, "commanded"), (False, "fitted")])
 def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(stated: bool, gains: str, tmp_path: Path) -> None:
     """A loop of 1 kHz holds its torque for 1 ms: position and measured speed are 0.5 ms old. The file's 1 ms for the speed, as
-    of a difference, would be an inertia that lacks 1.5 N·m·s · 0.5 ms, 1.5 %, at every joint. A rate that the file does not state
-    is named, and written with the error that the diagnosis says."""
+    of a difference, would be an inertia that lacks 1.5 N·m·s · 0.5 ms, 1.5 %, at every joint. A newer speed than the
+    file's, or a rate that it does not state, is named, and written with the error that the diagnosis says."""
     drive = f"{FILES['impedance']}, gains: {gains}{', loop_hz: 1000.0' * stated}"
     machine = RobotMachine(robot(tmp_path, drive), "robot")
     one, other = (recording("impedance", name, hz, 1, 0.0, held_steps=50) for name, hz in (("a", 2.5), ("b", 2.0)))
@@ -133,12 +133,15 @@ def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(stated: bool
     d, after = found.diagnosis, found.diagnosis.errors["after"]["validation"]
     assert after < 1.2 and not [name for name in d.names if name not in d.present]
     assert d.base["speed_delay_s"] == pytest.approx(-0.5e-3 * stated, abs=0.1e-3)
-    if stated:
-        assert d.base["position_age_s"] == pytest.approx(0.0, abs=0.05e-3) and not d.changed
-        return
     (off,), told = d.changed, verdict("swing", d).finding
-    assert off.name == "loop_hz" and off.after == pytest.approx(1000.0, rel=0.1) and off.without > 2.0
-    assert "loop_hz of the file is not stated" in told and f"write `loop_hz: {off.after:.4g}`" in told
+    assert off.without > 2.0 and d.status == "numbers_off"
+    if stated:
+        assert d.base["position_age_s"] == pytest.approx(0.0, abs=0.05e-3)
+        assert off.name == "speed_delay_s" and off.after == d.base["speed_delay_s"] and off.effect == ""
+        assert "speed_delay_s of the file is off" in told and "the effect speed_delay" in told
+    else:
+        assert off.name == "loop_hz" and off.after == pytest.approx(1000.0, rel=0.1)
+        assert "loop_hz of the file is not stated" in told and f"write `loop_hz: {off.after:.4g}`" in told
     problem = JointProblem(machine.mended([found])[0].robot, "swing", Measurements((one,), (other,)))
     assert rms(stacked(problem, problem.start, [], problem.validation)) == pytest.approx(after, abs=0.02)
 
@@ -158,8 +161,7 @@ def test_targets_that_wait_for_a_loop_unlike_the_rows_are_named(held_steps: int,
 def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(tmp_path: Path) -> None:
     made = robot(tmp_path, "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.8, torque_nm_per_a: 1.0")
     _, model, error = fitted(made, swept("pwm"), "coulomb_friction")
-    assert error < 1.5
-    assert model.values["stall_nm"] == pytest.approx(12.0 * 0.8 / 4.0, rel=0.005)
+    assert error < 1.5 and model.values["stall_nm"] == pytest.approx(12.0 * 0.8 / 4.0, rel=0.005)
     assert model.values["back_emf"] == pytest.approx(0.8 * 0.8 / 4.0, rel=0.03)
     config = made.config.joints["swing"]
     mended = dataclasses.replace(config, **config.law_numbers(model.values))

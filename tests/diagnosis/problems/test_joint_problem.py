@@ -46,8 +46,7 @@ def test_commanded_gains_efforts_or_known_weight_pin_the_torques_and_nothing_els
     def pinned(recordings, gains: GainsAre = "fitted", effort=False, names=()):
         return JointProblem(NOMINAL, SIGNAL, Measurements(recordings), gains=gains, effort=effort).pinned_by(names)
 
-    assert pinned(chirps) == ()
-    assert pinned(chirps, gains="auto") == ("commanded gains",)
+    assert pinned(chirps) == () and pinned(chirps, gains="auto") == ("commanded gains",)
     assert pinned(chirps, effort=True) == ("recorded effort",)
     # Slowly with 0.5 kg: weight varies by 0.14 N·m (standard deviation; 4.7 floors × K_p), J q̈ by 0.02 N·m.
     loaded = recorded(NOMINAL, dataclasses.replace(WIDE_TRIANGLE, payload_kg=0.5), 3)
@@ -85,8 +84,7 @@ def test_fitted_gains_find_what_the_robot_has():
     model = fit(problem, problem.fit, (), problem.start)
     low, high = model.intervals()["kp"]
     assert low < 60.0 < high and high / low < 1.1
-    assert model.values["kd"] == pytest.approx(6.0, rel=0.02)
-    assert model.error == pytest.approx(1.0, abs=0.05)
+    assert model.values["kd"] == pytest.approx(6.0, rel=0.02) and model.error == pytest.approx(1.0, abs=0.05)
 
 
 def test_commanded_gains_that_nobody_stated_are_refused_with_the_way_out(chirps):
@@ -143,8 +141,7 @@ def test_an_effect_that_the_twin_has_is_refitted_and_is_no_candidate_twice():
     # the twin has it in all joints of both arms, and too little of it
     twin = TwinConfig(effects=[friction(0.3, ("joint4", "joint5"), "both")])
     problem = JointProblem(twin, SIGNAL, made)
-    assert problem.present == ("coulomb_friction",)
-    assert problem.start["coulomb_friction.torque_nm"] == 0.3
+    assert problem.present == ("coulomb_friction",) and problem.start["coulomb_friction.torque_nm"] == 0.3
     keep = ("coulomb_friction", "backlash", "cogging")
     found = diagnose(
         problem,
@@ -192,8 +189,7 @@ def test_a_repeated_motion_is_judged_by_its_own_noise_floor():
     floor = {r.name: float(r.floor[0]) for r in (*problem.fit, *problem.validation)}
     assert floor["chirp"] == floor["chirp_again"] == pytest.approx(NOISE_RAD, rel=0.1)
     assert floor["held_steps"] == floor["held_steps_again"] == pytest.approx(loud, rel=0.1)
-    assert floor["wide_triangle"] == problem.floors[0].value
-    assert NOISE_RAD < floor["wide_triangle"] < loud
+    assert floor["wide_triangle"] == problem.floors[0].value and NOISE_RAD < floor["wide_triangle"] < loud
     assert rms(stacked(problem, problem.start, [], problem.validation)) == pytest.approx(1.0, abs=0.1)
 
 
@@ -222,8 +218,7 @@ def test_efforts_of_a_sampled_drive_are_no_effect_of_the_joint():
     problem = JointProblem(NOMINAL, "left_joint3", made)
     begun = problem.start | {"coulomb_friction.torque_nm": 1.5, "coulomb_friction.presliding_rad": 0.0}
     model = fit(problem, problem.fit, ("coulomb_friction",), begun)
-    assert model.error < 1.1
-    assert model.values["coulomb_friction.torque_nm"] == pytest.approx(2.0, rel=0.03)
+    assert model.error < 1.1 and model.values["coulomb_friction.torque_nm"] == pytest.approx(2.0, rel=0.03)
     low, high = model.intervals()["effort_age_s"]
     assert 0.0 < low < high < 2e-3
 
@@ -231,8 +226,7 @@ def test_efforts_of_a_sampled_drive_are_no_effect_of_the_joint():
 def test_effort_that_one_recording_lacks_is_not_used(chirps):
     silent = dataclasses.replace(chirps[1], effort=np.full_like(chirps[1].effort, np.nan))
     problem = JointProblem(NOMINAL, SIGNAL, Measurements((chirps[0], silent)))
-    assert not problem.effort
-    assert problem.fit[0].measured.shape[1] == 1
+    assert not problem.effort and problem.fit[0].measured.shape[1] == 1
     assert names(problem) == ["torque_ff", "speed_delay_s"]
 
 
@@ -292,16 +286,13 @@ def test_a_sampled_loop_with_a_known_weight_is_no_effect_and_its_gains_are_found
     found = diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start)
     assert found.status == "nothing_missing"
     low, high = found.after.intervals()["speed_delay_s"]
-    assert low < case.loop.late_s < high
-    assert high - low < 1e-3
+    assert low < case.loop.late_s < high and high - low < 1e-3
     low, high = found.after.intervals()["kp"]
-    assert low < case.values()["kp"] < high
-    assert high / low < 1.05
+    assert low < case.values()["kp"] < high and high / low < 1.05
     new = TwinConfig()
     set_numbers(new, case.signal, found.base, found.intervals)
     (effect,) = new.effects
-    assert isinstance(effect, SpeedDelay)
-    assert effect.acts_on() == [case.signal]
+    assert isinstance(effect, SpeedDelay) and effect.acts_on() == [case.signal]
     assert effect.delay_s == found.base["speed_delay_s"]
 
 
@@ -357,8 +348,7 @@ def test_an_effort_s_floor_is_at_least_what_no_smooth_curve_explains():
     rng = np.random.default_rng(0)
     noisy = dataclasses.replace(stiff, effort=stiff.effort + rng.normal(0.0, 0.5, stiff.effort.shape))
     problem = JointProblem(NOMINAL, SIGNAL, Measurements((*plain, noisy)), effort=True)
-    assert problem.fit[2].floor[1] == pytest.approx(0.5, rel=0.2)
-    assert problem.fit[0].floor[1] < 0.1
+    assert problem.fit[2].floor[1] == pytest.approx(0.5, rel=0.2) and problem.fit[0].floor[1] < 0.1
     assert problem.fit[2].floor[0] == pytest.approx(NOISE_RAD, rel=0.3)
 
 
@@ -376,8 +366,7 @@ def test_intervals_widen_by_what_the_other_recordings_would_move():
     assert moved[index] == pytest.approx(0.1, abs=0.02)
     wider = dataclasses.replace(model, moved=moved)
     low, high = wider.intervals()["torque_ff"]
-    assert low < 0.85
-    assert high > 1.15
+    assert low < 0.85 and high > 1.15
     assert np.ptp(model.intervals()["torque_ff"]) < 0.1
 
 
@@ -395,8 +384,7 @@ def test_with_commanded_gains_the_delay_is_found_from_a_start_of_zeros(delay_s: 
     problem = JointProblem(twin, SIGNAL, measurements)
     assert problem.commanded
     found = diagnose(problem, problem.fit, problem.validation, start=problem.start)
-    assert found.names == ()
-    assert found.base["speed_delay_s"] == pytest.approx(delay_s, abs=2e-4)
+    assert found.names == () and found.base["speed_delay_s"] == pytest.approx(delay_s, abs=2e-4)
     assert "speed_delay_s" not in found.at_bound  # absent is no end of a range that says anything
 
 
@@ -404,8 +392,7 @@ def test_a_payload_off_its_place_is_said_with_the_way_out_and_is_nothing_of_the_
     case = draw_case((), 30038, design="pack")
     found = diagnose_joint(case.twin, case.signal, recordings(case, "pack"), gains="fitted")
     (remark,) = [r for r in found.diagnosis.remarks if "payload" in r]
-    assert "5.2 mm" in remark
-    assert "payload_position_m" in remark
+    assert "5.2 mm" in remark and "payload_position_m" in remark
     assert PiperTwin(case.twin).mended([found])[0].config.effects == case.twin.effects
 
 

@@ -108,8 +108,7 @@ def test_recordings_that_leave_the_joint_alone_are_left_out(finding):
     made = sweeps(stated=False)
     more = dataclasses.replace(made, fit=(*made.fit, still("other", right_joint1=0.3)))
     again = diagnose_joint(TwinConfig(), SIGNAL, more, search=ONE, without=WITHOUT)
-    assert again.recordings == finding.recordings
-    assert again.diagnosis.errors == finding.diagnosis.errors
+    assert again.recordings == finding.recordings and again.diagnosis.errors == finding.diagnosis.errors
 
 
 @pytest.mark.slow
@@ -141,8 +140,7 @@ def test_two_workers_find_the_same_as_one():
     ]
     assert sorted(told) == sorted(2 * joints)
     for one, two in zip(*found, strict=True):
-        assert one.part == two.part
-        assert one.diagnosis.names == two.diagnosis.names == ("coulomb_friction",)
+        assert one.part == two.part and one.diagnosis.names == two.diagnosis.names == ("coulomb_friction",)
         assert one.diagnosis.base == two.diagnosis.base
         assert one.diagnosis.errors == two.diagnosis.errors
         assert one.diagnosis.effects == two.diagnosis.effects

@@ -109,8 +109,7 @@ def torque_speed_line(torque: float, q: float, v: float) -> float:
 @pytest.mark.slow
 def test_a_torque_that_falls_with_the_speed_is_found_with_its_two_numbers() -> None:
     said = found_in(*LIMITED, acting=torque_speed_line)
-    assert said.names == ("torque_speed_limit",)
-    assert said.status == "at_floor", said.errors
+    assert said.names == ("torque_speed_limit",) and said.status == "at_floor", said.errors
     assert said.after.values["torque_speed_limit.stall_nm"] == pytest.approx(5.0, rel=0.03)
     assert said.after.values["torque_speed_limit.no_load_rad_per_s"] == pytest.approx(6.0, rel=0.03)
 
@@ -122,8 +121,7 @@ WIDE = ((sweep(1.0, 0.4, 4.0), sweep(0.8, 0.9)), sweep(0.9, 0.55, 4.0))
 @pytest.mark.parametrize(("angle_rad", "width_rad"), [(0.45, 0.06), pytest.param(-0.3, 0.25, marks=pytest.mark.slow)])
 def test_a_tight_spot_is_found_where_it_is_and_as_wide_as_it_is(angle_rad: float, width_rad: float) -> None:
     said = found_in(*WIDE, friction=lambda q: 1.5 * math.exp(-(((q - angle_rad) / width_rad) ** 2)))
-    assert said.names == ("position_dependent_friction",)
-    assert said.status == "at_floor", said.errors
+    assert said.names == ("position_dependent_friction",) and said.status == "at_floor", said.errors
     values = {k.split(".")[1]: v for k, v in said.after.values.items() if k.startswith("position")}
     assert values["angle_rad"] == pytest.approx(angle_rad, abs=0.1 * width_rad)
     assert values["width_rad"] == pytest.approx(width_rad, rel=0.15)

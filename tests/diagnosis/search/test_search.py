@@ -70,8 +70,7 @@ def test_what_cannot_be_told_apart_is_a_tie_and_the_simpler_one_is_taken(rival: 
 def test_an_effect_that_the_fitted_numbers_take_up_stays_unseen_and_explains_nothing():
     fit, validation, _ = made(Hidden(strength=1.0), Ripple(strength=1.0))
     found = diagnose(MadeProblem(Hidden, Ripple), fit, validation)
-    assert found.names == ("ripple",)
-    assert found.base["gain"] == pytest.approx(4.0, abs=0.02)
+    assert found.names == ("ripple",) and found.base["gain"] == pytest.approx(4.0, abs=0.02)
     row = next(row for row in found.rounds[0].evidence if row.name == "hidden")
     assert row.explained == 0.0
 
@@ -118,12 +117,10 @@ def test_a_fit_that_has_not_converged_is_no_proof_that_nothing_is_missing():
     """Gain 1 to gain 3 is further along the valley than 60 and 200 steps go; wide floors make every place of it look right."""
     fit, validation = ([dataclasses.replace(record(k, offset=0.0, noise=0.5), floor=np.array([2.0]))] for k in (0, 1))
     cut = diagnose(Valley(), fit, validation)
-    assert cut.errors["after"]["validation"] < 1.25
-    assert cut.trouble
+    assert cut.errors["after"]["validation"] < 1.25 and cut.trouble
     assert cut.status == "not_converged"
     whole = diagnose(Valley(), fit, validation, config=SearchConfig(last_steps=1000))
-    assert whole.status == "nothing_missing"
-    assert whole.base["gain"] == pytest.approx(3.0, abs=0.05)
+    assert whole.status == "nothing_missing" and whole.base["gain"] == pytest.approx(3.0, abs=0.05)
 
 
 def test_a_direction_that_the_recordings_leave_open_is_wide_and_no_trouble(monkeypatch):
@@ -151,8 +148,7 @@ def test_a_round_goes_on_to_the_next_effect_when_the_best_one_is_refused():
     first, second = found.rounds[0].evidence[:2]
     assert (first.name, second.name) == ("ripple", "overtone")
     assert "ΔBIC -" in first.verdict
-    assert second.verdict == "added"
-    assert found.names == ("overtone",)
+    assert second.verdict == "added" and found.names == ("overtone",)
 
 
 Richer = kind("richer", lambda t, seed: Square.signal(t, seed) + 0.0775 / 2.0 * np.sin(7.0 * t), Squire)
@@ -168,8 +164,7 @@ def test_below_one_floor_the_simplest_effect_is_taken_and_not_the_one_with_less_
     found = diagnose(MadeProblem(Square, Richer), fit, validation)
     errors = {row.name: row.validation_error for row in found.rounds[0].evidence}
     assert errors["richer"] ** 2 == pytest.approx(0.69, abs=0.06)
-    assert errors["square"] ** 2 == pytest.approx(0.90, abs=0.06)
-    assert found.names == ("square",)
+    assert errors["square"] ** 2 == pytest.approx(0.90, abs=0.06) and found.names == ("square",)
     assert found.rivals == {"square": ("richer",)}
 
 
@@ -269,10 +264,8 @@ def test_gains_that_move_by_more_than_twice_are_a_finding_of_their_own(stated: f
     assert len(found.remarks) == moved
     if moved:
         remark = found.remarks[0]
-        assert remark.startswith("kp ")
-        assert f"{stated:.4g}" in remark
-        assert f"{3 / stated:.2g}" in remark
-        assert "measurements.yaml" in remark
+        assert remark.startswith("kp ") and f"{stated:.4g}" in remark
+        assert f"{3 / stated:.2g}" in remark and "measurements.yaml" in remark
 
 
 def test_an_error_that_only_the_fit_recordings_show_is_searched_too():
