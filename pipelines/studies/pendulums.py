@@ -57,6 +57,7 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
     )
     added = next((name for name in d.names if name not in d.present), None)
     beside = {*d.rivals.get(added, ()), *effects.get(added).near_twins} if added else set()
+    mended = axis.with_numbers(d.base)
     truth = {"stall_nm": 7.4 * servo.torque_nm_per_a / servo.resistance_ohm, "inertia": servo.inertia}
     return {
         "seed": seed,
@@ -70,7 +71,7 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
         "after": round(d.errors["after"]["validation"], 3),
         "fitted_test": round(d.errors["fitted"]["test"], 3),
         "after_test": round(d.errors["after"]["test"], 3),
-        "numbers": {name: round(d.base[name] / value, 3) for name, value in truth.items()},
+        "numbers": {name: round(getattr(mended, name) / value, 3) for name, value in truth.items()},
         "found": [{p.name: round(getattr(e, p.name), 5) for p in e.parameters()} for e in d.effects],
         "floor_mrad": round(1e3 * problem.floors[0].value, 3),
         "cpu_s": round(time.process_time() - began, 2),

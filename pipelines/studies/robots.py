@@ -7,6 +7,7 @@ fitted numbers refitted, is at least 1.5 noise floors.
 """
 
 import json
+import os
 import sys
 import tempfile
 import time
@@ -136,10 +137,13 @@ def share_row(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Calla
 def run_missing(
     path: Path, jobs: Sequence[tuple[int, str]], run: Callable[[tuple[int, str]], dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Append a row to ``path`` for each job (seed, hidden) whose seed has none, two jobs at a time; returns all rows."""
+    """Append a row to ``path`` for each job (seed, hidden) whose seed has none, one on each core; returns all rows."""
     done = {r["seed"] for r in map(json.loads, path.read_text().splitlines())} if path.exists() else ()
     missing = [job for job in jobs if job[0] not in done]
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool, path.open("a") as file:
+    with (
+        ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool,
+        path.open("a") as file,
+    ):
         for row in pool.map(run, missing):
             file.write(json.dumps(row) + "\n")
             file.flush()

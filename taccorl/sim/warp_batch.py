@@ -112,7 +112,7 @@ class WarpBatch(Batch):
     After ``step`` with ``mjSTAGE_NONE`` the arrays are not refreshed, except for clocks, until the next ``step`` with a stage, or
     ``refresh``: worlds stay on the device, and of what is written to the arrays only controls and forces reach it. A world that
     diverges is a NaN for itself: its ``warning`` counts it, and from the next step on its place on the device computes a copy of
-    a sound world."""
+    a sound world. So does one in which MuJoCo Warp gave up a contact of two convex shapes."""
 
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0, *, settings: WarpSettings) -> None:
         super().__init__(model, nsim, nthread)
@@ -188,14 +188,15 @@ class WarpBatch(Batch):
             self._park(worlds, ~run, int(np.argmax(run)))
             self._fitting(lambda: worlds.run(nstep, refresh=int(stage) != _NONE))
             self._lost |= ~run
-            if full := worlds.overflow(run):
+            finite = worlds.finite()
+            full, unfound = worlds.overflow(run & finite)
+            if full:
                 self._time_s[self._behind] = self._refreshed_s[self._behind]
                 self._lost[:], self._behind[:] = True, False
                 raise TaccorlError(full)
             self._lost &= ~run
             self._tick(run, nstep)
-            bad = ~worlds.finite()
-            self._unsound = bad
+            self._unsound = bad = ~finite | unfound
             self._behind |= run
             if int(stage) != _NONE:
                 self._pull_state(run)
@@ -383,27 +384,29 @@ class _Worlds:
         ok = [(abs(values) < _LARGEST).all(1) for values in of_state]
         return np.asarray((ok[0] & ok[1]).cpu() if self._device.is_cuda else ok[0] & ok[1])
 
-    def overflow(self, run: np.ndarray) -> str:
-        """Text of which buffer was too small in one of the worlds ``run`` (N,) bool, if one was; the flags are cleared."""
+    def overflow(self, run: np.ndarray) -> tuple[str, np.ndarray]:
+        """Text of which buffer was too small in one of the worlds ``run`` (N,) bool, if one was; and (N,) bool: those of them in
+        which a contact of two convex shapes was not found, which no setting helps. The flags are cleared."""
         kinds, flags = mjw.OverflowType, self._data.overflow.numpy()
-        found = int(np.bitwise_or.reduce(flags[run])) & ~int(kinds.ITERATIONS | kinds.LS_ITERATIONS)  # as in MuJoCo C
+        unfound = run & ((flags & int(kinds.EPA_HORIZON)) != 0)
+        run, ignored = run & ~unfound, kinds.ITERATIONS | kinds.LS_ITERATIONS  # as in MuJoCo C
+        found = int(np.bitwise_or.reduce(flags[run])) & ~int(ignored) if run.any() else 0
         contacts = max(int(self._data.nacon.numpy()[0]), int(self._data.ncollision.numpy()[0])) / self._num
-        needed = {"contacts": int(np.ceil(contacts)), "constraints": int(self._data.nefc.numpy()[run].max())}
+        needed = {"contacts": int(np.ceil(contacts)), "constraints": int(self._data.nefc.numpy()[run].max(initial=0))}
         # ``forward`` sets no flag for the first two buffers.
         few = {"constraints": found & int(kinds.NEFC | kinds.NJMAX_NNZ)}
         few["contacts"] = found & ~few["constraints"]
-        if found & kinds.EPA_HORIZON:
+        if flags.any():
             self._data.overflow.zero_()
-            return f"physics=warp: the contact of two convex shapes is not found, and no setting helps; {_WAY_OUT}"
         for name, flag in few.items():
             have = getattr(self._settings, name)
             if flag or needed[name] > have:
-                self._data.overflow.zero_()
-                return (
+                words = (
                     f"physics=warp: a world needs room for more than {have} {name} ({needed[name]} at the last step; "
                     f"{kinds(flag).name or 'counted'}). Raise it: physics=warp:{name}={2 * max(have, needed[name])}"
                 )
-        return ""
+                return words, unfound
+        return "", unfound
 
     def write(self, tensor: Any, rows: np.ndarray, values: np.ndarray) -> None:
         """Write ``values`` (N, …) of ``rows`` (N,) bool into a device's tensor (N, …)."""

@@ -48,8 +48,7 @@ def test_each_step_is_normalised_by_its_own_mean_and_deviation():
 def test_without_statistics_nothing_changes_and_other_normalisations_are_refused():
     steps = ChunkSteps.of_statistics(None, config(), 2)
     x = torch.randn(4, 3, 2)
-    assert torch.equal(steps.normalized(x), x)
-    assert torch.equal(steps.restored(x), x)
+    assert torch.equal(steps.normalized(x), x) and torch.equal(steps.restored(x), x)
     other = config(normalization_mapping={"ACTION": NormalizationMode.MEAN_STD})
     with pytest.raises(TaccorlError, match=r"normalize_steps=true.*MEAN_STD.*normalize_steps=false"):
         ChunkSteps.of_statistics(STATISTICS, other, 2)
@@ -92,11 +91,9 @@ def test_the_mean_follows_its_recursion_and_changes_places_without_a_copy():
     assert float(averaged.get_buffer("weight")) == pytest.approx(mean)
     trained, place = network.weight, network.weight.data_ptr()
     averaged.exchange(network)
-    assert network.weight is trained  # the optimiser's own
-    assert network.weight.item() == pytest.approx(mean)
+    assert network.weight is trained  # the optimiser's own and network.weight.item() == pytest.approx(mean)
     averaged.exchange(network)
-    assert network.weight.item() == 3.0
-    assert network.weight.data_ptr() == place
+    assert network.weight.item() == 3.0 and network.weight.data_ptr() == place
 
 
 def trained(policy: TactilePI05Policy) -> None:

@@ -46,8 +46,7 @@ def test_tokens_without_contact_are_removed_not_zeroed(policy):
     with policy.model.sensing(None, *policy._readings(batch)):
         _, valid, _ = policy.model.embed_prefix(images, image_masks, *prompt)
         _, suffix_valid, starts_block, _ = policy.model.embed_suffix(torch.zeros(2, 10, 32), torch.ones(2))
-    assert valid[:, -8:].tolist() == [[True] * 8, [False] * 8]
-    assert suffix_valid.sum(1).tolist() == [18, 10]
+    assert valid[:, -8:].tolist() == [[True] * 8, [False] * 8] and suffix_valid.sum(1).tolist() == [18, 10]
     # Touch is a block, actions are one: the context looks at neither, touch not at actions.
     assert starts_block[0].tolist() == [1.0] + 7 * [0.0] + [1.0] + 9 * [0.0]
 

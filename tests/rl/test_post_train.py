@@ -85,8 +85,7 @@ def test_one_iteration_leaves_a_policy_folder_and_a_line(start, real, tmp_path, 
     before, after = open_checkpoint(start, "cpu").load(0).policy.state_dict(), weights(out)
     moved = [name for name, value in before.items() if not torch.equal(value, after[name])]
     assert moved and not any("paligemma.model" in name for name in moved)
-    assert main(options(start, real, out)) == 2  # in use
-    assert "--resume=true" in capsys.readouterr().err
+    assert main(options(start, real, out)) == 2  # in use and "--resume=true" in capsys.readouterr().err
     last = out / "checkpoints" / "last"
     assert require_checkpoint(last / "pretrained_model", "") == require_checkpoint(last / "training_state", "") == []
 
@@ -229,8 +228,7 @@ def test_the_watched_episode_is_the_one_that_ended_and_no_later_state_of_another
             first, watch.ended = watch.ended, None
     assert first is not None and (first.seed, first.outcome, first.partial) == (1, "timeout", 1)
     np.testing.assert_array_equal(first.actions_TA, [*actions[0, 0], actions[1, 0, 0]])
-    assert first.values_T.tolist() == [0, 0, 1]
-    assert watch.ended is not None and watch.ended.seed == 3
+    assert first.values_T.tolist() == [0, 0, 1] and watch.ended is not None and watch.ended.seed == 3
     np.testing.assert_array_equal(watch.ended.actions_TA, actions[3, 0])
 
 

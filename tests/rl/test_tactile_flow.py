@@ -98,8 +98,7 @@ def test_features_are_the_mean_of_valid_tokens() -> None:
     assert policy.features(batch).shape == (2, policy.num_features) == (2, 96)
     other = actor(discrete_state_input=None)
     beside = other.features(batch)
-    assert beside.shape[1] == other.num_features
-    assert torch.equal(beside[:, 96:], batch["observation.state"])
+    assert beside.shape[1] == other.num_features and torch.equal(beside[:, 96:], batch["observation.state"])
 
 
 def test_frozen_parts_have_no_gradient_and_stay() -> None:

@@ -93,8 +93,7 @@ def test_inner_faces_of_a_part_are_no_surface(name: str, partition: str) -> None
     truth = extruded_depth(outline, -0.005, 0.01, p)
     depth = part_depth(found, p)
     inside = truth > 0
-    assert inside.sum() > 1000
-    assert np.abs(depth - truth)[inside].max() < 1e-7
+    assert inside.sum() > 1000 and np.abs(depth - truth)[inside].max() < 1e-7
     assert (depth[~inside] < 1e-7).all()
     if len(outlines) > 1:  # the test can fail: with inner faces as surfaces the depth is wrong
         naive = part_depth(found._replace(surface=np.full_like(found.surface, -1)), p)
@@ -140,8 +139,7 @@ def test_depth_in_a_heap_of_boxes_is_the_distance_to_its_surface(seed: int) -> N
     p = p[within(p).max(axis=0) > 1e-5]
     nearest = KDTree(np.concatenate(strewn)).query(p)[0]
     depth = part_depth(shapes_of(model, list(range(5)), np.float64), p)
-    assert len(p) > 500
-    assert (depth - nearest).max() < 1e-6
+    assert len(p) > 500 and (depth - nearest).max() < 1e-6
     assert (nearest - depth).max() < 0.00025
     assert (nearest - within(p).max(axis=0)).max() > 0.001  # what the deepest box alone would say
 
@@ -246,8 +244,7 @@ def test_depth_is_the_closed_form_to_a_micrometre_in_any_pose(name: str) -> None
     depth, _ = depth_in_body(shape(name), position, velocity, GRID)
     truth = SHAPES[name][1](points(position))
     inside = truth > 0
-    assert 0.01 < inside.mean() < 0.6
-    assert np.abs(depth - truth)[inside].max() < 2e-8
+    assert 0.01 < inside.mean() < 0.6 and np.abs(depth - truth)[inside].max() < 2e-8
     assert (depth[~inside] < 2e-8).all()
 
 

@@ -86,8 +86,7 @@ def test_a_state_of_the_same_scene_made_anew_is_taken():
 def test_a_row_begins_with_its_scene_and_then_has_the_physics():
     sim = scene()
     row = sim.state_rows()[0]
-    assert row.shape == (sim.row_size,)
-    assert 0 < row[0] < 1 and row[0] * 2**52 == int(row[0] * 2**52)
+    assert row.shape == (sim.row_size,) and 0 < row[0] < 1 and row[0] * 2**52 == int(row[0] * 2**52)
     np.testing.assert_array_equal(row[1 : 1 + sim.batch.nstate], sim.batch.state[0])
     spoilt = row.copy()
     spoilt[0] += 2**-52  # the last bit
@@ -121,8 +120,7 @@ def test_a_simulation_that_is_not_stepped_keeps_everything(effects: list[str]):
             np.testing.assert_array_equal(sim.executed[i], executed[i])
             for name, values in before.memory.items():
                 np.testing.assert_array_equal(now.memory[name][i], values[i], err_msg=name)
-        assert sim.judge.steps.tolist() == [0, k + 1, 0]
-        assert sim.judge.held[[0, 2]].tolist() == [4 + k] * 2
+        assert sim.judge.steps.tolist() == [0, k + 1, 0] and sim.judge.held[[0, 2]].tolist() == [4 + k] * 2
         assert not sim.clipped.any()
     np.testing.assert_array_equal(sim.batch.state[1], alone.batch.state[0])
     np.testing.assert_array_equal(sim.targets[1], alone.targets[0])
@@ -209,8 +207,7 @@ def test_rows_are_the_paper_s(task):
 def test_draws_fill_their_range_and_never_leave_it():
     rng = np.random.default_rng(0)
     frictions = np.array([draw(tasks.get("test_tube").rows, rng)["friction"][0] for _ in range(2000)])
-    assert 0.3 <= frictions.min() < 0.301
-    assert 0.699 < frictions.max() <= 0.7
+    assert 0.3 <= frictions.min() < 0.301 and 0.699 < frictions.max() <= 0.7
     assert frictions.mean() == pytest.approx(0.5, abs=3 * 0.4 / math.sqrt(12 * 2000))  # three standard errors
 
 

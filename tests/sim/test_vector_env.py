@@ -77,8 +77,7 @@ def test_a_chunk_equals_its_single_steps(episode):
     actions = for_all(episode.actions[MIDDLE : MIDDLE + 8], 3) + np.linspace(0, 0.01, 3)[:, None, None]
     chunk = by_chunk.step_chunk(actions)
     steps = [by_step.step(actions[:, k]) for k in range(8)]
-    assert same(chunk.observation, steps[-1][0])
-    assert same(chunk.info, steps[-1][4])
+    assert same(chunk.observation, steps[-1][0]) and same(chunk.info, steps[-1][4])
     assert np.array_equal(chunk.tactile, np.stack([s[0][TACTILE] for s in steps], axis=1))
     assert chunk.num_steps.tolist() == [8, 8, 8] and chunk.reward.tolist() == [0, 0, 0]
     assert not np.array_equal(chunk.observation[STATE][0], chunk.observation[STATE][2])

@@ -166,6 +166,24 @@ def test_a_cylinder_on_the_table_touches_it_and_is_not_thrown_off(warp):
     assert worlds._data.contact.dist.numpy()[:count].min() > -1e-3
 
 
+@pytest.mark.slow
+def test_a_world_whose_contact_is_given_up_has_diverged_and_stops_no_other(warp, monkeypatch):
+    """Room for two edges of EPA's horizon: the cylinder in the box of the first world is not found; the second one's falls."""
+    part = '<body><freejoint/><geom type="cylinder" size="0.02 0.01"/></body><geom type="box" size="0.1 0.1 0.01"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{part}</worldbody></mujoco>")
+
+    def falling(edges: int) -> tuple[list[int], np.ndarray]:
+        monkeypatch.setattr("mujoco_warp._src.collision_convex.MJ_MAX_EPAHORIZON", edges)
+        batch = WarpBatch(model, 2, 1, settings=WarpSettings(device="cpu", contacts=8))
+        batch.bind("qpos")[:] = [[0.0, 0.02, 0.019, 1.0, 0.0, 0.0, 0.0], [0.0, 0.02, 1.0, 1.0, 0.0, 0.0, 0.0]]
+        batch.step(nstep=5, stage=mujoco.mjtStage.mjSTAGE_POS)
+        return batch.warning[:, int(mujoco.mjtWarning.mjWARN_BADQACC), 1].tolist(), batch.bind("qpos")[1].copy()
+
+    (lost, fell), (none, whole) = falling(2), falling(24)
+    assert lost == [1, 0] and none == [0, 0]
+    np.testing.assert_array_equal(fell, whole)
+
+
 # A delay in MuJoCo's history, a friction of the model, further joints, and what is rewritten after each physics step.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["command_delay", "coulomb_friction", "joint_compliance", "torque_lag"])

@@ -31,13 +31,11 @@ STATED = {
     "weight_cos": "weight",
     "stall_nm": "winding",
     "back_emf": "winding",
-    "speed_delay_s": "speed_age",
-    "speed_late_s": "speed_age",
-    "position_age_s": "position_age",
-    "target_late_s": "target_age",
 }
 """Always fitted number that a file can state → group of numbers that are judged together. Not here: gains that nobody knows and
 that are fitted, and numbers of cells, pads and recordings, whose refit is expected."""
+TIMES = {"speed_delay_s": "speed", "speed_late_s": "speed", "position_age_s": "position", "target_late_s": "target"}
+"""Likewise times of a drive, which are fitted beside every choice of the fewest numbers."""
 NEGLIGIBLE = 0.01
 """If, with the added effects, a number is fitted within this share of the file's value, its change is not reported. A choice."""
 BACK = 0.1
@@ -158,7 +156,7 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     """Fitted numbers that the file states, those of one effect together; the group first whose return to the file's values costs
     least by the covariance of ``model``."""
     names = {f.name for f in model.frees}
-    stated = STATED | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
+    stated = STATED | TIMES | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
     stated |= {} if fits.problem.other_gain is None else {fits.problem.other_gain.name: "gain"}
     # Of a drive whose gains are not known, constant torque and delay of the speed are not either.
     unknown = {"torque_ff", *(("speed_delay_s",) if "loop_s" not in names else ())} if "kp" in names else ()

@@ -85,12 +85,10 @@ def test_a_diverged_simulation_does_not_spoil_its_neighbour_or_its_own_next_epis
     sim.arrays["qpos"][0, 3] = np.nan
     for _ in range(4):
         sim.step(targets)
-    assert sim.diverged.tolist() == [True, False]
-    assert sim.reading()[1].max() > 0.5
+    assert sim.diverged.tolist() == [True, False] and sim.reading()[1].max() > 0.5
     sim.reset([0], np.array([0]))
     sim.step(targets)
-    assert not sim.diverged.any()
-    assert np.isfinite(sim.reading()).all()
+    assert not sim.diverged.any() and np.isfinite(sim.reading()).all()
 
 
 def test_states_of_a_twin_with_other_effects_are_refused() -> None:

@@ -48,8 +48,7 @@ def test_pictures_fade_out_towards_the_absent_value(name: str):
     cls = effects.get(name)
     nearly = {p.name: p.absent + 0.01 * (p.typical - p.absent) for p in cls.parameters() if p.absent is not None}
     there = apart(swing(start(typical_effect(name))), nominal())
-    assert there > 0.2
-    assert apart(swing(start(make_effect(name, **nearly))), nominal()) <= 0.05 * there
+    assert there > 0.2 and apart(swing(start(make_effect(name, **nearly))), nominal()) <= 0.05 * there
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -153,8 +152,7 @@ def test_blur_is_in_pixels_of_the_stream_and_stops_at_the_bars():
     effect = make_effect("camera_exposure", gain=1.0, gamma=1.0, blur_px=4.0)
     sim = start(effect)
     square = sim.render(["front"], size=(224, 224))["front"][0]  # 168 rows of picture, 28 of bars above and below
-    assert not square[:28].any()
-    assert not square[-28:].any()
+    assert not square[:28].any() and not square[-28:].any()
     assert square[28].mean() > 60  # not darkened by the bar
     plain = start().render(["front"], size=(224, 224))["front"][0]
     same = blurred(plain[28:-28].astype(np.float32), 4.0 * 224 / 640)

@@ -133,15 +133,13 @@ def test_a_run_is_the_same_alone_and_in_a_batch_on_any_number_of_threads_and_fro
 @pytest.mark.parametrize("name", list(effects))
 def test_parameters_are_described(name: str) -> None:
     cls = effects.get(name)
-    assert cls.name == name
-    assert cls.__doc__
+    assert cls.name == name and cls.__doc__
     assert any(p.absent is not None for p in cls.parameters())
     assert not [p.name for p in cls.parameters() if ROBOT.hand in p.name], "names hold for any robot"
     for p in cls.parameters():
         assert p.low <= p.typical <= p.high
         assert p.absent is None or p.low <= p.absent <= p.high or math.isinf(p.absent)
-        assert p.absent != p.typical
-        assert p.symbol
+        assert p.absent != p.typical and p.symbol
         assert p.source
         of_reading = p.unit.replace("reading", "1") if "reading" in cls.needs else p.unit
         unit = next((unit for suffix, unit in UNITS.items() if p.name.endswith(suffix)), "1")

@@ -229,8 +229,7 @@ def test_delays_reach_grippers_too() -> None:
     for _ in range(48):  # 0.2 s
         sim.advance(targets[None], 5)
         openings.append(sim.proprioception()[0, 13])
-    assert np.ptp(openings[:24]) < 1e-6
-    assert openings[-1] < openings[0] - 0.005
+    assert np.ptp(openings[:24]) < 1e-6 and openings[-1] < openings[0] - 0.005
 
 
 def test_a_gravity_mismatch_of_one_arm_leaves_the_other_where_it_was() -> None:

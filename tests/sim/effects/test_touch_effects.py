@@ -35,8 +35,7 @@ class Pads:
         self.added.scan(given, np.arange(1))
         np.testing.assert_array_equal(self.added(given), seen, err_msg="after its scan it reads something else")
         np.testing.assert_array_equal(given, before, err_msg="what the sensor handed over was changed")
-        assert seen.dtype == np.float32
-        assert seen.shape == SHAPE
+        assert seen.dtype == np.float32 and seen.shape == SHAPE
         return seen[0]
 
 
@@ -199,8 +198,7 @@ def test_gain_spread_is_of_the_stated_width_and_belongs_to_the_board() -> None:
     gain = one.read(1.0)
     log = np.log(gain)
     # 1536 draws: standard errors 0.2 / √1536 = 0.005 of the mean, 0.0036 of the deviation; four of them allowed
-    assert abs(log.mean()) < 0.02
-    assert log.std() == pytest.approx(0.2, abs=0.015)
+    assert abs(log.mean()) < 0.02 and log.std() == pytest.approx(0.2, abs=0.015)
     np.testing.assert_array_equal(same.read(1.0), gain)
     assert (other.read(1.0) != gain).all()
     np.testing.assert_allclose(one.read(bumps()), bumps() * gain, rtol=1e-6)
@@ -210,8 +208,7 @@ def test_dead_taxels_are_as_many_as_stated_and_a_greater_share_adds_to_them() ->
     few, more = DeadTaxels(share=0.05, seed=1), DeadTaxels(share=0.10, seed=1)
     some, others = few.dead(SHAPE[1:]), more.dead(SHAPE[1:])
     assert some.sum(axis=(1, 2)).tolist() == [19] * 4  # round(0.05 · 384)
-    assert others.sum(axis=(1, 2)).tolist() == [38] * 4
-    assert others[some].all()
+    assert others.sum(axis=(1, 2)).tolist() == [38] * 4 and others[some].all()
     assert (some[0] != some[1]).any()
     np.testing.assert_array_equal(Pads(few).read(1.0) == 0.0, some)
     np.testing.assert_array_equal(Pads(DeadTaxels(share=1.0)).read(1.0), 0.0)
