@@ -85,6 +85,7 @@ class RigidJoint(ABC):
     """Known fields of ``drive_numbers.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
+    stated_age_s: float = 0.0  # Share of it that the machine's file states beside the loop's [s]
     speed_delay_s: float = 0.0  # Delay of the measured velocity in the controller [s]
     exact_timing: ClassVar[bool] = False
     """Whether the age of the position is fitted if gains are commanded: at 3.7 rad/s half a millisecond makes 18 noise floors of

@@ -103,7 +103,7 @@ class RobotJoint(DriveJoint):
         self._payload_in = [*own, robot.last_body(signal)][0]
         # At a slide the weight of an unknown mass is a constant force, too.
         self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
-        self.position_age_s += law.position_age_s
+        self.position_age_s, self.stated_age_s = self.position_age_s + law.position_age_s, law.position_age_s
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
 

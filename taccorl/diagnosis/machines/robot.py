@@ -431,7 +431,7 @@ class RobotMachine(Machine):
             made = [(e.name, {f.name: getattr(e, f.name) for f in dataclasses.fields(e)}) for e in a.effects]
             new = [make_effect(name, **own) for name, own in made]
             if "position_age_s" in a.base:
-                numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])
+                numbers["position_age_s"] = float(a.base["position_age_s"])
             half_s = 0.5 * float(a.base.get("loop_s", 0.0))
             if half_s > 0.0:
                 numbers["loop_hz"] = 0.5 / half_s

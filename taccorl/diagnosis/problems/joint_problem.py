@@ -229,7 +229,8 @@ class JointProblem(WithoutMaps):
         lever, half_s = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE)), 0.5 * base.get(LOOP.name, 0.0)
         if SPEED_DELAY.name in base:
             effects = [*effects, SpeedDelay(**self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s)]
-        age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
+        stated_s, (gains, facts) = self.model.joint.stated_age_s, self.model.joint.numbers(base)
+        age_s = base.get(POSITION_AGE.name, stated_s) - stated_s + half_s
         facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
             newer = 2.0 * bool(self.model.joint.facts["effort_after"])
@@ -271,7 +272,9 @@ class JointProblem(WithoutMaps):
             return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in [*found, *scale])
         if self.commanded:
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
-            age = POSITION_AGE if joint.position_age_s or POSITION_AGE.name in self.known else LOOP
+            at = joint.stated_age_s
+            aged_by = dataclasses.replace(POSITION_AGE, start=at, low=at + POSITION_AGE.low)
+            age = aged_by if joint.position_age_s or POSITION_AGE.name in self.known else LOOP
             found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [age] * aged
             found += [EFFORT_AGE] * (self.effort and not joint.exact_timing)
         elif not joint.winding:
