@@ -173,7 +173,8 @@ def page(rows: Rows) -> str:
             noise = next((row["noise"] for row in _most([r for r in mine if "noise" in r])), None)
             loud = f"{noise['without']:g} → {noise['with']:g} % of {noise['n']:g}" if noise else "not run"
             none = share([r for r in mine if r.get("stage") == "ppo" and not r["demonstrations"]])
-            table_1.append((task, text, paper, share(learnt), loud, none, share(new) + of))
+            first = share(learnt) + (f"; of {learnt[0]['demonstrations']} demonstrations" if learnt else "")
+            table_1.append((task, text, paper, first, loud, none, share(new) + of))
         few = {key: of for key, of in grips(seen, task).items() if {*DEMONSTRATIONS[:-1]} & {*of}}
         table_5 += [(task, *key, *(share(of.get(n, [])) for n in DEMONSTRATIONS)) for key, of in few.items()]
     for task, pictures, n, clear, executed in sorted({cell[:5] for cell in cells}):

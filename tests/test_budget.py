@@ -6,8 +6,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_558,
-    "taccorl/cli": 4_867,
+    "taccorl/alignment": 14_564,
+    "taccorl/cli": 4_882,
     "taccorl/data": 8_742,
     "taccorl/diagnosis": 11_056,
     "taccorl/episodes": 4_048,
@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_345,
-    "tests": 55_500,
-    "pipelines": 6_306,
+    "tests": 55_460,
+    "pipelines": 6_307,
 }
 MOST_LINES_OF_A_FILE = 500
 

@@ -126,27 +126,37 @@ def _diagnosed(
         )
     diagnoses = report["diagnoses"]
     parts = machine.select(list(diagnoses), config.joints, config.pads)
-    found = {name for part in parts for name in _found(diagnoses[part])}
-    for name in {*names}.difference(*(_off(diagnoses[part]) for part in parts)):
+    told = {part: {*_found(diagnoses[part]), *_changed(diagnoses[part])} for part in parts}
+    found = {name for own in told.values() for name in own}
+    for name in {*names} - found:
+        if any(name in {*diagnoses[part]["base"], *machine.numbers(part)} for part in parts):
+            raise TaccorlError(
+                f"{path}: {name} is not off in that diagnosis; what it found: {', '.join(sorted(found)) or 'nothing'}"
+            )
         effects.get(name)
-    additions, refused, written, said = [], [], set(), {}
+    additions, refused, left_out, written, said = [], [], [], set(), {}
     for part in parts:
-        own = [*_found(diagnoses[part]), *_off(diagnoses[part])]
-        # What was found at some part is not taken where it only ties with what was found.
-        wanted = {name for name in names if name in own or (name not in found and name in _fitted(diagnoses[part]))}
+        # What was found at some part is not taken where it only ties with what was found, or is in the file.
+        wanted = {n for n in names if n in told[part] or (n not in found and n in _fitted(diagnoses[part]))}
         try:
             fit = _fit_of(wanted or {*names}, part, diagnoses[part])
         except TaccorlError as error:
             refused.append(error)
+            left_out += [error] * bool(wanted & told[part])
             continue
         if fit is None:
             continue
         additions.append(_addition(machine, part, fit))
         written |= {*(e["effect"] for e in fit["effects"]), *_off(diagnoses[part])}
         said[part] = report["verdicts"][part]["finding"] if fit is diagnoses[part] else fit["effects"][-1]["evidence"]
+    left = [name for name in names if name not in written]
     if refused and (config.joints or config.pads or not additions):
         raise refused[0]
-    if left := [name for name in names if name not in written]:
+    if left_out and left:
+        raise left_out[0]
+    for error in left_out:
+        print(f"not written: {error}")
+    if left:
         tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]} | found)
         raise TaccorlError(f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}")
     return additions, shlex.split(report["provenance"].get("command", "")), said
@@ -163,6 +173,11 @@ def _off(diagnosis: dict[str, Any]) -> list[str]:
     from taccorl.diagnosis.search.problem import EFFORT_SCALE
 
     return [c["name"] for c in diagnosis.get("changed", ()) if "." not in c["name"] and c["name"] != EFFORT_SCALE]
+
+
+def _changed(diagnosis: dict[str, Any]) -> set[str]:
+    """Numbers and effects of the file that a diagnosis of one part says are off."""
+    return {*_off(diagnosis), *(c["name"].rpartition(".")[0] for c in diagnosis.get("changed", ()) if "." in c["name"])}
 
 
 def _fitted(diagnosis: dict[str, Any]) -> set[str]:
@@ -185,7 +200,7 @@ def _fit_of(wanted: set[str], part: str, diagnosis: dict[str, Any]) -> dict[str,
     if not new:
         raise TaccorlError(
             f"{part}: {', '.join(sorted(wanted))} was refitted beside {' and '.join(sorted(own))}; `taccorl add-effect "
-            f"{','.join(sorted(own))}` writes them together"
+            f"{','.join(sorted(own | wanted))}` writes them together"
         )
     for offer in diagnosis.get("offers", ()):
         if {*offer["added"]} == new:

@@ -71,8 +71,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder, said, words
     assert (folder / "twin.yaml").read_bytes() == before
     twin = load_twin(copy)
     (effect,) = twin.effects
-    assert effect.acts_on() == [SIGNAL]
-    assert vars(effect)["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
+    assert effect.acts_on() == [SIGNAL] and vars(effect)["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
     low, high = effect.interval["torque_nm"]
     assert low < vars(effect)["torque_nm"] < high and "validation error" in effect.evidence
     # gains that were refitted with it come along, for this joint of this arm
@@ -132,6 +131,29 @@ def test_an_effect_of_all_pads_by_hand(said, tmp_path):
     assert len(load_twin(out).effects[0].acts_on()) == 4
 
 
+def test_each_joint_gets_what_its_diagnosis_tells_and_what_is_left_out_is_said(folder, said, tmp_path):
+    report = json.loads((folder / "diagnosis" / "report.json").read_text())
+    own, other, off = report["diagnoses"][SIGNAL], "left_joint5", [{"name": "torque_ff"}]
+    report["verdicts"][other] = report["verdicts"][SIGNAL]
+
+    def wrote(names: str, *diagnoses: dict) -> str:
+        report["diagnoses"] = dict(zip((SIGNAL, other), diagnoses, strict=True))
+        (tmp_path / "report.json").write_text(json.dumps(report))
+        out = tmp_path / f"{len([*tmp_path.iterdir()])}.yaml"
+        code, text = said(names, f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={out}")
+        assert code == 0 and f"{other}: " in text
+        return text
+
+    refitted = {"effect": "viscous_friction", "damping_nms_per_rad": 1.0}
+    in_file = {"effects": [refitted], "present": ["viscous_friction"]}
+    both = wrote("torque_ff", own | {"changed": off}, own | in_file | {"changed": off})
+    assert f"not written: {SIGNAL}: torque_ff was refitted beside coulomb_friction; `taccorl add-effect" in both
+    assert "coulomb_friction,torque_ff` writes them together" in both
+    viscous = [*off, {"name": "viscous_friction.damping_nms_per_rad"}]
+    both = wrote("torque_ff,viscous_friction", own | in_file | {"changed": viscous}, own | in_file | {"changed": off})
+    assert f"{SIGNAL}: " in both and "not written" not in both
+
+
 def test_a_diagnosis_of_another_twin_is_refused(folder, said, tmp_path):
     other = TwinConfig()
     other.controller.kp_nm_per_rad[0] += 1.0
@@ -146,6 +168,7 @@ def test_a_diagnosis_of_another_twin_is_refused(folder, said, tmp_path):
     [
         (["coulomb_frictoin"], "coulomb_friction"),
         (["slew_limit"], "slew_limit was not fitted in"),
+        (["kd"], "kd is not off in that diagnosis; what it found: coulomb_friction"),
         (["touch_lag"], "touch_lag was not fitted in"),
         (["coulomb_friction", "--joints=[J4]"], f"J4: no such joint is swept in these recordings; known: {SIGNAL}"),
         (["coulomb_friction", "--joints=[joint4]", "--values={torque_nm: -1}"], "outside of"),

@@ -78,8 +78,7 @@ def test_gains_are_not_fitted_to_a_clock_that_is_50_ms_late(said: Any, tmp_path:
     code, text = said("align", "sweeps")
     late_ms = float(re.search(r"comes (\d+) ms after the replay, in \d of \d recordings", text)[1])  # pyright: ignore
     assert code == 1 and 45 <= late_ms <= 60 and text.index(SIGNAL) < text.index("comes")
-    assert not (tmp_path / "alignment" / "twin.yaml").exists()
-    assert "--accept=shifted_from_twin" in text
+    assert not (tmp_path / "alignment" / "twin.yaml").exists() and "--accept=shifted_from_twin" in text
     code, _ = said("align", "sweeps", "--accept=shifted_from_twin", "--out=nevertheless")
     assert code == 0 and (tmp_path / "nevertheless" / "twin.yaml").exists()
 
@@ -130,8 +129,7 @@ def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
     (option,) = re.findall(r"--policy\.noise_threshold=(\S+)", found.remarks[1])
     assert 0 < float(counts) == pytest.approx(75 * float(option), rel=1e-3)  # reading = counts / 75
     twin, why = aligned(config, [found])
-    assert why == ""
-    assert vars(twin.sensor)["normal_stiffness_per_m"] == pytest.approx(K_N, rel=0.01)
+    assert why == "" and vars(twin.sensor)["normal_stiffness_per_m"] == pytest.approx(K_N, rel=0.01)
     assert vars(twin.sensor)["normal_damping_s_per_m"] == pytest.approx(K_D, rel=0.1)
     alone = align_part("left pads", config, Measurements((presses[0],), (), rule="by hand"))
     assert "validation" in alone.trouble

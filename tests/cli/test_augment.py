@@ -50,8 +50,7 @@ def test_the_result_keeps_yield_causes_and_grips(place):
 def test_the_same_command_again_makes_nothing_anew(collected, place, said):
     attempts = sorted((place / "store" / "mimicgen").iterdir())
     code, text = said("augment", f"--source={collected}", *WORDS)
-    assert code == 0
-    assert f"yield:   1 of {len(attempts)}" in text
+    assert code == 0 and f"yield:   1 of {len(attempts)}" in text
     assert (
         "warning: fewer than 50 different grips" in text and "taccorl collect --task=assembly_2 --episodes=3500" in text
     )
@@ -80,8 +79,7 @@ def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(collected,
     (place / "strict.yaml").write_text(yaml.safe_dump(spec))
     words = ("--spec=strict.yaml", "--task=assembly_2", "--images=false", "--out=strict", "--store=store")
     code, text = said("augment", f"--source={collected}", *words)
-    assert code == 2
-    assert "1 of 1 failed (1 force); nothing was written" in text
+    assert code == 2 and "1 of 1 failed (1 force); nothing was written" in text
     command = shlex.split(text.rpartition("To view one: ")[2])
     assert command[:2] == ["taccorl", "view"]
     assert said(*command[1:], "--save=failed.rrd")[0] == 0

@@ -49,8 +49,7 @@ def table(folder: Path, name: str = "press.csv", **columns: np.ndarray) -> Path:
 def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping, said):
     sensor, presses, out = creeping / "taxel.yaml", creeping / "presses", creeping / "diagnosis"
     code, shown = said("compare", presses, f"--twin={sensor}", f"--out={creeping / 'compared'}")
-    assert code == 0
-    assert "fingertip touch" in shown and "loading" in shown
+    assert code == 0 and "fingertip touch" in shown and "loading" in shown
     assert "simulated force cells" in shown
     code, shown = said("diagnose", presses, f"--twin={sensor}", f"--out={out}")
     assert code == 0 and "fingertip lacks taxel_creep" in shown
@@ -200,8 +199,7 @@ def test_a_wrong_recording_is_said_with_what_to_do_and_nothing_is_compared(tmp_p
     (tmp_path / "taxel.yaml").write_text(SENSOR)
     for verb in ("compare", "diagnose"):
         code, shown = said(verb, "presses", "--twin=taxel.yaml")
-        assert code == 1
-        assert words in " ".join(shown.split())
+        assert code == 1 and words in " ".join(shown.split())
 
 
 def test_another_rate_than_the_file_says_is_an_error_and_can_be_accepted(tmp_path, said):

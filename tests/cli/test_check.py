@@ -51,8 +51,7 @@ def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path, sai
 def test_an_episode_that_the_operator_discarded_is_no_warning(tmp_path, said):
     path = record(tmp_path / "two.mcap", duration_s=4.0, episodes=2, outcomes=("discard", "success"))
     code, text = said(path, SPEC, "--pictures=false")
-    assert code == 0
-    assert "discarded by the operator" in text
+    assert code == 0 and "discarded by the operator" in text
 
 
 def test_pictures_that_do_not_decode_are_named_and_the_rest_is_checked(good, tmp_path, said):
@@ -66,8 +65,7 @@ def test_a_bad_file_in_a_folder_does_not_hide_the_others(good, tmp_path, said):
     shutil.copy(good, tmp_path / "b.mcap")
     (tmp_path / "a.mcap").write_bytes(b"not a recording")
     code, text = said(tmp_path, SPEC, "--pictures=false")
-    assert code == 1
-    assert "unreadable" in text and "is not an MCAP file" in text
+    assert code == 1 and "unreadable" in text and "is not an MCAP file" in text
     assert "70 rows" in text
 
 

@@ -16,8 +16,7 @@ def test_the_list_has_every_effect_with_equation_units_and_what_shows_it(said) -
     for name in effects:
         cls = effects.get(name)
         entry = shown.split(f"{name}  (", 1)[1].split("\n\n", 1)[0]
-        assert cls.equation in entry
-        assert cls.to_record in entry
+        assert cls.equation in entry and cls.to_record in entry
         for p in cls.parameters():
             assert f"{p.symbol}: {p.name} [{p.unit}]" in entry
 
@@ -34,8 +33,7 @@ def test_the_list_has_every_effect_with_equation_units_and_what_shows_it(said) -
 def test_a_kind_lists_its_effects_only(said, kind: str, there: set[str], not_there: set[str]) -> None:
     code, shown = said("effects", f"--for={kind}")
     names = {line.split("  (")[0] for line in shown.splitlines() if line and not line.startswith(" ")}
-    assert code == 0
-    assert there <= names
+    assert code == 0 and there <= names
     assert not not_there & names
 
 

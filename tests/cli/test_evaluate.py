@@ -18,8 +18,7 @@ SHORT = ("--episodes=2", "--episode_length=4")
 
 def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: Path) -> None:
     code, shown = said(*EXPERT, *SHORT, "--failures=1", "--out=scored")
-    assert code == 0
-    assert "expert, assembly_1: 0 of 2 episodes succeeded: 0.0 % (95 %: 0.0 … 65.8)" in shown
+    assert code == 0 and "expert, assembly_1: 0 of 2 episodes succeeded: 0.0 % (95 %: 0.0 … 65.8)" in shown
     assert "failures: timeout 2" in shown
     rows = read_rows(tmp_path / "scored/episodes.jsonl")
     assert [(r.seed, r.outcome, r.steps) for r in rows] == [(1000, "timeout", 4), (1001, "timeout", 4)]

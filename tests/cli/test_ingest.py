@@ -42,11 +42,9 @@ def tree(folder: Path) -> dict[str, bytes]:
 def test_the_command_of_the_readme_says_where_everything_is(good, said):
     before = good.read_bytes()
     code, text = said(good, SPEC, "--out=outputs/my dataset")
-    assert code == 0
-    assert "recordings: 1 written, 0 split, 0 quarantined, 0 refused" in text
+    assert code == 0 and "recordings: 1 written, 0 split, 0 quarantined, 0 refused" in text
     assert "report:  outputs/my dataset.ingest_report.json" in text
-    assert "taccorl view 'outputs/my dataset' --episode=0" in text
-    assert "(1 episodes, 70 rows)" in text
+    assert "taccorl view 'outputs/my dataset' --episode=0" in text and "(1 episodes, 70 rows)" in text
     report = json.loads(Path("outputs/my dataset.ingest_report.json").read_text())
     assert report["rows"] == 70
     assert (Path("outputs/my dataset") / "meta/info.json").is_file()

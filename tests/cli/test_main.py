@@ -64,8 +64,7 @@ def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(s
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])
 def test_the_list_is_no_error(words, capsys):
-    assert main(words) == 0
-    assert "usage: taccorl <verb>" in capsys.readouterr().out
+    assert main(words) == 0 and "usage: taccorl <verb>" in capsys.readouterr().out
 
 
 def test_the_version_is_the_packages(capsys):
@@ -251,8 +250,7 @@ def test_what_inspect_prints_and_drafts_has_no_control_characters(tmp_path, caps
     assert main(["ingest", "inspect", str(path)]) == 0
     assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
     printed = capsys.readouterr().out
-    assert not STEERS.search(printed)
-    assert r"/arm\x1b[31m/joint\x07_state\u202e\x9b2J\nrow: 2" in printed
+    assert not STEERS.search(printed) and r"/arm\x1b[31m/joint\x07_state\u202e\x9b2J\nrow: 2" in printed
     for name in ("mine.yaml", "mine_dataset.yaml"):
         assert not STEERS.search((tmp_path / name).read_text())
         assert yaml.safe_load((tmp_path / name).read_text())

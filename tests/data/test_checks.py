@@ -58,8 +58,7 @@ def test_findings_come_worst_first_and_name_their_place(good):
     action[100, 3] += 1.0
     findings = check_episode(with_arrays(good, state=state, action=action), pictures=False)
     ranks = [("error", "warning", "note").index(f.severity) for f in findings]
-    assert ranks == sorted(ranks)
-    assert ranks[0] == 0
+    assert ranks == sorted(ranks) and ranks[0] == 0
     assert all(f.text and f.check for f in findings)
 
 
@@ -184,8 +183,7 @@ def test_limit_tolerance_is_two_per_cent_of_the_span(good, share, is_error):
     limits = [f for f in check_episode(with_arrays(good, action=action), pictures=False) if f.check == "joint_limit"]
     assert bool(limits) == is_error
     if is_error:
-        assert "2% of the span" in limits[0].text
-        assert limits[0].rows is not None
+        assert "2% of the span" in limits[0].text and limits[0].rows is not None
         assert 90 <= limits[0].rows[0] <= 100
         assert 110 <= limits[0].rows[1] <= 120
 

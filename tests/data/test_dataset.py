@@ -127,8 +127,7 @@ def test_every_row_of_every_episode_shows_its_own_picture(made: dict[str, Path],
                 found = np.array([picture[camera].mean() for picture in shown])
                 expected = np.array([grey(camera, row) for row in range(length)])
                 assert np.abs(found - expected).max() <= 3  # neighbours differ by 8
-        assert shown[0][FRONT].shape == (64, 64, 3)
-        assert shown[0][FRONT].dtype == np.uint8
+        assert shown[0][FRONT].shape == (64, 64, 3) and shown[0][FRONT].dtype == np.uint8
 
 
 def test_pictures_are_pixel_for_pixel_those_of_lerobots_own_reader(made: dict[str, Path]) -> None:
@@ -150,8 +149,7 @@ def test_frames_of_a_part_of_an_episode_are_those_rows(made: dict[str, Path]) ->
 def test_numbers_tasks_and_names_come_back_exactly(made: dict[str, Path]) -> None:
     for index, length in enumerate(LENGTHS):
         episode = Dataset(made["h264"]).episode(index)
-        assert episode.instruction == TASKS[index]
-        assert episode.num_rows == length
+        assert episode.instruction == TASKS[index] and episode.num_rows == length
         assert episode.arrays["observation.tactile"].dtype == np.int16
         assert np.array_equal(episode.arrays["observation.tactile"], [tactile(index, row) for row in range(length)])
         assert np.array_equal(episode.arrays["observation.state"], [state(index, row) for row in range(length)])

@@ -190,8 +190,7 @@ def test_the_wires_12_by_32_frame_becomes_the_pads_32_by_12():
 )
 def test_counts_are_the_same_from_bytes_lists_arrays_and_base64(frame):
     counts = decode.pad_extractor(channel(), sensor(2, 2))(frame)
-    assert counts.tolist() == [0, 1, 254, 255]
-    assert counts.dtype == np.uint8
+    assert counts.tolist() == [0, 1, 254, 255] and counts.dtype == np.uint8
 
 
 def test_sixteen_bit_counts_come_little_endian_and_no_others_are_taken():
@@ -276,8 +275,7 @@ def test_raw_pictures_with_and_without_padded_rows(encoding, padding):
     message = SimpleNamespace(height=4, width=6, encoding=encoding, step=rows.shape[1], data=rows.tobytes())
     expected = np.repeat(image[..., :1], 3, axis=2) if encoding == "mono8" else image
     found = pictures.picture(message, channel())
-    assert np.array_equal(found, expected)
-    assert found.flags.c_contiguous
+    assert np.array_equal(found, expected) and found.flags.c_contiguous
     if not padding:
         as_json = {"height": 4, "width": 6, "encoding": encoding, "data": base64.b64encode(rows.tobytes()).decode()}
         assert np.array_equal(pictures.picture(as_json, channel()), expected)

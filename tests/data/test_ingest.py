@@ -182,8 +182,7 @@ def test_the_dataset_holds_what_cutting_gives(mixed, spec):
                 assert (stored.instruction, stored.success) == (episode.instruction, episode.success)
                 assert stored.start_ns == episode.start_ns
                 index += 1
-    assert index == dataset.num_episodes
-    assert dataset.video_problems() == []
+    assert index == dataset.num_episodes and dataset.video_problems() == []
 
 
 def test_the_named_commands_show_what_is_wrong(mixed, capsys):
@@ -212,8 +211,7 @@ def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_i
     assert ingests.run(tmp_path / "in.mcap") == 1
     [entry] = ingests.report()["recordings"]
     assert [e["outcome"] for e in entry["episodes"]] == ["written", "quarantined"]
-    assert entry["outcome"] == "split"
-    assert ingests.report()["episodes_quarantined"] == 1
+    assert entry["outcome"] == "split" and ingests.report()["episodes_quarantined"] == 1
     assert "1 of 2 episodes quarantined" in entry["reason"] and "right_wrist" in json.dumps(
         entry["episodes"][1]["findings"]
     )

@@ -122,8 +122,7 @@ def test_each_row_shows_its_own_picture_after_merging_twice(filmed, tmp_path, mo
             assert item["episode_index"] == number
             assert abs(float(item[TOP].mean()) * 255 - (4 * k + 20 * seed) % 256) < 2
         row += rows
-    assert row == len(joined)
-    assert [*check_bookkeeping(Dataset(tmp_path / "all"))] == []
+    assert row == len(joined) and [*check_bookkeeping(Dataset(tmp_path / "all"))] == []
 
 
 @pytest.mark.parametrize(("limit_mb", "per_chunk", "files"), [(1, 2, 3), (100, 1000, 1)])

@@ -106,8 +106,7 @@ def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 def test_every_shipped_spec_loads(path):
     loaders = {"sensors": load_sensor_spec, "recordings": load_recording_spec}
     load = loaders.get(path.parent.name, load_dataset_spec)
-    assert load(path).spec_version == 1
-    assert find_spec(path.stem) == path
+    assert load(path).spec_version == 1 and find_spec(path.stem) == path
 
 
 def test_shipped_tactile_numbers_are_the_papers():
@@ -379,8 +378,7 @@ def _assert_says(error: SpecError, file: Path, place: str, reason: str) -> None:
     """``file:line: … place …: … reason``, one line, the line being that of the last key of ``place`` that is in the file."""
     message = str(error)
     head, _, rest = message.removeprefix(str(file)).partition(": ")
-    assert message.startswith(str(file)), message
-    assert head.startswith(":")
+    assert message.startswith(str(file)), message and head.startswith(":")
     line = int(head[1:])
     assert "\n" not in message
     assert place in rest, message

@@ -54,8 +54,7 @@ def test_grid_does_not_drift_over_ten_hours():
 
 def test_asof_is_stale_beyond_max_age_and_not_at_it():
     m = match(ns(4, 5, 35, 36, 50), ns(5, 50), "asof", max_age_s=0.03)
-    assert m.index[:, 0].tolist() == [-1, 0, 0, 0, 1]
-    assert m.fresh.tolist() == [False, True, True, False, True]
+    assert m.index[:, 0].tolist() == [-1, 0, 0, 0, 1] and m.fresh.tolist() == [False, True, True, False, True]
     assert m.age_s[1:].tolist() == [0.0, 0.03, 0.031, 0.0]
 
 
@@ -70,8 +69,7 @@ def test_window_is_stale_while_a_gap_lies_inside_it():
 @pytest.mark.parametrize("align", ["hold", "asof", "window"])
 def test_without_samples_no_row_is_fresh_and_without_rows_there_is_nothing(align):
     m = match(ns(0, 10), np.empty(0, dtype=np.int64), align, max_age_s=1.0, history=3, rate_hz=100)
-    assert not m.fresh.any()
-    assert (m.index == -1).all()
+    assert not m.fresh.any() and (m.index == -1).all()
     assert m.index.shape == (2, 3 if align == "window" else 1)
     assert np.isinf(m.age_s).all()
     m = match(np.empty(0, dtype=np.int64), ns(0, 10), align, max_age_s=1.0, history=3, rate_hz=100)

@@ -164,8 +164,7 @@ def test_contact_coverage_is_told_and_of_windows_that_of_the_newest_reading(good
     text = one(good, "contact_coverage").text
     for name in PADS:
         share = pad(good, name).contact.mean()
-        assert 0.2 < share < 0.8
-        assert f"{name} in {share:.0%} of the rows" in text
+        assert 0.2 < share < 0.8 and f"{name} in {share:.0%} of the rows" in text
     assert one(_window(good), "contact_coverage").text == text
 
 
@@ -196,8 +195,7 @@ def test_enclosed_taxels_ought_to_show_the_lesser_neighbour() -> None:
     frame[0, 4, [2, 5]] = 60, 40  # two taxels between
     frame[0, 0, [0, 4]] = 90, 90  # three taxels between: may be a hollow of the part
     expected = touch_checks.inside_contact(frame)[0]
-    assert expected[2].tolist() == [0, 0, 50, 0, 0, 0, 0]
-    assert expected[4].tolist() == [0, 0, 0, 40, 40, 0, 0]
+    assert expected[2].tolist() == [0, 0, 50, 0, 0, 0, 0] and expected[4].tolist() == [0, 0, 0, 40, 40, 0, 0]
     assert expected[0].max() == 0
     corner = np.zeros((1, 6, 6))
     corner[0, 1:5, 1], corner[0, 4, 1:5] = 80, 80

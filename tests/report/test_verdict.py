@@ -243,8 +243,7 @@ def test_an_effect_that_test_recordings_do_not_show_is_said_with_both_errors():
 )
 def test_a_gain_of_less_than_a_tenth_of_what_lies_above_the_floor_is_none(before, after, nothing):
     """14.1² − 1 = 197.8: a tenth is 19.8; 14.1² − 13² = 29.8, 14.1² − 13.6² = 13.9. 1.3² − 1 = 0.69 of at least one floor²."""
-    assert gains_nothing(before, after) == nothing
-    assert ("no gain" in of_test(before, after)) == nothing
+    assert gains_nothing(before, after) == nothing and ("no gain" in of_test(before, after)) == nothing
 
 
 def test_data_comes_before_any_effect(one):
@@ -279,8 +278,7 @@ def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one, reason):
         "doubt": "velocity",
         "disagree": "1.47",
     }
-    assert v.level == "moderate"
-    assert said[reason] in " ".join((v.confidence, *v.remarks))
+    assert v.level == "moderate" and said[reason] in " ".join((v.confidence, *v.remarks))
     assert reason != "doubt" or "1 remark below" in v.confidence
 
 

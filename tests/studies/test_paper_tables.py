@@ -34,7 +34,7 @@ def test_cells_are_what_was_counted():
     assert transfer(after := [row | {"stage": "ppo"} for row in moved]) == {}
     assert "| late | after | 0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* | +14; p = 2e-05 |" in page(after)
     puzzle = "| puzzle | cameras and touch | 16 %; 4 %; 0 %; 71 % |"
-    assert f"{puzzle} 0 % (0 … 4) of 96* | not run | not run | not run |" in page(rows[:1])
+    assert f"{puzzle} 0 % (0 … 4) of 96*; of 9 demonstrations | not run | not run | not run |" in page(rows[:1])
     loud = {"stage": "ppo", "successes": 96, "noise": {"n": 128.0, "without": 90.6, "with": 50.0}}
     after = "100 % (96 … 100) of 96*; of 9 demonstrations |"
     assert f"{puzzle} not run | 90.6 → 50 % of 128 | not run | {after}" in page([ROW | loud])
@@ -59,7 +59,9 @@ def test_cells_are_what_was_counted():
         "| each its own grip for 300, then corrections | not run | not run | 100 % (96 … 100) of 96* | not run |"
         in told
     )
-    assert "| assembly_1 | cameras and touch | 47 %; 35 %; 0 %; 92 % | 0 % (0 … 4) of 96* |" in told
+    assert (
+        "| assembly_1 | cameras and touch | 47 %; 35 %; 0 %; 92 % | 0 % (0 … 4) of 96*; of 100 demonstrations |" in told
+    )
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,8 @@ def sim(request: pytest.FixtureRequest) -> Simulation:
 
 def test_it_states_what_it_is(sim):
     task = sim.task
-    assert tasks.get(task.name) is type(task)
-    assert task.instruction.strip()
-    assert task.__doc__
-    assert task.time_limit_s > 0
+    assert tasks.get(task.name) is type(task) and task.instruction.strip()
+    assert task.__doc__ and task.time_limit_s > 0
     assert set(task.home_rad) == set(ROBOT.arms)
     for arm, home in task.home_rad.items():
         low, high = ROBOT.action_low[ROBOT.joint_slice(arm)], ROBOT.action_high[ROBOT.joint_slice(arm)]

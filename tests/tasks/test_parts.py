@@ -143,8 +143,7 @@ def test_cradle_plug_centre_of_mass_is_where_the_task_needs_it():
     plug = cradle_plug()
     assert 0.018 <= plug.com_part_m[2] <= 0.020
     core = plug.solids[-1]
-    assert not core.touches
-    assert core.mass_kg / core.volume_m3 == pytest.approx(8500, rel=0.01)
+    assert not core.touches and core.mass_kg / core.volume_m3 == pytest.approx(8500, rel=0.01)
 
 
 @by_name([part for part in ALL if part.name != "tube"])  # whose cap hides the capsule's upper end
@@ -319,8 +318,7 @@ def test_a_part_at_rest_stays_where_it_is(part):
     bench.run(1.0)
     assert np.linalg.norm((bench.pose(part.name) - before)[:3, 3]) < 1e-4
     assert Rotation.from_matrix(bench.pose(part.name)[:3, :3] @ before[:3, :3].T).magnitude() < 1e-3
-    assert np.linalg.norm((before - rest)[:3, 3]) < 1e-4
-    assert bench.data.contact.dist.min() > -5e-5
+    assert np.linalg.norm((before - rest)[:3, 3]) < 1e-4 and bench.data.contact.dist.min() > -5e-5
 
 
 # --- Test Tube Insertion

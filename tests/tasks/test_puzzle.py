@@ -133,8 +133,7 @@ def test_all_three_in_their_holes_succeed_after_half_a_second(sim):
     assert now(sim).partial[0] == 0
     for num, piece in enumerate(PIECES, start=1):
         put(sim, piece, over_hole(sim, piece, IN_HOLE_M + 1e-4))
-        assert now(sim).partial[0] == num
-        assert now(sim).goal[0] == (num == 3)
+        assert now(sim).partial[0] == num and now(sim).goal[0] == (num == 3)
     stay(sim, 14)
     assert not sim.judge.outcome.success[0]
     stay(sim, 1)
@@ -173,8 +172,7 @@ def test_a_piece_in_flight_through_its_place_does_not_count(sim):
     put_all_in(sim)
     for speed_mps, counts in ((-0.05, False), (-0.01, True)):  # falling
         put(sim, "triangle", over_hole(sim, "triangle", IN_HOLE_M + 1e-4), (0, 0, speed_mps))
-        assert now(sim).goal[0] == counts
-        assert now(sim).partial[0] == 2 + counts
+        assert now(sim).goal[0] == counts and now(sim).partial[0] == 2 + counts
 
 
 @pytest.mark.parametrize("height_m", [0.0005, 0.0020])  # lying in, and hovering low enough to count

@@ -40,8 +40,7 @@ def test_the_lines_of_the_readme_download_no_weights(monkeypatch: pytest.MonkeyP
     for line in lines:
         config = lerobot_train(None, monkeypatch, *line.split()[1:])
         kinds[config.policy.type] = config.policy
-    assert kinds["act"].pretrained_backbone_weights is None
-    assert kinds["tactile_pi05"].base_checkpoint is None
+    assert kinds["act"].pretrained_backbone_weights is None and kinds["tactile_pi05"].base_checkpoint is None
 
 
 @pytest.mark.parametrize("name", ALL)

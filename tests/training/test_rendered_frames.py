@@ -55,8 +55,7 @@ def test_the_plain_reader_refuses_it_with_the_way_out_and_check_does_not_crash(d
     with pytest.raises(DatasetError, match=r"declared: has no videos of observation\.images\.front.*--dataset\.cache="):
         load(declared, monkeypatch, None)
     dataset = Dataset(declared)
-    assert dataset.unstored == (FRONT,)
-    assert dataset.episode(0).picture_keys == ()
+    assert dataset.unstored == (FRONT,) and dataset.episode(0).picture_keys == ()
     assert dataset.video_problems() == []
     with pytest.raises(DatasetError, match=r"observation\.images\.front: not stored as video"):
         dataset.video(0, FRONT)

@@ -34,6 +34,8 @@ TODO = "TODO"  # Placeholder for a value that only the user knows; a file that c
 REMOVABLE = 0.95
 """Largest share of a body's mass that a ``payload`` below 0 may remove. A choice: what is left must be above 0."""
 _LEAST_REACH_M = 0.05
+MOST_EARLY_S = 0.01
+"""Bound of a position's age below that of the loop. A choice, beyond the periods of all loops."""
 _ALONG = 0.9999  # least cosine between axes that count as parallel
 _HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
 
@@ -61,6 +63,10 @@ class JointConfig(DriveLaw):
         check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",))
         optional = ("loop_hz", "command_hz")
         check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
+        if not self.position_age_s > -MOST_EARLY_S:
+            raise TaccorlError(
+                f"joint.position_age_s: is {self.position_age_s:g}; an age above −{MOST_EARLY_S:g} s is expected"
+            )
         self.check_law("joint")
         self.check_known("joint", {e.name: [p.name for p in e.parameters()] for e in self.effects})
         if self.law == "pwm" and self.gains == "fitted":

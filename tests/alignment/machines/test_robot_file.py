@@ -416,6 +416,7 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
         (("shoulder:", "sholder:"), r"robot\.yaml:4: joints → sholder: arm.xml has no joint 'sholder'.*shoulder"),
         (("model: arm.xml", "model: leg.xml"), r"robot\.yaml:2: model: no file 'leg.xml' beside it"),
         (("kp: 50.0", "kp: -50.0"), r"robot\.yaml:4.*kp"),
+        (("kp: 50.0", "kp: 50.0, position_age_s: -1.0"), r"robot\.yaml:4.*position_age_s: is -1; an age above −0\.01 s"),
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: backlash, play_rad: 0.01}]}"),
          r"backlash needs.*inertia.*write rotor_inertia \(kg·m²\).*gear.*shoulder"),
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
