@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_564,
+    "taccorl/alignment": 14_569,
     "taccorl/cli": 4_882,
     "taccorl/data": 8_742,
     "taccorl/diagnosis": 11_056,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_514,
     "taccorl/training": 1_557,
     "taccorl/views": 2_345,
-    "tests": 55_460,
+    "tests": 55_455,
     "pipelines": 6_307,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -47,10 +47,8 @@ def test_dataset_holds_successes_with_state_seed_and_subtasks(collected):
     episode = dataset.episode(0)
     assert episode.success
     assert episode.origin == Origin("twin", "MuJoCo twin, not a robot")
-    assert episode.arrays["sim.success"][-1, 0] == 1
-    assert episode.arrays["sim.state"].dtype == np.float64
-    assert len(set(episode.arrays["sim.seed"][:, 0])) == 1
-    assert episode.stages
+    assert episode.arrays["sim.success"][-1, 0] == 1 and episode.arrays["sim.state"].dtype == np.float64
+    assert len(set(episode.arrays["sim.seed"][:, 0])) == 1 and episode.stages
     simulation = episode.provenance["simulation"]
     assert isinstance(simulation, dict)
     assert simulation["task"] == "assembly_1"

@@ -98,8 +98,7 @@ def test_policy_episodes_are_read_as_they_were_written(sim: Simulation, tmp_path
 
 def test_a_stall_is_a_second_without_motion_and_without_progress() -> None:
     still, same = np.zeros((31, 14)), np.zeros((31, 2), int)
-    assert is_stall(still, same)
-    assert not is_stall(still[1:], same[1:])  # 30 rows are 29 steps
+    assert is_stall(still, same) and not is_stall(still[1:], same[1:])  # 30 rows are 29 steps
     for column, amount, stalls in ((0, 0.019, True), (0, 0.021, False), (13, 0.0009, True), (13, 0.0011, False)):
         moved = still.copy()
         moved[15, column] = amount
@@ -214,8 +213,7 @@ def test_a_policy_with_more_time_than_the_task_s_own_is_taken_over_beyond_it(sim
     assert (
         done.facts["cause"] == "drawn before the grasp" and done.facts["takeover_step"] == int(10 * share(0, seed)) >= 8
     )
-    assert done.rows == 3
-    assert sim.judge.limit_steps == 4
+    assert done.rows == 3 and sim.judge.limit_steps == 4
 
 
 def test_a_policy_that_holds_still_has_stalled_after_a_second(sim: Simulation, stub: None) -> None:

@@ -184,8 +184,7 @@ def test_experts_actions_re_executed_give_bit_identical_rows(tmp_path):
     assert outcome_of(sim) == "success", "choose another seed: this one is to show a success"
     other = plan.make()
     again = run(dataclasses.replace(plan, source=LeaderSource(folder=str(tmp_path))), other)
-    assert outcome_of(other) == "success"
-    assert len(again.rows) == len(original.rows)
+    assert outcome_of(other) == "success" and len(again.rows) == len(original.rows)
     for key in original.rows[0]:
         np.testing.assert_array_equal(column(again, key), column(original, key), err_msg=key, strict=True)
 
@@ -250,8 +249,7 @@ def test_re_execution_that_does_not_end_as_recorded_is_an_error(tmp_path, sim):
 def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path):
     command = ["-m", "taccorl.cli.main", "collect", "--task=bench", "--source.type=leader", "--images=false"]
     done = fresh_python(*command, "--store=store", "--out=out", cwd=tmp_path, without=("DISPLAY", "WAYLAND_DISPLAY"))
-    assert done.returncode == 2
-    assert "DISPLAY and WAYLAND_DISPLAY are not set" in done.stderr
+    assert done.returncode == 2 and "DISPLAY and WAYLAND_DISPLAY are not set" in done.stderr
     assert "--source.type=expert" in done.stderr and "Traceback" not in done.stderr
 
 

@@ -114,8 +114,7 @@ def test_items_that_others_gave_rise_to_are_run_and_their_results_follow(workers
         return [10 * item] if 0 < item < 10 else None
 
     found = LocalEngine(workers=workers).map(toys.double, [1, 2, 3], on_done=tens)
-    assert found[:3] == [2, 4, 6]
-    assert sorted(found[3:]) == [20, 40, 60]
+    assert found[:3] == [2, 4, 6] and sorted(found[3:]) == [20, 40, 60]
     assert sorted(more) == [10, 20, 30, 100, 200, 300]
 
 
@@ -180,8 +179,7 @@ def test_script_without_a_main_guard_is_told_so_instead_of_hanging(tmp_path):
         "LocalEngine(workers=2).map(double, [1, 2])\n"
     )
     done = fresh_python(script, path=Path(toys.__file__).parents[1])
-    assert done.returncode == 1
-    assert "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
+    assert done.returncode == 1 and "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
 
 
 # Processes that outlive nobody.

@@ -50,8 +50,7 @@ def test_tree_names_stage_version_key_digest_config_date_and_raw_sources(world):
     assert lines[4] == f"├─ ingest v1  key {episode['key']}  digest {episode['digest'][:12]}"
     assert "config: rate_hz=20.0 (all else at its default)" in lines[7]
     assert lines[8] == f"│  └─ source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}"
-    assert lines[9].startswith("└─ ingest v1")
-    assert lines[-1] == GOOD
+    assert lines[9].startswith("└─ ingest v1") and lines[-1] == GOOD
 
 
 def test_any_file_of_a_dataset_explains_the_dataset_and_a_raw_file_is_its_own_source(world):
@@ -109,8 +108,7 @@ def test_dataset_whose_store_is_gone_still_tells_its_lineage_down_to_the_raw_fil
         assert f"ingest v1  key {episode.path.name}  digest {episode.digest[:12]}" in shown
         assert f"not in the store any more: {episode.path}" in shown
         assert f"source  {source.path}  digest {source.digest[:12]}" in shown
-    assert shown.count("config: rate_hz=20.0 (all else at its default)") == 2
-    assert lines[-1] == GOOD
+    assert shown.count("config: rate_hz=20.0 (all else at its default)") == 2 and lines[-1] == GOOD
     (world.raw / "demo_0.raw").write_text("edited")  # the raw files are judged all the same
     (world.raw / "demo_1.raw").unlink()
     assert [problem.split(":")[0] for problem in problems(again.path)] == ["changed since", "missing"]

@@ -58,8 +58,7 @@ def test_two_threads_at_once_do_the_work_once(tmp_path):
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(digests) == 3
-    assert len(set(digests)) == 1
+    assert len(digests) == 3 and len(set(digests)) == 1
     assert len(log.read_text().splitlines()) == 3
 
 

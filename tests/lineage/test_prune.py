@@ -45,12 +45,10 @@ def test_keeps_what_the_dataset_was_made_from_however_deep_and_frees_the_rest(wo
     ]
     # Five files each: 200 bytes less 0…4, and the text "20.0" or "30.0" at the end of each; and the manifest.
     manifest_bytes = (folders[0].path / "manifest.json").stat().st_size
-    assert folders[0].size_bytes == 5 * 200 - 10 + 5 * 4 + manifest_bytes
-    assert folders[2].size_bytes == 1000
+    assert folders[0].size_bytes == 5 * 200 - 10 + 5 * 4 + manifest_bytes and folders[2].size_bytes == 1000
     assert delete(store, folders) == []
     assert len(store.folders()) == 3  # two episodes and what they were merged into
-    assert trace(world / "dataset", store).num_problems() == 0
-    assert unneeded(store, [world / "dataset"]) == []
+    assert trace(world / "dataset", store).num_problems() == 0 and unneeded(store, [world / "dataset"]) == []
 
 
 def test_what_a_published_dataset_was_made_from_stays_without_being_named(world):

@@ -256,9 +256,10 @@ class DrivenAxis(DriveJoint):
 
     keeps_times: ClassVar[bool] = True
 
-    def __init__(self, config: AxisConfig) -> None:
+    def __init__(self, config: AxisConfig, stated: AxisConfig | None = None) -> None:
+        """``stated``: the file's axis, if ``config`` has fitted numbers, which change no physics step by their loop's rate."""
         super().__init__(config, config.name, config.unit, config.loop_hz, config.command_hz)
-        self.config, self.target_late_s = config, config.target_late_s
+        self.config, self._stated, self.target_late_s = config, stated or config, config.target_late_s
         late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
         self.facts = {**self.facts, "speed_age": self.speed_delay_s, "speed_delay__delay_s": late_s}
         self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
@@ -268,7 +269,7 @@ class DrivenAxis(DriveJoint):
         return self
 
     def timestep_s(self, motion: JointMotion) -> float:
-        return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)
+        return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale, self._stated.loop_hz)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         c = self.config

@@ -127,7 +127,8 @@ class RobotJoint(DriveJoint):
         return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
 
     def timestep_s(self, motion: JointMotion) -> float:
-        return self._config.timestep_s(motion.rate_hz, self.known.inertia + self._config.armature, motion.kp_scale)
+        c = self._config
+        return c.timestep_s(motion.rate_hz, self.known.inertia + c.armature, motion.kp_scale, c.loop_hz)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = self._terms(motion.pose, self._every_mass(bodies))

@@ -134,7 +134,7 @@ class AxisProblem(WithoutMaps):
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
         """For each recording and case (T, C) simulated position [rad, m] and effort [N·m, N]; of law effort the effort alone. NaN
         after the last measured row. ``cases``: fitted numbers, and effects besides those of the file that are not fitted."""
-        models = [JointModel(DrivenAxis(self._bare.with_numbers(base))) for base, _ in cases]
+        models = [JointModel(DrivenAxis(self._bare.with_numbers(base), self._bare)) for base, _ in cases]
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
         numbers = [
             Numbers(m.gains, own, waits_s=base.get("loop_waits_s", 0.0), effort_scale=by)

@@ -91,8 +91,7 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
         made.append(dataclasses.replace(m, measured=link[:, None]))
     dropped = find_dropped(made, 0)
     assert dropped.found >= 6 + 4 * dropped.mirrored, "the check sees holds, or this test shows nothing"
-    assert not dropped.certain
-    assert "dropped_commands" not in said(made)
+    assert not dropped.certain and "dropped_commands" not in said(made)
 
 
 @pytest.mark.parametrize(("kp", "kd"), [(60.0, 8.0), (200.0, 10.0)])
@@ -134,8 +133,7 @@ def test_the_first_recording_may_be_the_odd_one_and_of_two_nothing_tells_which_i
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
     m = recording("a", 3, drop=0.05, longest=4)
     dropped = find_dropped([m], 0)
-    assert dropped.certain
-    assert 0.01 < dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
+    assert dropped.certain and 0.01 < dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
     findings = check_measurements([m])["a"]
     ((text, severity),) = ((f.text, f.severity) for f in findings if f.check == "dropped_commands")
     assert "previous target" in text and severity == "warning"

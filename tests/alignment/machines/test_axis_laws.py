@@ -108,6 +108,28 @@ def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(ax
     assert np.abs(found.reported - truth).max() < most, np.abs(found.reported - truth).max()
 
 
+def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of_the_loop():
+    """Rows of 1 ms, a loop of 2 kHz, targets 1.5 ms late: rows show the force of the period before them. With steps of 1 ms, in
+    which such a target is half of the one before, the effort is off by 0.29 N·m (0.006). A fitted rate changes no step."""
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.04, kp=40.0, kd=2.0, loop_hz=2000.0, target_late_s=1.5e-3)
+    target = 0.3 * np.sin(2 * np.pi * (2.0 + 8.0 * np.arange(800) / 800) * np.arange(800) / 1000)
+    q = v = seen = asked = 0.0
+    efforts = []
+    for n in range(1600):
+        efforts += [asked] * (n % 2 == 0)
+        goal = target[(n - 3) // 2] if n >= 3 else 0.0
+        seen, asked = q, 40.0 * (goal - q) - 2.0 * (q - seen) * 2000.0
+        for _ in range(50):
+            v += DT_S * asked / 0.04
+            q += DT_S * v
+    m = of_signal("made", 1000, target, np.zeros(800), "servo")
+    joint, fitted = DrivenAxis(axis), DrivenAxis(axis, dataclasses.replace(axis, loop_hz=None))
+    motion = motion_of(m, "servo", joint)
+    assert joint.timestep_s(motion) == pytest.approx(5e-4) and fitted.timestep_s(motion) == pytest.approx(1e-3)
+    off = [np.std(JointModel(j).simulate(motion, j.gains).effort - efforts) for j in (joint, fitted)]
+    assert off[0] < 0.02 and off[1] > 0.1
+
+
 def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():
     """J q̈ = kd (v* − q̇): q = v* (t − T (1 − e^(−t/T))), T = J / kd = 0.1 s."""
     axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)

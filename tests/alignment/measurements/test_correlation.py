@@ -38,8 +38,7 @@ def test_unmeasured_rows_do_not_count():
 
 
 def test_few_rows_and_a_channel_that_is_exactly_zero():
-    assert independent_rows([np.zeros((5, 1))]) == 5
-    assert independent_rows([np.zeros((100, 3))]) == 300
+    assert independent_rows([np.zeros((5, 1))]) == 5 and independent_rows([np.zeros((100, 3))]) == 300
     assert independent_rows([np.full((50, 1), np.nan)]) == 1
 
 

@@ -34,8 +34,7 @@ def test_rest_residue_and_repeats_each_recover_a_known_noise(motion):
     floors = noise_floor([first, dataclasses.replace(second, repeat_of="a")])
     found = {method: [] for method in ("repeats", "rest", "residue")}
     for signal in first.signals:
-        assert floors[signal].used.method == "repeats"
-        assert not floors[signal].lower_bound
+        assert floors[signal].used.method == "repeats" and not floors[signal].lower_bound
         for method, value in by_method(floors[signal]).items():
             found[method].append(value)
     # 14 independent signals each; a block of 48 white samples knows σ to 10 %, 80 of them to 1 %.
@@ -70,8 +69,7 @@ def test_without_repeats_the_floor_is_a_lower_bound_and_says_so(motion):
     floor = noise_floor([measured(*motion, np.random.default_rng(0), NOISE)])["left_joint5"]
     assert floor.lower_bound
     assert floor.used.method in ("rest", "residue")
-    assert "record the motion twice" in floor.words()
-    assert "mrad" in floor.words()
+    assert "record the motion twice" in floor.words() and "mrad" in floor.words()
 
 
 def test_repeats_see_what_the_robot_does_not_repeat(motion):

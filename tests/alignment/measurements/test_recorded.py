@@ -100,8 +100,7 @@ def truth_rows(m: Measurement, trajectory: Trajectory) -> tuple[np.ndarray, np.n
 
 
 def test_mcap_is_read_at_the_command_s_own_200_hz(recorded, moved):
-    assert recorded.rate_hz == 200.0
-    assert recorded.signals == ROBOT.action_names
+    assert recorded.rate_hz == 200.0 and recorded.signals == ROBOT.action_names
     assert recorded.instruction == NO_LOSS.instruction  # of the first start marker
     assert recorded.origin == Origin(None, "surrogate recording")
     assert recorded.time_s[-1] > SECONDS + LEAD_S  # rests included
@@ -128,8 +127,7 @@ def test_a_frame_of_a_pad_has_the_time_at_which_its_scan_had_been_read(recorded,
         log_ns = [m.log_time for _, _, m in make_reader(file).iter_messages(topics=["/left_robot_left_finger"])]
     read_s = (np.array(log_ns) - recorded.start_ns) * 1e-9
     nearest = np.abs(recorded.touch.time_s[:, 0][:, None] - read_s).min(axis=1)
-    assert len(nearest) > 300
-    assert nearest.max() < 1e-6
+    assert len(nearest) > 300 and nearest.max() < 1e-6
 
 
 def test_what_the_recording_says_of_itself_is_kept(recorded):
