@@ -59,13 +59,13 @@ PARTS = {
     ],
 }
 """Part of the tables → command-line arguments of each call of ``pipelines.learn`` that measures it."""
-_STAGES = ("co-trained", "with noise", "RL, untrained", "RL")
+PAPER_STAGES = ("co-trained", "with noise", "RL, untrained", "RL")
 PAPER = {
-    "touch": dict(zip(_STAGES, ((41, 16, 47, 58), (36, 4, 35, 42), (0,) * 4, (72, 71, 92, 79)), strict=True)),
-    "cameras": dict(zip(_STAGES, ((42, 12, 39, 39), (35, 5, 25, 25), (0,) * 4, (50, 54, 77, 61)), strict=True)),
+    "touch": dict(zip(PAPER_STAGES, ((41, 16, 47, 58), (36, 4, 35, 42), (0,) * 4, (72, 71, 92, 79)), strict=True)),
+    "cameras": dict(zip(PAPER_STAGES, ((42, 12, 39, 39), (35, 5, 25, 25), (0,) * 4, (50, 54, 77, 61)), strict=True)),
 }
 """Sensors → stage → completed [%] in simulation, of ``TASKS``: the paper's Table 1, π0.5 and 128 environments."""
-HEADS_1 = f"task | policy | paper: {'; '.join(_STAGES)} | here: by imitation | with PPO's noise"
+HEADS_1 = f"task | policy | paper: {'; '.join(PAPER_STAGES)} | here: by imitation | with PPO's noise"
 PAPER_BETA = "The paper, of a robot and α = 0.5: 45 % with β = 0, 80 % with 0.1 and with 1, less with 5"
 PAPER_REAL = "real-only 35 %, co-trained (α = 0.5) 45 %, after RL 95 %"
 """The paper's Table 2, assembly_1 with touch: of a robot."""

@@ -136,7 +136,7 @@ def _diagnosed(
         effects.get(name)
     additions, refused, left_out, written, said = [], [], [], set(), {}
     for part in parts:
-        # What was found at some part is not taken where it only ties with what was found, or is in the file.
+        # If some joint's diagnosis reports a name, it is written for the joints whose diagnosis reports it, and for no others.
         wanted = {n for n in names if n in told[part] or (n not in found and n in _fitted(diagnoses[part]))}
         try:
             fit = _fit_of(wanted or {*names}, part, diagnoses[part])
@@ -176,7 +176,7 @@ def _off(diagnosis: dict[str, Any]) -> list[str]:
 
 
 def _changed(diagnosis: dict[str, Any]) -> set[str]:
-    """Numbers and effects of the file that a diagnosis of one part says are off."""
+    """Names of the numbers and effects in the machine's file whose values the diagnosis of one joint found to be wrong."""
     return {*_off(diagnosis), *(c["name"].rpartition(".")[0] for c in diagnosis.get("changed", ()) if "." in c["name"])}
 
 

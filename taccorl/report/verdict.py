@@ -63,7 +63,8 @@ UNCERTAIN: Mapping[Kind, str] = {
 """Kind of low confidence → its first reason."""
 SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
 LATE: Mapping[str, str] = {"command_delay": "positions and efforts", "sensor_delay": "positions"}
-"""Effect of a delay → columns of the recording. If these were logged late by the delay, the recording would look the same."""
+"""Name of an effect that is a delay → columns of a recording. If the logger had stored these columns late by that delay, the
+recording would look the same as one of a robot with the effect."""
 NEXT: Mapping[str, str] = {
     "data_first": "The same motions again, once the data is settled.",
     "gains_moved": "First state the commanded gains (kp, kd) and check the time stamps.",

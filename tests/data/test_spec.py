@@ -378,7 +378,8 @@ def _assert_says(error: SpecError, file: Path, place: str, reason: str) -> None:
     """``file:line: … place …: … reason``, one line, the line being that of the last key of ``place`` that is in the file."""
     message = str(error)
     head, _, rest = message.removeprefix(str(file)).partition(": ")
-    assert message.startswith(str(file)), message and head.startswith(":")
+    assert message.startswith(str(file)), message
+    assert head.startswith(":")
     line = int(head[1:])
     assert "\n" not in message
     assert place in rest, message

@@ -106,8 +106,7 @@ def test_the_registrys_effect_with_the_true_numbers_explains_what_is_hidden(name
 
 def test_the_same_seed_gives_the_same_robot_and_recordings_bit_for_bit():
     one, other = (draw_case(["coulomb_friction", "command_delay"], 5, design="chirp") for _ in range(2))
-    assert one.truth() == other.truth()
-    assert one.twin == other.twin
+    assert one.truth() == other.truth() and one.twin == other.twin
     for a, b in zip(recordings(one).all, recordings(other).all, strict=True):
         for name in ("target", "measured", "velocity", "effort"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))

@@ -109,7 +109,6 @@ def test_a_second_robot_replaces_the_first_and_nothing_else(case, folder, tmp_pa
 
 
 def test_the_command_line_says_what_is_missing(capsys):
-    assert main(["surrogate"]) == 2
-    assert "--secret=" in capsys.readouterr().err
+    assert main(["surrogate"]) == 2 and "--secret=" in capsys.readouterr().err
     assert main(["surrogate", "--secret=1", "--effects=[nothing_of_the_sort]"]) == 2
     assert "no hidden effect" in capsys.readouterr().err

@@ -83,8 +83,7 @@ def test_nothing_is_wrong_with_the_recordings(read):
 
 def test_the_truth_is_sealed_and_the_twin_is_the_one_to_start_from(case, written):
     folder = written[0]
-    assert load_twin(folder / TWIN) == case.twin
-    assert reveal(folder) == json.loads(json.dumps(case.truth()))
+    assert load_twin(folder / TWIN) == case.twin and reveal(folder) == json.loads(json.dumps(case.truth()))
     for path in (folder / TRUTH, folder / TWIN, *(folder / PRESSES).iterdir()):
         assert b"saturation" not in path.read_bytes()
 

@@ -145,8 +145,7 @@ def test_each_failure_has_its_name_and_is_none_while_the_tube_only_passes(sim, d
     put(sim, "tube", over_hole(depth_mm * 1e-3, lean_deg=lean_deg, aside_m=aside_m))
     assert TestTube.failures[seen] == 0.5  # it may still slide in, or the hand take it again
     assert sim.contact("tube", "rack").touching[0]
-    assert failures(sim) == {seen}
-    assert not goal(sim)
+    assert failures(sim) == {seen} and not goal(sim)
 
 
 def test_a_tube_on_the_table_is_dropped_after_half_a_second(sim):

@@ -89,8 +89,7 @@ def test_a_users_readme_stays_as_it_is(copy: Path, tmp_path: Path, capsys: pytes
     else:
         (copy / "README.md").write_text("mine\n")
     add_card(copy)
-    assert (copy / "README.md").read_text() == "mine\n"
-    assert not (copy / ".card").exists()
+    assert (copy / "README.md").read_text() == "mine\n" and not (copy / ".card").exists()
     assert capsys.readouterr().out == ""
 
 

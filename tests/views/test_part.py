@@ -23,8 +23,7 @@ def test_rows_pictures_and_stages_begin_at_the_same_row():
     assert np.array_equal(shown[0]["observation.images.front"], whole[30]["observation.images.front"])
     # Whole: reach from 0, hold from 36, release from 72. Row 30 lies in "reach".
     assert part.stages == ((0, "reach"), (6, "hold"), (42, "release"))
-    assert part.start_ns == EPISODE.start_ns + 1_000_000_000
-    assert part.origin == ORIGIN
+    assert part.start_ns == EPISODE.start_ns + 1_000_000_000 and part.origin == ORIGIN
     assert part.name.endswith("1.00 to 2.50 s")
 
 

@@ -24,8 +24,7 @@ def test_active_sum_and_peak_are_what_one_adds_up_by_hand():
     assert SMALL.noise_count == 15
     rows = pad([[16, 15], [-40, 31]], [[0, 3], [14, 15]])
     assert rows.num_active.tolist() == [2, 0]  # 16 and 31 are above 15; 15 is not
-    assert rows.sum_count.tolist() == [16 + 31, 0]
-    assert rows.peak_count.tolist() == [31, 15]
+    assert rows.sum_count.tolist() == [16 + 31, 0] and rows.peak_count.tolist() == [31, 15]
     full = Pad("left_a", FLEXITAC, np.full((1, 32, 12), 255, dtype=np.int16))
     assert full.sum_count.tolist() == [32 * 12 * 255]  # 97920 > 32767
 

@@ -77,8 +77,7 @@ def test_recorded_actions_in_the_twin_begin_where_they_were_recorded(dataset: Pa
         np.array(found[f"/{root}/curves/observation/state/left_joint_2_rad"]["Scalars:scalars"].values)[:, 0]
         for root in "ab"
     )
-    assert len(a) == len(b) == Dataset(dataset).num_rows(0)
-    assert np.abs(a - b)[:10].max() < 2e-3
+    assert len(a) == len(b) == Dataset(dataset).num_rows(0) and np.abs(a - b)[:10].max() < 2e-3
     assert 0.01 < np.abs(a - b).max() < 0.3
     assert "/b/touch/sum/left_a" not in found, "an empty bench has nothing to touch"
     page = found["/pair"]["TextDocument:text"].values[0][0]

@@ -38,7 +38,7 @@ NEEDED: Mapping[Law, tuple[str, ...]] = {
 }
 """Law → fields of ``DriveLaw`` that it requires."""
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4  # Range of the physics step [s]
-OF_LOOP_S = 2.5e-4  # Shortest step that the period of a loop asks for [s]: a choice, for the time of a simulation
+OF_LOOP_S = 2.5e-4  # For loops with shorter periods the step is this [s]: a choice that limits the time of a simulation
 STEP_SHARE = 0.05
 """Physics step as a share of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
 WINDING_WITHIN = 3.0
@@ -177,8 +177,15 @@ class DriveLaw:
         return found
 
     def timestep_s(self, rate_hz: float, inertia: float, held: float, loop_hz: float | None) -> float:
-        """Physics step [s] for rows at ``rate_hz``, an inertia [kg·m²], the stiffness that holds law effort [N·m/rad], and the
-        rate of the drive's loop that the file states: what a late target does to the effort of a row shows in each period."""
+        """Physics step of the one-joint model [s], of which a whole number fits between two rows of a recording.
+
+        Args:
+            rate_hz: rows of the recording in a second.
+            inertia: of the joint [kg·m²].
+            held: stiffness that holds the joint at its measured position, for law ``effort`` [N·m/rad].
+            loop_hz: rate of the drive's loop that the file states; None if it states none. A step is at most one period long,
+                so that a target that arrives between two rows acts in the right period.
+        """
         damping = self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         wanted = min(wanted, max(1.0 / loop_hz, OF_LOOP_S)) if loop_hz else wanted

@@ -43,12 +43,12 @@ class Rigid(NamedTuple):
 
 
 class PointMass(NamedTuple):
-    """A mass rigidly fixed to a body, which the controller's gravity compensation leaves out; a point if ``spread_m2`` is 0."""
+    """A mass that is fixed to a body, and that the controller's gravity compensation does not carry."""
 
     mass_kg: float
     body: int  # Id of the body
     place_m: tuple[float, float, float]  # Place of its centre in the body's frame [m]
-    spread_m2: np.ndarray = np.zeros((3, 3))  # (3, 3) mean of r rᵀ [m²], r from its centre, body frame
+    spread_m2: np.ndarray = np.zeros((3, 3))  # (3, 3) mean of r rᵀ [m²], r from its centre, body frame; 0: a point
 
 
 class MassTorque(NamedTuple):
@@ -85,7 +85,7 @@ class RigidJoint(ABC):
     """Known fields of ``drive_numbers.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
-    stated_age_s: float = 0.0  # Share of it that the machine's file states beside the loop's [s]
+    stated_age_s: float = 0.0  # Part of ``position_age_s`` that the machine's file states beyond half a loop period [s]
     speed_delay_s: float = 0.0  # Delay of the measured velocity in the controller [s]
     exact_timing: ClassVar[bool] = False
     """Whether the age of the position is fitted if gains are commanded: at 3.7 rad/s half a millisecond makes 18 noise floors of

@@ -102,8 +102,8 @@ class AxisConfig(DriveLaw):
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
         if not self.speed_late_s >= (newest := -0.5 / self.loop_hz if self.loop_hz else 0.0):
             raise TaccorlError(
-                f"axis.speed_late_s: is {self.speed_late_s:g}, and no speed is newer than {newest:g}, minus half a period of the "
-                "loop (loop_hz); correct it"
+                f"axis.speed_late_s: is {self.speed_late_s:g} s; write at least {newest:g} s, minus half a period of "
+                "loop_hz: the value of a measured speed"
             )
         self.check_law("axis")
         self.check_known("axis", {e.name: [p.name for p in registry.get(e.name).parameters()] for e in self.effects})
@@ -257,7 +257,8 @@ class DrivenAxis(DriveJoint):
     keeps_times: ClassVar[bool] = True
 
     def __init__(self, config: AxisConfig, stated: AxisConfig | None = None) -> None:
-        """``stated``: the file's axis, if ``config`` has fitted numbers, which change no physics step by their loop's rate."""
+        """``stated``: axis as its file has it, if numbers of ``config`` are fitted; a fitted ``loop_hz`` does not change the
+        physics step."""
         super().__init__(config, config.name, config.unit, config.loop_hz, config.command_hz)
         self.config, self._stated, self.target_late_s = config, stated or config, config.target_late_s
         late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0

@@ -35,7 +35,7 @@ REMOVABLE = 0.95
 """Largest share of a body's mass that a ``payload`` below 0 may remove. A choice: what is left must be above 0."""
 _LEAST_REACH_M = 0.05
 MOST_EARLY_S = 0.01
-"""Bound of a position's age below that of the loop. A choice, beyond the periods of all loops."""
+"""``position_age_s`` of a file must be above minus this value [s]. A choice: longer than the period of any drive's loop."""
 _ALONG = 0.9999  # least cosine between axes that count as parallel
 _HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
 
@@ -60,12 +60,12 @@ class JointConfig(DriveLaw):
     FITTED: ClassVar[tuple[str, ...]] = (*DriveLaw.FITTED, "effort_scale", "speed_delay_s", "position_age_s")
 
     def __post_init__(self) -> None:
-        check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",))
+        check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",), finite=("position_age_s",))
         optional = ("loop_hz", "command_hz")
         check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
         if not self.position_age_s > -MOST_EARLY_S:
             raise TaccorlError(
-                f"joint.position_age_s: is {self.position_age_s:g}; an age above −{MOST_EARLY_S:g} s is expected"
+                f"joint.position_age_s: is {self.position_age_s:g} s; write a value above −{MOST_EARLY_S:g} s"
             )
         self.check_law("joint")
         self.check_known("joint", {e.name: [p.name for p in e.parameters()] for e in self.effects})

@@ -35,7 +35,8 @@ STATED = {
 """Always fitted number that a file can state → group of numbers that are judged together. Not here: gains that nobody knows and
 that are fitted, and numbers of cells, pads and recordings, whose refit is expected."""
 TIMES = {"speed_delay_s": "speed", "speed_late_s": "speed", "position_age_s": "position", "target_late_s": "target"}
-"""Likewise times of a drive, which are fitted beside every choice of the fewest numbers."""
+"""Delays of the drive, which are always fitted and may be stated in the machine's file → group, as in ``STATED``. They stay free
+in every fit of ``_fewest``."""
 NEGLIGIBLE = 0.01
 """If, with the added effects, a number is fitted within this share of the file's value, its change is not reported. A choice."""
 BACK = 0.1
@@ -95,7 +96,8 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[tuple
 
 
 Off = list[tuple[list[Free], float]]
-"""Groups of numbers, each with the validation error [noise floors] if the group has the values of the file."""
+"""Groups of numbers of the machine's file that are wrong, each with the validation error [noise floors] of a fit in which the
+group keeps the file's values."""
 
 
 def _off(fits: Fits, model: Fit) -> Off:
@@ -117,9 +119,9 @@ def _off(fits: Fits, model: Fit) -> Off:
 
 
 def _fewest(fits: Fits, model: Fit, given: Values) -> tuple[Off, Fit, tuple[str, ...]] | None:
-    """Search for the fewest numbers of the file, at most two, whose fit explains as much as ``model`` with all others as in the
-    file. Returns these numbers, the fit, and a text for each number that does as well in place of the last one; None if
-    more than two are needed. ``given``: values of the file."""
+    """Find at most two numbers, as few as possible, of the machine's file such that a fit of these alone, all others as the file
+    states them, explains the recordings as well as ``model``. Returns these numbers, the fit, and a text for each number that
+    does as well as the last one; None if two are too few. ``given``: values of the file."""
     every = [f for f in fits.problem.base if f.name in STATED] + [
         f for n in fits.present for f in fits.problem.candidates[n].frees
     ]
@@ -158,7 +160,7 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     names = {f.name for f in model.frees}
     stated = STATED | TIMES | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
     stated |= {} if fits.problem.other_gain is None else {fits.problem.other_gain.name: "gain"}
-    # Of a drive whose gains are not known, constant torque and delay of the speed are not either.
+    # Where the gains are unknown, fitted values of the constant torque and of the speed's delay are expected to differ.
     unknown = {"torque_ff", *(("speed_delay_s",) if "loop_s" not in names else ())} if "kp" in names else ()
     groups: dict[str, list[Free]] = {}
     for f in model.frees:

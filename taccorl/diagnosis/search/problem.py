@@ -45,7 +45,7 @@ class Free:
     """True: the number may be absent while its effect is there (``Effect.optional``). It is fitted from starts above 0 only, and
     otherwise stays at 0."""
     unless: str = ""
-    """Name of an effect that makes this number superfluous: in a fit with that effect the number is held at ``start``."""
+    """Name of an effect with the same influence on the recordings: in a fit with that effect this number is held at ``start``."""
 
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /

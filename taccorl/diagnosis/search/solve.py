@@ -146,7 +146,7 @@ def solved(
     without: Sequence[str] = (),
     progress: Progress = no_progress,
 ) -> PartFinding:
-    """Search for the effect that is missing in one part (``solve``), with the recordings that ``problem`` holds.
+    """Call ``solve`` for one joint, axis or pad, with the fit, validation and test recordings of ``problem``.
 
     Args:
         part: name of the part.

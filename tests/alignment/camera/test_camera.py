@@ -49,8 +49,7 @@ def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off_and_held_out_frames_
     truth, fit = made(camera)[0], fitted(camera)
     angle_deg, distance_mm = drawn.pose_error(fit.offset, truth)
     assert fit.converged, fit.problems
-    assert drawn.pose_error(fit.start, truth) == pytest.approx((2.7, 25.0))
-    assert angle_deg < 0.3
+    assert drawn.pose_error(fit.start, truth) == pytest.approx((2.7, 25.0)) and angle_deg < 0.3
     assert distance_mm < 4.0
     assert (np.abs(fit.offset - truth) < fit.half_width).all()
     assert fit.num_held_out == 4  # the fourth and the eighth frame, and the two stages

@@ -14,8 +14,7 @@ def test_the_outline_of_a_square_is_where_the_square_is():
     bodies, depth = np.zeros((60, 80), int), np.full((60, 80), np.inf)
     bodies[20:40, 30:50], depth[20:40, 30:50] = 5, 0.7
     edges = twin_edges(bodies, depth, SMALL)
-    assert len(edges.points) == 80
-    assert (edges.bodies == 5).all()
+    assert len(edges.points) == 80 and (edges.bodies == 5).all()
     np.testing.assert_allclose(edges.points[:, 2], -0.7)
     u = SMALL.cx_px + SMALL.fx_px * edges.points[:, 0] / 0.7
     v = SMALL.cy_px - SMALL.fy_px * edges.points[:, 1] / 0.7

@@ -40,8 +40,7 @@ def episode() -> Episode:
 @pytest.mark.slow
 def test_a_camera_is_calibrated_from_an_episode():
     frames = camera_frames(episode(), "front", 10)
-    assert frames.pictures.shape[1:] == (224, 224, 3)
-    assert frames.joints.shape == (len(frames.pictures), 14)
+    assert frames.pictures.shape[1:] == (224, 224, 3) and frames.joints.shape == (len(frames.pictures), 14)
     fit = calibrate_camera(frames, TwinConfig(), "front")
     angle_deg, distance_mm = pose_error(fit.offset, TRUTH)
     assert fit.converged, fit.problems

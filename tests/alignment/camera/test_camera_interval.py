@@ -72,8 +72,7 @@ def test_the_worst_direction_is_the_longest_axis_and_is_put_in_words():
     noise[1, 3] = noise[3, 1] = 0.99 * np.deg2rad(3.0) * 0.04  # a turn and a shift that look alike
     width, words = Covariance(noise=noise, twin=np.zeros((6, 6))).worst()
     # In units of 0.3° and 4 mm both are 10: [[100, 99], [99, 100]] has the eigenvalue 199.
-    assert width == pytest.approx(1.96 * np.sqrt(199))
-    assert "turn about up (±5.88°)" in words
+    assert width == pytest.approx(1.96 * np.sqrt(199)) and "turn about up (±5.88°)" in words
     assert "shift right (±78.4 mm)" in words
     assert "back" not in words
 

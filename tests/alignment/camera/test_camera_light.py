@@ -22,8 +22,7 @@ def test_gain_gamma_and_blur_are_found():
     seen = np.pad(soft + rng.normal(0, 3, inside.shape), ((0, 0), (28, 28), (0, 0), (0, 0)))
     pictures = np.clip(np.round(seen), 0, 255).astype(np.uint8)
     fit = camera_light(CameraFrames(pictures=pictures, joints=joints), TwinConfig(), "front")
-    assert fit.gain == pytest.approx(0.8, rel=0.05)
-    assert fit.gamma == pytest.approx(1.3, rel=0.05)
+    assert fit.gain == pytest.approx(0.8, rel=0.05) and fit.gamma == pytest.approx(1.3, rel=0.05)
     assert fit.blur_px == pytest.approx(1.2, abs=0.25)
     assert fit.grey_after < 0.2 * fit.grey_before
 

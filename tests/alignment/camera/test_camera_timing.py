@@ -21,8 +21,7 @@ def test_latency_is_found_within_its_interval_and_10_ms(camera: str):
     config = TwinConfig()
     config.cameras = [dataclasses.replace(c, recording_size=(120, 160)) for c in config.cameras]
     fit = camera_latency(iter(pictures), time_s, joints, config, camera)
-    assert not fit.problems
-    assert fit.latency_s == pytest.approx(late_s, abs=0.010)
+    assert not fit.problems and fit.latency_s == pytest.approx(late_s, abs=0.010)
     assert fit.interval_s[0] - 0.003 <= late_s <= fit.interval_s[1] + 0.003
     other = moving_joints(np.random.default_rng(motion + 1), time_s)
     assert "otherwise than the arms move" in camera_latency(iter(pictures), time_s, other, config, camera).problems[0]

@@ -109,8 +109,9 @@ def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(ax
 
 
 def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of_the_loop():
-    """Rows of 1 ms, a loop of 2 kHz, targets 1.5 ms late: rows show the force of the period before them. With steps of 1 ms, in
-    which such a target is half of the one before, the effort is off by 0.29 N·m (0.006). A fitted rate changes no step."""
+    """A row every 1 ms, a loop of 2 kHz, targets that act 1.5 ms after their row. The logged effort of a row is the torque of the
+    loop period before it. The model's effort is off by 0.006 N·m with steps of one loop period (0.5 ms), and by 0.29 N·m with
+    steps of 1 ms, in which old and new target are averaged. A fitted loop rate must not change the step."""
     axis = AxisConfig(name="servo", unit="rad", inertia=0.04, kp=40.0, kd=2.0, loop_hz=2000.0, target_late_s=1.5e-3)
     target = 0.3 * np.sin(2 * np.pi * (2.0 + 8.0 * np.arange(800) / 800) * np.arange(800) / 1000)
     q = v = seen = asked = 0.0

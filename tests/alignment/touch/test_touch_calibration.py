@@ -40,8 +40,7 @@ def test_the_noise_is_found_where_nothing_touches(presses: list[TouchMotion]) ->
 
 
 def test_stiffness_and_damping_are_recovered_within_their_intervals(found: TouchCalibration) -> None:
-    assert found.trouble == ""
-    assert found.stiffness.value == pytest.approx(K_N, rel=0.003)
+    assert found.trouble == "" and found.stiffness.value == pytest.approx(K_N, rel=0.003)
     assert found.damping.value == pytest.approx(K_D, rel=0.03)
     # A smoothed opening cuts a press's corners by some µm, which noise alone knows nothing of: 4 standard errors
     for number, truth in ((found.stiffness, K_N), (found.damping, K_D)):

@@ -49,8 +49,7 @@ def test_counts_of_the_law_are_those_that_were_made_by_other_arithmetic(motion: 
     left = model.counts(motion, model.simulate(motion, K_N, K_D)) - motion.measured
     assert np.abs(left).mean() < 0.05
     touched = motion.depth()[0] > 0
-    assert np.sqrt(np.mean(np.square(left[touched]))) < 0.6
-    assert np.abs(left).max() < 6
+    assert np.sqrt(np.mean(np.square(left[touched]))) < 0.6 and np.abs(left).max() < 6
 
 
 def test_rate_is_the_derivative_of_depth(motion: TouchMotion) -> None:

@@ -389,7 +389,7 @@ def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows:
 
 
 def test_a_speed_that_is_newer_than_a_measured_one_is_refused():
-    with pytest.raises(TaccorlError, match=r"is -0\.0006, and no speed is newer than -0\.0005"):
+    with pytest.raises(TaccorlError, match=r"is -0\.0006 s; write at least -0\.0005 s"):
         dataclasses.replace(TIMED, speed_late_s=-6e-4)
 
 

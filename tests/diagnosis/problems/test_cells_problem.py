@@ -118,7 +118,8 @@ def test_the_interval_of_a_lag_contains_the_lag_of_a_sensor_simulated_at_10_khz(
     d = diagnose(problem, problem.fit, problem.validation, (), start=problem.start)
     assert d.names == ("touch_lag",)
     low, high = (d.effects[0].interval or {})["time_constant_s"]
-    assert low <= lag_s <= high, (low, high) and high - low < 2e-3
+    assert low <= lag_s <= high, (low, high)
+    assert high - low < 2e-3
 
 
 def test_temperature_changes_gain_and_zero_about_20_degrees():
