@@ -58,7 +58,7 @@ improve() { # NUMBER TWIN STAGE [BETA]
   for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
     stage=$([ "$scored_of" = "$policies/$2" ] && echo start || echo "$3")
     score=$out/score_${scored}_train_8_clear_nothing_$stage
-    if [ "$3" = ppo ] || [ "$scored_of" != "$policies/$2" ]; then
+    if [[ "$3" = ppo && "$2" != *untrained* ]] || [ "$scored_of" != "$policies/$2" ]; then
       OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task="$task" \
         --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=$(((each + 1) / 2)) --failures=0 \
         --out="$score" >"$score.log" 2>&1
@@ -78,6 +78,9 @@ about |= {"real": int(real), "sim_weight": learnt["policy"]["sim_weight"]} if re
 about |= {} if stage == "start" else {"beta": float(beta)}
 noise = re.search(r"over (\d+) episodes: ([\d.]+)% without noise, ([\d.]+)% with", Path(log).read_text())
 about |= {"noise": dict(zip(("n", "without", "with"), map(float, noise.groups())))} if noise and stage != "start" else {}
+if stage != "start":
+    progress = (Path(log).with_suffix("") / "progress.jsonl").read_text().splitlines()
+    about["updates"] = sum(json.loads(line)["actor_steps"] > 0 for line in progress)  # iterations that changed the policy
 (Path(score) / "settings.json").write_text(json.dumps(about | {"stage": stage}))
 P
     fi

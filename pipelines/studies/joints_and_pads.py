@@ -118,15 +118,8 @@ def run(job: Job) -> dict[str, Any]:
     made = recordings(case, job.design)
     recorded = time.process_time()
     problem = JointProblem(case.twin, case.signal, made, gains="fitted", effort=how.effort)
-    found = diagnose(
-        problem,
-        problem.fit,
-        problem.validation,
-        problem.test,
-        start=problem.start,
-        without=job.without,
-        config=SearchConfig(max_effects=len(job.hidden) + 1),
-    )
+    sides, config = (problem.fit, problem.validation, problem.test), SearchConfig(max_effects=len(job.hidden) + 1)
+    found = diagnose(problem, *sides, start=problem.start, without=job.without, config=config)
     done = time.process_time()
     truth = case.values()
     if how.loaded:  # some millimetres off its place a mass adds a constant torque of its own

@@ -45,16 +45,8 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
         measurements = read_measurements(Path(name) / "swings", units={"servo": "rad"})
     began = time.process_time()
     problem = AxisProblem(axis, measurements)
-    config = SearchConfig(max_effects=1)
-    d = diagnose(
-        problem,
-        problem.fit,
-        problem.validation,
-        problem.test,
-        start=problem.start,
-        present=problem.present,
-        config=config,
-    )
+    sides, config = (problem.fit, problem.validation, problem.test), SearchConfig(max_effects=1)
+    d = diagnose(problem, *sides, start=problem.start, present=problem.present, config=config)
     added = next((name for name in d.names if name not in d.present), None)
     beside = {*d.rivals.get(added, ()), *effects.get(added).near_twins} if added else set()
     mended = axis.with_numbers(d.base)

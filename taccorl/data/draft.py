@@ -25,10 +25,8 @@ YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 """Words that YAML does not read as text unless they are quoted."""
 PICTURE_SHAPE = (224, 224, 3)  # Of pictures in a drafted dataset: the input size of π0.5, to which they are letterboxed
 FPS = 30  # Greatest row rate of a draft with pictures [Hz], and that of one with neither pictures nor positions
-ROW_CLOCK_READERS = (
-    "hdf5",
-    "lerobot",
-)  # Of rows without times: their drafts state ``lead_frames``, the row of a command
+# Of rows without times: their drafts state ``lead_frames``, the row of a command
+ROW_CLOCK_READERS = ("hdf5", "lerobot")
 ACTION_TIME = "action_time: next_row   # action of row t: the last command sent before row t + 1"
 ROW_ACTION_TIME = (
     "action_time: this_row   # action of row t: sent right after the observation of row t, as by LeRobot's record loop; "

@@ -223,10 +223,8 @@ FROZEN_COMMAND_S = 1.0
 """Least time of a command that stands still while its joint leaves it [s]; slow ones are approached."""
 SETTLED_S = 0.3
 """Time after a command's last change in which its joint may move in any way [s]: the highest plausible lag."""
-SCALES = (
-    0.7,
-    1.07,
-)  # Plausible motion per commanded motion: soft servos lag behind fast commands, none exceeds slow ones
+# Plausible motion per commanded motion: soft servos lag behind fast commands, none exceeds slow ones
+SCALES = (0.7, 1.07)
 SCALE_SURE = 0.98  # Least correlation of state and command at which their scale is judged
 SCALE_GAIN = 3.0  # A scale is reported if the deviation from the command is this many times that from the scaled one
 OTHER_MOVES = 0.02  # Least change of an element of unknown unit that counts as motion, as a share of its largest value

@@ -76,9 +76,8 @@ def _judged(f: Finding) -> str:
 
 
 def _in_twin(d: Diagnosis) -> str:
-    times = (
-        d.base["kp"] / d.start["kp"] if "kp" in d.base else 1.0
-    )  # a law's own kp may be another one, as of a cascade
+    # a law's own kp may be another one, as of a cascade
+    times = d.base["kp"] / d.start["kp"] if "kp" in d.base else 1.0
     return "in the twin" if times == 1.0 else f"in the twin, with kp {times:.4g} times the stated one"
 
 

@@ -369,9 +369,8 @@ def test_a_recording_tells_the_trajectory_at_its_own_times(told):
     _, recorder, story = told
     rows = recorder.episode("x", {}).arrays["observation.state"]
     time_s = LEAD_S + np.arange(len(rows)) / 30
-    np.testing.assert_allclose(
-        story.at("state", time_s), rows, atol=2e-4
-    )  # between 200 Hz samples, moving at up to 1 rad/s
+    # between 200 Hz samples, moving at up to 1 rad/s
+    np.testing.assert_allclose(story.at("state", time_s), rows, atol=2e-4)
     np.testing.assert_allclose(story.at("state", np.array([0.0, LEAD_S / 2]))[0], rows[0], atol=1e-6)  # rest before
 
 

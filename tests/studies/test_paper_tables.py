@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipelines.paper_tables import gain, main, page, read, share, take, transfer
+from pipelines.paper_tables import gain, main, page, read, share, take, touch_gain, transfer
 
 ABOUT = {"sensors": "touch", "demonstrations": 9, "seed": 1, "twin": "", "scored_in": "", "steps": 5}
 ONE = {"task": "puzzle", "pictures": "clear", "hidden": "", "n": 96, "successes": 0}
@@ -27,6 +27,10 @@ def test_cells_are_what_was_counted():
     assert gain({"nominal": rows[:1], "mended": rows[1:]}) == "+14; p = 2e-05"  # Fisher
     assert gain({"randomised": rows[:1], "mended": rows[1:]}, "randomised").startswith("+14")
     assert gain({"mended": rows[1:]}, "randomised") == "not run"
+    half, full = [ROW | {"successes": 48}], [ROW | {"successes": 96}]
+    # Wilson: 96.15 … 100 and 40.20 … 59.80; 25 - √(3.85² + 3 · 9.80²) / 2, 25 + √(3 · 9.80²) / 2
+    assert touch_gain([full, half], [half, half]) == "+25 (+16 … +33)"
+    assert touch_gain([full, half], [half, []]) == "not run"
     six = [[ROW | {"n": 100, "successes": k + 10 * j} for j in range(3)] for k in (0, 30)]
     assert gain({"nominal": six[0], "mended": six[1]}).endswith("; +7 … +53")  # 30 ± 2.776 · √(200 / 3), Welch
     moved = [row | {"scored_in": "late_cd34"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]]

@@ -93,9 +93,8 @@ def test_a_tie_of_an_effect_that_is_not_there_any_more_says_nothing():
 def test_silently_wrong_is_at_the_floor_with_another_effect_and_no_word_of_the_true_one():
     assert silently_wrong(row(("backlash",), ("cogging",)))
     assert not silently_wrong(row(("backlash",), ("cogging",), status="something_else"))
-    assert silently_wrong(
-        row(("backlash",), ("cogging",), status="gains_moved")
-    )  # which says nothing of what is hidden
+    # which says nothing of what is hidden
+    assert silently_wrong(row(("backlash",), ("cogging",), status="gains_moved"))
     assert not silently_wrong(row(("backlash", "slew_limit"), ("slew_limit", "cogging")))
     assert not silently_wrong(row(("backlash",), (), status="nothing_missing"))
 

@@ -41,9 +41,8 @@ def test_motions_keep_limits_and_speed_and_begin_and_end_at_rest(motion, joint):
         target = motion.target(room)
         low, high = ROBOT.links[joint - 1].range_rad
         assert low < target.min() and target.max() < high
-        assert (
-            np.abs(np.diff(target)).max() * motions.RATE_HZ < 1.3 * motions.SPEED_RAD_PER_S
-        )  # amplitudes change within the chirp, too
+        # amplitudes change within the chirp, too
+        assert np.abs(np.diff(target)).max() * motions.RATE_HZ < 1.3 * motions.SPEED_RAD_PER_S
         rest = round(motions.REST_S * motions.RATE_HZ)
         assert np.ptp(target[:rest]) == 0 and np.ptp(target[-rest:]) < 1e-3
         assert np.ptp(target) > 0.03

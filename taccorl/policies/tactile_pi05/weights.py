@@ -48,9 +48,8 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
     """Load plain π0.5 weights into ``policy``: all except those of touch. The language heads of the source are not used.
     ``source``: as for ``find_weights``. Raises TaccorlError: it cannot be read, or does not match; nothing is loaded then."""
     stored = load_file(find_weights(source, said := f"--policy.base_checkpoint={source}"))
-    fixed = policy._fix_pytorch_state_dict_keys(
-        stored, policy.config
-    )  # older names; the embedding out of the language head
+    # older names; the embedding out of the language head
+    fixed = policy._fix_pytorch_state_dict_keys(stored, policy.config)
     weights = {k if k.startswith("model.") else f"model.{k}": v for k, v in fixed.items() if not k.endswith(_UNUSED)}
     _load(policy, weights, said, may_miss=_TACTILE)
 

@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-_GAP_S = (
-    1 / 60
-)  # states closer than this are not kept beside each other; between two, everything goes in a straight line
+# states closer than this are not kept beside each other; between two, everything goes in a straight line
+_GAP_S = 1 / 60
 
 
 class PastScene:

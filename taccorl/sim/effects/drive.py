@@ -104,9 +104,8 @@ class IntegralAction(JointEffect):
             actuator.biasprm[:3] = [bias[0] / scale, -kp / scale, bias[2] / scale**2]
 
 
-@effect(
-    "speed_delay", slot="load", needs="velocity"
-)  # MuJoCo reduces an inertia, when all other effects on it are there
+# MuJoCo reduces an inertia, when all other effects on it are there
+@effect("speed_delay", slot="load", needs="velocity")
 class SpeedDelay(JointEffect):
     """Delay τ of the velocity in the controller: −K_d (q̇ − τ q̈), to first order in τ an inertia of −K_d τ.
 

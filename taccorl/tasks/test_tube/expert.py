@@ -22,11 +22,8 @@ _GRIP_M = (0.0600, 0.0645)  # from the tube's bottom: clear of the stand's block
 _HOVER_M = (0.400, 0.005, 0.110)  # of the upright tube's bottom
 _LIFT_M = 0.06
 _IN_STAND_M = 0.004
-_UPRIGHT_RAD, _ABOVE_HOLE_M, _CLEAR_M = (
-    0.5,
-    0.05,
-    0.02,
-)  # of a tube that can be brought to the hole's mouth from where it is
+# of a tube that can be brought to the hole's mouth from where it is
+_UPRIGHT_RAD, _ABOVE_HOLE_M, _CLEAR_M = (0.5, 0.05, 0.02)
 _HEADING_RAD = np.deg2rad(55)  # of the hand above the rack
 _TURN_RADPS = 0.8  # fastest joint while the tube turns, on average
 _GIVE_WAY = 0.25  # at least: both plates of the rack hold the tube, and a stiff wrist would wedge it between them

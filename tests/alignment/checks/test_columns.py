@@ -99,7 +99,7 @@ def test_a_joint_that_is_turned_in_all_columns_is_named_where_its_weight_shows_i
 
 
 @pytest.mark.parametrize("place", ["-.05 0 .12", "-.05 0 -.12", ".12 0 -.05"])
-@pytest.mark.parametrize("carried", ["1.0", "0.0"])
+@pytest.mark.parametrize("carried", ["1.0", pytest.param("0.0", marks=pytest.mark.slow)])
 def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, carried: str, tmp_path: Path) -> None:
     """The law of the drives holds whatever turns: only a reversed effort breaks it, at its own joint."""
     (tmp_path / "model").mkdir()
@@ -152,13 +152,13 @@ def test_efforts_show_the_gains_of_drives(machine: RobotMachine, kp: int, kd: in
 
 
 EXCHANGED = ("swapped_joints", "elbow ↔ shoulder")
-HIDDEN: list[tuple[str, dict[str, float], set[tuple[str, str]]]] = [
+HIDDEN = [
     ("command_delay", {"delay_s": 0.03}, set()),
-    ("command_lag", {"time_constant_s": 0.05}, set()),
     ("coulomb_friction", {"torque_nm": 3.0}, {EXCHANGED}),
-    ("torque_saturation", {"torque_max_nm": 4.0}, set()),
-    ("unbalance", {"torque_nm": 3.0, "hangs_at_rad": 1.0}, {EXCHANGED}),
-    ("armature", {"added_kgm2": 0.2}, {EXCHANGED}),
+    pytest.param("command_lag", {"time_constant_s": 0.05}, set(), marks=pytest.mark.slow),
+    pytest.param("torque_saturation", {"torque_max_nm": 4.0}, set(), marks=pytest.mark.slow),
+    pytest.param("unbalance", {"torque_nm": 3.0, "hangs_at_rad": 1.0}, {EXCHANGED}, marks=pytest.mark.slow),
+    pytest.param("armature", {"added_kgm2": 0.2}, {EXCHANGED}, marks=pytest.mark.slow),
 ]
 """Effect, its numbers, and what is said of exchanged columns besides: laws show those where the effect is not in the drive."""
 
@@ -176,9 +176,8 @@ def test_effects_are_no_exchange_and_no_turned_sign_and_hide_none(
     assert not said & {"swapped_joints", "exchanged_target", "wrong_sign", "reversed"}
     unseen = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in made]
     for own in (made, unseen):
-        assert not any(
-            machine.check(Measurements(tuple(own))).values()
-        )  # no other gains, time or sign of efforts either
+        # no other gains, time or sign of efforts either
+        assert not any(machine.check(Measurements(tuple(own))).values())
     for columns in (COLUMNS, COLUMNS[:2]):
         found = errors(machine, [changed(m, columns, [0, 2, 1]) for m in made])
         assert found == named or not named, columns

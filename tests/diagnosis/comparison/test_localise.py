@@ -72,9 +72,8 @@ def test_high_load_and_contact_are_read_off_torque_and_pads():
     cells = cells_of(residual, position, torque=torque, touched=touched)
     assert cells["in contact"].share_of_error == pytest.approx(1.0)
     assert cells["no contact"].ratio == 0.0
-    assert cells["high load"].share_of_time == pytest.approx(
-        0.25, abs=0.01
-    )  # the highest quarter, within the first 2 s and beyond
+    # the highest quarter, within the first 2 s and beyond
+    assert cells["high load"].share_of_time == pytest.approx(0.25, abs=0.01)
     assert "in contact" not in cells_of(residual, position), "no pads: neither regime"
 
 

@@ -116,9 +116,8 @@ def test_two_effects_that_are_missing_at_once_are_both_found_and_nothing_else() 
     """Dry friction and armature in a joint of the leg. Alone, Stribeck friction removes more than Coulomb friction: its further
     numbers fit a part of the armature."""
     row = pair_study.run((90001, "coulomb_friction+armature"))
-    assert (
-        row["left"]["coulomb_friction"] > 20.0 and row["left"]["armature"] > 5.0
-    )  # noise floors, with the other one fitted
+    # noise floors, with the other one fitted
+    assert row["left"]["coulomb_friction"] > 20.0 and row["left"]["armature"] > 5.0
     assert row["first"] == "coulomb_friction" and set(row["found"]) == {"coulomb_friction", "armature"}, row
     assert pair_study.exactly(row) and not pair_study.exactly(row | {"found": ["stribeck_friction", "armature"]})
     assert row["status"] == "at_floor" and row["confidence"] != "low"
