@@ -26,9 +26,9 @@ def loading_speed() -> Iterator[Row]:
 
     from taccorl.training.reading import FastReader
 
-    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as folder:
         for label, cameras, goal in (("3 × 224² video", 3, "≥ 2"), ("no video", 0, "≥ 5")):
-            root = _write(Path(name) / f"cameras_{cameras}", cameras)
+            root = _write(Path(folder) / f"cameras_{cameras}", cameras)
             loaders = {reader: _loader(root, reader) for reader in (FastReader, DatasetReader)}
             backend = loaders[FastReader].dataset.reader._video_backend  # pyright: ignore[reportAttributeAccessIssue]
             # One epoch of each in turn: other work on the machine meets both. The first, in which workers start, is not counted.
@@ -44,7 +44,7 @@ def loading_speed() -> Iterator[Row]:
             yield Row.of(ratios, by=mean, name=name, unit="×", goal=goal, **rival)
             yield Row.of(ours, by=mean, name=f"rows per second, {shown}", unit="rows/s")
             if cameras:
-                yield from _cached(root, Path(name) / "store", mean(stock))
+                yield from _cached(root, Path(folder) / "store", mean(stock))
 
 
 def _cached(root: Path, store: Path, stock: float) -> Iterator[Row]:

@@ -52,7 +52,7 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
         notes.append("or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound")
     for signal in dict.fromkeys(s.signal for s in scores if s.kind == "effort" and c.of(s.signal)):
         words = ", ".join(f"{use} {' → '.join(_together(found, signal, use) for found in every)}" for use in c.uses)
-        notes.append(f"{signal}: position and effort together: {words} × floor (diagnose takes each recording's own)")
+        notes.append(f"{signal}: position and effort together: {words} × floor, as diagnose counts")
     heads += ["NRMSE", "noise floor", "n"]
     return Section(title="How far off", heads=heads, rows=rows, right=range(2, len(heads)), notes=notes)
 

@@ -160,14 +160,8 @@ def _add_finger(spec: mujoco.MjSpec, hand: mujoco.MjsBody, arm: str, finger: str
     body.inertia = [2e-5, 2e-5, 5e-6]
     slide = mujoco.mjtJoint.mjJNT_SLIDE
     # The armature is the gripper motor's rotor as the finger feels it; damping its gear. Neither is published.
-    body.add_joint(
-        name=f"{arm}_finger_{finger}",
-        type=slide,
-        axis=[0, side, 0],
-        range=[0, ROBOT.finger_stroke_m],
-        armature=0.1,
-        damping=5.0,
-    )
+    motor, stroke = {"armature": 0.1, "damping": 5.0}, [0, ROBOT.finger_stroke_m]
+    body.add_joint(name=f"{arm}_finger_{finger}", type=slide, axis=[0, side, 0], range=stroke, **motor)
     box = mujoco.mjtGeom.mjGEOM_BOX
     back = side * (ROBOT.pad_thickness_m + 0.0055)
     _geom(body, arm, type=box, size=[0.011, 0.005, 0.043], pos=[0, back, pad_z - 0.012], rgba=DARK)

@@ -219,12 +219,8 @@ def write_cells(case: CellsCase, folder: Path) -> int:
 
     def table(m: CellMeasurement) -> dict[str, np.ndarray]:
         readings = {f"{cell}.reading": own for cell, own in zip(config.names, m.measured.T, strict=True)}
-        return {
-            "t": m.time_s,
-            **dict(zip(load, m.target.T, strict=False)),
-            **readings,
-            "temperature_c": m.temperature_c,
-        }
+        pressed = dict(zip(load, m.target.T, strict=False))
+        return {"t": m.time_s} | pressed | readings | {"temperature_c": m.temperature_c}
 
     truth = {"data": ORIGIN, "seed": case.seed, "hidden": case.hidden, "values": case.values}
     write_tables(folder, PRESSES, spec, made, table, truth)

@@ -79,13 +79,7 @@ def card_text(dataset: Dataset) -> str:
 def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
     """As LeRobot's own card, without a licence: its owner adds that."""
     kinds = dict.fromkeys(DOMAIN_TAGS[origin.domain] for origin in origins if origin.domain)
-    tags = [
-        "LeRobot",
-        "taccorl",
-        *(["tactile"] if dataset.spec.keys("tactile") else []),
-        *kinds,
-        dataset.spec.robot_type,
-    ]
+    tags = ["LeRobot", "taccorl", *["tactile"] * bool(dataset.spec.keys("tactile")), *kinds, dataset.spec.robot_type]
     return {
         "task_categories": ["robotics"],
         "tags": [tag for tag in dict.fromkeys(tags) if tag],

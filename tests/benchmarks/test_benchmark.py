@@ -211,7 +211,7 @@ def test_a_bare_word_would_run_everything_and_is_refused() -> None:
 MODULES = [m.name for m in pkgutil.iter_modules(pipelines.benchmarks.__path__) if not m.name.startswith("__")]
 for _name in MODULES:
     importlib.import_module(f"pipelines.benchmarks.{_name}")
-ON_A_GPU = ("full_size", "full_post_training", "physics_on_gpu")
+ON_A_GPU = ("full_size", "full_adapters", "full_post_training", "physics_on_gpu")
 SUITE = """
 def test_one(record_property):
     record_property("mcap: files", 2)

@@ -195,8 +195,12 @@ def test_a_number_of_the_file_that_is_off_is_the_result_and_is_written(
     assert f"{name} of slide {before:g} → {c['after']:.4g} {c['unit']}" in text.split("wrote diagnosis/drive.yaml")[1]
     assert Path("diagnosis/drive.yaml").read_text() == Path(f"drive+{printed[0]}.yaml").read_text()
     for changed, added, way in (
-        ([], [], "--values" if "." in name else "no effect 'inertia'"),
-        ([c], [{"effect": "viscous_friction", "damping_nms_per_rad": 1.0}], "add-effect viscous_friction"),
+        ([], [], "--values" if "." in name else "inertia is not off in that diagnosis"),
+        (
+            [c],
+            [{"effect": "viscous_friction", "damping_nms_per_rad": 1.0}],
+            f"add-effect {printed[0]},viscous_friction",
+        ),
     ):
         d |= {"changed": changed, "effects": [*d["effects"], *added]}
         Path("diagnosis/report.json").write_text(json.dumps(report))

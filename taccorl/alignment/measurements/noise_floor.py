@@ -16,6 +16,7 @@ is a lower bound, or cycles if they differ by more. The floor is never below the
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -158,6 +159,26 @@ def noise_floor(
         repeated = any(e.method in ("repeats", "cycles") for e in found)
         floors[signal] = SignalFloor(signal, kind, name, used, tuple(found), lower_bound=not repeated)
     return floors
+
+
+def floors_by_motion(
+    measurements: Sequence[Measurement], kind: Kind = "position", unexplained: Sequence[Measurement] = ()
+) -> dict[str, dict[str, SignalFloor]]:
+    """Recording → signal → floor: of its motion's recordings if it was repeated, else of all ``measurements``. That of an effort,
+    whose noise grows with gains and motion, is at least what no smooth curve explains in the recording. Arguments and errors as
+    of ``noise_floor``."""
+    roots, every = motions(measurements), noise_floor(measurements, kind, unexplained)
+    own: dict[str, dict[str, SignalFloor]] = {}
+    for root in dict.fromkeys(roots.values()):
+        group, left = ([m for m in of if roots[m.name] == root] for of in (measurements, unexplained))
+        own[root] = every | (noise_floor(group, kind, left) if len(group) > 1 else {})
+    found = {name: dict(own[root]) for name, root in roots.items()}
+    for m in measurements if kind == "effort" else ():
+        for signal, alone in noise_floor([m], kind).items():
+            for residue in (e for e in alone.estimates if e.method == "residue"):
+                if residue.value > (there := found[m.name][signal]).value:
+                    found[m.name][signal] = dataclasses.replace(there, used=residue)
+    return found
 
 
 def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:

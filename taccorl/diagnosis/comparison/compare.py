@@ -20,7 +20,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor, touch_floor
+from taccorl.alignment.measurements.noise_floor import SignalFloor, floors_by_motion, noise_floor, touch_floor
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.data.finding import Finding
@@ -39,6 +39,10 @@ from taccorl.sim.twin import TwinConfig
 
 GRIPPERS = tuple(f"{arm}_gripper" for arm in ROBOT.arms)
 """Names of the gripper signals, in the order of the arms."""
+
+
+type Floors = dict[str, dict[str, SignalFloor]]
+"""Recording → signal → noise floor."""
 
 
 def compare(
@@ -63,12 +67,12 @@ def compare(
         (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
     ]
     every = [m for _, m in uses]
-    floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
+    floors: dict[Kind, Floors] = {kind: floors_by_motion(every, kind) for kind in ("position", "effort")}
     traces: list[Trace] = []
     touches: list[TouchTrace] = []
     left_out: list[str] = []
     clock: dict[str, tuple[Finding, ...]] = {}
-    levels = {signal: floor.value for signal, floor in floors["position"].items()}
+    levels = {signal: floor.value for signal, floor in noise_floor(every).items()}
     responses = replay_all(config, every, progress)
     for (use, m), response in zip(uses, responses, strict=True):
         traces += traces_of(m, use, response, floors)
@@ -107,6 +111,7 @@ def compare_joints(
     file: str,
     effects: tuple[str, ...],
     uncertain: Sequence[str],
+    by_motion: bool,
     progress: Callable[[str, int, int], None],
 ) -> Comparison:
     """As ``compare``, for a machine whose joints have the ``laws`` of its ``file``: each is simulated alone.
@@ -114,6 +119,7 @@ def compare_joints(
     Args:
         whole: function that returns a recording with all signals of the machine.
         uncertain: joints whose drives have numbers that ``diagnose`` fits.
+        by_motion: noise floors as of ``floors_by_motion``; if false, of all recordings together.
     """
     uses: list[tuple[Use, Measurement]] = [(use, whole(m)) for use in USES for m in getattr(measurements, use)]
     every = [m for _, m in uses]
@@ -127,9 +133,12 @@ def compare_joints(
         followed = FOLLOWED * np.array([m.target_kind(s) == "effort" for s in m.signals])
         left.append(dataclasses.replace(m, effort=m.effort - followed * np.nan_to_num(response.effort)))
     left *= any("effort" in m.target_kinds for m in every)
-    floors: dict[Kind, dict[str, SignalFloor]] = {"position": noise_floor(every)}
-    floors["effort"] = noise_floor(every, "effort", left)
-    levels = {signal: floor.value for signal, floor in floors["position"].items()}
+    pooled: dict[Kind, dict[str, SignalFloor]] = {"position": noise_floor(every)}
+    pooled["effort"] = noise_floor(every, "effort", left)
+    floors: dict[Kind, Floors] = {kind: dict.fromkeys((m.name for m in every), own) for kind, own in pooled.items()}
+    if by_motion:
+        floors = {"position": floors_by_motion(every), "effort": floors_by_motion(every, "effort", left)}
+    levels = {signal: floor.value for signal, floor in pooled["position"].items()}
     for (use, m), (known, response) in zip(uses, replayed, strict=True):
         positions = m.with_position_targets(np.nan_to_num(response.reported))
         response.reported[:, [m.column(s) for s in known if laws[s].law == "effort"]] = np.nan  # held where measured
@@ -200,14 +209,15 @@ def held_up(m: Measurement) -> list[str]:
     return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
 
 
-def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
+def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, Floors]) -> list[Trace]:
     """Measured and replayed values over time: one trace for each compared signal, one for its effort if recorded. ``floors``:
-    kind → signal → noise floor; signals without one are left out."""
+    of each kind; signals without one are left out."""
     touched = in_contact(response.measurement)
     found = []
     even = response.measurement
     for signal in compared(m):
         j, arm = even.column(signal), signal.split("_", 1)[0]
+        felt = touched[:, ROBOT.arms.index(arm)] if arm in ROBOT.arms else np.zeros(even.num_rows, dtype=bool)
         columns: dict[Kind, tuple[np.ndarray, np.ndarray]] = {
             "position": (even.measured[:, j], response.reported[:, j]),
             "effort": (even.effort[:, j], response.effort[:, j]),
@@ -215,7 +225,7 @@ def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, d
         for kind, (measured, replayed) in columns.items():
             known = bool(np.isfinite(measured).any() and np.isfinite(replayed).any())
             recorded = known if kind == "position" else even.has_effort()[j]
-            if not recorded or signal not in floors[kind]:
+            if not recorded or signal not in floors[kind][m.name]:
                 continue
             unit = even.units[j] if kind == "position" else UNITS[even.units[j]][1]
             found.append(
@@ -232,10 +242,8 @@ def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, d
                     measured=measured,
                     replayed=replayed,
                     torque=response.effort[:, j],
-                    touched=touched[:, ROBOT.arms.index(arm)]
-                    if arm in ROBOT.arms
-                    else np.zeros(even.num_rows, dtype=bool),
-                    floor=floors[kind][signal],
+                    touched=felt,
+                    floor=floors[kind][m.name][signal],
                     origin=m.origin,
                 )
             )

@@ -6,6 +6,7 @@ This shows where the error is, not its cause: a delay, a payload, a wrong gain s
 Letters in shapes: T rows.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -215,10 +216,12 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
         motions = motions_of(comparison.of(signal, kind))
         squares = [m.trace.residual**2 for m in motions]
         total, rows = (float(f(np.concatenate(squares))) for f in (np.nansum, lambda s: np.isfinite(s).sum()))
-        floor = motions[0].trace.floor.value
+        levels = [np.full(len(s), m.trace.floor.value**2) for s, m in zip(squares, motions, strict=True)]
         for regime in REGIMES:
-            inside = np.concatenate([s[regime.rows(m)] for s, m in zip(squares, motions, strict=True)])
-            cells.append(cell_of(signal, kind, regime.name, inside[np.isfinite(inside)], total, rows, floor))
+            which = [regime.rows(m) & np.isfinite(s) for s, m in zip(squares, motions, strict=True)]
+            inside, level = (np.concatenate([v[w] for v, w in zip(of, which, strict=True)]) for of in (squares, levels))
+            floor = math.sqrt(level.sum() / max(len(level), 1))
+            cells.append(cell_of(signal, kind, regime.name, inside, total, rows, floor))
     return [cell for cell in cells if cell]
 
 

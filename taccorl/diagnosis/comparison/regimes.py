@@ -99,12 +99,8 @@ def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
     ]
     found = [r for r in (*pooled, *rows) if r is not None]
     coverage = _coverage(motions)
-    return RegimeErrors(
-        signal=traces[0].signal,
-        rows=tuple(found),
-        coverage=tuple(coverage),
-        remarks=(*_disagreements(found), *_gaps(coverage)),
-    )
+    remarks = (*_disagreements(found), *_gaps(coverage))
+    return RegimeErrors(signal=traces[0].signal, rows=tuple(found), coverage=tuple(coverage), remarks=remarks)
 
 
 def with_regimes(

@@ -163,7 +163,7 @@ class Score:
     nrmse: float
     """RMSE / standard deviation of the measurement."""
     floor: float
-    """Noise floor."""
+    """Noise floor, the root of the mean square over the rows where those of the recordings differ."""
     floor_words: str
     """Text of the floor, with its method."""
     lower_bound: bool
@@ -239,6 +239,12 @@ class Comparison:
 # scores ----------------------------------------------------------------------------------------------------------------
 
 
+def pooled_floor(traces: Sequence[Trace]) -> float:
+    """Root of the mean square of the floors of the measured rows of one signal, in its unit."""
+    rows = [np.isfinite(t.residual).sum() for t in traces]
+    return float(np.sqrt(np.average([t.floor.value**2 for t in traces], weights=rows if any(rows) else None)))
+
+
 def _score(traces: Sequence[Trace]) -> Score:
     first = traces[0]
     left = np.concatenate([t.residual for t in traces])
@@ -254,9 +260,9 @@ def _score(traces: Sequence[Trace]) -> Score:
         rmse=rmse,
         interval=_rms_interval(np.concatenate(sums), np.concatenate(counts)),
         nrmse=rmse / spread if spread > 0 else math.inf,
-        floor=first.floor.value,
-        floor_words=first.floor.words(),
-        lower_bound=first.floor.lower_bound,
+        floor=pooled_floor(traces),
+        floor_words=first.floor.words() + "; of each motion its own" * (len({t.floor.value for t in traces}) > 1),
+        lower_bound=any(t.floor.lower_bound for t in traces),
         n=int(np.isfinite(left).sum()),
         recordings=len(traces),
     )

@@ -91,13 +91,8 @@ class MachineSurrogate:
             | {p.name: getattr(h.effect, p.name) for p in h.effect.parameters()}
             for h in self.hidden
         ]
-        return {
-            "data": ORIGIN,
-            "seed": self.seed,
-            "part": self.ground.part,
-            "hidden": effects,
-            "numbers": dict(self.numbers),
-        }
+        about = {"data": ORIGIN, "seed": self.seed, "part": self.ground.part}
+        return about | {"hidden": effects, "numbers": dict(self.numbers)}
 
 
 def draw_machine(
@@ -153,13 +148,16 @@ def _sized(
     values: Values = (
         dict(problem.start) | {f.name: f.start for f in c.frees} | c.starts[int(rng.integers(len(c.starts)))]
     )
-    best = Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_))
+    best, tried_so = Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_)), dict[bool, float]()
     for _ in range(TRIES):
         if wanted / 1.5 <= best.floors <= 1.5 * wanted:
             break
         factor = min(max(wanted / max(best.floors, 1e-3), 0.1), 10.0)
         own = getattr(best.effect, strength.name)
+        tried_so[best.floors > wanted] = own
         new = absent + (own - absent) * factor if math.isfinite(absent) else own / factor
+        if len(tried_so) == 2:  # too weak and too strong: gains take up the effect until they are at their bounds
+            new = sum(tried_so.values()) / 2
         new = min(max(new, strength.low), strength.high)
         if new == own:
             break

@@ -106,6 +106,7 @@ class Axis(Machine):
             file=f"{self.name}.yaml",
             effects=self.effects,
             uncertain=[c.name] * (c.law == "pwm" or c.gains == "fitted"),
+            by_motion=False,
             progress=progress,
         )
 

@@ -139,6 +139,7 @@ class RobotMachine(Machine):
             file=self.robot.path.name,
             effects=self.effects,
             uncertain=[s for s, law in laws.items() if law.is_uncertain],
+            by_motion=True,
             progress=progress,
         )
 

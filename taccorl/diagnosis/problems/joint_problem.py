@@ -19,9 +19,9 @@ from taccorl.alignment.controller.joint_kernel import LANES
 from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion, first_rows
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.measurements.folder import Measurements, motions
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, noise_floor
+from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, floors_by_motion, noise_floor
 from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -131,16 +131,7 @@ class JointProblem(WithoutMaps):
         left = [unexplained(self.model, m, own) for m in everything if self._first]
         self.floors = floors_of(everything, signal, effort=self.effort, unexplained=left)[self._first :]
         """Noise floors over all recordings; a recording whose motion was repeated has its own."""
-        root = motions(everything)
-        repeated = [r for r in root.values() if sum(other == r for other in root.values()) > 1]
-        groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
-        self._own_floors = {
-            r: floors_of(group, signal, effort=self.effort, unexplained=[m for m in left if root[m.name] == r])[
-                self._first :
-            ]
-            for r, group in groups.items()
-        }
-        self._motion = root
+        self._own_floors = [floors_by_motion(everything, f.kind, left) for f in self.floors]
         sides = (measurements.fit, measurements.validation, measurements.test)
         recordings = [[self._recording(m) for m in side] for side in sides]
         self.fit, self.validation, self.test = with_regimes(recordings, everything, self.floors[0])
@@ -293,15 +284,8 @@ class JointProblem(WithoutMaps):
 
     def _recording(self, m: Measurement) -> Recording:
         kinds, motion = ("position", "effort"), motion_of(m, self.signal, self.model.joint)
-        return recording_of(m, self.signal, motion, kinds[self._first : 1 + self.effort], self._floor_values(m))
-
-    def _floor_values(self, m: Measurement) -> list[float]:
-        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains."""
-        values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
-        if self.effort:
-            residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
-            values[-1] = max([values[-1], *residue])
-        return values
+        floors = [own[m.name][self.signal].value for own in self._own_floors]
+        return recording_of(m, self.signal, motion, kinds[self._first : 1 + self.effort], floors)
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""

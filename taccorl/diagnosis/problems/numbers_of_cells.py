@@ -28,13 +28,8 @@ def numbers_apart(problem: CellsProblem, d: Diagnosis) -> list[str]:
     """A remark for each effect of ``d`` whose number differs from cell to cell, with the error that such numbers leave and the
     largest and least of them in the unit of the load; none if the diagnosis ended near the noise floor."""
     left = d.errors["after"]["validation"]
-    judged = problem.validation
-    if (
-        left <= SearchConfig().little
-        or len(problem.channels) < 2
-        or not judged
-        or problem.config.same_place_mm is not None
-    ):
+    judged, one_place = problem.validation, problem.config.same_place_mm is not None
+    if left <= SearchConfig().little or len(problem.channels) < 2 or not judged or one_place:
         return []
     remarks = []
     for k, effect in enumerate(d.effects):

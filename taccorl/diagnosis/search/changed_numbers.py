@@ -4,8 +4,8 @@ The search refits the effects of the file, and a few other numbers of it, in eve
 file, its refit removes the error, and no effect is missing: the change is then the result of the diagnosis.
 
 A change is named by the rule of the search: the fit is clearly better than the one with the number as the file has it, and all
-others refitted. Numbers can make up for each other, so they
-are returned to the file's values one after another, the least significant first, and stay there where the error hardly rises.
+others refitted, which is above the noise floor. Numbers can make up for each other, so they are returned to the file's values
+one after another, the least significant first, and stay there where the error hardly rises.
 All efforts by one factor, as of a wrong torque constant, act as another inertia does, unless weight, friction or a load is known.
 A number of the drive may have moved because an effect is missing that acts alike in these recordings, such as a weight on a
 constant torque: effects that do as well in its place are named with it (``Changed.instead``).
@@ -13,6 +13,7 @@ constant torque: effects that do as well in its place are named with it (``Chang
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -74,24 +75,14 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[tuple
             of_drive = "." not in frees[0].name
             instead = _instead(fits, model, frees, names) if of_drive else ()
             rate = "loop_s" in model.values and frees[0].name in OF_LOOP
+            changed = partial(Changed, without=without, alone=fit is not model, instead=instead, ties=ties)
             for f in frees if rate else moved or (frees if fit is model else []):
                 name, before, after, unit = f.name, float(given[f.name]), float(model.values[f.name]), f.unit
                 if rate and model.values["loop_s"] < SHORTEST_STEP_S:
                     continue  # faster than the model's own steps
                 if rate:
                     name, before, after, unit = "loop_hz", np.inf, 1.0 / max(model.values["loop_s"], 1e-9), "Hz"
-                alone = fit is not model
-                own = Changed(
-                    name=name,
-                    before=before,
-                    after=after,
-                    unit=unit,
-                    without=without,
-                    alone=alone,
-                    instead=instead,
-                    ties=ties,
-                )
-                found.setdefault(name, own)
+                found.setdefault(name, changed(name=name, before=before, after=after, unit=unit))
     return tuple(found.values()), model
 
 
@@ -111,7 +102,7 @@ def _off(fits: Fits, model: Fit) -> Off:
     for frees in groups:
         stated = {f.name: fits.given[f.name] for f in frees}
         trial = _refitted(fits, model, with_held(fits.problem, kept | stated))
-        if refusal(smaller, trial, config):
+        if refusal(smaller, trial, config) or fits.at_floor(trial):
             kept, smaller = kept | stated, trial
         else:
             found.append((frees, trial.error))

@@ -65,13 +65,8 @@ def grips_words(report: dict[str, Any]) -> str:
 def grips_warning(task: str) -> tuple[str, str]:
     """Why few grips are too few, and the command that makes many demonstrations whose grips differ."""
     words = ["taccorl", "collect", f"--task={task}", "--episodes=3500", "--source.hands.grasp_m=0.004"]
-    words += [
-        "--source.hands.grasp_rad=0.06",
-        "--source.hands.pulse_rad=0.02",
-        "--pictures=cache",
-        "--resolution=84x112",
-    ]
-    words += ["--part_poses=true", f"--out=outputs/{task}_many"]
+    words += ["--source.hands.grasp_rad=0.06", "--source.hands.pulse_rad=0.02", "--pictures=cache"]
+    words += ["--resolution=84x112", "--part_poses=true", f"--out=outputs/{task}_many"]
     why = (
         f"fewer than {FEWEST} different grips: policies learn to recognise few grips instead of measuring where a part lies in "
         "the hand: 33 % success on assembly_1 after 1000 demonstrations of 10 grips, 91 % after 1000 of the expert's, each with "
