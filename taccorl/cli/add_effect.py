@@ -130,8 +130,10 @@ def _diagnosed(
     found = {name for own in told.values() for name in own}
     for name in {*names} - found:
         if any(name in {*diagnoses[part]["base"], *machine.numbers(part)} for part in parts):
+            gains = name in ("kp", "kd") and {*parts} & {*machine.fitted_gains}
+            way = "; fitted gains are written by `taccorl diagnose` with --until=noise_floor" * bool(gains)
             raise TaccorlError(
-                f"{path}: {name} is not off in that diagnosis; what it found: {', '.join(sorted(found)) or 'nothing'}"
+                f"{path}: {name} is not off in that diagnosis; what it found: {', '.join(sorted(found)) or 'nothing'}{way}"
             )
         effects.get(name)
     additions, refused, left_out, written, said = [], [], [], set(), {}

@@ -136,6 +136,7 @@ def verdict(
         reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
     # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
     unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (floor and kind == "nothing_missing")
+    unsure = unsure or (added(d) and any(c.name in d.undetermined for c in d.changed))
     tied = kind == "ties" or (kind == "numbers_off" and w.instead)
     level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or tied else "high"
     first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
@@ -361,7 +362,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
     if d.at_bound:
         yield f"{_some(d.at_bound)} at the end of its range"
     if unknown := [c.name for c in d.changed if c.name in d.undetermined]:
-        yield f"the recordings do not determine {_some(unknown)}"
+        beside = ", so that what was added may stand in for an effect that is not known" * bool(added(d))
+        yield f"the recordings do not determine {_some(unknown)}{beside}"
 
 
 def _record_next(

@@ -164,13 +164,8 @@ def _draw_instants(figure: Figure, grid: Any, episode: Episode, instants: tuple[
         edge, gate, noise = image.axes.get_position(), pads[0].gate_count, pads[0].sensor.noise_count
         high = 2 * edge.height / max(len(instants), 2)
         bar = figure.add_axes((edge.x1 + 0.015, edge.y1 - high, 0.012, high))
-        words = {
-            0: "0",
-            noise: f"{noise:g} noise",
-            gate: f"{gate:.3g} contact",
-            most / 2: f"{most / 2:g}",
-            most: f"{most}",
-        }
+        words = {0: "0", noise: f"{noise:g} noise", gate: f"{gate:.3g} contact"}
+        words |= {most / 2: f"{most / 2:g}", most: f"{most}"}
         figure.colorbar(image, cax=bar).set_ticks(list(words), labels=list(words.values()), fontsize=9)
         bar.set_title("counts above\nbaseline", fontsize=9, color=SOFT, loc="left")
 

@@ -101,17 +101,13 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
     """0.0035 of 0.052 N·m is 7 % of what the file has."""
     off = Changed(name="coulomb_friction.torque_nm", before=0.052, after=0.252, unit="N·m", without=12.3, alone=False)
     ends = {off.name: (0.246, 0.258)}
-    v = verdict(PART, changed(nothing, status="numbers_off", changed=(off,), intervals=nothing.intervals | ends))
+    found = changed(nothing, status="numbers_off", changed=(off,), intervals=nothing.intervals | ends)
+    v = verdict(PART, found)
     assert (v.kind, v.level) == ("numbers_off", "high")
     assert "0.052 → 0.252 N·m (0.246 … 0.258)" in v.finding and "12.30" in v.finding and "nothing" not in v.finding
-    unknown = changed(
-        nothing, status="numbers_off", changed=(off,), intervals=nothing.intervals | ends, undetermined=(off.name,)
-    )
-    doubted = verdict(PART, unknown)
-    assert (
-        "not determined: with other numbers any of 0.246 … 0.258 fits" in doubted.finding
-        and doubted.level == "moderate"
-    )
+    doubted = verdict(PART, changed(found, undetermined=(off.name,)))
+    assert "not determined: with other numbers any of 0.246 … 0.258 fits" in doubted.finding
+    assert doubted.level == "moderate"
     for stage in ("before", "after"):
         assert f"{nothing.errors[stage]['validation']:.2f}" in v.finding
     assert not v.record_next.startswith("Nothing") and "coulomb_friction" in v.record_next
@@ -122,6 +118,8 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
     assert "friction" in verdict(PART, changed(nothing, status="numbers_off", changed=(off,), present=())).command
     held = changed(nothing, status="numbers_off", changed=(off,), present=("coulomb_friction",))
     assert verdict(PART, held).command == ""
+    beside = verdict(PART, changed(one, changed=(off,), intervals=one.intervals | ends, undetermined=(off.name,)))
+    assert beside.level == "low" and "may stand in for an effect that is not known" in beside.confidence
     for after, instead in ((0.0035, True), (0.035, False)):
         less = dataclasses.replace(off, after=after)
         finding = verdict(PART, changed(one, changed=(less,))).finding

@@ -23,6 +23,7 @@ from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import MOVING
 from taccorl.data.finding import Finding, Severity, listed
 
 NEAR = 0.3  # Largest distance of r from 0 or 1 for a decision
@@ -81,7 +82,8 @@ def check_effort_time(
             found[m.name].append(find(check, signal, text, severity=severity))
 
     moved = [_moved(m, signal, inertia(m)) for m in every]
-    if text := _two_machines(law, every, signal) or _two_machines(law, moved, signal, unseen=True):
+    alone = [m for m in moved if not _others_move(m, signal)]  # else their accelerations push it
+    if text := _two_machines(law, every, signal) or _two_machines(law, alone, signal, unseen=True):
         tell("other_gains", text, "warning", every)
         return
     unseen = not any(m.has_effort()[m.column(signal)] for m in recordings)
@@ -113,6 +115,11 @@ def _moved(m: Measurement, signal: str, inertia: float) -> Measurement:
     effort, j = np.full_like(m.measured, np.nan), m.column(signal)
     effort[:, j] = inertia * np.gradient(np.gradient(m.measured[:, j], m.period_s), m.period_s)
     return dataclasses.replace(m, effort=effort)
+
+
+def _others_move(m: Measurement, signal: str) -> bool:
+    """Whether any other joint is commanded to move in the recording."""
+    return bool((np.ptp(np.delete(m.target, m.column(signal), axis=1), axis=0) > MOVING).any())
 
 
 def _two_machines(law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool = False) -> str:

@@ -415,7 +415,10 @@ def _simulated(
         if with_cogging:
             wave_sine, wave_cosine = sine_and_cosine(periods * q + phase)
             force += cogging_nm * wave_sine
-            stiffness += max(-cogging_nm * periods * wave_cosine, 0.0)
+            least = (
+                -0.5 * inertia / (ahead * h * ahead * h) if midpoint else 0.0 * inertia
+            )  # MuJoCo takes no other one ahead
+            stiffness += max(-cogging_nm * periods * wave_cosine, least)
         if with_bristle:
             shares = v / stribeck_speed
             most = sliding_nm + (static - sliding_nm) * decayed(shares * shares)[0]

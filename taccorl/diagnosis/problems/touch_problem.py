@@ -248,15 +248,8 @@ class TouchProblem(WithoutMaps):
         every = np.ones(len(motion.time_s), dtype=bool)
         kept = np.zeros_like(every)
         kept[(rows[:, None] * FRAMES_A_ROW + np.arange(FRAMES_A_ROW)).ravel()] = True
-        return _Chosen(
-            motion,
-            rows,
-            taxels,
-            motion.cut(every, rectangle),
-            motion.cut(kept, rectangle),
-            window,
-            np.searchsorted(window, taxels),
-        )
+        cuts = motion.cut(every, rectangle), motion.cut(kept, rectangle)
+        return _Chosen(motion, rows, taxels, *cuts, window, np.searchsorted(window, taxels))
 
     def _channel(self, taxel: int) -> str:
         pad, row, column = np.unravel_index(taxel, self.floor_count.shape)

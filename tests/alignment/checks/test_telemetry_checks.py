@@ -516,9 +516,16 @@ def test_positions_show_a_wrong_kp_but_not_both_gains_off_alike_as_of_another_in
     assert found == pytest.approx([100.0, 8.0] * named, rel=0.05)
 
 
-@pytest.mark.parametrize(("kp", "named"), [(100.0, False), (200.0, True)])
-def test_recordings_of_two_machines_are_told_by_what_differs(kp: float, named: bool):
+@pytest.mark.parametrize(("kp", "far", "named"), [(100.0, 0.0, False), (200.0, 0.0, True), (200.0, 0.3, False)])
+def test_recordings_of_two_machines_are_told_by_what_differs(kp: float, far: float, named: bool):
+    """Where a second joint moves, too, by 0.3 rad, its accelerations push the first one: nothing is said."""
     every = [moved_by_law(0), moved_by_law(1), moved_by_law(2, kp)]
+    for k, m in enumerate(every):
+        second = {
+            name: np.hstack([getattr(m, name), far * np.sin(m.time_s)[:, None]]) for name in ("target", "measured")
+        }
+        about = {"signals": ("servo", "second"), "units": ("rad", "rad"), "quantum": np.zeros(2)}
+        every[k] = Measurement(name=m.name, time_s=m.time_s, **about, **second)
     law, findings = DriveLaw(law="impedance", kp=120.0, kd=8.0), {m.name: [] for m in every}
     check_effort_time(law, every, findings, "servo", "servo.yaml", lambda _: 0.4)
     assert ["2 times as large in 2.csv as in" in f.text for f in findings["0.csv"]] == [True] * named

@@ -78,7 +78,10 @@ def test_a_lane_does_not_depend_on_the_others() -> None:
     assert len({round(float(one), 9) for one in apart}) == len(apart)  # each effect does something
 
 
-@pytest.mark.parametrize("effect", [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}])
+COGS = {"cogging__torque_nm": 5.0, "cogging__periods": 30.0}
+
+
+@pytest.mark.parametrize("effect", [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}, COGS])
 def test_steps_of_half_a_millisecond_are_nearly_as_good_as_those_of_a_twentieth(effect: dict[str, float]) -> None:
     sent, none, ones = 0.3 * np.sin(0.02 * np.arange(1000)), np.zeros(1000), np.ones(1000)
     drive, more = Drive(400.0, 10.0, 0.0, 0.1, gravity_cos=3.0, midpoint=1.0, **effect), (none, none, ones, ones, none)
