@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_511,
     "taccorl/training": 1_557,
     "taccorl/views": 2_334,
-    "tests": 55_447,
+    "tests": 55_449,
     "pipelines": 6_319,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -199,5 +199,5 @@ def _next(
         yield from ["next: record what decides, see Record next"] * undecided
         yield f"{'to write what was refitted' if undecided else 'next'}: {shlex.join([*words, *_given(config)])}"
         yield from [f"{' or '.join(tied)} does as well as {names[0]}: see Record next"] * bool(tied)
-    elif any(machine.option_of(f.part) for f in found):
+    elif any(f.part in machine.fitted_gains or machine.option_of(f.part) for f in found):
         yield f"a twin with the refitted numbers: {further}"

@@ -208,17 +208,19 @@ def test_a_number_of_the_file_that_is_off_is_the_result_and_is_written(
         assert code == 2 and way in text, text
 
 
+def test_gains_that_nobody_knows_are_written_by_the_command_that_is_printed(bench, said, tmp_path):
+    """The file has half of the drive's kp, and its friction."""
+    (twin := tmp_path / "half.yaml").write_text(KNOWS.replace(f"kp: {KP}", f"kp: {KP / 2}\ngains: fitted"))
+    text = said("diagnose", bench / "bench", f"--twin={twin}", f"--out={tmp_path / 'd'}", FEW)[1]
+    assert "a twin with the refitted numbers: taccorl diagnose" in text
+    code, text = said("add-effect", "kp", f"--twin={twin}", f"--diagnosis={tmp_path / 'd'}")
+    assert code == 2 and "kp is not off" in text and "--until=noise_floor" in text
+
+
 @pytest.mark.slow
 def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_was_stated(tmp_path, said, monkeypatch):
     """12 N of dry friction and 150 N·s/m; the file knows neither. Errors are of position and effort together."""
-    monkeypatch.chdir(tmp_path)
-    Path("bench").mkdir()
-    for name, amplitude_m, hz, seed in (("one", 0.1, 0.6, 1), ("again", 0.1, 0.6, 2), ("held", 0.08, 0.8, 3)):
-        write(Path("bench") / f"{name}.csv", amplitude_m, hz, seed, damping=150.0)
-    Path("bench/measurements.yaml").write_text(
-        "recordings:\n  again.csv: {repeat_of: one.csv}\n  held.csv: {use: validation}\n"
-    )
-    Path("drive.yaml").write_text(FILE)
+    monkeypatch.chdir(made(tmp_path, damping=150.0))
     code, text = said("diagnose", "bench", "--twin=drive.yaml", "--out=found", FEW, "--until=noise_floor")
     d = json.loads(Path("found/report.json").read_text())["diagnoses"]["slide"]
     both = [e["effect"] for e in d["effects"]]
