@@ -143,7 +143,8 @@ def row_of(score: Path) -> dict[str, Any]:
 
 
 def share(rows: Rows) -> str:
-    """``95 % (93 … 97); 94.1, 96.1 %``: all scenes of all seeds with Wilson's 95 % interval, then each seed; updates by PPO."""
+    """``95 % (93 … 97) of 256; 94.1, 96.1``: completed of all scenes with Wilson's 95 % interval, then by each training; then the
+    number of iterations of PPO that changed the policy, if the rows state it."""
     if not rows:
         return "not run"
     (p,), (low,), (high,) = _shares([rows])
@@ -210,13 +211,13 @@ their number, each training (`*`: one). 0.5 mm of clearance, 8 actions executed 
 
 {_table(f"{HEADS_1} | after PPO, untrained | after PPO", table_1)}
 
-Updates: iterations of PPO that changed the policy; the first three train the critic alone. Untrained policies were stopped there,
-as no episode had succeeded.
+Updates: iterations of PPO that changed the policy; the first three train the critic alone. Untrained policies were stopped after
+at most three, so that PPO did not change them; none of their episodes succeeded.
 
-Points by which touch is above cameras alone, mean of the tasks, 95 % of the scenes:
+Completed with touch minus completed with cameras alone, in points, mean of the tasks (95 %, of the scenes):
 
-- by imitation of as many demonstrations: {touch_gain(*learnt_of.values())}; the paper: {paper_gain["co-trained"]:+.0f};
-- after PPO, of unequal numbers of demonstrations: {touch_gain(*new_of.values())}; the paper: {paper_gain["RL"]:+.0f}.
+- by imitation of equal numbers of demonstrations: {touch_gain(*learnt_of.values())}; the paper: {paper_gain["co-trained"]:+.0f};
+- after PPO, of different numbers of demonstrations: {touch_gain(*new_of.values())}; the paper: {paper_gain["RL"]:+.0f}.
 
 ## Tighter holes, randomised pictures, more actions between looks
 
@@ -320,8 +321,8 @@ def gain(of: dict[str, Rows], over: str = "nominal") -> str:
 
 
 def touch_gain(*of: list[Rows]) -> str:
-    """Points, mean of the tasks, by which the rows of each task with touch are above those with cameras alone. The 95 % interval
-    joins those of the cells, as if independent (Zou and Donner 2008, doi:10.1002/sim.3095)."""
+    """``+13 (+12 … +14)``: completed with touch minus with cameras alone [points], mean of the tasks. ``of``: rows of each task
+    with touch, then with cameras. The 95 % interval: Zou and Donner 2008, doi:10.1002/sim.3095, of independent cells."""
     if not all(itertools.chain(*of)):
         return "not run"
     (p, low, high), (q, floor, top) = map(_shares, of)
@@ -335,7 +336,7 @@ def _counts(rows: Rows) -> tuple[int, int]:
 
 
 def _shares(cells: Iterable[Rows]) -> np.ndarray:
-    """Completed scenes of the rows of each cell, then the ends of Wilson's 95 % interval [%]: (3, cells)."""
+    """(3, C) share of completed scenes in each of C cells [%], then the lower and upper ends of Wilson's 95 % interval."""
     return 100 * np.transpose([(done / n, *wilson_interval(done, n)) for done, n in map(_counts, cells)])
 
 

@@ -5,7 +5,7 @@
 # PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
 # clock; then start and result are scored in the surrogate. `TASK=assembly_2 bash .ci/gpu/ppo.sh nominal SECOND`: of $POLICIES/nominal,
 # in the nominal twin alone. RUNS="nominal_1000 ppo_anchored,nominal_2000 ppo_anchored 5": other policies of $POLICIES, whose names begin
-# with that of their twin, 5: weight of the anchor. FIRST, THREADS, DONE: first core, number of cores, file of the end, beside another such job.
+# with that of their twin, 5: weight of the anchor; of a policy with "untrained" in its name the start is not scored. FIRST, THREADS, DONE: first core, number of cores, file of the end, beside another such job.
 if [ "$1" = pack ]; then
   mkdir -p outputs/ppo_{1,2,3}
   ln -sfn "$(realpath "$2")" outputs/ppo_1/nominal && ln -sfn "$(realpath "$3")" outputs/ppo_1/mended

@@ -138,7 +138,7 @@ def _diagnosed(
         effects.get(name)
     additions, refused, left_out, written, said = [], [], [], set(), {}
     for part in parts:
-        # If some joint's diagnosis reports a name, it is written for the joints whose diagnosis reports it, and for no others.
+        # An effect or number that the diagnosis of any joint reports is written for the joints that report it, for no others.
         wanted = {n for n in names if n in told[part] or (n not in found and n in _fitted(diagnoses[part]))}
         try:
             fit = _fit_of(wanted or {*names}, part, diagnoses[part])

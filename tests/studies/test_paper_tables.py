@@ -28,7 +28,8 @@ def test_cells_are_what_was_counted():
     assert gain({"randomised": rows[:1], "mended": rows[1:]}, "randomised").startswith("+14")
     assert gain({"mended": rows[1:]}, "randomised") == "not run"
     half, full = [ROW | {"successes": 48}], [ROW | {"successes": 96}]
-    # Wilson: 96.15 … 100 and 40.20 … 59.80; 25 - √(3.85² + 3 · 9.80²) / 2, 25 + √(3 · 9.80²) / 2
+    # Two tasks, 95 % intervals by Wilson: 96 of 96 is 96.15 … 100 %, 48 of 96 is 40.20 … 59.80 %. The mean gain is (50 + 0) / 2
+    # points, its ends are 25 - √(3.85² + 3 · 9.80²) / 2 and 25 + √(3 · 9.80²) / 2.
     assert touch_gain([full, half], [half, half]) == "+25 (+16 … +33)"
     assert touch_gain([full, half], [half, []]) == "not run"
     six = [[ROW | {"n": 100, "successes": k + 10 * j} for j in range(3)] for k in (0, 30)]

@@ -82,7 +82,8 @@ def check_effort_time(
             found[m.name].append(find(check, signal, text, severity=severity))
 
     moved = [_moved(m, signal, inertia(m)) for m in every]
-    alone = [m for m in moved if not _others_move(m, signal)]  # else their accelerations push it
+    # Accelerations of other joints act on this one, and ``_moved`` does not know them.
+    alone = [m for m in moved if not _others_move(m, signal)]
     if text := _two_machines(law, every, signal) or _two_machines(law, alone, signal, unseen=True):
         tell("other_gains", text, "warning", every)
         return

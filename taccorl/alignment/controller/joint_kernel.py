@@ -415,9 +415,8 @@ def _simulated(
         if with_cogging:
             wave_sine, wave_cosine = sine_and_cosine(periods * q + phase)
             force += cogging_nm * wave_sine
-            least = (
-                -0.5 * inertia / (ahead * h * ahead * h) if midpoint else 0.0 * inertia
-            )  # MuJoCo takes no other one ahead
+            # A negative stiffness is part of midpoint steps alone: there m11 stays above half of the inertia.
+            least = -0.5 * inertia / (ahead * h * ahead * h) if midpoint else 0.0 * inertia
             stiffness += max(-cogging_nm * periods * wave_cosine, least)
         if with_bristle:
             shares = v / stribeck_speed

@@ -164,9 +164,9 @@ def noise_floor(
 def floors_by_motion(
     measurements: Sequence[Measurement], kind: Kind = "position", unexplained: Sequence[Measurement] = ()
 ) -> dict[str, dict[str, SignalFloor]]:
-    """Recording → signal → floor: of its motion's recordings if it was repeated, else of all ``measurements``. That of an effort,
-    whose noise grows with gains and motion, is at least what no smooth curve explains in the recording. Arguments and errors as
-    of ``noise_floor``."""
+    """Noise floors of each recording: recording → signal → floor. If its motion was repeated, the floor is estimated from the
+    recordings of that motion, else from all ``measurements``. The noise of an effort grows with gains and motion, so its floor
+    is at least the ``residue`` of the recording. Arguments and errors as of ``noise_floor``."""
     roots, every = motions(measurements), noise_floor(measurements, kind, unexplained)
     own: dict[str, dict[str, SignalFloor]] = {}
     for root in dict.fromkeys(roots.values()):

@@ -119,7 +119,8 @@ def compare_joints(
     Args:
         whole: function that returns a recording with all signals of the machine.
         uncertain: joints whose drives have numbers that ``diagnose`` fits.
-        by_motion: noise floors as of ``floors_by_motion``; if false, of all recordings together.
+        by_motion: each recording has the noise floors of ``floors_by_motion``; if false, those of all recordings together. It
+            is as the machine's own ``diagnose`` takes them.
     """
     uses: list[tuple[Use, Measurement]] = [(use, whole(m)) for use in USES for m in getattr(measurements, use)]
     every = [m for _, m in uses]

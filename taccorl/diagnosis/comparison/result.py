@@ -163,7 +163,7 @@ class Score:
     nrmse: float
     """RMSE / standard deviation of the measurement."""
     floor: float
-    """Noise floor, the root of the mean square over the rows where those of the recordings differ."""
+    """Noise floor; where recordings have different ones, their root mean square (``pooled_floor``)."""
     floor_words: str
     """Text of the floor, with its method."""
     lower_bound: bool
@@ -240,7 +240,7 @@ class Comparison:
 
 
 def pooled_floor(traces: Sequence[Trace]) -> float:
-    """Root of the mean square of the floors of the measured rows of one signal, in its unit."""
+    """Noise floor of several recordings of one signal, in its unit: root mean square, weighted by measured rows."""
     rows = [np.isfinite(t.residual).sum() for t in traces]
     return float(np.sqrt(np.average([t.floor.value**2 for t in traces], weights=rows if any(rows) else None)))
 

@@ -148,16 +148,16 @@ def _sized(
     values: Values = (
         dict(problem.start) | {f.name: f.start for f in c.frees} | c.starts[int(rng.integers(len(c.starts)))]
     )
-    best, tried_so = Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_)), dict[bool, float]()
+    best, ends = Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_)), dict[bool, float]()
     for _ in range(TRIES):
         if wanted / 1.5 <= best.floors <= 1.5 * wanted:
             break
         factor = min(max(wanted / max(best.floors, 1e-3), 0.1), 10.0)
         own = getattr(best.effect, strength.name)
-        tried_so[best.floors > wanted] = own
+        ends[best.floors > wanted] = own
         new = absent + (own - absent) * factor if math.isfinite(absent) else own / factor
-        if len(tried_so) == 2:  # too weak and too strong: gains take up the effect until they are at their bounds
-            new = sum(tried_so.values()) / 2
+        if len(ends) == 2:  # a strength that is too low and one that is too high are known: halve the range
+            new = sum(ends.values()) / 2
         new = min(max(new, strength.low), strength.high)
         if new == own:
             break

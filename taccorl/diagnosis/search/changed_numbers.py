@@ -3,9 +3,9 @@
 The search refits the effects of the file, and a few other numbers of it, in every hypothesis. Where such a number is wrong in the
 file, its refit removes the error, and no effect is missing: the change is then the result of the diagnosis.
 
-A change is named by the rule of the search: the fit is clearly better than the one with the number as the file has it, and all
-others refitted, which is above the noise floor. Numbers can make up for each other, so they are returned to the file's values
-one after another, the least significant first, and stay there where the error hardly rises.
+A change is named by the rule of the search: with the number as the file states it, and all others refitted, the error is clearly
+larger, and above the noise floor. Numbers can make up for each other, so they are returned to the file's values one after
+another, the least significant first, and stay there where the error hardly rises.
 All efforts by one factor, as of a wrong torque constant, act as another inertia does, unless weight, friction or a load is known.
 A number of the drive may have moved because an effect is missing that acts alike in these recordings, such as a weight on a
 constant torque: effects that do as well in its place are named with it (``Changed.instead``).
@@ -151,7 +151,7 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     names = {f.name for f in model.frees}
     stated = STATED | TIMES | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
     stated |= {} if fits.problem.other_gain is None else {fits.problem.other_gain.name: "gain"}
-    # Where the gains are unknown, fitted values of the constant torque and of the speed's delay are expected to differ.
+    # Where the gains are unknown, the constant torque and the speed's delay may differ from the file's, and are not reported.
     unknown = {"torque_ff", *(("speed_delay_s",) if "loop_s" not in names else ())} if "kp" in names else ()
     groups: dict[str, list[Free]] = {}
     for f in model.frees:

@@ -109,7 +109,7 @@ def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(ax
 
 
 def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of_the_loop():
-    """A row every 1 ms, a loop of 2 kHz, targets that act 1.5 ms after their row. The logged effort of a row is the torque of the
+    """The drive's loop runs at 2 kHz, a row is logged every 1 ms, and its target acts 1.5 ms later. Its effort is that of the
     loop period before it. The model's effort is off by 0.006 N·m with steps of one loop period (0.5 ms), and by 0.29 N·m with
     steps of 1 ms, in which old and new target are averaged. A fitted loop rate must not change the step."""
     axis = AxisConfig(name="servo", unit="rad", inertia=0.04, kp=40.0, kd=2.0, loop_hz=2000.0, target_late_s=1.5e-3)
