@@ -5,7 +5,8 @@
 # PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
 # clock; then start and result are scored in the surrogate. `TASK=assembly_2 bash .ci/gpu/ppo.sh nominal SECOND`: of $POLICIES/nominal,
 # in the nominal twin alone. RUNS="nominal_1000 ppo_anchored,nominal_2000 ppo_anchored 5": other policies of $POLICIES, whose names begin
-# with that of their twin, 5: weight of the anchor; of a policy with "untrained" in its name the start is not scored. FIRST, THREADS, DONE: first core, number of cores, file of the end, beside another such job.
+# with that of their twin, 5: weight of the anchor; of a policy with "untrained" in its name, or if START=false, the start is not scored.
+# FIRST, THREADS, DONE: first core, number of cores, file of the end, beside another such job; SCORE_WORKERS: processes that score a policy.
 if [ "$1" = pack ]; then
   mkdir -p outputs/ppo_{1,2,3}
   ln -sfn "$(realpath "$2")" outputs/ppo_1/nominal && ln -sfn "$(realpath "$3")" outputs/ppo_1/mended
@@ -58,9 +59,9 @@ improve() { # NUMBER TWIN STAGE [BETA]
   for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
     stage=$([ "$scored_of" = "$policies/$2" ] && echo start || echo "$3")
     score=$out/score_${scored}_train_8_clear_nothing_$stage
-    if [[ "$3" = ppo && "$2" != *untrained* ]] || [ "$scored_of" != "$policies/$2" ]; then
+    if [[ "$3" = ppo && "$2" != *untrained* && ${START:-true} = true ]] || [ "$scored_of" != "$policies/$2" ]; then
       OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task="$task" \
-        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=$(((each + 1) / 2)) --failures=0 \
+        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 "${scored_in[@]}" --batch_size=64 --workers=${SCORE_WORKERS:-$(((each + 1) / 2))} --failures=0 \
         --out="$score" >"$score.log" 2>&1
       since "$2 $3 ${4:-} scored: $?"
       python3 - "$policies/$2/train_config.json" "$robot" "$score" "$stage" "$beta" "$out.log" <<'P'

@@ -2,9 +2,10 @@
 
 import json
 
+import matplotlib.pyplot as plt
 import pytest
 
-from pipelines.paper_tables import gain, main, page, read, share, take, touch_gain, transfer
+from pipelines.paper_tables import draw_curves, gain, main, page, read, row_of, share, take, touch_gain, transfer
 
 ABOUT = {"sensors": "touch", "demonstrations": 9, "seed": 1, "twin": "", "scored_in": "", "steps": 5}
 ONE = {"task": "puzzle", "pictures": "clear", "hidden": "", "n": 96, "successes": 0}
@@ -19,6 +20,15 @@ def test_a_score_becomes_one_row_however_often_it_is_taken(tmp_path):
     for _ in range(2):
         take([score], tmp_path / "rows.jsonl")
     assert [ROW.items() <= row.items() for row in read(tmp_path / "rows.jsonl")] == [True]
+    # Of an iteration in which no episode ended nothing is drawn. 3 of 7 as its share.
+    lines = ({"episodes": 7, "success": 3 / 7}, {"episodes": 0, "success": 0.0}, {"episodes": 64, "success": 1.0})
+    (tmp_path / "progress.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert "curve" not in row_of(score)
+    (score / "settings.json").write_text(json.dumps(ABOUT | {"stage": "ppo"}))
+    after = row_of(score)
+    assert after["curve"] == [[7, 3], [0, 0], [64, 64]]
+    draw_curves([after, ROW], picture := tmp_path / "curves.png")
+    assert plt.imread(picture).shape[:2] == (374, 990)  # 3.4 and 9 inches of 110 points
 
 
 def test_cells_are_what_was_counted():
