@@ -101,7 +101,7 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
     Args:
         commanded: gains are known, so that every torque is.
         effort: the motor's effort was recorded, or something else fixes the scale of all torques: those of effects are absolute,
-            too. The gains are not: on sampled loops (docs/diagnosis.md) none of 52 intervals held the true K_p.
+            too. The gains are not: on sampled loops none of 52 intervals held the true K_p.
         kd: K_d [N·m·s/rad], if it is commanded and not fitted: the influence of the loop's timing on an inertia depends on it.
     """
     frees = {f.name: k for k, f in enumerate(fit.frees)}

@@ -28,7 +28,7 @@ WORDS: dict[Status, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
-    """Acceptance criteria of an effect. The values are choices, checked in docs/diagnosis.md."""
+    """Acceptance criteria of an effect. The values are choices; docs/diagnosis.md has the results with them."""
 
     floor: float = 1.3
     """Validation error [noise floors] at or below which the search ends, provided that the fit error is at most ``little``: the
@@ -53,7 +53,7 @@ class SearchConfig:
     """Least decrease of the Bayesian information criterion on the fit recordings for a model with more numbers: strong evidence
     (Kass and Raftery 1995). Any decrease suffices where ``sure_gain`` or ``sure_score`` is reached."""
     width: int = 2
-    """Number of models that the search extends at each depth; docs/diagnosis.md has the results of 1 to 3."""
+    """Number of models that the search extends at each depth."""
     max_effects: int = 4
     """Most effects that the search adds."""
     last_steps: int = 100
