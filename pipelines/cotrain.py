@@ -23,15 +23,15 @@ import yaml
 
 from pipelines.lerobot_commands import FIRST_SEED, Scoring, Training
 from pipelines.steps import chosen, lerobot, parsed, step
-from pipelines.surrogate_twin import ORIGIN, draw_surrogate_twin
 from taccorl.cli import augment, collect, ingest, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.evaluation.statistics import told_rate, wilson_interval
-from taccorl.sim.twin_file import save_twin
 
+ORIGIN = "twin with hidden effects and other cameras, not a robot"
+"""Text of the origin of the surrogate's demonstrations."""
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=4,--batch_size=4]")
@@ -43,8 +43,8 @@ class CotrainConfig:
 
     task: str = "assembly_2"
     """Task: {tasks}."""
-    secret: int = 7
-    """Which surrogate robot."""
+    robot: Path = Path("configs/surrogates/other_cameras.yaml")
+    """Twin file of the surrogate robot."""
     real: int = 50
     """N_real: episodes of the surrogate robot."""
     sources: int = 20
@@ -77,16 +77,17 @@ def record(recordings: Path, config: CollectConfig) -> None:
 def main(words: list[str]) -> None:
     config = parsed(CotrainConfig, chosen(words, SMALL), "python -m pipelines.cotrain")
     out, task, store = config.out / config.task, config.task, config.out / "store"
-    recipe, name = config.train or Path(f"configs/cotrain/{task}.yaml"), f"surrogate_{config.secret}"
+    recipe, name = config.train or Path(f"configs/cotrain/{task}.yaml"), f"surrogate_{config.robot.stem}"
     if not recipe.is_file():  # before hours of collecting
         raise SystemExit(f"--train={recipe}: no such file; for a task of your own, copy one of configs/cotrain")
-    parts = (f"{name}.yaml", f"{name}_recordings_{config.real}", name, f"{name}_and_twin")
-    robot, recordings, real, both = (out / part for part in parts)
+    parts = (f"{name}_recordings_{config.real}", name, f"{name}_and_twin")
+    recordings, real, both = (out / part for part in parts)
     sources, many = out / "sources", out / "augmented"
+    if not config.robot.is_file():
+        raise SystemExit(f"--robot={config.robot}: no such file; configs/surrogates has some")
     out.mkdir(parents=True, exist_ok=True)
-    save_twin(draw_surrogate_twin(config.secret), robot)
     shown = CollectConfig(
-        task=task, episodes=config.real, as_recording=True, seed=1, twin=robot, origin=ORIGIN, store=store
+        task=task, episodes=config.real, as_recording=True, seed=1, twin=config.robot, origin=ORIGIN, store=store
     )
     record(recordings, shown)  # seed 1: the two domains do not share their scenes
     step(ingest.run, IngestConfig(paths=[recordings], spec=RECORDING_SPEC, out=real, store=store))
@@ -107,7 +108,7 @@ def main(words: list[str]) -> None:
     lerobot(training.command())
     limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
     scored = {"twin": [f"--env.task={task}", *limit]}
-    scored["surrogate"] = [*scored["twin"], f"--env.twin={robot}"]
+    scored["surrogate"] = [*scored["twin"], f"--env.twin={config.robot}"]
     rows = []
     for name, place in scored.items():
         scoring = Scoring(training, place, config.scored)

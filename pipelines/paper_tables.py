@@ -59,6 +59,9 @@ PARTS = {
         f"--scored_in=[configs/surrogates/{r}.yaml] --real=50 --sim_weight=[0,0.5,0.95] --episodes=1200 {_SHORT} {_SEEDS}"
         for r in ROBOTS
     ],
+    "effects": [
+        f"--scored_in=[configs/surrogates/{r}.yaml] --singly=true --episodes=1000 {_SHORT} {_SEEDS}" for r in ROBOTS
+    ],
 }
 """Part of the tables → command-line arguments of each call of ``pipelines.learn`` that measures it."""
 PAPER_STAGES = ("co-trained", "with noise", "RL, untrained", "RL")
@@ -79,7 +82,7 @@ class PaperTablesConfig:
     """Parts to run, and scores to take."""
 
     only: list[str] = field(default_factory=list)
-    """Parts to run: imitation, randomised, grips, transfer, cotrained."""
+    """Parts to run: imitation, randomised, grips, transfer, cotrained, effects."""
     page: bool = False
     """Run nothing."""
     take: list[Path] = field(default_factory=list)
@@ -208,6 +211,8 @@ def page(rows: Rows) -> str:
         table_6.append((f"{name}: {real}, {n}", *map(share, shares)))
         betas = (("start", 1), ("ppo", 0), *(([*STAGES][-1], beta) for beta in (0.1, 1, 5)))
         table_7.append((name, *(share(mixed[robot, real, 0.95, *cell]) for cell in betas)))
+    single = singly(seen)
+    table_8 = [(*name, share(of), gain({"nominal": nominal, "mended": of})) for name, (nominal, of) in single.items()]
     learnt_more, gains = (np.subtract(PAPER["touch"][s], PAPER["cameras"][s]) for s in ("co-trained", "RL"))
     puzzle = TASKS.index("puzzle")
     others = [[cell for k, cell in enumerate(of) if k != puzzle] for of in new_of.values()]
@@ -263,6 +268,13 @@ scored ([settings](training.md#post-training-ppo-in-the-twin)).
 
 {_table("surrogate | PPO | in: nominal | in: mended | mended − nominal", sorted(table_4, key=lambda row: row[0]))}
 
+### What each effect costs
+
+Policies of the nominal twin, scored in it with a single effect of a surrogate, in the same scenes; in the nominal twin itself
+{share([row for row in seen if any(row in nominal for nominal, _ in single.values())])}.
+
+{_table("effect | as in | completed | gained, in points", table_8)}
+
 ## Table 2 and α: demonstrations of the surrogate beside those of the nominal twin
 
 assembly_1, cameras and touch, scored in the surrogate; the loss is α · the twin's + (1 − α) · the surrogate's.
@@ -308,6 +320,21 @@ def transfer(rows: Rows, stage: str = "") -> dict[tuple[str, int], dict[str, Row
         key = row["scored_in"].rpartition("_")[0], row["demonstrations"]
         found[key][kind if kind in TWINS else "surrogate"].append(row)
     return {key: of for key, of in found.items() if key[0] in ROBOTS and {"nominal", "mended"} <= of.keys()}
+
+
+def singly(rows: Rows) -> dict[tuple[str, str], tuple[Rows, Rows]]:
+    """(effect or section of a twin, surrogate) → rows of policies in the nominal twin, and in it with that of the surrogate
+    alone, in the same scenes."""
+    found: dict[tuple[str, str], tuple[Rows, Rows]] = defaultdict(lambda: ([], []))
+    differ = {"key", "successes", "commit", "date", "scored_in", "stage"}
+    scenes = [{name: value for name, value in row.items() if name not in differ} for row in rows]
+    for row, same in zip(rows, scenes, strict=True):
+        effect, of, robot = row["scored_in"].rpartition("_")[0].partition("_of_")
+        if of:
+            nominal = [r for r, other in zip(rows, scenes, strict=True) if other == same and not r["scored_in"]]
+            for side, more in zip(found[effect, robot], (nominal, [row]), strict=True):
+                side += more
+    return found
 
 
 def grips(rows: Rows, task: str = "assembly_1") -> dict[tuple[str, str], dict[int, Rows]]:

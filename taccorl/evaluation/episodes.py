@@ -43,13 +43,21 @@ class EpisodeRow:
     clipped_steps: int
     """Number of control steps with a target beyond the limits."""
     measures: dict[str, float] = field(default_factory=dict)
-    """Measures of the task at the end; names state units."""
+    """Measures of the task at the end, and ``ARM_touch_counts``, the largest reading of an arm's pads; names state units."""
+    reset: dict[str, float] = field(default_factory=dict)
+    """Place of each part after the reset, in the world: ``PART_x_m``, ``PART_y_m``, ``PART_yaw_rad``."""
     pictures: str = "clear"
     """How the policy saw the pictures: ``clear``, ``randomised``, or ``none`` if it uses none."""
     hidden: str = ""
     """What was hidden from the policy, of ``HIDDEN``, with commas between."""
     reason: str = ""
     """Explanation of ``bad_action`` (the joint) and ``unreachable`` (the pose); empty for other outcomes."""
+
+    @property
+    def failed_in(self) -> dict[str, str]:
+        """Arm → its first subtask that did not end; empty for a success."""
+        began = {arm: [name for name, end in own.items() if end is None] for arm, own in self.subtask_end_s.items()}
+        return {arm: names[0] for arm, names in began.items() if names and not self.success}
 
     @property
     def success(self) -> bool:

@@ -3,6 +3,7 @@
 Letters in shapes: N environments, T control steps of an episode.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -13,6 +14,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.evaluation.episodes import NO_PICTURES, SUCCESS, EpisodeRow
 from taccorl.robots import ROBOT
 from taccorl.sim.outcome import BAD_ACTION
+from taccorl.sim.part_poses import posed_bodies
 from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
@@ -120,6 +122,8 @@ class _Running:
         self.subtask_end_s: dict[str, dict[str, float | None]] = {arm: dict.fromkeys(own) for arm, own in names.items()}
         self.end: tuple[str, str] | None = None
         """Outcome and reason."""
+        self.touch = np.zeros(len(ROBOT.arms))
+        """Largest reading of each arm's pads [counts]."""
 
     @property
     def actions(self) -> np.ndarray:
@@ -211,6 +215,7 @@ def roll_out(
     memory += (np.empty((num, limit + 1, len(ROBOT.arms)), np.int16),)
     began = observation[STATE_KEY], _each(envs.facts(), num)
     running = [_Running(names, *own) for own in zip(*memory, *began, strict=True)]
+    places = _places(envs)
     actor.begin(envs, checked_pictures(pictures))
     views: Observation = {}
     while True:
@@ -230,6 +235,7 @@ def roll_out(
         facts = _each(envs.facts(), envs.num_envs)
         for i in np.flatnonzero(~over):
             running[i].stepped(actions[i], facts[i], observation[STATE_KEY][i])
+            running[i].touch = observation[TACTILE_KEY][i].reshape(len(ROBOT.arms), -1).max(axis=1)
         over = np.array([one.end is not None for one in running])
         if progress is not None:
             successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
@@ -240,7 +246,18 @@ def roll_out(
         if over.all():
             break
     seen = pictures if actor.needs_images else NO_PICTURES
-    return [_rollout(envs, actor, int(seed), seen, hidden, one) for seed, one in zip(seeds, running, strict=True)]
+    each = zip(seeds, running, places, strict=True)
+    return [_rollout(envs, actor, int(seed), seen, hidden, one, place) for seed, one, place in each]
+
+
+def _places(envs: TaccorlVectorEnv) -> list[dict[str, float]]:
+    """``EpisodeRow.reset`` of each environment."""
+    places: list[dict[str, float]] = [{} for _ in range(envs.num_envs)]
+    for body in posed_bodies(envs.sim.task):
+        for place, pose in zip(places, envs.sim.poses(body), strict=True):
+            yaw = math.atan2(pose[1, 0], pose[0, 0])
+            place |= {f"{body}_x_m": float(pose[0, 3]), f"{body}_y_m": float(pose[1, 3]), f"{body}_yaw_rad": yaw}
+    return places
 
 
 def _in_last_subtask(running: Sequence[_Running], names: Mapping[str, Sequence[str]]) -> np.ndarray:
@@ -249,10 +266,17 @@ def _in_last_subtask(running: Sequence[_Running], names: Mapping[str, Sequence[s
 
 
 def _rollout(
-    envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, hidden: Sequence[str], one: _Running
+    envs: TaccorlVectorEnv,
+    actor: Actor,
+    seed: int,
+    pictures: str,
+    hidden: Sequence[str],
+    one: _Running,
+    place: dict[str, float],
 ) -> Rollout:
     assert one.end is not None
     outcome, reason = one.end
+    touched = {f"{arm}_touch_counts": counts for arm, counts in zip(ROBOT.arms, one.touch, strict=True)}
     row = EpisodeRow(
         policy=actor.name,
         task=envs.task,
@@ -265,7 +289,8 @@ def _rollout(
         subtask_end_s=one.subtask_end_s,
         clipped_steps=one.clipped_steps,
         # A diverged simulation has no measures: JSON knows no NaN.
-        measures={k: float(v) for k, v in one.facts["measures"].items() if np.isfinite(v)},
+        measures={k: float(v) for k, v in (one.facts["measures"] | touched).items() if np.isfinite(v)},
+        reset=place,
         reason=reason,
         pictures=pictures,
         hidden=", ".join(hidden),

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import cv2
 import mujoco
 import numpy as np
+from scipy.stats import mannwhitneyu
 
 import taccorl
 from taccorl.evaluation.episodes import EpisodeRow, Summary, summaries
@@ -27,6 +28,7 @@ from taccorl.sim.twin_file import twin_text
 
 ORIGIN = "Simulated in the MuJoCo twin; no robot was used"
 _JPEG_QUALITY = 88
+_FEWEST = 5  # successes, and failures, from which their quantities are compared
 _SHOWN_PX = 176  # side of a picture on the page: six instants fit beside each other
 
 
@@ -113,13 +115,16 @@ class Evaluation:
         found, title = summaries(self.rows), f"all {len(self.rows)} episodes"
         rows = [*map(_episode, self.rows)]
         every = Section(title=title, heads=_EPISODE, rows=rows, right=(2, 4, 5, 6, 7), folded=True)
+        shown = [_failure(*failed) for failed in failures]
         checked = [preflight(one.name, one.checks) for one in self.policies if one.checks]
         sections = [
             Section(text=[self.robot.get("origin", ORIGIN)], style="data"),
             dataclasses.replace(self.lines(), style="high"),
             _scores(found),
             *([_paired(self.comparisons, self.names)] if self.comparisons else []),
-            Section(title="Failures", parts=[_categories(found), *(_failure(*failed) for failed in failures)]),
+            Section(
+                title="Failures", parts=[_categories(found), by_subtask(self.rows), *differences(self.rows), *shown]
+            ),
             *([Section(title="Checkpoint and environment", parts=checked, folded=True)] if checked else []),
             Section(title="Episodes", parts=[every]),
             Section(title="How this report was made", rows=[*self.about.items()], folded=True),
@@ -163,6 +168,58 @@ def _categories(found: Sequence[Summary]) -> Section:
     rows = [[s.policy, s.task, name, str(n), _percent(n / s.n)] for s in found for name, n in s.failures.items()]
     heads = ("policy", "task", "category", "episodes", "share of all")
     return Section(heads=heads, rows=rows, right=(3, 4), notes=[] if rows else ["None."])
+
+
+def _of_each(rows: Sequence[EpisodeRow]) -> dict[tuple[str, str], list[EpisodeRow]]:
+    """(policy, task) → its episodes."""
+    found: dict[tuple[str, str], list[EpisodeRow]] = {}
+    for row in rows:
+        found.setdefault((row.policy, row.task), []).append(row)
+    return found
+
+
+def by_subtask(rows: Sequence[EpisodeRow]) -> Section:
+    """In which subtask of an arm episodes failed."""
+    cells = []
+    for (policy, task), own in _of_each(rows).items():
+        for arm, names in own[0].subtask_end_s.items():
+            begun = len(own)
+            for name in names:
+                ended = sum(row.subtask_end_s[arm][name] is not None for row in own)
+                failed = sum(row.failed_in.get(arm) == name for row in own)
+                cells.append([policy, task, arm, name, str(begun), str(ended), str(failed)])
+                begun = ended
+    heads = ("policy", "task", "arm", "subtask", "begun", "ended", "failed in it")
+    note = "Both arms work at the same time: a failure counts for each."
+    return Section(title="By subtask", heads=heads, rows=cells, right=(4, 5, 6), notes=[note])
+
+
+def differences(rows: Sequence[EpisodeRow]) -> list[Section]:
+    """Where parts were after the reset, and what was measured at the end, of failures and of successes."""
+    sections = []
+    for (policy, task), own in _of_each(rows).items():
+        sides = [[row.reset | row.measures for row in own if row.success == success] for success in (True, False)]
+        cells = []
+        for name in dict.fromkeys(name for side in sides for one in side for name in one):
+            good, bad = (np.array([one[name] for one in side if name in one]) for side in sides)
+            if min(len(good), len(bad)) >= _FEWEST and np.ptp([*good, *bad]) > 0:
+                when = "at the end" if name in own[0].measures else "after the reset"
+                cells.append((float(mannwhitneyu(good, bad)[1]), [name, when, _middle(good), _middle(bad)]))
+        cells.sort(key=lambda cell: cell[0])
+        heads = ("quantity", "when", "successes: median (5 … 95 %)", "failures: median (5 … 95 %)", "p")
+        note = "p: Mann-Whitney test of each quantity by itself; by chance one in 20 is below 0.05."
+        table = [[*cell, f"{p:.2g}"] for p, cell in cells]
+        few = f"Needs {_FEWEST} successes and {_FEWEST} failures."
+        title = f"What differs between successes and failures of {policy}, {task}"
+        sections.append(
+            Section(title=title, heads=heads, rows=table, right=(4,), notes=[note if cells else few], folded=True)
+        )
+    return sections
+
+
+def _middle(values: np.ndarray) -> str:
+    low, middle, high = np.percentile(values, (5, 50, 95))
+    return f"{middle:.4g} ({low:.4g} … {high:.4g})"
 
 
 def _failure(failed: FailedEpisode, rrd: Path) -> Section:

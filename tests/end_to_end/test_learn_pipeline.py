@@ -151,13 +151,13 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(cache, tm
     cotrain.main(words)
     out = tmp_path / "assembly_2"
 
-    both = Dataset(out / "surrogate_7_and_twin")
+    both = Dataset(out / "surrogate_other_cameras_and_twin")
     origins = [both.episode(k).origin for k in range(both.num_episodes)]
     num_sim = 2 if cache == "none" else 1
     assert origins[0].domain == "surrogate" and origins[1:] == [TWIN] * num_sim
     assert bool(both.unstored) == (cache == "host") == ("observation.environment_state" in both.info["features"])
     assert both.spec.action_time == "next_row"
-    real = Dataset(out / "surrogate_7")
+    real = Dataset(out / "surrogate_other_cameras")
     assert real.provenance is not None and real.provenance["stage"] == "dataset"  # through recordings and ingest
     is_sim = [both.values(k, ["observation.is_sim"])["observation.is_sim"].mean() for k in range(1 + num_sim)]
     assert is_sim == [0.0] + [1.0] * num_sim
@@ -188,5 +188,7 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(cache, tm
 
 
 def test_what_the_pipeline_does_not_know_is_named() -> None:
-    with pytest.raises(SystemExit, match=r"did you mean 'secret'\?"):
-        cotrain.main(["--secrte=3"])
+    with pytest.raises(SystemExit, match=r"did you mean 'robot'\?"):
+        cotrain.main(["--robto=a.yaml"])
+    with pytest.raises(SystemExit, match=r"--robot=a\.yaml: no such file; configs/surrogates has some"):
+        cotrain.main(["--robot=a.yaml"])

@@ -62,7 +62,15 @@ def same(one: list[Rollout], other: list[Rollout]) -> bool:
 
 
 def test_who_holds_still_runs_out_of_time() -> None:
-    rows = [r.row for r in score(scenes(), StandIn())]
+    plugs: list[np.ndarray] = []
+
+    def look(step: int, actions: np.ndarray, envs: TaccorlVectorEnv) -> None:
+        if step == 0:
+            plugs.extend(envs.sim.poses("plug")[:, :2, 3])
+
+    rows = [r.row for r in score(scenes(), StandIn(look))]
+    assert [[row.reset["plug_x_m"], row.reset["plug_y_m"]] for row in rows] == [plug.tolist() for plug in plugs]
+    assert all(0 <= row.measures["left_touch_counts"] < 10 for row in rows)  # noise; a grip has more than 50
     assert [row.seed for row in rows] == [7, 8, 9]
     assert [row.outcome for row in rows] == ["timeout"] * 3
     assert all(row.steps == STEPS and row.time_s == pytest.approx(STEPS / 30) for row in rows)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from taccorl.evaluation.statistics import (
     told_rate,
     wilson_interval,
 )
+from taccorl.report.evaluated import by_subtask, differences
 
 Z2 = 3.841459  # z², z = 1.959964
 
@@ -152,3 +154,25 @@ def test_other_scenes_are_not_compared() -> None:
         compare([row(0, "success"), row(1, "success")], [row(0, "success"), row(2, "success")])
     with pytest.raises(TaccorlError, match="2 and 1 episodes"):
         compare([row(0, "success"), row(0, "success")], [row(0, "success")])
+
+
+def test_where_episodes_fail_and_what_differs_by_hand() -> None:
+    # Of 15 episodes 3 fail in grasp and 2 in insert. Failures begin at 20 … 24 mm, successes at 0 … 9: of C(15, 5) = 3003 orders
+    # two are so extreme, p = 2 / 3003. The depth is the same in all, and says nothing.
+    ends = [(0.5, 2.0)] * 10 + [(None, None)] * 3 + [(0.5, None)] * 2
+    places = [*range(10), *range(20, 25)]
+    rows = [
+        row(
+            k,
+            "success" if k < 10 else "timeout",
+            subtask_end_s={"left": dict(zip(("grasp", "insert"), end, strict=True))},
+        )
+        for k, end in enumerate(ends)
+    ]
+    rows = [replace(one, reset={"tray_x_m": 1e-3 * place}) for one, place in zip(rows, places, strict=True)]
+    assert [one.failed_in for one in rows[9:14:2]] == [{}, {"left": "grasp"}, {"left": "insert"}]
+    assert [line[3:] for line in by_subtask(rows).rows] == [["grasp", "15", "12", "3"], ["insert", "12", "10", "2"]]
+    middles = ["0.0045 (0.00045 … 0.00855)", "0.022 (0.0202 … 0.0238)"]
+    assert [one.rows for one in differences(rows)] == [[["tray_x_m", "after the reset", *middles, f"{2 / 3003:.2g}"]]]
+    (few,) = differences(rows[:14])
+    assert few.rows == [] and few.notes == ["Needs 5 successes and 5 failures."]

@@ -5,7 +5,19 @@ import json
 import matplotlib.pyplot as plt
 import pytest
 
-from pipelines.paper_tables import draw_curves, gain, main, page, read, row_of, share, take, touch_gain, transfer
+from pipelines.paper_tables import (
+    draw_curves,
+    gain,
+    main,
+    page,
+    read,
+    row_of,
+    share,
+    singly,
+    take,
+    touch_gain,
+    transfer,
+)
 
 ABOUT = {"sensors": "touch", "demonstrations": 9, "seed": 1, "twin": "", "scored_in": "", "steps": 5}
 ONE = {"task": "puzzle", "pictures": "clear", "hidden": "", "n": 96, "successes": 0}
@@ -65,6 +77,11 @@ def test_cells_are_what_was_counted():
     assert "| late | 50 % (43 … 57) of 192* | not run | not run | not run | 14 % (10 … 20) of 192* |" in page(
         [imitated, anchored, start]
     )
+    # One effect alone: 48 against 96 of the same 96 scenes; other scenes and a policy after PPO (its row has beta) do not count.
+    late, start = ROW | {"scored_in": "creep_of_late_ab12", "successes": 48}, ROW | {"stage": "start", "successes": 96}
+    others = [ROW | {"first_scene": 60}, ROW | {"stage": "ppo", "beta": 0.0}]
+    assert singly([late, start, *others]) == {("creep", "late"): ([start], [late])}
+    assert "| creep | late | 50 % (40 … 60) of 96* | -50; p = 2e-18 |" in page([late, start, *others])
     grip = ROW | {"task": "assembly_1", "demonstrations": 100}
     many = grip | {"demonstrations": 1000, "successes": 48}
     told = page([grip, many | {"sources": 10}, many | {"corrected": 300, "successes": 96}, grip | {"stage": "ppo"}])
