@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_608,
+    "taccorl/alignment": 14_610,
     "taccorl/cli": 4_884,
     "taccorl/data": 8_738,
-    "taccorl/diagnosis": 11_036,
+    "taccorl/diagnosis": 11_042,
     "taccorl/episodes": 4_043,
     "taccorl/evaluation": 1_906,
     "taccorl/lerobot_plugin": 343,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_511,
     "taccorl/training": 1_557,
     "taccorl/views": 2_334,
-    "tests": 55_427,
+    "tests": 55_468,
     "pipelines": 6_203,
 }
 MOST_LINES_OF_A_FILE = 500

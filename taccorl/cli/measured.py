@@ -299,8 +299,8 @@ def far_off(comparison: "Comparison", fitted: Collection[str], findings: Mapping
             per = "per rad, not per degree" if traces[0].unit == "rad" else "per m, not per mm"
             lines[s.signal] = (
                 f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. "
-                f"{constant} unit or factor of its columns, kp and kd ({per}), inertia, and of law pwm "
-                "supply_v, resistance_ohm and torque_nm_per_a"
+                f"{constant} unit or factor of its columns, kp and kd ({per}), inertia, loop_hz "
+                "(too slow a loop is not stable), and of law pwm supply_v, resistance_ohm and torque_nm_per_a"
             )
     return list(lines.values())
 

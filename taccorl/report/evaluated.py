@@ -204,7 +204,7 @@ def differences(rows: Sequence[EpisodeRow]) -> list[Section]:
             good, bad = (np.array([one[name] for one in side if name in one]) for side in sides)
             if min(len(good), len(bad)) >= _FEWEST and np.ptp([*good, *bad]) > 0:
                 when = "at the end" if name in own[0].measures else "after the reset"
-                cells.append((float(mannwhitneyu(good, bad)[1]), [name, when, _middle(good), _middle(bad)]))
+                cells.append((float(np.array(mannwhitneyu(good, bad))[1]), [name, when, _middle(good), _middle(bad)]))
         cells.sort(key=lambda cell: cell[0])
         heads = ("quantity", "when", "successes: median (5 … 95 %)", "failures: median (5 … 95 %)", "p")
         note = "p: Mann-Whitney test of each quantity by itself; by chance one in 20 is below 0.05."

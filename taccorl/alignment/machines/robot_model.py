@@ -92,8 +92,9 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     model = _compiled(path, spec, root)
     names = [model.joint(k).name for k in range(model.njnt)]
     if "" in names:
-        body = model.body(model.jnt_bodyid[names.index("")]).name
-        raise TaccorlError(f"{path}: a joint of body {body} has no name; give it one")
+        k = names.index("")
+        body = model.body(model.jnt_bodyid[k]).name or "without a name"
+        raise TaccorlError(f"{path}: joint {k + 1} of {model.njnt}, of body {body}, has no name; give it one")
     inertias = _inertias(model)
     joints = {name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(names)}
     remarks += [remark for facts in joints.values() for remark in _of_limits(root, facts)]
@@ -238,8 +239,9 @@ def _compiled(path: Path, spec: mujoco.MjSpec, root: Element) -> mujoco.MjModel:
                 if path.suffix == ".urdf"
                 else f'<inertial pos="x y z" mass="kg" diaginertia="Ixx Iyy Izz"/> in <body name="{named}">'
             )
+            link = named or "without a name (give it one)"
             raise TaccorlError(
-                f"{path}: link {named} moves and has no mass or inertia; write {inertial}, from CAD or the data sheet"
+                f"{path}: link {link} moves and has no mass or inertia; write {inertial}, from CAD or the data sheet"
             ) from error
         if "inertia" in text and (why := unbalanced(root)):
             raise TaccorlError(why) from error

@@ -94,16 +94,15 @@ def diagnose(
         fits, other = other, None
     fits.problem.learn(fits.first.values)
     beam = Beam(fits, [name for name in fits.problem.candidates if name not in without])
-    answer, removed, remarks = beam.pruned(beam.search())
+    answer, removed, remarks = beam.result()
     if other is not None and better(other.base, answer, fits.config):
         fits, other, beam = other, None, Beam(other, beam.names)
-        answer, removed, remarks = beam.pruned(beam.search())
+        answer, removed, remarks = beam.result()
     steps = beam.steps(answer)
     rivals = beam.rivals(answer, steps)
     rounds = beam.rounds(answer, steps, rivals)
-    first = fits.first
     changed, model = changed_numbers(fits, answer.fit, beam.names)
-    stages = {"before": fits.as_it_was, "fitted": first, "after": model}
+    stages = {"before": fits.as_it_was, "fitted": fits.first, "after": model}
     errors = {stage: fits.errors(one.values, one.effects, test) for stage, one in stages.items()}
     without_it = {
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
@@ -143,7 +142,7 @@ def diagnose(
         undetermined=_undetermined(model),
         trouble=model.trouble,
         cpu_s=time.process_time() - began,
-        before=first,
+        before=fits.first,
         after=model,
     )
 
@@ -158,6 +157,13 @@ class Beam:
     def __init__(self, fits: Fits, names: Sequence[str]) -> None:
         self.fits, self.config, self.names = fits, fits.config, list(names)
         self.remarks: list[str] = []
+
+    def result(self) -> tuple[Model, list[str], list[str]]:
+        """``pruned`` of ``search``; once more where the last refit shows a flaw of all that was found: it kept others out."""
+        found = self.search()
+        (answer, removed, _) = result = self.pruned(found)
+        flawed = removed and not self.fits.added(answer) and self.fits.flaw(self.fits.models[frozenset(found.names)])
+        return self.pruned(self.search()) if flawed else result
 
     def search(self) -> Model:
         """The best model with at most ``max_effects`` effects more than the twin has, or of the rounds before ``Stopped``."""
@@ -275,6 +281,7 @@ class Beam:
             answer = rigid if better(rigid, answer, c) else answer
         while True:
             last = fits.model_of(fits.finished(answer.fit))
+            fits.models |= {frozenset(last.names): last} if fits.flaw(last) else {}
             parts = [(n, fits.without(last, n, again=True)) for n in fits.added(last)]
             # What is left above the floor widens intervals where no known effect explains it, not where none may be added.
             left_over = len(parts) < c.max_effects
@@ -397,14 +404,13 @@ class Beam:
         probed = sorted(
             (n for k, n in fits.probes if k == key and n not in models), key=lambda n: -fits.probes[key, n].explained
         )
-        after = pick or parent
         return Round(
             evidence=tuple(fits.evidence(models[n], parent, verdicts[n]) for n in order),
             not_refitted=tuple(probed),
             added=added or None,
             ties=tuple(n for n in tied if n in models),
-            validation_error=after.error,
-            fit_error=after.fit.error,
+            validation_error=(pick or parent).error,
+            fit_error=(pick or parent).fit.error,
         )
 
 
