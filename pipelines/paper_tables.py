@@ -212,10 +212,11 @@ def page(rows: Rows) -> str:
         betas = (("start", 1), ("ppo", 0), *(([*STAGES][-1], beta) for beta in (0.1, 1, 5)))
         table_7.append((name, *(share(mixed[robot, real, 0.95, *cell]) for cell in betas)))
     single = singly(seen)
-    table_8 = [(*name, share(of), gain({"nominal": nominal, "mended": of})) for name, (nominal, of) in single.items()]
+    alone = [row for row in seen if any(row in nominal for nominal, _ in single.values())]
+    costs = sorted(single.items(), key=lambda item: np.divide(*_counts(item[1][1])))
+    table_8 = [(*name, share(of), gain({"nominal": nominal, "mended": of})) for name, (nominal, of) in costs]
     learnt_more, gains = (np.subtract(PAPER["touch"][s], PAPER["cameras"][s]) for s in ("co-trained", "RL"))
-    puzzle = TASKS.index("puzzle")
-    others = [[cell for k, cell in enumerate(of) if k != puzzle] for of in new_of.values()]
+    others = [[cell for k, cell in enumerate(of) if TASKS[k] != "puzzle"] for of in new_of.values()]
     return f"""# The paper's tables, by simulation
 
 Written by `python -m pipelines.paper_tables` of `docs/results.jsonl` (commit, seed, scenes). **Simulated**: a small π0.5 from
@@ -226,15 +227,15 @@ their number, each training (`*`: one). 0.5 mm of clearance, 8 actions executed 
 
 {_table(f"{HEADS_1} | after PPO, untrained | after PPO", table_1)}
 
-Updates: iterations of PPO that changed the policy, if they were counted. Of untrained policies, three with 32 environments of 72
-decisions: no episode succeeded, so that no reward says what to improve.
+Updates: iterations of PPO that changed the policy, if they were counted. Of untrained policies at most three, of 32 environments
+of 72 decisions: no episode succeeded, so that no reward says what to improve.
 
 Completed with touch minus completed with cameras alone, in points, mean of the tasks (95 %, of the scenes):
 
 - by imitation of equal numbers of demonstrations: {touch_gain(*learnt_of.values())}; the paper: {learnt_more.mean():+.0f};
 - after PPO, of different numbers of demonstrations: {touch_gain(*new_of.values())}; the paper: {gains.mean():+.0f}.
   Without puzzle, whose policies learnt from 2800 and 1000: {touch_gain(*others)};
-  the paper: {np.delete(gains, puzzle).mean():+.0f}.
+  the paper: {np.delete(gains, TASKS.index("puzzle")).mean():+.0f}.
 
 ![completed in each iteration of PPO]({CURVES.name})
 
@@ -270,8 +271,8 @@ scored ([settings](training.md#post-training-ppo-in-the-twin)).
 
 ### What each effect costs
 
-Policies of the nominal twin, scored in it with a single effect of a surrogate, in the same scenes; in the nominal twin itself
-{share([row for row in seen if any(row in nominal for nominal, _ in single.values())])}.
+Policies of the nominal twin, of {", ".join(map(str, sorted({row["demonstrations"] for row in alone})))} demonstrations,
+scored in it with one effect of a surrogate (configs/surrogates), in the same scenes; in the nominal twin itself {share(alone)}.
 
 {_table("effect | as in | completed | gained, in points", table_8)}
 

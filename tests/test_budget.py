@@ -25,7 +25,7 @@ MOST_LINES = {
     "taccorl/training": 1_557,
     "taccorl/views": 2_334,
     "tests": 55_468,
-    "pipelines": 6_203,
+    "pipelines": 6_204,
 }
 MOST_LINES_OF_A_FILE = 500
 
