@@ -726,17 +726,14 @@ def of_a_wheel(name: str, target: np.ndarray, repeat_of: str | None = None) -> M
 
 
 def test_two_frictions_that_look_like_one_are_not_called_unknown():
-    """Of two missing effects one is asked for: the law of grease explains both, and its last refit shows that it is no more than
-    these two. Then the one of them that explains most is named, not none."""
+    """One effect is asked for. The law of grease explains both, but is no more than the two: the greater one is named."""
     t = np.arange(2000) / 250
     chirp, triangle = 3 * np.sin(2 * np.pi * (0.2 * t + 0.2 * t**2)), 8 * np.abs((t / 3 + 0.25) % 1 - 0.5) - 2
     waves = 1.5 * np.sin(2 * np.pi * 0.31 * t) + 1.5 * np.sin(2 * np.pi * 0.77 * t + 1)
     fit_to = of_a_wheel("one", chirp), of_a_wheel("again", chirp, "one"), of_a_wheel("tri", triangle)
-    wheel = AxisConfig(
-        name="wheel", unit="rad", law="velocity", inertia=0.05, kd=0.8, loop_hz=1000.0, known=("unbalance",)
-    )
-    considered = "coulomb_friction", "power_law_friction", "viscous_friction"
-    found = one_round(wheel, Measurements(fit_to, (of_a_wheel("held", waves),)), considered)
+    axis = AxisConfig(name="wheel", unit="rad", law="velocity", inertia=0.05, kd=0.8, loop_hz=1e3, known=("unbalance",))
+    names = "coulomb_friction", "power_law_friction", "viscous_friction"
+    found = one_round(axis, Measurements(fit_to, (of_a_wheel("held", waves),)), names)
     assert found.names == ("coulomb_friction",) and found.status == "too_many"
     verdicts = {e.name: e.verdict for e in found.rounds[0].evidence}
     assert "no more than coulomb_friction and viscous_friction" in verdicts["power_law_friction"]
