@@ -23,15 +23,17 @@ import yaml
 
 from pipelines.lerobot_commands import FIRST_SEED, Scoring, Training
 from pipelines.steps import chosen, lerobot, parsed, step
+from pipelines.surrogate_twin import named
 from taccorl.cli import augment, collect, ingest, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
+from taccorl.errors import TaccorlError
 from taccorl.evaluation.statistics import told_rate, wilson_interval
 
 ORIGIN = "twin with hidden effects and other cameras, not a robot"
-"""Text of the origin of the surrogate's demonstrations."""
+"""Origin that datasets of the simulated robot state."""
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=4,--batch_size=4]")
@@ -44,7 +46,7 @@ class CotrainConfig:
     task: str = "assembly_2"
     """Task: {tasks}."""
     robot: Path = Path("configs/surrogates/other_cameras.yaml")
-    """Twin file of the surrogate robot."""
+    """Twin file of the simulated robot whose demonstrations stand for those of a real one."""
     real: int = 50
     """N_real: episodes of the surrogate robot."""
     sources: int = 20
@@ -77,14 +79,16 @@ def record(recordings: Path, config: CollectConfig) -> None:
 def main(words: list[str]) -> None:
     config = parsed(CotrainConfig, chosen(words, SMALL), "python -m pipelines.cotrain")
     out, task, store = config.out / config.task, config.task, config.out / "store"
-    recipe, name = config.train or Path(f"configs/cotrain/{task}.yaml"), f"surrogate_{config.robot.stem}"
+    recipe = config.train or Path(f"configs/cotrain/{task}.yaml")
     if not recipe.is_file():  # before hours of collecting
         raise SystemExit(f"--train={recipe}: no such file; for a task of your own, copy one of configs/cotrain")
+    try:
+        name = f"surrogate_{named(config.robot)}"  # another content of the file is another robot
+    except TaccorlError as error:
+        raise SystemExit(f"--robot: {error}; configs/surrogates has some") from error
     parts = (f"{name}_recordings_{config.real}", name, f"{name}_and_twin")
     recordings, real, both = (out / part for part in parts)
     sources, many = out / "sources", out / "augmented"
-    if not config.robot.is_file():
-        raise SystemExit(f"--robot={config.robot}: no such file; configs/surrogates has some")
     out.mkdir(parents=True, exist_ok=True)
     shown = CollectConfig(
         task=task, episodes=config.real, as_recording=True, seed=1, twin=config.robot, origin=ORIGIN, store=store

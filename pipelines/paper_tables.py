@@ -273,6 +273,7 @@ scored ([settings](training.md#post-training-ppo-in-the-twin)).
 
 Policies of the nominal twin, of {", ".join(map(str, sorted({row["demonstrations"] for row in alone})))} demonstrations,
 scored in it with one effect of a surrogate (configs/surrogates), in the same scenes; in the nominal twin itself {share(alone)}.
+p: Fisher's exact test of all scenes; 95 % intervals, where given, of three trainings or more.
 
 {_table("effect | as in | completed | gained, in points", table_8)}
 
@@ -425,11 +426,12 @@ def draw_grips(rows: Rows, path: Path) -> None:
 def draw_curves(rows: Rows, path: Path) -> None:
     """A picture: completed under noise in each iteration of PPO in the nominal twin; intervals of the episodes."""
     figure, axis = plt.subplots(figsize=(9, 3.4), layout="constrained")
-    for row in (row for row in rows if row.get("curve") and row["demonstrations"] and not row["twin"]):
-        at, ended = zip(*((k + 1, cell) for k, cell in enumerate(row["curve"]) if cell[0]), strict=True)
-        height, *ends = 100 * np.transpose([(done / n, *wilson_interval(done, n)) for n, done in ended])
-        label = f"{row['task']}, {SENSORS[row['sensors']]}"
-        axis.errorbar(at, height, abs(ends - height), marker="o", ms=3, capsize=2, lw=1, label=label)
+    for row in (row for row in rows if row["demonstrations"] and not row["twin"]):
+        cells = {k: [{"n": n, "successes": done}] for k, (n, done) in enumerate(row.get("curve", []), start=1) if n}
+        if cells:
+            height, *ends = _shares(cells.values())
+            label = f"{row['task']}, {SENSORS[row['sensors']]}"
+            axis.errorbar(list(cells), height, abs(ends - height), marker="o", ms=3, capsize=2, lw=1, label=label)
     axis.set(ylim=(0, 100), xlabel="iteration of PPO", ylabel="completed, with noise [%]")
     axis.set_title("simulated; episodes that ended in the iteration; whiskers: 95 % of the episodes", fontsize=9)
     figure.legend(loc="outside right center", fontsize=8)

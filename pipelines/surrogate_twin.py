@@ -1,4 +1,4 @@
-"""The twin that commands mend of recordings of a surrogate, a simulated robot whose twin file is in configs/surrogates."""
+"""Twins corrected by ``taccorl diagnose`` from recordings of a surrogate, a simulated robot described by a twin file."""
 
 import dataclasses
 import shutil

@@ -45,7 +45,8 @@ class EpisodeRow:
     measures: dict[str, float] = field(default_factory=dict)
     """Measures of the task at the end, and ``ARM_touch_counts``, the largest reading of an arm's pads; names state units."""
     reset: dict[str, float] = field(default_factory=dict)
-    """Place of each part after the reset, in the world: ``PART_x_m``, ``PART_y_m``, ``PART_yaw_rad``."""
+    """Position of each part, and its rotation about the vertical axis, after the reset, in the world frame: ``PART_x_m``,
+    ``PART_y_m``, ``PART_yaw_rad``."""
     pictures: str = "clear"
     """How the policy saw the pictures: ``clear``, ``randomised``, or ``none`` if it uses none."""
     hidden: str = ""
@@ -55,7 +56,7 @@ class EpisodeRow:
 
     @property
     def failed_in(self) -> dict[str, str]:
-        """Arm → its first subtask that did not end; empty for a success."""
+        """Arm → first of its subtasks that the episode did not complete; empty for a successful episode."""
         began = {arm: [name for name, end in own.items() if end is None] for arm, own in self.subtask_end_s.items()}
         return {arm: names[0] for arm, names in began.items() if names and not self.success}
 
@@ -132,10 +133,15 @@ class Summary:
 
 def summaries(rows: Iterable[EpisodeRow]) -> list[Summary]:
     """Return one summary for each policy and task, in the order of the rows."""
+    return [Summary.of(group) for group in grouped(rows).values()]
+
+
+def grouped(rows: Iterable[EpisodeRow]) -> dict[tuple[str, str], list[EpisodeRow]]:
+    """(policy, task) → its episodes, in the order of the rows."""
     groups: dict[tuple[str, str], list[EpisodeRow]] = {}
     for row in rows:
         groups.setdefault((row.policy, row.task), []).append(row)
-    return [Summary.of(group) for group in groups.values()]
+    return groups
 
 
 def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[str, PairedComparison]:

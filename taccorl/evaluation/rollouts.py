@@ -105,6 +105,8 @@ class _Running:
         states: np.ndarray,
         subtasks: np.ndarray,
         state: np.ndarray,
+        touch: np.ndarray,
+        place: dict[str, float],
         facts: dict[str, Any],
     ) -> None:
         """
@@ -113,7 +115,7 @@ class _Running:
             states: (limit + 1, 14) float32 array, likewise; and ``subtasks``, (limit + 1, 2) int16. They are parts of arrays that
                 are allocated once for all environments. A small array kept in every step, between the large temporary ones of
                 the pictures, fragments the heap: 32 environments then took 13 GB in 900 steps.
-            state: (14,) ``observation.state`` after the reset; and ``facts`` of the environment.
+            state: (14,) ``observation.state`` after the reset; ``touch``, of pads [counts]; ``place``: ``EpisodeRow.reset``.
         """
         self._actions, self._states, self._subtasks = actions, states, subtasks
         self._states[0], self._subtasks[0], self.facts = state, facts["subtask"], facts
@@ -122,8 +124,7 @@ class _Running:
         self.subtask_end_s: dict[str, dict[str, float | None]] = {arm: dict.fromkeys(own) for arm, own in names.items()}
         self.end: tuple[str, str] | None = None
         """Outcome and reason."""
-        self.touch = np.zeros(len(ROBOT.arms))
-        """Largest reading of each arm's pads [counts]."""
+        self.touch, self.place = touch, place
 
     @property
     def actions(self) -> np.ndarray:
@@ -213,9 +214,8 @@ def roll_out(
     num, limit, size = envs.num_envs, envs.sim.judge.limit_steps, len(ROBOT.action_names)
     memory = np.empty((num, limit, size), np.float32), np.empty((num, limit + 1, size), np.float32)
     memory += (np.empty((num, limit + 1, len(ROBOT.arms)), np.int16),)
-    began = observation[STATE_KEY], _each(envs.facts(), num)
+    began = observation[STATE_KEY], observation[TACTILE_KEY], _places(envs), _each(envs.facts(), num)
     running = [_Running(names, *own) for own in zip(*memory, *began, strict=True)]
-    places = _places(envs)
     actor.begin(envs, checked_pictures(pictures))
     views: Observation = {}
     while True:
@@ -235,7 +235,7 @@ def roll_out(
         facts = _each(envs.facts(), envs.num_envs)
         for i in np.flatnonzero(~over):
             running[i].stepped(actions[i], facts[i], observation[STATE_KEY][i])
-            running[i].touch = observation[TACTILE_KEY][i].reshape(len(ROBOT.arms), -1).max(axis=1)
+            running[i].touch = observation[TACTILE_KEY][i].copy()
         over = np.array([one.end is not None for one in running])
         if progress is not None:
             successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
@@ -246,8 +246,7 @@ def roll_out(
         if over.all():
             break
     seen = pictures if actor.needs_images else NO_PICTURES
-    each = zip(seeds, running, places, strict=True)
-    return [_rollout(envs, actor, int(seed), seen, hidden, one, place) for seed, one, place in each]
+    return [_rollout(envs, actor, int(seed), seen, hidden, one) for seed, one in zip(seeds, running, strict=True)]
 
 
 def _places(envs: TaccorlVectorEnv) -> list[dict[str, float]]:
@@ -266,17 +265,12 @@ def _in_last_subtask(running: Sequence[_Running], names: Mapping[str, Sequence[s
 
 
 def _rollout(
-    envs: TaccorlVectorEnv,
-    actor: Actor,
-    seed: int,
-    pictures: str,
-    hidden: Sequence[str],
-    one: _Running,
-    place: dict[str, float],
+    envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, hidden: Sequence[str], one: _Running
 ) -> Rollout:
     assert one.end is not None
     outcome, reason = one.end
-    touched = {f"{arm}_touch_counts": counts for arm, counts in zip(ROBOT.arms, one.touch, strict=True)}
+    largest = one.touch.reshape(len(ROBOT.arms), -1).max(axis=1)
+    touched = {f"{arm}_touch_counts": counts for arm, counts in zip(ROBOT.arms, largest, strict=True)}
     row = EpisodeRow(
         policy=actor.name,
         task=envs.task,
@@ -290,7 +284,7 @@ def _rollout(
         clipped_steps=one.clipped_steps,
         # A diverged simulation has no measures: JSON knows no NaN.
         measures={k: float(v) for k, v in (one.facts["measures"] | touched).items() if np.isfinite(v)},
-        reset=place,
+        reset=one.place,
         reason=reason,
         pictures=pictures,
         hidden=", ".join(hidden),

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 import taccorl
-from taccorl.evaluation.episodes import EpisodeRow, Summary, summaries
+from taccorl.evaluation.episodes import EpisodeRow, Summary, grouped, summaries
 from taccorl.evaluation.evaluate import Scenes, scenes_to_json
 from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check
@@ -170,18 +170,10 @@ def _categories(found: Sequence[Summary]) -> Section:
     return Section(heads=heads, rows=rows, right=(3, 4), notes=[] if rows else ["None."])
 
 
-def _of_each(rows: Sequence[EpisodeRow]) -> dict[tuple[str, str], list[EpisodeRow]]:
-    """(policy, task) → its episodes."""
-    found: dict[tuple[str, str], list[EpisodeRow]] = {}
-    for row in rows:
-        found.setdefault((row.policy, row.task), []).append(row)
-    return found
-
-
 def by_subtask(rows: Sequence[EpisodeRow]) -> Section:
-    """In which subtask of an arm episodes failed."""
+    """Table: how many episodes began, ended and failed in each subtask of each arm."""
     cells = []
-    for (policy, task), own in _of_each(rows).items():
+    for (policy, task), own in grouped(rows).items():
         for arm, names in own[0].subtask_end_s.items():
             begun = len(own)
             for name in names:
@@ -195,25 +187,23 @@ def by_subtask(rows: Sequence[EpisodeRow]) -> Section:
 
 
 def differences(rows: Sequence[EpisodeRow]) -> list[Section]:
-    """Where parts were after the reset, and what was measured at the end, of failures and of successes."""
+    """Tables that compare failed with successful episodes: positions of the parts after the reset, measures at the end."""
     sections = []
-    for (policy, task), own in _of_each(rows).items():
+    for (policy, task), own in grouped(rows).items():
         sides = [[row.reset | row.measures for row in own if row.success == success] for success in (True, False)]
         cells = []
         for name in dict.fromkeys(name for side in sides for one in side for name in one):
             good, bad = (np.array([one[name] for one in side if name in one]) for side in sides)
             if min(len(good), len(bad)) >= _FEWEST and np.ptp([*good, *bad]) > 0:
-                when = "at the end" if name in own[0].measures else "after the reset"
+                when = "after the reset" if any(name in row.reset for row in own) else "at the end"
                 cells.append((float(np.array(mannwhitneyu(good, bad))[1]), [name, when, _middle(good), _middle(bad)]))
         cells.sort(key=lambda cell: cell[0])
         heads = ("quantity", "when", "successes: median (5 … 95 %)", "failures: median (5 … 95 %)", "p")
         note = "p: Mann-Whitney test of each quantity by itself; by chance one in 20 is below 0.05."
+        note = note if cells else f"Needs {_FEWEST} successes and {_FEWEST} failures."
         table = [[*cell, f"{p:.2g}"] for p, cell in cells]
-        few = f"Needs {_FEWEST} successes and {_FEWEST} failures."
         title = f"What differs between successes and failures of {policy}, {task}"
-        sections.append(
-            Section(title=title, heads=heads, rows=table, right=(4,), notes=[note if cells else few], folded=True)
-        )
+        sections.append(Section(title=title, heads=heads, rows=table, right=(4,), notes=[note], folded=True))
     return sections
 
 

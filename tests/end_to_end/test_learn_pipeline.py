@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines import cotrain, learn
+from pipelines.surrogate_twin import named
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
@@ -151,13 +152,14 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(cache, tm
     cotrain.main(words)
     out = tmp_path / "assembly_2"
 
-    both = Dataset(out / "surrogate_other_cameras_and_twin")
+    name = f"surrogate_{named(cotrain.CotrainConfig().robot)}"
+    both = Dataset(out / f"{name}_and_twin")
     origins = [both.episode(k).origin for k in range(both.num_episodes)]
     num_sim = 2 if cache == "none" else 1
     assert origins[0].domain == "surrogate" and origins[1:] == [TWIN] * num_sim
     assert bool(both.unstored) == (cache == "host") == ("observation.environment_state" in both.info["features"])
     assert both.spec.action_time == "next_row"
-    real = Dataset(out / "surrogate_other_cameras")
+    real = Dataset(out / name)
     assert real.provenance is not None and real.provenance["stage"] == "dataset"  # through recordings and ingest
     is_sim = [both.values(k, ["observation.is_sim"])["observation.is_sim"].mean() for k in range(1 + num_sim)]
     assert is_sim == [0.0] + [1.0] * num_sim
@@ -190,5 +192,5 @@ def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(cache, tm
 def test_what_the_pipeline_does_not_know_is_named() -> None:
     with pytest.raises(SystemExit, match=r"did you mean 'robot'\?"):
         cotrain.main(["--robto=a.yaml"])
-    with pytest.raises(SystemExit, match=r"--robot=a\.yaml: no such file; configs/surrogates has some"):
+    with pytest.raises(SystemExit, match=r"--robot: a\.yaml: no such file.*; configs/surrogates has some"):
         cotrain.main(["--robot=a.yaml"])

@@ -161,18 +161,17 @@ def test_where_episodes_fail_and_what_differs_by_hand() -> None:
     # two are so extreme, p = 2 / 3003. The depth is the same in all, and says nothing.
     ends = [(0.5, 2.0)] * 10 + [(None, None)] * 3 + [(0.5, None)] * 2
     places = [*range(10), *range(20, 25)]
-    rows = [
-        row(
-            k,
-            "success" if k < 10 else "timeout",
-            subtask_end_s={"left": dict(zip(("grasp", "insert"), end, strict=True))},
-        )
-        for k, end in enumerate(ends)
-    ]
+    each = [{"left": dict(zip(("grasp", "insert"), end, strict=True))} for end in ends]
+    rows = [row(k, "success" if k < 10 else "timeout", subtask_end_s=own) for k, own in enumerate(each)]
     rows = [replace(one, reset={"tray_x_m": 1e-3 * place}) for one, place in zip(rows, places, strict=True)]
     assert [one.failed_in for one in rows[9:14:2]] == [{}, {"left": "grasp"}, {"left": "insert"}]
     assert [line[3:] for line in by_subtask(rows).rows] == [["grasp", "15", "12", "3"], ["insert", "12", "10", "2"]]
     middles = ["0.0045 (0.00045 … 0.00855)", "0.022 (0.0202 … 0.0238)"]
     assert [one.rows for one in differences(rows)] == [[["tray_x_m", "after the reset", *middles, f"{2 / 3003:.2g}"]]]
+    ended = [
+        replace(one, reset={}, measures={"depth_m": 1e-3 * place}) for one, place in zip(rows, places, strict=True)
+    ]
+    diverged = [replace(ended[0], outcome="diverged", measures={}), *ended[1:]]  # which has none
+    assert [one.rows[0][:2] for one in differences(diverged)] == [["depth_m", "at the end"]]
     (few,) = differences(rows[:14])
     assert few.rows == [] and few.notes == ["Needs 5 successes and 5 failures."]

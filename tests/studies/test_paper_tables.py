@@ -39,7 +39,7 @@ def test_a_score_becomes_one_row_however_often_it_is_taken(tmp_path):
     (score / "settings.json").write_text(json.dumps(ABOUT | {"stage": "ppo"}))
     after = row_of(score)
     assert after["curve"] == [[7, 3], [0, 0], [64, 64]]
-    draw_curves([after, ROW], picture := tmp_path / "curves.png")
+    draw_curves([after, ROW, after | {"curve": [[0, 0]]}], picture := tmp_path / "curves.png")
     assert plt.imread(picture).shape[:2] == (374, 990)  # 3.4 and 9 inches of 110 points
 
 

@@ -415,7 +415,7 @@ def _simulated(
         if with_cogging:
             wave_sine, wave_cosine = sine_and_cosine(periods * q + phase)
             force += cogging_nm * wave_sine
-            # A negative stiffness is part of midpoint steps alone: there m11 stays above half of the inertia.
+            # Only midpoint steps take a negative stiffness, bounded so that m11 stays above half of the inertia.
             least = -0.5 * inertia / (ahead * h * ahead * h) if midpoint else 0.0 * inertia
             stiffness += max(-cogging_nm * periods * wave_cosine, least)
         if with_bristle:

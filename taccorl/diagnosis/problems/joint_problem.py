@@ -255,7 +255,7 @@ class JointProblem(WithoutMaps):
         kp, kd, torque_ff = self.model.gains
         found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (not self.model.joint.holds_torque_ff)
         joint = self.model.joint
-        # A speed that a drive measures is half a period of its loop newer than one that it computes from two positions. The
+        # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
         # lower bound is a little below that value, so that a fit to such a drive does not end at the bound.
         delay = dataclasses.replace(SPEED_DELAY, low=-0.6 * joint.speed_delay_s)
         units = Scale(unit=joint.unit)

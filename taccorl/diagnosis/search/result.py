@@ -28,7 +28,7 @@ WORDS: dict[Status, str] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig:
-    """Acceptance criteria of an effect. The values are choices; docs/diagnosis.md has the results with them."""
+    """Thresholds by which the search accepts an effect. They are choices; docs/diagnosis.md: how often it is right."""
 
     floor: float = 1.3
     """Validation error [noise floors] at or below which the search ends, provided that the fit error is at most ``little``: the

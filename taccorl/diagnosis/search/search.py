@@ -159,7 +159,8 @@ class Beam:
         self.remarks: list[str] = []
 
     def result(self) -> tuple[Model, list[str], list[str]]:
-        """``pruned`` of ``search``; once more where the last refit shows a flaw of all that was found: it kept others out."""
+        """``search``, then ``pruned``. Where the last refit of all added effects is flawed (``Fits.flaw``), the search runs again
+        without them: it had preferred them to others."""
         found = self.search()
         (answer, removed, _) = result = self.pruned(found)
         flawed = removed and not self.fits.added(answer) and self.fits.flaw(self.fits.models[frozenset(found.names)])

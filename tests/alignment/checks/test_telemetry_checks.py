@@ -518,7 +518,7 @@ def test_positions_show_a_wrong_kp_but_not_both_gains_off_alike_as_of_another_in
 
 @pytest.mark.parametrize(("kp", "far", "named"), [(100.0, 0.0, False), (200.0, 0.0, True), (200.0, 0.3, False)])
 def test_recordings_of_two_machines_are_told_by_what_differs(kp: float, far: float, named: bool):
-    """Without efforts. While a second joint moves by 0.3 rad its accelerations act on the first one, so there is no finding."""
+    """No efforts are recorded. A second joint moves by 0.3 rad, and its accelerations act on the first: that is no finding."""
     every = [moved_by_law(0), moved_by_law(1), moved_by_law(2, kp)]
     for k, m in enumerate(every):
         second = {
