@@ -11,7 +11,7 @@ import math
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -167,9 +167,8 @@ def share(rows: Rows) -> str:
 def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
-    mixed = _grouped(
-        [{"stage": "", "beta": 1} | r for r in rows if "real" in r], "scored_in", "real", "sim_weight", "stage", "beta"
-    )
+    real = [{"stage": "", "beta": 1} | row for row in rows if "real" in row]
+    mixed = _grouped(real, "task", "scored_in", "real", "sim_weight", "stage", "beta")
     plain = [row for row in seen if PLAIN.items() <= row.items() and not {"sources", "corrected"} & row.keys()]
     own = _grouped(plain, "task", "sensors")
     harder = [row for row in seen if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])]
@@ -181,17 +180,21 @@ def page(rows: Rows) -> str:
             paper = "; ".join(f"{stage[k]} %" for stage in PAPER[sensors].values())
             mine = own[task, sensors]
             trained = [r for r in mine if r["demonstrations"]]
-            learnt, old, new, _ = (_most([r for r in trained if r.get("stage") == s]) for s in (None, *STAGES))
-            old = [r for r in old if new and r["demonstrations"] == new[0]["demonstrations"]]
-            of = f"; of {new[0]['demonstrations']} demonstrations" if new else ""
-            of += f", before {share(old)}" if old else ""
+            learnt = _most([r for r in trained if "stage" not in r])
+            old, new = (
+                _grouped([r for r in trained if r.get("stage") == s], "demonstrations") for s in ("start", "ppo")
+            )
+            after = [
+                f"{share(new[n])}; of {n[0]} demonstrations" + (f", before {share(old[n])}" if n in old else "")
+                for n in sorted(new, reverse=True)
+            ]
             noise = next((row["noise"] for row in _most([r for r in mine if "noise" in r])), None)
             loud = f"{noise['without']:g} → {noise['with']:g} % of {noise['n']:g}" if noise else "not run"
-            none = share([r for r in mine if r.get("stage") == "ppo" and not r["demonstrations"]])
+            none = share([r for r in mine if r.get("stage") == "ppo" and not r["demonstrations"] and r["updates"]])
             first = share(learnt) + (f"; of {learnt[0]['demonstrations']} demonstrations" if learnt else "")
-            table_1.append((task, text, paper, first, loud, none, share(new) + of))
+            table_1.append((task, text, paper, first, loud, none, "; ".join(after) or "not run"))
             learnt_of[sensors].append(learnt)
-            new_of[sensors].append(new)
+            new_of[sensors].append(new[min(new, default=(0,))])
         few = {key: of for key, of in grips(seen, task).items() if {*DEMONSTRATIONS[:-1]} & {*of}}
         table_5 += [(task, *key, *(share(of.get(n, [])) for n in DEMONSTRATIONS)) for key, of in few.items()]
     for task, pictures, n, clear, executed in sorted({cell[:5] for cell in cells}):
@@ -202,21 +205,22 @@ def page(rows: Rows) -> str:
     for stage, text in STAGES.items():
         for (robot, _), of in transfer(seen, stage).items():
             table_4.append((robot, text, share(of["nominal"]), share(of["mended"]), gain(of)))
-    for robot, real in sorted({key[:2] for key in mixed}):
-        name = robot.rpartition("_")[0]
-        weights = [mixed[robot, real, *cell, 1] for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))]
+    for task, robot, few in sorted({key[:3] for key in mixed}):
+        name, of = robot.rpartition("_")[0], (task, robot, few)
+        weights = [mixed[*of, *cell, 1] for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))]
         n = max(row["demonstrations"] for row in itertools.chain(*weights))
-        alone = transfer(seen).get((name, n), {})
+        alone = transfer(seen, task=task, needed=set()).get((name, n), {})
         shares = [*weights, alone.get("nominal", []), alone.get("mended", [])]
-        table_6.append((f"{name}: {real}, {n}", *map(share, shares)))
+        table_6.append((f"{task}, {name}: {few}, {n}", *map(share, shares)))
         betas = (("start", 1), ("ppo", 0), *(([*STAGES][-1], beta) for beta in (0.1, 1, 5)))
-        table_7.append((name, *(share(mixed[robot, real, 0.95, *cell]) for cell in betas)))
+        table_7.append((f"{task}, {name}", *(share(mixed[*of, 0.95, *cell]) for cell in betas)))
     single = singly(seen)
     alone = [row for row in seen if any(row in nominal for nominal, _ in single.values())]
     costs = sorted(single.items(), key=lambda item: np.divide(*_counts(item[1][1])))
     table_8 = [(*name, share(of), gain({"nominal": nominal, "mended": of})) for name, (nominal, of) in costs]
     learnt_more, gains = (np.subtract(PAPER["touch"][s], PAPER["cameras"][s]) for s in ("co-trained", "RL"))
-    others = [[cell for k, cell in enumerate(of) if TASKS[k] != "puzzle"] for of in new_of.values()]
+    after = (row for of in new_of.values() for cell in of for row in cell)
+    least = " or ".join(map(str, sorted({row["demonstrations"] for row in after})))
     return f"""# The paper's tables, by simulation
 
 Written by `python -m pipelines.paper_tables` of `docs/results.jsonl` (commit, seed, scenes). **Simulated**: a small π0.5 from
@@ -233,9 +237,7 @@ of 72 decisions: no episode succeeded, so that no reward says what to improve.
 Completed with touch minus completed with cameras alone, in points, mean of the tasks (95 %, of the scenes):
 
 - by imitation of equal numbers of demonstrations: {touch_gain(*learnt_of.values())}; the paper: {learnt_more.mean():+.0f};
-- after PPO, of different numbers of demonstrations: {touch_gain(*new_of.values())}; the paper: {gains.mean():+.0f}.
-  Without puzzle, whose policies learnt from 2800 and 1000: {touch_gain(*others)};
-  the paper: {np.delete(gains, TASKS.index("puzzle")).mean():+.0f}.
+- after PPO of policies of {least} demonstrations: {touch_gain(*new_of.values())}; the paper: {gains.mean():+.0f}.
 
 ![completed in each iteration of PPO]({CURVES.name})
 
@@ -279,18 +281,18 @@ p: Fisher's exact test of all scenes; 95 % intervals, where given, of three trai
 
 ## Table 2 and α: demonstrations of the surrogate beside those of the nominal twin
 
-assembly_1, cameras and touch, scored in the surrogate; the loss is α · the twin's + (1 − α) · the surrogate's.
-The paper, of a robot: {PAPER_REAL}.
+Cameras and touch, scored in the surrogate; the loss is α · the twin's + (1 − α) · the surrogate's.
+The paper, of a robot and assembly_1: {PAPER_REAL}.
 
-{_table("surrogate: its, the twin's | α = 0 | 0.5 | 0.95 | … after PPO, anchored | 1: nominal twin | mended twin", table_6)}
+{_table("task, surrogate: its, the twin's | α = 0 | 0.5 | 0.95 | … after PPO, anchored | 1: nominal twin | mended twin", table_6)}
 
 ### β: weight of the anchor on the surrogate's demonstrations
 
 A co-trained policy (α = 0.95), post-trained in the nominal twin, all for the same time, scored in the surrogate. {PAPER_BETA}.
 
-{_table("surrogate | before PPO | β = 0 | 0.1 | 1 | 5", table_7)}
+{_table("task, surrogate | before PPO | β = 0 | 0.1 | 1 | 5", table_7)}
 
-**Not run**: PPO after other policies; Table 2 in other surrogates; α and β on assembly_2; other cells that say so.
+**Not run**: PPO after other policies; Table 2 in other surrogates; other cells that say so.
 """
 
 
@@ -312,16 +314,19 @@ def _most(rows: Rows) -> Rows:
     return sorted((row for row in rows if row["demonstrations"] == most), key=lambda row: row["seed"])
 
 
-def transfer(rows: Rows, stage: str = "") -> dict[tuple[str, int], dict[str, Rows]]:
-    """(surrogate, demonstrations) → twin of the demonstrations → rows; where both the nominal and the mended one were tried.
+def transfer(
+    rows: Rows, stage: str = "", task: str = "assembly_1", needed: Set[str] = frozenset(("nominal", "mended"))
+) -> dict[tuple[str, int], dict[str, Rows]]:
+    """(surrogate, demonstrations) → twin of the demonstrations → rows; where all of ``needed`` were tried.
     ``stage``: of ``STAGES``, for rows of post-training."""
     found: dict[tuple[str, int], dict[str, Rows]] = defaultdict(lambda: defaultdict(list))
-    scored = (row for row in rows if row["scored_in"] and row.get("stage", "") == stage and "real" not in row)
+    own = (row for row in rows if row["scored_in"] and row["task"] == task and "real" not in row)
+    scored = (row for row in own if row.get("stage", "") == stage)
     for row in sorted(scored, key=lambda row: (row["scored_in"], -row["demonstrations"], row["seed"])):
         kind = (row["twin"] or "nominal").partition("_")[0]
         key = row["scored_in"].rpartition("_")[0], row["demonstrations"]
         found[key][kind if kind in TWINS else "surrogate"].append(row)
-    return {key: of for key, of in found.items() if key[0] in ROBOTS and {"nominal", "mended"} <= of.keys()}
+    return {key: of for key, of in found.items() if key[0] in ROBOTS and needed <= of.keys()}
 
 
 def singly(rows: Rows) -> dict[tuple[str, str], tuple[Rows, Rows]]:
@@ -424,13 +429,13 @@ def draw_grips(rows: Rows, path: Path) -> None:
 
 
 def draw_curves(rows: Rows, path: Path) -> None:
-    """A picture: completed under noise in each iteration of PPO in the nominal twin; intervals of the episodes."""
+    """A picture: completed under noise in each iteration of PPO in the nominal twin, of Table 1; intervals of the episodes."""
     figure, axis = plt.subplots(figsize=(9, 3.4), layout="constrained")
-    for row in (row for row in rows if row["demonstrations"] and not row["twin"]):
+    for row in (row for row in rows if row["demonstrations"] and not (row["twin"] or row["scored_in"])):
         cells = {k: [{"n": n, "successes": done}] for k, (n, done) in enumerate(row.get("curve", []), start=1) if n}
         if cells:
             height, *ends = _shares(cells.values())
-            label = f"{row['task']}, {SENSORS[row['sensors']]}"
+            label = f"{row['task']}, {SENSORS[row['sensors']]}, {row['demonstrations']}"
             axis.errorbar(list(cells), height, abs(ends - height), marker="o", ms=3, capsize=2, lw=1, label=label)
     axis.set(ylim=(0, 100), xlabel="iteration of PPO", ylabel="completed, with noise [%]")
     axis.set_title("simulated; episodes that ended in the iteration; whiskers: 95 % of the episodes", fontsize=9)

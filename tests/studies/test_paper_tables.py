@@ -56,7 +56,9 @@ def test_cells_are_what_was_counted():
     assert touch_gain([full, half], [half, []]) == "not run"
     six = [[ROW | {"n": 100, "successes": k + 10 * j} for j in range(3)] for k in (0, 30)]
     assert gain({"nominal": six[0], "mended": six[1]}).endswith("; +7 … +53")  # 30 ± 2.776 · √(200 / 3), Welch
-    moved = [row | {"scored_in": "late_cd34"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]]
+    moved = [
+        row | {"scored_in": "late_cd34", "task": "assembly_1"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]
+    ]
     assert {key: [*of] for key, of in transfer(moved).items()} == {("late", 9): ["nominal", "mended", "randomised"]}
     assert transfer(after := [row | {"stage": "ppo"} for row in moved]) == {}
     assert "| late | after | 0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* | +14; p = 2e-05 |" in page(after)
@@ -65,17 +67,25 @@ def test_cells_are_what_was_counted():
     loud = {"stage": "ppo", "successes": 96, "noise": {"n": 128.0, "without": 90.6, "with": 50.0}}
     after = "100 % (96 … 100) of 96*; of 9 demonstrations |"
     assert f"{puzzle} not run | 90.6 → 50 % of 128 | not run | {after}" in page([ROW | loud])
-    untrained, fewer = ROW | {"stage": "ppo", "demonstrations": 0}, ROW | {"stage": "start", "demonstrations": 8}
-    told = page([ROW | loud, untrained, fewer, fewer | loud | {"stage": "noise"}])
-    assert f"{puzzle} not run | 90.6 → 50 % of 128 | 0 % (0 … 4) of 96* | {after}" in told
+    # Without an update nothing was trained. Each number of demonstrations has its own result.
+    untrained, fewer = ROW | {"stage": "ppo", "demonstrations": 0, "updates": 3}, ROW | {"demonstrations": 8}
+    less, start = fewer | {"stage": "ppo", "successes": 48}, fewer | {"stage": "start"}
+    told = page([ROW | loud, untrained, untrained | {"updates": 0}, less, start, fewer | loud | {"stage": "noise"}])
+    both = f"{after[:-2]}; 50 % (40 … 60) of 96*; of 8 demonstrations, before 0 % (0 … 4) of 96* |"
+    assert f"{puzzle} not run | 90.6 → 50 % of 128 | 0 % (0 … 4) of 96*, updates: 3 | {both}" in told
+    assert "after PPO of policies of 8 demonstrations: not run" in told
     beside = [*moved, moved[1] | {"twin": "", "real": 5, "sim_weight": 0.5}]
     assert len(transfer(beside)["late", 9]["nominal"]) == 1
     alone = "0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* |"
-    assert f"| late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | not run | {alone}" in page(beside)
+    assert f"| assembly_1, late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | not run | {alone}" in page(beside)
+    other = page([row | {"task": "puzzle"} for row in beside])
+    assert f"| puzzle, late: 5, 9 | not run | 14 % (10 … 20) of 192* | not run | not run | {alone}" in other
+    assert "| late, 9 |" not in other  # the twins' table is of assembly_1
     imitated = moved[1] | {"twin": "", "real": 5, "sim_weight": 0.95}
     anchored, start = imitated | {"stage": "ppo_anchored", "beta": 5.0}, imitated | {"stage": "start", "successes": 96}
-    assert "| late | 50 % (43 … 57) of 192* | not run | not run | not run | 14 % (10 … 20) of 192* |" in page(
-        [imitated, anchored, start]
+    assert (
+        "| assembly_1, late | 50 % (43 … 57) of 192* | not run | not run | not run | 14 % (10 … 20) of 192* |"
+        in page([imitated, anchored, start])
     )
     # One effect alone: 48 against 96 of the same 96 scenes; other scenes and a policy after PPO (its row has beta) do not count.
     late, start = ROW | {"scored_in": "creep_of_late_ab12", "successes": 48}, ROW | {"stage": "start", "successes": 96}
