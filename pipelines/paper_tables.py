@@ -72,6 +72,9 @@ PAPER = {
 """Sensors → stage → completed [%] in simulation, of ``TASKS``: the paper's Table 1, π0.5 and 128 environments."""
 HEADS_1 = f"task | policy | paper: {'; '.join(PAPER_STAGES)} | here: by imitation | with PPO's noise"
 PAPER_BETA = "The paper, of a robot and α = 0.5: 45 % with β = 0, 80 % with 0.1 and with 1, less with 5"
+PAPER_ALPHA = (
+    "The paper, assembly_2 of a robot after PPO without an anchor: 25 % with α = 0, 45 % with 0.5, 40 % with 0.95"
+)
 PAPER_REAL = "real-only 35 %, co-trained (α = 0.5) 45 %, after RL 95 %"
 """The paper's Table 2, assembly_1 with touch: of a robot."""
 Rows = list[dict[str, Any]]
@@ -134,7 +137,8 @@ def take(scores: list[Path], path: Path = ROWS) -> None:
 
 def row_of(score: Path) -> dict[str, Any]:
     """A score of ``pipelines.learn`` as a row; its key follows from the policy, the scenes and the result. After PPO, ``curve``:
-    [episodes that ended, completed] of each iteration, of those that began at a reset, under noise."""
+    [episodes that ended, completed] of each iteration, of those that began at a reset, under noise; ``flow_loss``: on fixed rows
+    of the anchor, after each."""
     about, told = (json.loads((score / f"{n}.json").read_text("utf-8")) for n in ("settings", "evaluation"))
     (one,), scenes = told["scores"], told["scenes"]
     row = about | {name: one[name] for name in ("task", "pictures", "hidden", "n", "successes")}
@@ -146,21 +150,22 @@ def row_of(score: Path) -> dict[str, Any]:
     words = json.dumps([row, [policy["digest"] for policy in told["policies"]]], sort_keys=True)
     key = {"key": sha256(words.encode()).hexdigest()[:12]}
     if row.get("stage", "start") != "start" and (progress := score.parent / "progress.jsonl").exists():
-        ended = (
-            (line["episodes"], line["success"]) for line in map(json.loads, progress.read_text("utf-8").splitlines())
-        )
-        row["curve"] = [[n, round(n * (share or 0))] for n, share in ended]
+        lines = [json.loads(line) for line in progress.read_text("utf-8").splitlines()]
+        row["curve"] = [[line["episodes"], round(line["episodes"] * (line["success"] or 0))] for line in lines]
+        row |= {"flow_loss": [round(line["drift"], 4) for line in lines]} if "drift" in lines[0] else {}
     return key | row
 
 
 def share(rows: Rows) -> str:
     """``95 % (93 … 97) of 256; 94.1, 96.1``: completed of all scenes with Wilson's 95 % interval, then by each training; then the
-    number of iterations of PPO that changed the policy, if the rows state it."""
+    number of iterations of PPO that changed the policy and the anchor's loss, if the rows state them."""
     if not rows:
         return "not run"
     (p,), (low,), (high,) = _shares([rows])
     each = f"; {', '.join(f'{100 * row["successes"] / row["n"]:.1f}' for row in rows)}" if len(rows) > 1 else "*"
     updates = "".join(f", updates: {row['updates']}" for row in rows if "updates" in row)
+    losses = (row["flow_loss"] for row in rows if "flow_loss" in row)
+    updates += "".join(f", flow loss {of[0]:g} → {of[-1]:g}" for of in losses)
     return f"{p:.0f} % ({low:.0f} … {high:.0f}) of {_counts(rows)[1]}{each}{updates}"
 
 
@@ -282,7 +287,7 @@ p: Fisher's exact test of all scenes; 95 % intervals, where given, of three trai
 ## Table 2 and α: demonstrations of the surrogate beside those of the nominal twin
 
 Cameras and touch, scored in the surrogate; the loss is α · the twin's + (1 − α) · the surrogate's.
-The paper, of a robot and assembly_1: {PAPER_REAL}.
+The paper, of a robot and assembly_1: {PAPER_REAL}. {PAPER_ALPHA}.
 
 {_table("task, surrogate: its, the twin's | α = 0 | 0.5 | 0.95 | … after PPO, anchored | 1: nominal twin | mended twin", table_6)}
 

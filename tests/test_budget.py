@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_511,
     "taccorl/training": 1_557,
     "taccorl/views": 2_334,
-    "tests": 55_478,
-    "pipelines": 6_215,
+    "tests": 55_481,
+    "pipelines": 6_220,
 }
 MOST_LINES_OF_A_FILE = 500
 

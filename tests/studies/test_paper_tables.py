@@ -38,7 +38,10 @@ def test_a_score_becomes_one_row_however_often_it_is_taken(tmp_path):
     assert "curve" not in row_of(score)
     (score / "settings.json").write_text(json.dumps(ABOUT | {"stage": "ppo"}))
     after = row_of(score)
-    assert after["curve"] == [[7, 3], [0, 0], [64, 64]]
+    assert after["curve"] == [[7, 3], [0, 0], [64, 64]] and "flow_loss" not in after
+    (tmp_path / "progress.jsonl").write_text("\n".join(json.dumps(line | {"drift": 0.06}) for line in lines))
+    assert row_of(score)["flow_loss"] == [0.06, 0.06, 0.06]
+    assert share([after | {"flow_loss": [0.06, 0.07, 0.05]}]).endswith("of 96*, flow loss 0.06 → 0.05")
     draw_curves([after, ROW, after | {"curve": [[0, 0]]}], picture := tmp_path / "curves.png")
     assert plt.imread(picture).shape[:2] == (374, 990)  # 3.4 and 9 inches of 110 points
 
