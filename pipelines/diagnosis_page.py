@@ -66,7 +66,7 @@ def write_page(rows: list[dict]) -> None:
         own = [r for r in joints if r["design"] == design and material(r)]
         lines.append(_share(f"{words}: exact, counted as one", own, exact_but_for_algebra))
     for words, condition, there in (("efforts used", "effort", True), ("positions only", "effort", False)):
-        own = [r for r in joints if material(r) and _has(r, condition) == there]
+        own = [r for r in joints if material(r) and (condition in r.get("conditions", ())) == there]
         lines.append(_share(f"… {words}: exact, counted as one", own, exact_but_for_algebra))
     mended = [r["errors"]["after"] for r in joints if "failed" not in r and material(r) and named(r)]
     lines.append(_spread("… error after / floor, validation", [e["validation"] for e in mended], (1.1, 1.3)))
@@ -118,10 +118,6 @@ def write_page(rows: list[dict]) -> None:
 
 def _of(rows: list[dict], study: str) -> list[dict]:
     return [r for r in rows if r["study"] == study]
-
-
-def _has(row: dict[str, Any], condition: str) -> bool:
-    return condition in row.get("conditions", ())
 
 
 def _worded(row: dict[str, Any]) -> bool:
@@ -246,14 +242,10 @@ def _said(row: dict[str, Any]) -> str:
     return str(row["first"] or words.get(str(row["status"]), "too many"))
 
 
-def _signal(row: dict[str, Any]) -> float:
-    """What the effect leaves above the floor, in floors, once the gains are refitted."""
-    return float(np.sqrt(max(row["errors"]["fitted"]["validation"] ** 2 - 1.0, 0.01)))
-
-
 def _detections(rows: list[dict]) -> tuple[np.ndarray, np.ndarray]:
-    """Signals, and whether the effect was named."""
-    return np.array([_signal(r) for r in rows]), np.array([named(r) for r in rows])
+    """Signals, what the effect leaves above the floor in floors once the gains are refitted, and whether it was named."""
+    left = np.array([row["errors"]["fitted"]["validation"] for row in rows])
+    return np.sqrt(np.maximum(left**2 - 1.0, 0.01)), np.array([named(r) for r in rows])
 
 
 def _half(signals: np.ndarray, found: np.ndarray) -> str:

@@ -17,7 +17,6 @@ from taccorl.alignment.controller.identification import REFERENCE, identify_cont
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion
-from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import SWEEP_HZ, SWEEP_S
 from taccorl.robots import ROBOT
@@ -117,13 +116,8 @@ def controller_sysid() -> Iterator[Row]:
         begin = time.process_time()
         fit = identify_controller([motion], model)
         cost.append(time.process_time() - begin)
-        ratio.append(_ratio_error(fit.gains, truth))
+        ratio.append(100.0 * abs(fit.gains.kd / fit.gains.kp / (truth.kd / truth.kp) - 1.0))
         kp_off.append(100.0 * abs(fit.gains.kp / truth.kp - 1.0))
     yield against_reference("controller of one joint from a 10 s sweep", cost, "≤ 300,000")
     yield Row.of(ratio, by=max, name="K_d / K_p off by, worst of six joints", unit="%", goal="≤ 1")
     yield Row.of(kp_off, by=max, name="K_p off by, worst of six joints", unit="%")
-
-
-def _ratio_error(found: Gains, truth: Gains) -> float:
-    """Of K_d / K_p, in percent."""
-    return 100.0 * abs(found.kd / found.kp / (truth.kd / truth.kp) - 1.0)

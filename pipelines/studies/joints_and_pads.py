@@ -152,7 +152,8 @@ def run_touch(job: Job) -> dict[str, Any]:
     config = SearchConfig(max_effects=len(job.hidden) + 1)
     found = diagnose(problem, fit_to, validation, test, start=problem.start, without=job.without, config=config)
     done = time.process_time()
-    truth = {"k_n": case.k_n, "k_d": case.k_d} | _hidden_values(case)
+    truth = {"k_n": case.k_n, "k_d": case.k_d}
+    truth |= {f"{h.name}.{name}": value for h in case.hidden for name, value in h.values.items()}
     return {
         **_head(job, f"{case.arm} pads", case),
         "conditions": [],
@@ -177,10 +178,6 @@ def _head(job: Job, signal: str, case: Case | TouchCase) -> dict[str, Any]:
         "left_floors": round(case.left_floors, 3),
         "true": [{k: _short(v) for k, v in h.values.items()} for h in case.hidden],
     }
-
-
-def _hidden_values(case: TouchCase) -> dict[str, float]:
-    return {f"{h.name}.{name}": value for h in case.hidden for name, value in h.values.items()}
 
 
 def _short(value: float) -> float:

@@ -19,7 +19,6 @@ from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
-    from taccorl.alignment.measurements.pressed import PressedObject
     from taccorl.data.finding import Finding
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Machine
@@ -79,6 +78,10 @@ def run(config: CompareConfig) -> int:
     for name in config.joints:  # before the replays, which take minutes
         if name not in signals:
             raise TaccorlError(f"--joints: {name!r} is in no recording; {nearest(name, signals)}")
+    kin = twins[0].of_joints == twins[-1].of_joints
+    for name in (s for s in signals if not kin or (s in twins[0].units and s not in twins[-1].units)):
+        own = f"is of another machine: it has no {name!r}, which {config.twin or 'the nominal twin'} has and recordings move"
+        raise TaccorlError(f"--against={config.against}: {own}; give a file of the same machine")
     moved = of_joints(measurements, config.joints)  # what is wrong with recordings of others holds nothing up
     measurements = moved if moved.all else measurements
     comparisons: list[Comparison] = []
@@ -114,10 +117,11 @@ def _check_outputs(config: CompareConfig) -> None:
 
 
 def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements") -> list["Comparison"]:
+    from taccorl.alignment.measurements.pressed import indenter
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.comparison.result import only
 
-    pressed = _pressed(config.pressed)
+    pressed = None if config.pressed.shape == "nothing" else indenter(**vars(config.pressed))
     found = []
     for twin, label in zip(twins, _labels(config, twins), strict=True):
         with Bars(len(measurements.all)) as bars:
@@ -140,22 +144,6 @@ def _labels(config: CompareConfig, twins: "Sequence[Machine]") -> list[str]:
     parts = [path.with_suffix("").parts for path in (config.twin, config.against)]
     depth = next((k for k in range(1, max(map(len, parts)) + 1) if parts[0][-k:] != parts[1][-k:]), 1)
     return ["/".join(own[-depth:]) for own in parts]
-
-
-def _pressed(config: PressedConfig) -> "PressedObject | None":
-    from taccorl.alignment.measurements.pressed import indenter
-
-    if config.shape == "nothing":
-        return None
-    return indenter(
-        config.shape,
-        config.radius_m,
-        config.arm,
-        length_m=config.length_m,
-        position_m=config.position_m,
-        rpy_rad=config.rpy_rad,
-        frame=config.frame,
-    )
 
 
 def _write(

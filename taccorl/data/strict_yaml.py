@@ -93,7 +93,8 @@ class Document[T]:
         except RecursionError as error:
             raise SpecError(f"{self.path}: is nested too deeply for a spec") from error
         if root is None:
-            raise SpecError(f"{self.path}: is empty; a complete example is any file in data_specs/")
+            keys = ", ".join(f.name for f in dataclasses.fields(typing.cast("Any", cls)))
+            raise SpecError(f"{self.path}: is empty; its keys are {keys}")
         self.value: T = self._build(cls, root, "")
 
     def has(self, key: str) -> bool:

@@ -49,7 +49,7 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
     if any(s.lower_bound and s.kind == "touch" for s in scores):
         notes.append("or more, of touch: the noise of each taxel; what presses do not repeat is not in it")
     if any(s.lower_bound and s.kind != "touch" for s in scores):
-        notes.append("or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound")
+        notes.append("or more: no recording repeats another (repeat_of), so this floor is a lower bound")
     for signal in dict.fromkeys(s.signal for s in scores if s.kind == "effort" and c.of(s.signal)):
         words = ", ".join(f"{use} {' → '.join(_together(found, signal, use) for found in every)}" for use in c.uses)
         notes.append(f"{signal}: position and effort together: {words} × floor, as diagnose counts")

@@ -32,14 +32,13 @@ def verdict_section(v: Verdict) -> Section:
 
 def brief(f: Finding, v: Verdict, options: Sequence[str] = ()) -> Section:
     """What a terminal shows of one part: the verdict, numbers and command of what was added, the confidence, and what to record
-    next where ties are left. report.html has more. ``options``: as in ``verdict``."""
+    next. report.html has more. ``options``: as in ``verdict``."""
     d, names = f.diagnosis, added(f.diagnosis)
     text: list[Value] = [Cell(v.finding, "bold")]
     text += [f"{f'{e.name} ' * (len(names) > 1)}{_in_twin(d)}: {_values(e)}" for e in d.effects if e.name in names]
     text += [Cell(f"to add it: {_to_add(f.part, names, options)}", "bold")] * (v.kind in ("effects", "ties"))
     text += [Cell(v.confidence, v.level)]
-    if v.kind != "effects":
-        text += [f"Record next: {v.record_next}", *[Cell(v.command, "bold")] * bool(v.command)]
+    text += [f"Record next: {v.record_next}", *[Cell(v.command, "bold")] * bool(v.command)]
     text += [f"Remark: {remark}" for remark in v.remarks[:REMARKS]]
     text += [f"and {len(v.remarks) - REMARKS} more remarks: see the page"] * (len(v.remarks) > REMARKS)
     text += [f"{_judged(f)}; errors of {f.measured}; noise floor {f.noise}", *[f.remark] * bool(f.remark)]

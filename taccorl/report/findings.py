@@ -33,7 +33,8 @@ def found_in_recordings(found: Mapping[str, Sequence[Finding]]) -> list[Section]
             if _key(f) not in several:
                 own.setdefault(f.check, []).append(f)
         if own:
-            sections.append(found_in(name, [_together(same) for same in own.values()]))
+            same = [dataclasses.replace(f, text=f.text + _also(more)) for f, *more in own.values()]
+            sections.append(found_in(name, same))
     sound = [name for name, findings in found.items() if all(f.severity == "note" for f in findings)]
     if sound:
         sections.append(found_in(f"{len(sound)} recordings: {', '.join(sound)}", []))
@@ -49,10 +50,6 @@ def found_in_recordings(found: Mapping[str, Sequence[Finding]]) -> list[Section]
 def _key(f: Finding) -> tuple[str, str, str]:
     """What findings in one line have in common: their topic, or the feature if they have none."""
     return f.severity, f.check, f.topic or f.feature
-
-
-def _together(same: Sequence[Finding]) -> Finding:
-    return dataclasses.replace(same[0], text=same[0].text + _also(same[1:]))
 
 
 def _also(others: Sequence[Finding]) -> str:

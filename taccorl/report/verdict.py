@@ -57,7 +57,7 @@ UNCERTAIN: Mapping[Kind, str] = {
     "data_first": "the recordings contradict themselves or the clock",
     "not_converged": "{w.trouble}",
     "gains_moved": "wrong time stamps or gains explain the data as well as the fitted gains do",
-    "something_else": "every known effect was tried, and none explains most of it",
+    "something_else": "every known effect was tried, and none with determined numbers explains most of it",
     "more": "what is still missing may change what was named",
 }
 """Kind of low confidence → its first reason."""
@@ -136,7 +136,7 @@ def verdict(
         reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
     # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
     unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (floor and kind == "nothing_missing")
-    unsure = unsure or (added(d) and any(c.name in d.undetermined for c in d.changed))
+    unsure = unsure or (added(d) and {*_open(d), *(c.name for c in d.changed if c.name in d.undetermined)})
     tied = kind == "ties" or (kind == "numbers_off" and w.instead)
     level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or tied else "high"
     first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
@@ -201,13 +201,20 @@ def added(d: Diagnosis) -> tuple[str, ...]:
     return tuple(name for name in d.names if name not in d.present)
 
 
+def _open(d: Diagnosis) -> list[str]:
+    """Added effects of which the recordings determine no number."""
+    known = {name.partition(".")[0] for name in d.intervals if name not in d.undetermined}
+    unknown = {name.partition(".")[0] for name in d.undetermined} - known
+    return [name for name in added(d) if name in unknown]
+
+
 def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
     if data:
         return "data_first"
     if d.status in ("something_else", "too_many"):
         first, after = (max(d.errors[stage]["validation"], 1.0) ** 2 for stage in (d.baseline, "after"))
         most = d.standing_out or first - after >= SearchConfig().sure_gain * (first - 1.0)
-        return "more" if added(d) and most else "something_else"
+        return "more" if {*added(d)} - {*_open(d)} and most else "something_else"
     if d.status in ALIKE:
         return d.status
     return "ties" if any(d.rivals.get(name) for name in added(d)) else "effects"
@@ -232,7 +239,7 @@ class _Words:
 
     @property
     def remains(self) -> str:
-        if not self.d.standing_out:
+        if added(self.d) or not self.d.standing_out:
             left = f"; {self.after:.2f} noise floors remain"
             alone = "alone " * (self.d.status == "too_many")  # tried one at a time
             return f"{alone}explains what is missing{f': with {self.names}, the nearest, {self.fell}' if added(self.d) else left}"
@@ -361,7 +368,7 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
         )
     if d.at_bound:
         yield f"{_some(d.at_bound)} at the end of its range"
-    if unknown := [c.name for c in d.changed if c.name in d.undetermined]:
+    if unknown := [*_open(d), *(c.name for c in d.changed if c.name in d.undetermined)]:
         beside = ", so that what was added may stand in for an effect that is not known" * bool(added(d))
         yield f"the recordings do not determine {_some(unknown)}{beside}"
 

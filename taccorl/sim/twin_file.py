@@ -48,7 +48,8 @@ def load_twin(path: Path) -> TwinConfig:
     line."""
     path = Path(path)
     if path.is_file() and path.stat().st_size == 0:
-        raise SpecError(f"{path}: is empty (0 bytes); a file of the nominal twin holds a comment: # nominal")
+        way = "write the `kind:` of your machine; of the PiPER's nominal twin it holds a comment, # nominal"
+        raise SpecError(f"{path}: is empty (0 bytes); {way}")
     if _says_nothing(path):
         return TwinConfig()
     kind, line = kind_of(path)

@@ -124,6 +124,7 @@ def test_only_the_joints_that_were_asked_for(folder, said):
         (["{folder}/nothing"], "no such file or folder"),
         (["{folder}/sweeps", "--twin={folder}/no.yaml"], "no.yaml"),
         (["{folder}/sweeps", "--twin={tmp}/arm.urdf"], "arm.urdf` drafts one"),
+        (["{folder}/sweeps", "--against={tmp}/slide.yaml"], "--against={tmp}/slide.yaml: is of another machine"),
         (["{folder}/sweeps", "--rerun={tmp}/x.png"], "must end in .rrd"),
         (["{folder}/sweeps", "--out={folder}/twin.yaml"], "is a file; give a folder"),
         (["{folder}/sweeps", "--out={folder}/./sweeps"], "contains the recordings; give another folder"),
@@ -133,8 +134,9 @@ def test_only_the_joints_that_were_asked_for(folder, said):
 )
 def test_what_cannot_be_done_is_said_before_any_work(words, message, folder, said, tmp_path):
     (tmp_path / "arm.urdf").touch()
+    (tmp_path / "slide.yaml").write_text("{kind: axis, name: slide, unit: m, inertia: 2, kp: 9, kd: 1}")
     code, text = said(*[w.format(folder=folder, tmp=tmp_path) for w in words])
-    assert code == 2 and message in text
+    assert code == 2 and message.format(tmp=tmp_path) in text
 
 
 def test_somebody_else_s_page_is_left_alone(folder, said, tmp_path):

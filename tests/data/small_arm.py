@@ -154,7 +154,7 @@ def write_mcap(path: Path, sent: Iterable[Sent], zstd: bool = False) -> Path:
             if m.topic not in channels:
                 schema = writer.register_schema(m.kind, "ros2msg", SCHEMAS[m.kind].encode())
                 channels[m.topic] = writer.register_channel(m.topic, "cdr", schema)
-            header = _header(m.stamp_ns)
+            header = {"stamp": {"sec": m.stamp_ns // 10**9, "nanosec": m.stamp_ns % 10**9}, "frame_id": "cam"}
             about = {"timestamp": header["stamp"], "frame_id": "cam"} if "Video" in m.kind else {"header": header}
             about = {} if m.kind.endswith("String") else about
             data = encoders[m.kind](about | m.fields)
@@ -162,10 +162,6 @@ def write_mcap(path: Path, sent: Iterable[Sent], zstd: bool = False) -> Path:
             writer.add_message(channels[m.topic], m.log_ns, data, m.log_ns)
         writer.finish()
     return path
-
-
-def _header(ns: int) -> dict[str, Any]:
-    return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "cam"}
 
 
 def write_bag(path: Path, sent: Iterable[Sent], ros: int) -> Path:

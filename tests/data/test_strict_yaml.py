@@ -178,7 +178,7 @@ def test_an_empty_value_is_nothing_only_where_nothing_is_allowed(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (b"", "a.yaml: is empty; a complete example is any file in data_specs/"),
+        (b"", "a.yaml: is empty; its keys are name, rate_hz, "),
         (b"# only a comment\n", "a.yaml: is empty"),
         (b"- name: pad\n- rate_hz: 1\n", "a.yaml:1: expected keys and values, found a list"),
         (b"just words\n", "a.yaml:1: expected keys and values, found 'just words'"),

@@ -435,10 +435,6 @@ def test_wrong_joints_leave_touch_against_grippers_unjudged(good: Episode) -> No
 # ---- how often faults are found ----
 
 
-def _dead(seed: int) -> Episode:
-    return rewired(base(seed), put(np.s_[:, RIGHT_A, *deepest(base(seed), RIGHT_A)], 0))
-
-
 def _stuck(seed: int) -> Episode:
     r, c = np.random.default_rng(seed).integers(0, (32, 12))
     return rewired(base(seed), put(np.s_[:, LEFT_B, r, c], 60 + 4 * seed))
@@ -449,17 +445,16 @@ def _saturated(seed: int) -> Episode:
     return with_arrays(base(seed), touch=touch - base(seed).baselines[TOUCH].astype(np.int16))
 
 
-def _noise_only(seed: int) -> Episode:
-    return touched(base(seed), noise(np.s_[:], np.random.default_rng(seed).uniform(0.5, 20)))
-
-
 FAULTS: dict[str, tuple[str, Callable[[int], Episode]]] = {
-    "taxel dead": ("dead_taxel", _dead),
+    "taxel dead": ("dead_taxel", lambda s: rewired(base(s), put(np.s_[:, RIGHT_A, *deepest(base(s), RIGHT_A)], 0))),
     "taxel stuck": ("stuck_taxel", _stuck),
     "saturated": ("saturated", _saturated),
     "arms swapped": ("swapped_pads", lambda s: reorder(base(s), [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B])),
     "one pad swapped": ("swapped_pads", lambda s: reorder(base(s), [RIGHT_A, LEFT_B, LEFT_A, RIGHT_B])),
-    "noise only": ("noise_only", _noise_only),
+    "noise only": (
+        "noise_only",
+        lambda s: touched(base(s), noise(np.s_[:], np.random.default_rng(s).uniform(0.5, 20))),
+    ),
     "touch late": ("touch_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, 0.3))),
     "touch early": ("touch_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, -0.3))),
     "one pad late": ("pad_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s={"left_a": 0.25})),

@@ -186,6 +186,10 @@ def test_one_effect_where_more_is_missing_is_not_called_the_answer():
     v = verdict(PART, d)
     assert (v.kind, v.level) == ("more", "low")
     assert d.names[0] in v.finding and "--until=noise_floor" in v.record_next
+    own = tuple(name for name in d.intervals if name.startswith(f"{d.names[0]}."))
+    unknown = verdict(PART, changed(d, undetermined=own))
+    assert own and unknown.kind == "something_else" and f"determine {d.names[0]}" in unknown.confidence
+    assert f"lacks {d.names[0]}" in v.finding and f"lacks {d.names[0]}" not in unknown.finding
     errors = d.errors | {"after": d.errors["after"] | {"validation": 0.8 * d.errors["fitted"]["validation"]}}
     little = verdict(PART, changed(d, errors=errors))  # 36 % of the squared error go
     assert little.kind == "something_else"
@@ -296,7 +300,8 @@ def test_the_terminal_has_verdict_numbers_and_command_first_and_few_lines(one):
         lines = [cell(value).text for value in section.text]
         assert [f"{d.errors[stage]['validation']:.2f}" in lines[0] for stage in ("fitted", "after")] == [True, True]
         assert words in lines[1] and lines[2].endswith(f"taccorl add-effect {effect.name} --twin=a.yaml")
-        assert len(lines) <= 14 and "3 more" in "".join(lines) and "nan" not in "".join(lines)
+        assert any(line.startswith("Record next: ") for line in lines), "as on the page"
+        assert len(lines) <= 15 and "3 more" in "".join(lines) and "nan" not in "".join(lines)
 
 
 @pytest.mark.parametrize(("led", "doubts"), [(1, 0), (2, 1)])

@@ -29,9 +29,9 @@ _SIGNALS = re.compile(r"joints|actions?\b|state|targets?\b|commands?\b|proprioce
 
 def robot_literals(code: str) -> Iterator[tuple[int, str]]:
     """(Line, literal) of what looks like a number or a list of names of this robot."""
-    tree = ast.parse(code)
-    types = {id(n) for node in ast.walk(tree) if _is_literal_type(node) for n in ast.walk(node)}
-    for node in ast.walk(tree):
+    nodes = [*ast.walk(ast.parse(code))]
+    types = {id(n) for node in nodes if _is_literal_type(node) for n in ast.walk(node)}
+    for node in nodes:
         if id(node) in types:
             continue
         match node:

@@ -202,10 +202,6 @@ def points(position: np.ndarray) -> np.ndarray:
 # ---- closed forms, written anew: depth of points (..., 3), any sign outside ----
 
 
-def sphere_depth(p: np.ndarray) -> np.ndarray:
-    return 0.012 - np.linalg.norm(p, axis=-1)
-
-
 def capsule_depth(p: np.ndarray) -> np.ndarray:
     nearest = np.clip(p[..., 2], -0.02, 0.02)
     return 0.008 - np.linalg.norm(p - np.stack([0 * nearest, 0 * nearest, nearest], axis=-1), axis=-1)
@@ -226,7 +222,7 @@ def wedge_depth(p: np.ndarray) -> np.ndarray:
 
 
 SHAPES = {
-    "sphere": ('<geom type="sphere" size=".012"/>', sphere_depth),
+    "sphere": ('<geom type="sphere" size=".012"/>', lambda p: 0.012 - np.linalg.norm(p, axis=-1)),
     "capsule": ('<geom type="capsule" size=".008 .02"/>', capsule_depth),
     "cylinder": ('<geom type="cylinder" size=".01 .025"/>', cylinder_depth),
     "box": ('<geom type="box" size=".01 .02 .03"/>', box_depth),

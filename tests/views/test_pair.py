@@ -45,10 +45,6 @@ def slower(num_rows: int = 40, fps: int = 10) -> Episode:
 A, B = made_episode(90, picture_size=64), slower()
 
 
-def first_contact_s(episode: Episode) -> float:
-    return float(episode.time_s[np.flatnonzero(contact_gate(pads_of(episode)))[0]])
-
-
 def logged(pair: Pair, folder: Path, at_s: float | None = None) -> Logged:
     save_shown(pair, folder / "pair.rrd", at_s=at_s)
     return read_rrd(folder / "pair.rrd")
@@ -58,7 +54,7 @@ def logged(pair: Pair, folder: Path, at_s: float | None = None) -> Logged:
 def test_row_0_or_the_first_contact_of_both_is_at_0_s(align: Align, tmp_path: Path):
     found = logged(Pair(A, B, align), tmp_path)
     for root, episode in (("a", A), ("b", B)):
-        contact_s = first_contact_s(episode)
+        contact_s = float(episode.time_s[np.flatnonzero(contact_gate(pads_of(episode)))[0]])
         assert contact_s > 0.9  # at 40 % of 3 s and of 4 s
         expected = episode.time_s - (contact_s if align == "contact" else 0.0)
         for path in ("curves/observation/state/left_joint_1_rad", "observation/images/front", "touch/sum/left_a"):

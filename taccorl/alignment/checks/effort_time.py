@@ -83,7 +83,7 @@ def check_effort_time(
 
     moved = [_moved(m, signal, inertia(m)) for m in every]
     # Accelerations of other joints act on this one, and ``_moved`` does not know them.
-    alone = [m for m in moved if not _others_move(m, signal)]
+    alone = [m for m in moved if not (np.ptp(np.delete(m.target, m.column(signal), axis=1), axis=0) > MOVING).any()]
     if text := _two_machines(law, every, signal) or _two_machines(law, alone, signal, unseen=True):
         tell("other_gains", text, "warning", every)
         return
@@ -116,11 +116,6 @@ def _moved(m: Measurement, signal: str, inertia: float) -> Measurement:
     effort, j = np.full_like(m.measured, np.nan), m.column(signal)
     effort[:, j] = inertia * np.gradient(np.gradient(m.measured[:, j], m.period_s), m.period_s)
     return dataclasses.replace(m, effort=effort)
-
-
-def _others_move(m: Measurement, signal: str) -> bool:
-    """Whether any other joint is commanded to move in the recording."""
-    return bool((np.ptp(np.delete(m.target, m.column(signal), axis=1), axis=0) > MOVING).any())
 
 
 def _two_machines(law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool = False) -> str:

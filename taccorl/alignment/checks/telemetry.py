@@ -88,12 +88,17 @@ def check_measurements(
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
     for name, finding in _slower_rows(sound, rates or {}):
         found[name].append(finding)
-    for a, b in itertools.combinations(sound, 2):
-        if not moves[a.name] & moves[b.name]:
+    copies, firsts = set[str](), {m.repeat_of for m in sound}
+    # The one that others repeat is the original, and one that repeats none.
+    ranked = sorted(sound, key=lambda m: (m.name not in firsts, m.repeat_of is not None))
+    for a, b in itertools.combinations(ranked, 2):
+        if not moves[a.name] & moves[b.name] or {a.name, b.name} & copies:
             continue  # other joints: of a hundred recordings most pairs
-        if all(np.array_equal(getattr(a, k), getattr(b, k), equal_nan=True) for k in ("measured", "target")):
-            text = f"{b.name} is {a.name}, number for number: no repeat, whose noise tells the floor, and nothing new. Remove it"
-            found[b.name].append(find("copied_recording", "", f"{text} (a simulation without noise repeats so, too)"))
+        if b.is_copy_of(a):
+            text = f"{b.name} is {a.name}, number for number: nothing new, and no repeat for the noise floor. "
+            way = "Remove it, in measurements.yaml, too (a simulation without noise repeats so as well)"
+            found[b.name].append(find("copied_recording", "", text + way))
+            copies.add(b.name)
             continue
         told = b.name in (a.name, a.repeat_of) or a.name == b.repeat_of or (a.repeat_of and a.repeat_of == b.repeat_of)
         if not told:

@@ -182,7 +182,7 @@ def read_measurements(
             f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
         )
     found = [_with_note(m, index, folder, names if whole else None) for m in found]
-    held = not any(m.repeat_of for m in found)
+    held = not repeat_pairs(found)
     found = [dataclasses.replace(m, held=held and "torque" in m.target_kinds) for m in found]
     # If the path is a single file, it is fitted, whatever ``use`` measurements.yaml states for it.
     named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
@@ -257,6 +257,19 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
             seen.append(root)
         roots[name] = root
     return roots
+
+
+def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:
+    """Pairs (first recording of a motion, one of its repeats), one pair for each repeat that is no copy."""
+    by_name = {m.name: m for m in measurements}
+    firsts: dict[str, M] = {}
+    pairs = []
+    roots = motions(by_name.values())
+    for name, root in sorted(roots.items(), key=lambda item: item[0] != item[1]):  # the original first, if it is here
+        first = firsts.setdefault(root, by_name[name])
+        if first.name != name and not by_name[name].is_copy_of(first):
+            pairs.append((first, by_name[name]))
+    return pairs
 
 
 def _load_index(folder: Path, holders: Sequence[str]) -> MeasurementIndex:

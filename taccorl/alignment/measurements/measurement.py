@@ -10,6 +10,7 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -152,7 +153,7 @@ class Measurement(Stated):
         """T."""
         return len(self.time_s)
 
-    @property
+    @cached_property
     def period_s(self) -> float:
         """Median time between rows [s]."""
         return float(np.median(np.diff(self.time_s))) if self.num_rows > 1 else float("nan")
@@ -161,6 +162,13 @@ class Measurement(Stated):
     def rate_hz(self) -> float:
         """Row rate [Hz], rounded to a thousandth."""
         return round(1.0 / self.period_s, 3)
+
+    def is_copy_of(self, other: "Measurement") -> bool:
+        """Whether all numbers are the same, as of a copied file (or a simulation without noise): then it is no repeat."""
+        pairs = [(getattr(self, name), getattr(other, name)) for name in ("target", "measured", "velocity", "effort")]
+        if self.touch is not None and other.touch is not None:
+            pairs.append((self.touch.counts, other.touch.counts))
+        return all(np.array_equal(one, two, equal_nan=True) for one, two in pairs)
 
     def column(self, signal: str) -> int:
         """Index j of a signal in ``signals`` and in the columns of the arrays. Raises TaccorlError: there is no signal of that

@@ -27,7 +27,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from taccorl.alignment.measurements.folder import motions
+from taccorl.alignment.measurements.folder import motions, repeat_pairs
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.repeats import Overlay, cycles, overlay
 from taccorl.errors import TaccorlError
@@ -171,7 +171,7 @@ def floors_by_motion(
     own: dict[str, dict[str, SignalFloor]] = {}
     for root in dict.fromkeys(roots.values()):
         group, left = ([m for m in of if roots[m.name] == root] for of in (measurements, unexplained))
-        own[root] = every | (noise_floor(group, kind, left) if len(group) > 1 else {})
+        own[root] = every | (noise_floor(group, kind, left) if repeat_pairs(group) else {})
     found = {name: dict(own[root]) for name, root in roots.items()}
     for m in measurements if kind == "effort" else ():
         for signal, alone in noise_floor([m], kind).items():
@@ -179,19 +179,6 @@ def floors_by_motion(
                 if residue.value > (there := found[m.name][signal]).value:
                     found[m.name][signal] = dataclasses.replace(there, used=residue)
     return found
-
-
-def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:
-    """Pairs (first recording of a motion, one of its repeats), one pair for each repeat."""
-    by_name = {m.name: m for m in measurements}
-    firsts: dict[str, M] = {}
-    pairs = []
-    roots = motions(by_name.values())
-    for name, root in sorted(roots.items(), key=lambda item: item[0] != item[1]):  # the original first, if it is here
-        first = firsts.setdefault(root, by_name[name])
-        if first.name != name:
-            pairs.append((first, by_name[name]))
-    return pairs
 
 
 def laid_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M, Overlay]]:

@@ -26,6 +26,7 @@ MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM
 """First bytes of a CSV file that state its encoding (byte order marks) → that encoding, for Python's codecs."""
 LONGEST_LINE = 1000  # Most characters of a line that states an origin
 _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
+_CUT_OFF = "cut off while it was written? Remove the row, or copy the file again"
 _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S:g} s of them follow each other"
 
 
@@ -155,7 +156,7 @@ def _read_csv(
                 if not row:
                     continue
                 if len(row) != len(header):
-                    hint = "; cut off while it was written? Remove the row, or copy the file again"
+                    hint = f"; {_CUT_OFF}"
                     if separator == "comma" and len(row) > len(header):
                         hint = (
                             "; decimal commas where commas part the columns? Save it with `;` between columns, with `separator: "
@@ -171,6 +172,10 @@ def _read_csv(
                     full = {k for r in left for k in at if k < len(r) and _is_number(r[k].replace(",", "."))}
                     if left and len(full) < len(at):
                         raise EmptyColumns({tuple(header[k] for k in at if k not in full): [path]}) from None
+                    bad = [k for k in at if not _is_number(row[k].replace(",", "."))]
+                    if found and bad == [len(header) - 1] and next(rows, None) is None:
+                        last = f"{path}:{first + rows.line_num}: the last row ends at column {header[-1]!r}"
+                        raise RecordingError(f"{last}; {_CUT_OFF}") from None
                     raise
     except UnicodeError as error:
         raise _undecodable(path, encoding, str(error)) from error

@@ -23,8 +23,7 @@ from taccorl.alignment.machines.cell_model import (
 from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of, load_cell_columns, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
-from taccorl.alignment.measurements.folder import Measurements, read_measurements
-from taccorl.alignment.measurements.noise_floor import repeat_pairs
+from taccorl.alignment.measurements.folder import Measurements, read_measurements, repeat_pairs
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, CellNumbers, Comparison, TouchTrace
 from taccorl.diagnosis.machines.machine import Addition, Counted, Finding, GainsAre, Machine, machines, numbers_of

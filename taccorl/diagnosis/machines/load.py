@@ -17,7 +17,7 @@ def load_machine(path: Path | None) -> Machine:
     if path is None:
         return PiperTwin.nominal()
     if path.is_file() and path.suffix.lower() in (".xml", ".mjcf", ".urdf"):
-        raise SpecError(f"{path}: --twin takes a robot file, not a model; `taccorl init-robot {path}` drafts one")
+        raise SpecError(f"{path}: is a model, where a robot file is needed; `taccorl init-robot {path}` drafts one")
     kind, line = kind_of(path)
     if kind is None:
         return PiperTwin.load(path)

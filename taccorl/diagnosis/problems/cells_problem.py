@@ -30,8 +30,8 @@ from taccorl.alignment.machines.cell_model import (
 from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of
 from taccorl.alignment.machines.cells_file import CellsConfig
-from taccorl.alignment.measurements.folder import Measurements
-from taccorl.alignment.measurements.noise_floor import repeat_pairs, residue_floor
+from taccorl.alignment.measurements.folder import Measurements, repeat_pairs
+from taccorl.alignment.measurements.noise_floor import residue_floor
 from taccorl.alignment.measurements.repeats import overlay
 from taccorl.diagnosis.problems.touch_problem import FIXED, MAX_CHANNELS
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, split_rows

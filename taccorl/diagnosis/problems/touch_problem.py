@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from taccorl.alignment.measurements.noise_floor import repeat_pairs
+from taccorl.alignment.measurements.folder import repeat_pairs
 from taccorl.alignment.measurements.repeats import overlay
 from taccorl.alignment.touch.calibration import noise_level
 from taccorl.alignment.touch.model import TouchModel

@@ -121,9 +121,9 @@ def test_a_reversed_effort_that_most_recordings_hardly_show_is_that_and_no_other
     centre of mass is elsewhere, so that inertia does not show the sign."""
     there = robot_machine(tmp_path, ARM.replace(".05 0 .12", ".12 0 -.05"), FILE)
     quick, slow, creep = (changed(m, ("effort",), [0, 1, 2], [1.0, 1.0, -1.0]) for m in recordings(there))
-    noise = np.random.default_rng(5).standard_normal((6, 1600, 3)) * [0.0, 0.0, 2.0]
+    noise = np.random.default_rng(5).standard_normal((4, 1600, 3)) * [0.0, 0.0, 2.0]
     made = [quick, dataclasses.replace(quick, name="quicker")]
-    for k, m in enumerate([slow, creep] * 3):
+    for k, m in enumerate([slow, creep] * 2):
         made.append(dataclasses.replace(m, name=f"{m.name}_{k}", effort=m.effort + noise[k]))
     law = machine.robot.config.joints["elbow"]
     fits = [law_fit(law, own, "elbow") for own in (made, made[:1])]
@@ -137,7 +137,9 @@ def test_gains_beside_a_target_share_that_no_drive_has_show_no_sign_of_the_effor
     assert LawFit(-1.8815, -1.4905, (0.106, 0.066), 0.326, 2.879).sign == -1
 
 
-@pytest.mark.parametrize(("kp", "kd", "noisy"), [(2, 2, 0), (2, 1, 0), (1, 2, 0), (2, 1, 1), (1, 1, 1)])
+@pytest.mark.parametrize(
+    ("kp", "kd", "noisy"), [(2, 2, 0), (1, 2, 0), (2, 1, 1), (1, 1, 1), pytest.param(2, 1, 0, marks=pytest.mark.slow)]
+)
 def test_efforts_show_the_gains_of_drives(machine: RobotMachine, kp: int, kd: int, noisy: int, tmp_path: Path) -> None:
     """Also beside friction, and with noise of 3 rad/s · 1 mrad / (√2 · 5 ms) = 0.4 N·m in the elbow's law."""
     stated = re.sub(r"kp: (\d+), kd: (\d+)", lambda m: f"kp: {kp * int(m[1])}, kd: {kd * int(m[2])}", FILE)
@@ -180,9 +182,8 @@ def test_effects_are_no_exchange_and_no_turned_sign_and_hide_none(
     for own in (made, unseen):
         # no other gains, time or sign of efforts either
         assert not any(machine.check(Measurements(tuple(own))).values())
-    for columns in (COLUMNS, COLUMNS[:2]):
-        found = errors(machine, [changed(m, columns, [0, 2, 1]) for m in made])
-        assert found == named or not named, columns
+    for columns in (COLUMNS, COLUMNS[:2]) if named else ():
+        assert errors(machine, [changed(m, columns, [0, 2, 1]) for m in made]) == named, columns
 
 
 @pytest.mark.parametrize(("effect", "number", "late"), [("armature", "added_kgm2", 0), ("command_delay", "delay_s", 1)])

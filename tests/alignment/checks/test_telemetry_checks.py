@@ -835,6 +835,9 @@ def test_an_untold_repeat_is_pointed_out(clean):
     assert check_measurements([clean, told]) == {"sweep": [], "again": []}
     (f,) = check_measurements([clean, dataclasses.replace(told, measured=clean.measured)])["again"]
     assert f.check == "copied_recording" and "again is sweep, number for number" in f.text
+    copy = dataclasses.replace(clean, name="a_copy")  # the one that nothing says anything of goes, whatever its name
+    checks = {name: [f.check for f in own] for name, own in check_measurements([copy, clean, told]).items()}
+    assert checks == {"a_copy": ["copied_recording"], "sweep": [], "again": []}
 
 
 def test_same_commands_with_another_answer_ask_about_gains_and_payload_not_for_repeat_of(clean):

@@ -214,10 +214,10 @@ def test_a_recording_of_one_joint_becomes_one_of_the_robot():
     ]
 
 
-@pytest.mark.parametrize("repeated", [False, True])
-def test_torques_are_held_where_nothing_repeats(tmp_path: Path, repeated: bool) -> None:
-    for name in ("a.csv", "b.csv"):
-        (tmp_path / name).write_text("t,servo.q,servo.tau_target\n0.0,0.1,0.0\n0.1,0.2,0.5\n0.2,0.3,0.0\n")
-    index = "recordings: {b.csv: {repeat_of: a.csv}}" if repeated else "recordings: {}"
-    (tmp_path / "measurements.yaml").write_text(index)
-    assert [m.held for m in read_measurements(tmp_path, units={"servo": "rad"}).all] == [not repeated] * 2
+@pytest.mark.parametrize(("last", "note", "held"), [(0.31, "", True), (0.31, "a.csv", False), (0.3, "a.csv", True)])
+def test_torques_are_held_where_nothing_repeats(tmp_path: Path, last: float, note: str, held: bool) -> None:
+    """A copy repeats nothing."""
+    for name, q in (("a.csv", 0.3), ("b.csv", last)):
+        (tmp_path / name).write_text(f"t,servo.q,servo.tau_target\n0.0,0.1,0.0\n0.1,0.2,0.5\n0.2,{q},0.0\n")
+    (tmp_path / "measurements.yaml").write_text(f"recordings: {{b.csv: {{repeat_of: {note or 'null'}}}}}")
+    assert [m.held for m in read_measurements(tmp_path, units={"servo": "rad"}).all] == [held] * 2

@@ -43,6 +43,18 @@ def test_rest_residue_and_repeats_each_recover_a_known_noise(motion):
         assert np.max(np.abs(np.array(values) / NOISE - 1)) < 0.15, method
 
 
+def test_a_copy_is_no_repeat(motion):
+    rng = np.random.default_rng(0)
+    first, second = (measured(*motion, rng, NOISE, name=name) for name in "ab")
+    alone = noise_floor([first])["left_joint5"]
+    copy = dataclasses.replace(first, name="c", repeat_of="a")
+    floor = noise_floor([first, copy])["left_joint5"]
+    assert floor.lower_bound and floor.value == pytest.approx(alone.value, rel=0.05)
+    again = dataclasses.replace(second, repeat_of="a")
+    both, three = ({k: f.used for k, f in noise_floor(of).items()} for of in ([first, again], [first, copy, again]))
+    assert both == three
+
+
 def test_rows_that_are_lost_all_over_leave_the_floor_as_it_is(motion):
     """One row of 20 in each: every block of 50 rows has gaps."""
     pair = [measured(*motion, np.random.default_rng(k), NOISE, name=name) for k, name in enumerate("ab")]

@@ -205,11 +205,13 @@ def test_empty_and_missing_files(tmp_path):
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "broken.parquet").write_bytes(b"PAR1 but no more")
     (tmp_path / "short.csv").write_text("t,left_joint5.q,left_joint5.q_target\n0,0,0\n")
+    (tmp_path / "cut.csv").write_text("t,left_joint5.q,left_joint5.q_target\n0,0,0\n0.01,0,-")
     (tmp_path / "latin.csv").write_bytes("t,F [µN]\n0,1\n".encode("latin-1"))
     for name, message in (
         ("empty.csv", "is empty"),
         ("broken.parquet", "cannot be read as parquet"),
         ("short.csv", "1 rows"),
+        ("cut.csv", "cut.csv:3: the last row ends at column 'left_joint5.q_target'; cut off .* copy the file again"),
         ("latin.csv", "latin.csv:1: .*utf-8.*0xb5.*encoding: latin-1"),
     ):
         with pytest.raises(RecordingError, match=message):

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -155,6 +156,9 @@ def test_parameters_are_described(name: str) -> None:
 def test_an_effect_says_what_it_is_and_what_it_may_be_mistaken_for(name: str) -> None:
     cls = effects.get(name)
     assert all((cls.equation, cls.in_words, cls.at_a_policy, cls.to_record, *cls.near_twins.values()))
+    if "joint" in cls.kinds():  # of a slide, too
+        words = " ".join((cls.at_a_policy, cls.to_record, *cls.near_twins.values()))
+        assert not {"arm", "arms", "hand"} & {*re.findall(r"\w+", words.lower())}
     for other in cls.near_twins:
         assert other != name
         assert other in BASE or name in effects.get(other).near_twins, f"{name}: {other} does not name it"

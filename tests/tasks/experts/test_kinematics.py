@@ -20,10 +20,6 @@ def left() -> ArmKinematics:
     return ArmKinematics("left", RobotConfig())
 
 
-def drawn_joints(rng: np.random.Generator) -> np.ndarray:
-    return rng.uniform(LOW + 0.1, HIGH - 0.1)
-
-
 def off(pose: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(pose[:3, 3] - goal[:3, 3])), float(np.linalg.norm(rotvec(pose, goal)))
 
@@ -32,7 +28,7 @@ def off(pose: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
 def test_the_tcp_is_where_plain_matrix_products_put_it(arm, y_m):
     kinematics, rng = ArmKinematics(arm, RobotConfig(mount_height_m=0.15)), np.random.default_rng(0)
     for _ in range(10):
-        joints = drawn_joints(rng)
+        joints = rng.uniform(LOW + 0.1, HIGH - 0.1)
         by_hand = transform((0, y_m, 0.15)) @ link_poses(joints)[-1] @ transform((0, 0, ROBOT.tcp_from_hand_m))
         np.testing.assert_allclose(kinematics.pose(joints), by_hand, atol=1e-9)
 
