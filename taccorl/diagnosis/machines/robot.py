@@ -235,7 +235,7 @@ class RobotMachine(Machine):
             done[f.part] = f
             if not larger or "payload" in lacked(f):
                 continue
-            machine, _ = self.mended([*masses, *larger])
+            machine, _ = self.mended(others := [*masses, *larger])
             problem = machine._problem_of(f, measurements, gains)
             left = block_squares(problem, f.diagnosis.after, problem.validation or split_rows(problem.fit)[1])
             if 1.0 / ALIKE < above_floor(left) / left_of(f) < ALIKE:
@@ -243,8 +243,8 @@ class RobotMachine(Machine):
             (again,) = diagnosed(machine, [f.part])
             most = ALIKE if len(lacked(again)) <= len(lacked(f)) else 1.0 / ALIKE
             if left_of(again) <= most * left_of(f):
-                what = " and ".join(f"{' and '.join(lacked(o))} of {o.part}" for o in [*masses, *larger])
-                text = f"judged with {what}: mend {' and '.join(o.part for o in [*masses, *larger])} first"
+                what = " and ".join(f"{' and '.join(lacked(o))} of {o.part}" for o in others)
+                text = f"judged with {what}: mend {' and '.join(o.part for o in others)} first"
                 done[f.part] = remarked(again, f"{text}, or all at once, and diagnose {f.part} again")
         return [done[f.part] for f in findings]
 
@@ -346,8 +346,8 @@ class RobotMachine(Machine):
         for one in tried[1:]:
             if all(robot.moves_body(part, robot.body_of(owner, one)) for part in alone or stands_for):
                 every.append(fitted([*group], one))
-                sure = 0.0 if one.like_link > found.payload.like_link else SearchConfig().sure_score  # fewer numbers
-                found = every[-1] if is_better(every[-1], found, first, sure) else found
+                least = 0.0 if one.like_link > found.payload.like_link else SearchConfig().sure_score  # fewer numbers
+                found = every[-1] if is_better(every[-1], found, first, least) else found
         bodies = [robot.body_of(owner, o.payload) for o in every if o.holds and not is_better(found, o, first)]
         ties = {robot.body_name(k) for k in bodies} - {robot.body_name(robot.body_of(owner, found.payload))}
         if not found.holds:
