@@ -196,6 +196,7 @@ def _next(
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
         tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
+        tied += [f"payload in {body}" for f in found for body in f.diagnosis.or_in if names[0] == "payload"]
         yield from ["next: record what decides, see Record next"] * undecided
         yield f"{'to write what was refitted' if undecided else 'next'}: {shlex.join([*words, *_given(config)])}"
         yield from [f"{' or '.join(tied)} does as well as {names[0]}: see Record next"] * bool(tied)

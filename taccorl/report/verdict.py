@@ -282,6 +282,9 @@ class _Words:
     def names(self) -> str:
         """Added effects, each with all others that may be missing in its place."""
         links = {e.name: f"{e.name} in {link}" for e in self.d.effects if (link := getattr(e, "link", ""))}
+        if self.d.or_in:
+            last = "" if "payload" in links else " in the last link that it moves"
+            links["payload"] = " or in ".join((links.get("payload", f"payload{last}"), *self.d.or_in))
         each = [" or ".join((links.get(name, name), *self.d.rivals.get(name, ()))) for name in added(self.d)]
         return ("; " if any(self.d.rivals.values()) else " and ").join(each)
 
@@ -337,6 +340,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
     others = [o for name in added(d) for o in d.rivals.get(name, ())]
     if kind == "ties" and others:
         yield f"{_some(others)} {'does' if len(others) == 1 else 'do'} as well"
+    if d.or_in:
+        yield f"a mass in {' or '.join(d.or_in)} explains as much"
     if test is None:
         yield "no test recording checks it: validation recordings chose the effects"
     elif test > FLOOR and validation <= LITTLE:

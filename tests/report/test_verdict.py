@@ -10,6 +10,7 @@ from made_traces import comparison, trace
 
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
+from taccorl.diagnosis.machines.changed_findings import without_numbers
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
@@ -58,6 +59,19 @@ def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one):
     pinned = verdict(PART, one, known=dataclasses.replace(known, pinned_by=("recorded effort",)))
     assert "K_p" not in pinned.record_next
     assert all(s.endswith(".") and "\n" not in s for s in (v.finding, v.confidence, v.record_next))
+
+
+def test_a_mass_that_may_be_in_two_bodies_is_said_of_both(one, nothing):
+    """A joint judged with it has no numbers of the file that are off: they may make up for its place."""
+    mass = (make_effect("payload", mass_kg=0.5, link="l6"),)
+    tied = found(changed(one, effects=mass, present=(), or_in=("l5",)))
+    v = verdict("a4", tied.diagnosis)
+    assert "a4 lacks payload in l6 or in l5" in v.finding and "l5" in v.confidence and v.level == "moderate"
+    off = Changed(name="torque_ff", before=0.0, after=0.12, unit="N·m", without=2.0, alone=False)
+    other = found(changed(nothing, status="numbers_off", changed=(off,)))
+    judged = without_numbers(other, tied).diagnosis
+    assert (judged.status, judged.changed) == ("nothing_missing", ()) and "torque_ff" in judged.remarks[-1]
+    assert without_numbers(other, found(one)) is other
 
 
 def test_errors_fall_from_those_of_the_twin_as_it_was_where_its_refit_is_worse(one):

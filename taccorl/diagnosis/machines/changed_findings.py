@@ -7,6 +7,7 @@ from typing import cast
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
 from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF
+from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import Diagnosis
@@ -25,6 +26,27 @@ def remarked[FindingT: Finding](f: FindingT, text: str) -> FindingT:
 def payloads(findings: Sequence[Finding]) -> list[Finding]:
     """Findings that add a payload."""
     return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
+
+
+def lacked(f: Finding) -> tuple[str, ...]:
+    """Names of the effects that a finding adds, and of the numbers of the file that it says are off."""
+    return (*(n for n in f.diagnosis.names if n not in f.diagnosis.present), *numbers_off(f))
+
+
+def numbers_off(f: Finding) -> tuple[str, ...]:
+    """Names of the numbers of the file that a finding says are off."""
+    return tuple(c.name for c in f.diagnosis.changed)
+
+
+def without_numbers(f: Finding, owner: Finding) -> Finding:
+    """The finding at a joint that feels the payload of ``owner``; if that may be in another body as well, without numbers of the
+    file that are off: they may make up for its place."""
+    d, off = f.diagnosis, " and ".join(numbers_off(f))
+    if not (owner.diagnosis.or_in and off):
+        return f
+    d = dataclasses.replace(d, changed=(), status="nothing_missing" if d.status == "numbers_off" else d.status)
+    text = f"{off} would remove a part of the error; so may the payload of {owner.part} in another body"
+    return remarked(dataclasses.replace(f, diagnosis=d), text)
 
 
 def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
@@ -59,16 +81,19 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     return remarked(dataclasses.replace(f, diagnosis=d), text)
 
 
-def placed(
-    f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]], ties: Sequence[str]
-) -> Finding:
-    """The finding with the intervals of a payload that was fitted to several joints, ``ends``, and a remark that names what it
-    explains: ``stands_for``, joint → effects that alone explain as much there; and ``ties``, bodies where it does as well."""
-    d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
-    effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
+def placed(f: Finding, model: Fit, stands_for: Mapping[str, Sequence[str]], ties: Sequence[str]) -> Finding:
+    """The finding with the mass, the intervals and the always fitted numbers of ``model``, which has one payload at several
+    joints, and with a remark that names what it explains: ``stands_for``, joint → effects that alone explain as much there.
+    ``ties``: other bodies in which it does as well."""
+    d, every = f.diagnosis, model.intervals()
+    ends = {name: interval for name, interval in every.items() if name.startswith("payload.")}
+    own = {name.removeprefix("payload."): interval for name, interval in ends.items()}
+    mass = {"mass_kg": model.values["payload.mass_kg"], "interval": own}
+    effects_ = [dataclasses.replace(e, **mass) if isinstance(e, Payload) else e for e in d.effects]
     known = cast(Known, f.known)
     for old in [n for n in known.identifiable if n.name in ends]:
-        now = dataclasses.replace(old, low=ends[old.name][0], high=ends[old.name][1])
+        low, high = ends[old.name]
+        now = dataclasses.replace(old, value=model.values[old.name], low=low, high=high)
         effects_ = [dataclasses.replace(e, evidence=e.evidence.replace(old.words(), now.words())) for e in effects_]
         numbers = [tuple(now if n.name == now.name else n for n in of) for of in (known.identifiable, known.absolute)]
         known = dataclasses.replace(known, identifiable=numbers[0], absolute=numbers[1])
@@ -82,10 +107,13 @@ def placed(
     if TORQUE_FF.name not in d.base:
         text += f"; {TORQUE_FF.name} of {f.part} is as the file states it"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
-    text += f"; in {' or '.join(ties)} a mass explains as much" if ties else ""
     of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())
     number = ("", 1.0) if of_mass else d.or_number
-    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends}, or_number=number)
+    base = {name: model.values.get(f"{f.part}/{name}", value) for name, value in d.base.items()}
+    more = ends | {name: every[f"{f.part}/{name}"] for name in base if f"{f.part}/{name}" in every}
+    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **more}, base=base, or_number=number)
+    changed = tuple(dataclasses.replace(c, after=base.get(c.name, c.after)) for c in d.changed)
+    d = dataclasses.replace(d, changed=changed, or_in=tuple(ties))
     return remarked(dataclasses.replace(f, diagnosis=d, known=known), text)
 
 

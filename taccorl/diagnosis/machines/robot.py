@@ -24,12 +24,15 @@ from taccorl.diagnosis.comparison.compare import compare_joints
 from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.diagnosis.machines.changed_findings import (
     TILT,
+    lacked,
     left_of,
+    numbers_off,
     payload_of,
     payloads,
     placed,
     remarked,
     standing_in,
+    without_numbers,
     without_payload,
     without_tilt,
 )
@@ -49,7 +52,8 @@ from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, move
 from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, is_better, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
-from taccorl.diagnosis.search.problem import candidate
+from taccorl.diagnosis.search.evidence import above_floor, block_squares
+from taccorl.diagnosis.search.problem import candidate, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
@@ -215,8 +219,34 @@ class RobotMachine(Machine):
     ) -> list[Finding]:
         """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again.
         Where no joint alone determines its mass and place, or several found one, one mass is fitted to all joints
-        (``one_mass``). One tilt of the base is fitted to all joints where several lack what it would explain (``one_tilt``)."""
-        return self._with_one_tilt(self._with_payloads(findings, (measurements, gains, diagnosed)), measurements, gains)
+        (``one_mass``). So is what else was found at a joint, where it changes the error of others that lack less. One tilt of
+        the base is fitted to all joints where several lack what it would explain (``one_tilt``)."""
+        how = measurements, gains, diagnosed
+        return self._with_one_tilt(self._beside_larger(self._with_payloads(findings, how), how), measurements, gains)
+
+    def _beside_larger(self, findings: Sequence[Finding], how: How) -> list[Finding]:
+        """``findings`` with those of joints that were judged again beside what was found at joints that lack more, where that
+        changes their error: a joint's acceleration is what its drive in the file makes of its targets, and loads the others."""
+        measurements, gains, diagnosed = how
+        done: dict[str, Finding] = {}
+        masses = [f for f in payloads(findings) if not f.diagnosis.rivals.get("payload")]
+        for f in sorted(findings, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"]):
+            larger = [o for o in done.values() if lacked(o) and "payload" not in lacked(o)]
+            done[f.part] = f
+            if not larger or "payload" in lacked(f):
+                continue
+            machine, _ = self.mended(others := [*masses, *larger])
+            problem = machine._problem_of(f, measurements, gains)
+            left = block_squares(problem, f.diagnosis.after, problem.validation or split_rows(problem.fit)[1])
+            if 1.0 / ALIKE < above_floor(left) / left_of(f) < ALIKE:
+                continue
+            (again,) = diagnosed(machine, [f.part])
+            most = ALIKE if len(lacked(again)) <= len(lacked(f)) else 1.0 / ALIKE
+            if left_of(again) <= most * left_of(f):
+                what = " and ".join(f"{' and '.join(lacked(o))} of {o.part}" for o in others)
+                text = f"judged with {what}: mend {' and '.join(o.part for o in others)} first"
+                done[f.part] = remarked(again, f"{text}, or all at once, and diagnose {f.part} again")
+        return [done[f.part] for f in findings]
 
     def _with_one_tilt(self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre) -> list[Finding]:
         """``findings`` with a remark on one tilt of the base in place of those on single joints, where it explains what several
@@ -248,7 +278,8 @@ class RobotMachine(Machine):
         return [remarked(without_tilt(f), text) if f.part in stands_for else f for f in findings]
 
     def _with_payloads(self, given: Sequence[Finding], how: How, sure: bool = True) -> list[Finding]:
-        """``sure``: a payload that one joint alone determines stays, unless joints that move it end with a larger error."""
+        """``sure``: a payload that one joint alone determines stays, unless joints that move it end with a larger error, or need
+        other numbers of the file with it, which one mass at all of them makes superfluous."""
         findings = given
         for body in dict.fromkeys(self.robot.last_body(f.part) for f in given):
             findings = self._with_one_mass(body, findings, how, sure)
@@ -271,9 +302,13 @@ class RobotMachine(Machine):
                 f"judged with the payload of {mass.mass_kg:.3g} kg in {body} that this diagnosis found at "
                 f"{felt[f.part].part}: add both, or the payload first and diagnose {f.part} again"
             )
-            again[f.part] = remarked(f, text)
-        if sure and any(left_of(again[f.part]) > ALIKE * left_of(f) for f in given if f.part in again):
-            return self._with_payloads(given, how, sure=False)
+            again[f.part] = remarked(without_numbers(f, felt[f.part]), text)
+        judged = [(f, again[f.part]) for f in given if f.part in again]
+        worse = any(left_of(now) > ALIKE * left_of(f) for f, now in judged)
+        if sure and (worse or any({*numbers_off(now)} - {*numbers_off(f)} for f, now in judged)):
+            together = self._with_payloads(given, how, sure=False)
+            if worse or payloads(together):
+                return together
         return [again.get(f.part, f) for f in findings]
 
     def _with_one_mass(self, body: int, findings: Sequence[Finding], how: How, sure: bool) -> list[Finding]:
@@ -290,13 +325,15 @@ class RobotMachine(Machine):
         if len(group) == 1 and not alone and self.units[next(iter(group))] == "rad":
             return list(findings)  # one vertical hinge tells a mass from a rotor in no way
         (owner,) = self._owners([group[part] for part in alone or stands_for])
-        at_centre = dict.fromkeys(PAYLOAD_AT, 0.0)
+        at_centre, made = dict.fromkeys(PAYLOAD_AT, 0.0), dict[tuple[str, int], JointProblem]()
 
         def fitted(parts: Sequence[str], assumed: Payload) -> OneMass:
             place = robot.body_of(owner, assumed)
             parts = [part for part in parts if robot.moves_body(part, place)]
             machine, own = self._assuming(owner, assumed), {"link": assumed.link, "like_link": assumed.like_link}
-            problems = {part: machine._problem_of(group[part], measurements, gains) for part in parts}
+            for part in [part for part in parts if (part, place) not in made]:
+                made[part, place] = machine._problem_of(group[part], measurements, gains)
+            problems = {part: made[part, place] for part in parts}
             idle = set.intersection(*({*robot.idle_axes(part, place)} for part in parts))
             at = at_centre if assumed.like_link else {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
             mass = candidate(machine.robot.joint(owner).in_units(Payload), {}, **own, **at)
@@ -307,11 +344,10 @@ class RobotMachine(Machine):
         first = found = fitted([*group], tried[0])
         every = [first]
         for one in tried[1:]:
-            if one.like_link and found.holds and max(found.errors.values()) <= SearchConfig().floor:
-                break
             if all(robot.moves_body(part, robot.body_of(owner, one)) for part in alone or stands_for):
                 every.append(fitted([*group], one))
-                found = every[-1] if is_better(every[-1], found, first) else found
+                least = 0.0 if one.like_link > found.payload.like_link else SearchConfig().sure_score  # fewer numbers
+                found = every[-1] if is_better(every[-1], found, first, least) else found
         bodies = [robot.body_of(owner, o.payload) for o in every if o.holds and not is_better(found, o, first)]
         ties = {robot.body_name(k) for k in bodies} - {robot.body_name(robot.body_of(owner, found.payload))}
         if not found.holds:
@@ -333,8 +369,7 @@ class RobotMachine(Machine):
         (again,) = diagnosed(self._assuming(owner, found.payload), [owner], left_out)
         if "payload" not in again.diagnosis.names:
             return list(findings)
-        ends = {k: v for k, v in found.model.intervals().items() if k.startswith("payload.")}
-        return [placed(again, ends, stands_for, sorted(ties)) if f.part == owner else f for f in findings]
+        return [placed(again, found.model, stands_for, sorted(ties)) if f.part == owner else f for f in findings]
 
     def _payload_body(self, found: Finding) -> int:
         """Id of the body of the payload that a finding adds, or would add."""

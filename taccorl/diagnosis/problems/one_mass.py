@@ -8,7 +8,7 @@ import numpy as np
 
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.search.evidence import Blocks, above_floor, block_squares, standard_score
-from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
+from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit, moved_by
 from taccorl.diagnosis.search.problem import Candidate, Case, Recording, Values, WithoutMaps, chosen, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.sim.effects.effect import Effect
@@ -119,7 +119,7 @@ def one_mass(
     names = {j: [n for n in d.names if n not in stands_for.get(j, ())] for j, d in alone.items()}
     whole = OneMassProblem(problems, names, payload)
     split = {j: (p.fit, p.validation) if p.validation else split_rows(p.fit) for j, p in problems.items()}
-    fit_to = [r for j, (own, _) in split.items() for r in whole.recordings(j, own)]
+    fit_to, others = ([r for j, own in split.items() for r in whole.recordings(j, own[k])] for k in (0, 1))
     start: Values = {f"{j}/{name}": value for j, d in alone.items() for name, value in fitted_numbers(d).items()}
     masses = [start.pop(name) for name in list(start) if name.endswith("/payload.mass_kg")]
     start |= dict.fromkeys((f.name for f in payload.frees[1:]), 0.0)
@@ -132,6 +132,7 @@ def one_mass(
     )
     rough = best_fit(whole, fit_to, (payload.name,), [f.values for f in rough[:_LIKELY]], _NEXT_STEPS)
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
+    model = replace(model, moved=moved_by(whole, model, fit_to, others, np.full(len(model.frees), FINE)))
     holds, before, after, squares = True, 0, len(payload.frees), {}
     for j, d in alone.items():
         squares[j], here = holds_at(whole, model, problems[j], d, j, split[j][1])
@@ -159,15 +160,15 @@ def holds_at(
     return (own, with_it), above_floor(with_it) <= ALIKE * above_floor(own)
 
 
-def is_better(one: OneMass, other: OneMass, everywhere: OneMass) -> bool:
+def is_better(one: OneMass, other: OneMass, everywhere: OneMass, sure: float = SearchConfig().sure_score) -> bool:
     """Whether ``one`` is better than ``other``: it alone holds, or it leaves less at all joints of ``everywhere`` together, by
-    ``sure_score`` standard errors between half seconds. A joint that a mass does not load keeps its own diagnosis."""
+    ``sure`` standard errors between half seconds. A joint that a mass does not load keeps its own diagnosis."""
     if not (one.holds and other.holds):
         return one.holds
     pairs = [[o.squares.get(j, own[:1])[-1] for o in (other, one)] for j, own in everywhere.squares.items()]
     gains = [more - less for more, less in pairs]
     squares, weights = (np.concatenate(own) for own in zip(*((g.squares, g.weights) for g in gains), strict=True))
-    return standard_score(Blocks(squares, weights / len(gains))) >= SearchConfig().sure_score
+    return standard_score(Blocks(squares, weights / len(gains))) >= sure
 
 
 def error_of(squares: Blocks) -> float:

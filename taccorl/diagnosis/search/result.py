@@ -201,6 +201,8 @@ class Diagnosis:
     or_number: tuple[str, float] = ("", 1.0)
     """Number of the file that explains as much as the added effects, ``effort_scale`` or ``kd``, and the factor by which it is
     off then; empty if none does."""
+    or_in: tuple[str, ...] = ()
+    """Other bodies of the model in which the added ``payload`` explains as much."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]
