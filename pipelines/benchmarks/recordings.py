@@ -1,4 +1,4 @@
-"""Figures of reading and writing recordings: ``make bench ONLY=ingest``, ``memory``, ``corruption``, ``kill``, ``start_up``."""
+"""Figures of reading and writing recordings: ``make bench ONLY=ingest``, ``memory``, ``corruption``, ``start_up``."""
 
 import os
 import resource
@@ -26,8 +26,7 @@ measured."""
 REPEATS = 3
 NATIVE = [480, 640, 3]
 CORRUPTION, DAMAGE = ("tests/end_to_end/test_corruption.py",), ("tests/end_to_end/test_random_damage.py",)
-KILLS = ("tests/end_to_end/test_interrupted.py", "-n", "2")
-"""Command-line arguments of pytest with which three benchmarks choose the tests that they run."""
+"""Command-line arguments of pytest with which a benchmark chooses the tests that it runs."""
 
 
 class Cost(NamedTuple):
@@ -207,16 +206,6 @@ def corruption() -> Iterator[Row]:
         silent = found.get(f"{kind}: changed, and the format cannot show it", 0)
         text = f"{kind}: random damage that changes rows and that the format cannot show; the report states so"
         yield _share(text, silent, found[f"{kind}: files"])
-
-
-@benchmark("kill")
-def kill() -> Iterator[Row]:
-    """Benchmark that ends each of five commands by kill -9 at 30 random moments and runs it again:
-    tests/end_to_end/test_interrupted.py."""
-    cases = _pytest(*KILLS).cases
-    for case, passed in cases.items():
-        verb = case.partition("[")[2].removesuffix("]")
-        yield _share(f"{verb}: identical after kill -9 at 30 moments and a rerun", 30 * passed, 30, "≥ 100")
 
 
 def _share(name: str, part: int, of: int, goal: str = "") -> Row:

@@ -1,13 +1,12 @@
 """Arithmetic of the study on rows written by hand, and one real job."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pipelines import diagnosis_page
-from pipelines.studies.cells import CellsRow, run_cells, table
+from pipelines.studies import cells
 from pipelines.studies.figures import SLOPE, confusion_matrix, detection_curves, half_detected
 from pipelines.studies.joints_and_pads import (
     IDENTICAL,
@@ -182,39 +181,30 @@ def test_the_same_job_gives_the_same_row_but_for_the_time_it_took():
 
 # ---- sensors of cells ----
 
-ROW = CellsRow(
-    hidden="taxel_creep",
-    seed=1,
-    found=("taxel_creep",),
-    named=True,
-    status="at_floor",
-    before=9.0,
-    after=1.0,
-    error=0.02,
-    cpu_s=2.0,
-)
+ROW = {"hidden": "taxel_creep", "seed": 1, "found": ["taxel_creep"], "named": True, "status": "at_floor"}
+ROW |= {"before": 9.0, "after": 1.0, "error": 0.02, "cpu_s": 2.0}
 
 
 def test_exact_is_the_hidden_effect_alone_and_of_a_clean_sensor_nothing():
-    assert ROW.exact
-    assert not dataclasses.replace(ROW, found=("taxel_creep", "touch_lag")).exact
-    assert not dataclasses.replace(ROW, found=()).exact
-    assert dataclasses.replace(ROW, hidden="", found=()).exact
-    assert not dataclasses.replace(ROW, before=1.4).material
+    assert cells.exact(ROW)
+    assert not cells.exact(ROW | {"found": ["taxel_creep", "touch_lag"]})
+    assert not cells.exact(ROW | {"found": []})
+    assert cells.exact(ROW | {"hidden": "", "found": []})
+    assert not cells.material(ROW | {"before": 1.4})
 
 
 def test_the_table_has_a_line_an_effect_and_names_each_case_that_was_not_exact():
-    wrong = dataclasses.replace(ROW, seed=2, found=("touch_lag",), error=float("nan"), status="something_else")
-    lines = table([ROW, wrong, dataclasses.replace(ROW, seed=3, before=1.2, found=())])
+    wrong = ROW | {"seed": 2, "found": ["touch_lag"], "error": None, "status": "something_else"}
+    lines = cells.counted([ROW, wrong, ROW | {"seed": 3, "before": 1.2, "found": []}])
     assert "| taxel_creep | 3 | 2 | 1 of 2 | 9.00 | 1.00 | 2.0% |" in lines
     assert "taxel_creep (seed 2): touch_lag, something_else" in lines[-1]
     assert "taxel_creep (seed 3): nothing, at_floor" in lines[-1]
 
 
 def test_one_case_is_run():
-    row = run_cells("", 3)
-    assert row.exact and row.status == "nothing_missing"
-    assert row.after < 1.3
+    row = cells.run((3, ""))
+    assert cells.exact(row) and row["status"] == "nothing_missing"
+    assert row["after"] < 1.3
 
 
 def test_a_section_is_replaced_and_others_stay(tmp_path, monkeypatch):
