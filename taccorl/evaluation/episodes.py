@@ -43,7 +43,8 @@ class EpisodeRow:
     clipped_steps: int
     """Number of control steps with a target beyond the limits."""
     measures: dict[str, float] = field(default_factory=dict)
-    """Measures of the task at the end, and ``ARM_touch_counts``, the largest reading of an arm's pads; names state units."""
+    """Measures of the task at the end; ``ARM_touch_counts``, the largest reading of an arm's pads; ``PART_on_OTHER_n``, the net
+    normal force between mating parts. Names state units."""
     reset: dict[str, float] = field(default_factory=dict)
     """Position of each part, and its rotation about the vertical axis, after the reset, in the world frame: ``PART_x_m``,
     ``PART_y_m``, ``PART_yaw_rad``."""

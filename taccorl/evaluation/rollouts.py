@@ -125,6 +125,8 @@ class _Running:
         self.end: tuple[str, str] | None = None
         """Outcome and reason."""
         self.touch, self.place = touch, place
+        self.forces: dict[str, float] = {}
+        """``PART_on_OTHER_n``, of mating parts after the last step."""
 
     @property
     def actions(self) -> np.ndarray:
@@ -233,9 +235,11 @@ def roll_out(
         actions[over] = observation[STATE_KEY][over]
         observation, *_ = envs.step(actions)
         facts = _each(envs.facts(), envs.num_envs)
+        forces = {f"{one}_on_{other}_n": envs.sim.contact(one, other).force_n for one, other in envs.sim.task.mating}
         for i in np.flatnonzero(~over):
             running[i].stepped(actions[i], facts[i], observation[STATE_KEY][i])
             running[i].touch = observation[TACTILE_KEY][i].copy()
+            running[i].forces = {name: float(force[i]) for name, force in forces.items()}
         over = np.array([one.end is not None for one in running])
         if progress is not None:
             successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
@@ -283,7 +287,7 @@ def _rollout(
         subtask_end_s=one.subtask_end_s,
         clipped_steps=one.clipped_steps,
         # A diverged simulation has no measures: JSON knows no NaN.
-        measures={k: float(v) for k, v in (one.facts["measures"] | touched).items() if np.isfinite(v)},
+        measures={k: float(v) for k, v in (one.facts["measures"] | touched | one.forces).items() if np.isfinite(v)},
         reset=one.place,
         reason=reason,
         pictures=pictures,

@@ -71,6 +71,7 @@ def test_who_holds_still_runs_out_of_time() -> None:
     rows = [r.row for r in score(scenes(), StandIn(look))]
     assert [[row.reset["plug_x_m"], row.reset["plug_y_m"]] for row in rows] == [plug.tolist() for plug in plugs]
     assert all(0 <= row.measures["left_touch_counts"] < 10 for row in rows)  # noise; a grip has more than 50
+    assert all(row.measures["plug_on_socket_n"] == 0.0 for row in rows)  # apart on the table
     assert [row.seed for row in rows] == [7, 8, 9]
     assert [row.outcome for row in rows] == ["timeout"] * 3
     assert all(row.steps == STEPS and row.time_s == pytest.approx(STEPS / 30) for row in rows)
@@ -278,6 +279,8 @@ def test_the_expert_succeeds_where_it_is_known_to() -> None:
     where = scenes(episodes=1, seed=plan.attempt_seed(0), episode_length=None)
     (found,) = score(where, ExpertActor())
     assert found.row.success and found.row.partial_credit == 1.0
+    weight_n = 9.81 * sim.model.body("plug").mass[0]
+    assert found.row.measures["plug_on_socket_n"] == pytest.approx(weight_n, rel=0.5)  # it rests in there, let go
     assert np.array_equal(found.actions, np.stack([row[EXECUTED] for row in collected.recorder.rows]))
     ends = [end for own in found.row.subtask_end_s.values() for end in own.values()]
     assert all(end is not None and 0 < end <= found.row.time_s for end in ends)
