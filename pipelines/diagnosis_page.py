@@ -39,9 +39,9 @@ does not know the gains. Half of the cases use efforts, half a loop sampled at 0
 | material | the validation error, gains refitted, is at least {MATERIAL:g} noise floors |
 | exact | the hidden effect was added first; of two, both |
 | counted as one | effects that angles cannot tell apart, such as Coulomb and asymmetric friction, command and sensor delay |
-| named | exact, or named as a tie, a rival or a near-twin |
+| named | exact, or named beside it: a tie or rival explains these recordings as well, a near-twin acts alike by nature |
 | silent; unknown | no effect is added; the hidden effect is not in the registry, or was taken from the search |
-| identifiable numbers | what the recordings determine: of positions ratios to K_p, times, angles; of efforts torques |
+| identifiable numbers | what recordings determine: of positions times, angles, torques over K_p; of efforts torques in N·m |
 | 50 % detection | √(error² − 1) floors, gains refitted, at which half of the cases are named |
 
 Intervals are 95 % (Wilson).

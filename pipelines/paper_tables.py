@@ -193,9 +193,12 @@ def page(rows: Rows) -> str:
                 f"{share(new[n])}; of {n[0]} demonstrations" + (f", before {share(old[n])}" if n in old else "")
                 for n in sorted(new, reverse=True)
             ]
-            noise = next((row["noise"] for row in _most([r for r in mine if "noise" in r])), None)
-            loud = f"{noise['without']:g} → {noise['with']:g} % of {noise['n']:g}" if noise else "not run"
-            none = share([r for r in mine if r.get("stage") == "ppo" and not r["demonstrations"] and r["updates"]])
+            loudest = _most([r for r in mine if "noise" in r])
+            noise = next((row["noise"] | {"demonstrations": row["demonstrations"]} for row in loudest), None)
+            loud = "{without:g} → {with:g} % of {n:g}; of {demonstrations}".format(**noise) if noise else "not run"
+            none = share(
+                [r for r in mine if r.get("stage") == "ppo" and not r["demonstrations"] and r.get("updates", 1)]
+            )
             first = share(learnt) + (f"; of {learnt[0]['demonstrations']} demonstrations" if learnt else "")
             table_1.append((task, text, paper, first, loud, none, "; ".join(after) or "not run"))
             learnt_of[sensors].append(learnt)
@@ -236,6 +239,7 @@ their number, each training (`*`: one). 0.5 mm of clearance, 8 actions executed 
 
 {_table(f"{HEADS_1} | after PPO, untrained | after PPO", table_1)}
 
+PPO's noise: completed without → with it, before any update; of so many demonstrations.
 Updates: iterations of PPO that changed the policy, if they were counted. Of untrained policies at most three, of 32 environments
 of 72 decisions: no episode succeeded, so that no reward says what to improve.
 
@@ -293,7 +297,9 @@ The paper, of a robot and assembly_1: {PAPER_REAL}. {PAPER_ALPHA}.
 
 ### β: weight of the anchor on the surrogate's demonstrations
 
-A co-trained policy (α = 0.95), post-trained in the nominal twin, all for the same time, scored in the surrogate. {PAPER_BETA}.
+One of the co-trained policies (α = 0.95), post-trained in the nominal twin, all for the same time, scored in the surrogate.
+{PAPER_BETA}.
+Flow loss: on fixed rows of the surrogate's demonstrations, after the first and the last iteration.
 
 {_table("task, surrogate | before PPO | β = 0 | 0.1 | 1 | 5", table_7)}
 

@@ -141,7 +141,7 @@ def checked(
     """Run the checks of telemetry and of the machine, and print their findings. ``verdict``: text with which the message
     begins if there are errors. ``accept``: checks whose errors become warnings. Returns: name of a recording → its findings;
     None if there are errors."""
-    from taccorl.alignment.checks.telemetry import accepted, check_measurements, one_cause
+    from taccorl.alignment.checks.telemetry import accepted, check_copies, check_measurements, one_cause
     from taccorl.cli.progress import LINE_EVERY_S, Steps
     from taccorl.report.terminal import show
 
@@ -152,7 +152,7 @@ def checked(
             flush=True,
         )
     steps = Steps(every_s=0.0 if rows > MANY_ROWS else LINE_EVERY_S)
-    found: dict[str, list[Finding]] = {}
+    found = check_copies(measurements.all)
     if machine.of_joints:
         limits, rates = machine.effort_limits, machine.command_rates
         found = check_measurements(measurements.all, accept=accept, limits=limits, rates=rates, progress=steps)

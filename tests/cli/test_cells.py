@@ -45,6 +45,14 @@ def table(folder: Path, name: str = "press.csv", **columns: np.ndarray) -> Path:
     return folder / name
 
 
+def test_a_copied_press_is_pointed_out(tmp_path, said):
+    (tmp_path / "sensor.yaml").write_text(SENSOR)
+    first = table(tmp_path / "presses")
+    (first.parent / "z.csv").write_bytes(first.read_bytes())
+    _, shown = said("compare", first.parent, f"--twin={tmp_path / 'sensor.yaml'}")
+    assert "copied_recording: z.csv is press.csv, number for number" in shown
+
+
 @pytest.mark.slow
 def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping, said):
     sensor, presses, out = creeping / "taxel.yaml", creeping / "presses", creeping / "diagnosis"

@@ -69,13 +69,13 @@ def test_cells_are_what_was_counted():
     assert f"{puzzle} 0 % (0 … 4) of 96*; of 9 demonstrations | not run | not run | not run |" in page(rows[:1])
     loud = {"stage": "ppo", "successes": 96, "noise": {"n": 128.0, "without": 90.6, "with": 50.0}}
     after = "100 % (96 … 100) of 96*; of 9 demonstrations |"
-    assert f"{puzzle} not run | 90.6 → 50 % of 128 | not run | {after}" in page([ROW | loud])
+    assert f"{puzzle} not run | 90.6 → 50 % of 128; of 9 | not run | {after}" in page([ROW | loud])
     # Without an update nothing was trained. Each number of demonstrations has its own result.
     untrained, fewer = ROW | {"stage": "ppo", "demonstrations": 0, "updates": 3}, ROW | {"demonstrations": 8}
     less, start = fewer | {"stage": "ppo", "successes": 48}, fewer | {"stage": "start"}
     told = page([ROW | loud, untrained, untrained | {"updates": 0}, less, start, fewer | loud | {"stage": "noise"}])
     both = f"{after[:-2]}; 50 % (40 … 60) of 96*; of 8 demonstrations, before 0 % (0 … 4) of 96* |"
-    assert f"{puzzle} not run | 90.6 → 50 % of 128 | 0 % (0 … 4) of 96*, updates: 3 | {both}" in told
+    assert f"{puzzle} not run | 90.6 → 50 % of 128; of 9 | 0 % (0 … 4) of 96*, updates: 3 | {both}" in told
     assert "after PPO of policies of 8 demonstrations: not run" in told
     beside = [*moved, moved[1] | {"twin": "", "real": 5, "sim_weight": 0.5}]
     assert len(transfer(beside)["late", 9]["nominal"]) == 1

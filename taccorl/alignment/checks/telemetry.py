@@ -20,13 +20,23 @@ from taccorl.alignment.checks import cells, clock, effort_time, robot, time_stam
 from taccorl.alignment.checks.registry import CHECKS, accepted, check, check_names, find, run
 from taccorl.alignment.checks.trial import MOVED, Trial, least_motion
 from taccorl.alignment.checks.unrepeated import check_repeatability
+from taccorl.alignment.measurements.folder import copies
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.repeats import Overlay, overlay
 from taccorl.data.finding import Finding
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 
-__all__ = ["MOVED", "accepted", "check_measurement", "check_measurements", "check_names", "least_motion", "one_cause"]
+__all__ = [
+    "MOVED",
+    "accepted",
+    "check_copies",
+    "check_measurement",
+    "check_measurements",
+    "check_names",
+    "least_motion",
+    "one_cause",
+]
 LISTED = cells, clock, effort_time, robot, time_stamps, wiring
 """Modules whose checks the list has once they are imported."""
 DIFFERENT = 3.0
@@ -88,18 +98,11 @@ def check_measurements(
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
     for name, finding in _slower_rows(sound, rates or {}):
         found[name].append(finding)
-    copies, firsts = set[str](), {m.repeat_of for m in sound}
-    # The one that others repeat is the original, and one that repeats none.
-    ranked = sorted(sound, key=lambda m: (m.name not in firsts, m.repeat_of is not None))
-    for a, b in itertools.combinations(ranked, 2):
-        if not moves[a.name] & moves[b.name] or {a.name, b.name} & copies:
+    copied = check_copies(sound)
+    found = {name: [*own, *copied.get(name, [])] for name, own in found.items()}
+    for a, b in itertools.combinations([m for m in sound if m.name not in copied], 2):
+        if not moves[a.name] & moves[b.name]:
             continue  # other joints: of a hundred recordings most pairs
-        if b.is_copy_of(a):
-            text = f"{b.name} is {a.name}, number for number: nothing new, and no repeat for the noise floor. "
-            way = "Remove it, in measurements.yaml, too (a simulation without noise repeats so as well)"
-            found[b.name].append(find("copied_recording", "", text + way))
-            copies.add(b.name)
-            continue
         told = b.name in (a.name, a.repeat_of) or a.name == b.repeat_of or (a.repeat_of and a.repeat_of == b.repeat_of)
         if not told:
             try:
@@ -146,6 +149,14 @@ def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> It
 
 
 @check("warning", "copied_recording")
+def check_copies(measurements: Sequence[Measurement]) -> dict[str, list[Finding]]:
+    """Name of each recording that is a copy of another → a finding."""
+    why = "number for number: nothing new, and no repeat for the noise floor. Remove it, and its entry in measurements.yaml if it"
+    end = "has one (a simulation without noise repeats so as well)"
+    of = copies(measurements)
+    return {name: [find("copied_recording", "", f"{name} is {first}, {why} {end}")] for name, first in of.items()}
+
+
 @check("note", "same_motion")
 @check("warning", "same_commands")
 def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:

@@ -232,6 +232,10 @@ def split(
     taken = {m for k, m in enumerate(free) if validation_every and k % validation_every == validation_every - 1}
     for name in names:
         uses.setdefault(name, "validation" if motion[name] in taken else "fit")
+    for name, first in copies(measurements).items():
+        if uses[name] != uses[first]:
+            said = f"{name} ({uses[name]}) is {first} ({uses[first]}), number for number: it would check what it was used for"
+            raise TaccorlError(f"{said}; remove one of them, in {INDEX}, too")
     sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
     if fit_needed and not sides["fit"]:
         raise TaccorlError(
@@ -257,6 +261,18 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
             seen.append(root)
         roots[name] = root
     return roots
+
+
+def copies(measurements: Iterable[Measurement]) -> dict[str, str]:
+    """Name of each recording that is a copy → name of the first of its kind: one that others repeat, or that repeats none."""
+    measurements = list(measurements)
+    firsts, there = {m.repeat_of for m in measurements}, dict[bytes, Measurement]()
+    found = {}
+    for m in sorted(measurements, key=lambda m: (m.name not in firsts, m.repeat_of is not None)):
+        first = there.setdefault(m.measured.tobytes(), m)
+        if first is not m and m.is_copy_of(first):
+            found[m.name] = first.name
+    return found
 
 
 def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:

@@ -165,7 +165,8 @@ class Measurement(Stated):
 
     def is_copy_of(self, other: "Measurement") -> bool:
         """Whether all numbers are the same, as of a copied file (or a simulation without noise): then it is no repeat."""
-        pairs = [(getattr(self, name), getattr(other, name)) for name in ("target", "measured", "velocity", "effort")]
+        names = ("time_s", "target", "measured", "velocity", "effort")
+        pairs = [(getattr(self, name), getattr(other, name)) for name in names]
         if self.touch is not None and other.touch is not None:
             pairs.append((self.touch.counts, other.touch.counts))
         return all(np.array_equal(one, two, equal_nan=True) for one, two in pairs)

@@ -16,7 +16,8 @@ from taccorl.robots import ROBOT
 
 def made(*names: str, **repeats: str) -> list[Measurement]:
     time_s, zeros = np.arange(4) / 200, np.zeros((4, 14))
-    return [Measurement(name=n, time_s=time_s, target=zeros, measured=zeros, repeat_of=repeats.get(n)) for n in names]
+    own = {n: zeros + 0.001 * k for k, n in enumerate(names)}
+    return [Measurement(name=n, time_s=time_s, target=zeros, measured=own[n], repeat_of=repeats.get(n)) for n in names]
 
 
 def names(measurements) -> list[str]:
@@ -41,7 +42,7 @@ TABLE = "t,left_joint5.q,left_joint5.q_target,left_joint5.tau\n" + "".join(f"{k 
 @pytest.fixture
 def folder(tmp_path):
     for k in (1, 2, 10, 3):
-        (tmp_path / f"sweep_{k}.csv").write_text(TABLE)
+        (tmp_path / f"sweep_{k}.csv").write_text(TABLE.replace(",0.1,", f",{0.1 + 0.001 * k},"))
     (tmp_path / "notes.txt").write_text("hello")
     return tmp_path
 
@@ -59,6 +60,18 @@ def test_every_third_motion_is_validation_and_the_record_says_so(folder):
     record = found.record()
     assert record["rule"] == "every 3. of 4 motions for validation"
     assert record["fit"] == ["sweep_1.csv", "sweep_2.csv", "sweep_10.csv"]
+
+
+def test_a_copy_of_a_fit_recording_checks_nothing(folder):
+    (folder / "last.csv").write_text((folder / "sweep_2.csv").read_text())
+    index = folder / "measurements.yaml"
+    index.write_text("recordings: {last.csv: {use: test}}")
+    with pytest.raises(
+        TaccorlError, match=r"sweep_2\.csv \(fit\) is last\.csv \(test\), number for number.*remove one"
+    ):
+        read_measurements(folder)
+    index.write_text("recordings: {last.csv: {repeat_of: sweep_2.csv}}")  # one use: a warning of the checks
+    assert names(read_measurements(folder).fit)[0] == "last.csv"
 
 
 def test_an_index_says_what_files_cannot(folder):
