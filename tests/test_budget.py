@@ -14,7 +14,7 @@ MOST_LINES = {
     "taccorl/evaluation": 1_911,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_067,
-    "taccorl/policies": 3_457,
+    "taccorl/policies": 3_461,
     "taccorl/report": 2_569,
     "taccorl/rl": 2_472,
     "taccorl/robot_plugin": 2_679,

@@ -36,7 +36,7 @@ class Compiled:
         self._compiled: Callable[..., Any] | None = None
 
     def __call__(self, *args: Any) -> Any:
-        if not any(isinstance(x, Tensor) and x.is_cuda for x in args):
+        if not _is_on_gpu(args):
             return self._plain(*args)
         from torch._dynamo import config  # slow to import, and nothing but training needs it
         from torch._dynamo.exc import TorchDynamoException
@@ -57,6 +57,10 @@ class Compiled:
             )
             self._compiled = self._plain
             return self._plain(*args)
+
+
+def _is_on_gpu(args: tuple[Any, ...]) -> bool:
+    return any(isinstance(x, Tensor) and x.is_cuda for x in args)
 
 
 class CompiledBackbone(PaliGemmaWithExpertModel):
