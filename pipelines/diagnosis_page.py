@@ -23,7 +23,7 @@ from pipelines.studies.robots import share
 from taccorl.data.origin import Origin
 
 PAGE = Path("docs/diagnosis.md")
-OTHERS = "<!-- Other machines: each section below is written by the command that it names. -->"
+OTHERS = "<!-- Other machines: the tables below are printed by the command that their section names. -->"
 """What follows this line in the page stays."""
 ORIGIN = [Origin("surrogate", "simulated robots; nothing was measured on a robot")]
 SIGNAL_BINS = (0.1, 0.5, 0.75, 1.1, 1.6, 2.4, 4.0, 8.0, 16.0, 64.0)
@@ -260,12 +260,3 @@ def _strength_errors(row: dict[str, Any]) -> list[float]:
     """Relative error of the first identifiable number of the hidden effect."""
     own = [n for name, n in row["numbers"].items() if name.startswith(f"{row['hidden'][0]}.")]
     return [abs(value / true - 1.0) for value, _, _, true in own[:1] if true]
-
-
-def replace_section(title: str, text: str) -> None:
-    """Write the section ``## title`` of another machine into the page, below ``OTHERS``; an older one of that title goes."""
-    own, _, others = PAGE.read_text(encoding="utf-8").partition(OTHERS)
-    sections = [f"## {part}" for part in others.split("\n## ")[1:]]
-    sections = [s.rstrip("\n") for s in sections if s.splitlines()[0] != f"## {title}"]
-    sections.append(f"## {title}\n\n{text.rstrip()}")
-    PAGE.write_text("\n\n".join([own.rstrip("\n"), OTHERS, *sections]) + "\n", encoding="utf-8")

@@ -1,7 +1,7 @@
 """Is the search right about sensors of cells? Simulated sensors, each with one of thirteen hidden effects or none.
 
-``python -m pipelines.studies.cells rows.jsonl`` runs the cases that the file lacks, in about six CPU-minutes, and writes the
-section of docs/diagnosis.md. Exact: the hidden effect alone was found; nothing where none is hidden. Named: it is the first or a
+``python -m pipelines.studies.cells rows.jsonl`` runs the cases that the file lacks, in six CPU-minutes, and prints the tables
+of docs/diagnosis.md. Exact: the hidden effect alone was found; nothing where none is hidden. Named: it is the first or a
 tie, rival or near-twin of it. Material: the validation error, gain and offset fitted, is at least 1.5 noise floors.
 """
 
@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from statistics import median_high
 from typing import Any
 
-from pipelines.diagnosis_page import replace_section
 from pipelines.studies.robots import MATERIAL_FLOORS, share_row, study
 from taccorl.diagnosis.problems.cells_problem import CellsProblem
 from taccorl.diagnosis.search.result import SearchConfig
@@ -24,7 +23,6 @@ ASKED = (
 """Nine effects of a single cell that reads nothing but a load; the others need a long hold, a temperature or neighbours."""
 FIRST_SEED, SENSORS, CLEAN = 50_000, 5, 20
 """Nothing was tuned on seeds from the first on."""
-TITLE = "Sensors of cells"
 Row = dict[str, Any]
 
 
@@ -70,7 +68,7 @@ def material(row: Row) -> bool:
 
 
 def counted(rows: Sequence[Row]) -> list[str]:
-    """Lines of Markdown: shares, a line for each hidden effect, and each case that was not exact; the section is written."""
+    """Lines of Markdown: shares, a line for each hidden effect, and each case that was not exact."""
     asked, others = ([r for r in rows if r["hidden"] and (r["hidden"] in ASKED) == one] for one in (True, False))
     seen, clean = [r for r in asked if material(r)], [r for r in rows if not r["hidden"]]
     lines = ["| what | asked | measured |", "|---|---|---|"]
@@ -99,18 +97,5 @@ def counted(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def main(rows: Sequence[Row]) -> list[str]:
-    text = """**Every sensor is simulated**, at 1 kHz, by equations of its own but for saturation, threshold, play, drift and
-temperature. Load noise, jitter, rounding to counts; noise correlated over 0.1 s in half. Three fit recordings (one repeated),
-two for validation, one for the test. Strengths leave 2 to 36 noise floors; weaker ones were not tried. Crosstalk and ghosting
-are hidden in grids of 3 × 4 cells. Noise of the load widens the fitted band of `taxel_play` by half of it.
-
-Command: `python -m pipelines.studies.cells docs/cells_study.jsonl`.
-
-"""
-    replace_section(TITLE, text + "\n".join(lines := counted(rows)) + "\n")
-    return lines
-
-
 if __name__ == "__main__":
-    study(jobs(), run, main)
+    study(jobs(), run, counted)

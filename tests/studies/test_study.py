@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines import diagnosis_page
 from pipelines.studies import cells
 from pipelines.studies.figures import SLOPE, confusion_matrix, detection_curves, half_detected
 from pipelines.studies.joints_and_pads import (
@@ -205,19 +204,6 @@ def test_one_case_is_run():
     row = cells.run((3, ""))
     assert cells.exact(row) and row["status"] == "nothing_missing"
     assert row["after"] < 1.3
-
-
-def test_a_section_is_replaced_and_others_stay(tmp_path, monkeypatch):
-    page = tmp_path / "page.md"
-    page.write_text("# Own\n\n## Design\n\ntext\n")
-    monkeypatch.setattr(diagnosis_page, "PAGE", page)
-    diagnosis_page.replace_section("Axes", "one")
-    diagnosis_page.replace_section("Cells", "two")
-    diagnosis_page.replace_section("Axes", "three")
-    own, marker, others = page.read_text().partition(diagnosis_page.OTHERS)
-    assert own == "# Own\n\n## Design\n\ntext\n\n"
-    assert marker
-    assert others == "\n\n## Cells\n\ntwo\n\n## Axes\n\nthree\n"
 
 
 # ---- figures hold the counts that they were given ----
