@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 14_651,
+    "taccorl/alignment": 14_654,
     "taccorl/cli": 4_873,
     "taccorl/data": 8_739,
     "taccorl/diagnosis": 11_108,
@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_511,
     "taccorl/training": 1_557,
     "taccorl/views": 2_334,
-    "tests": 55_546,
-    "pipelines": 6_122,
+    "tests": 55_548,
+    "pipelines": 6_123,
 }
 MOST_LINES_OF_A_FILE = 500
 

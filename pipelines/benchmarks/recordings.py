@@ -26,7 +26,7 @@ measured."""
 REPEATS = 3
 NATIVE = [480, 640, 3]
 CORRUPTION, DAMAGE = ("tests/end_to_end/test_corruption.py",), ("tests/end_to_end/test_random_damage.py",)
-"""Command-line arguments of pytest with which a benchmark chooses the tests that it runs."""
+"""Arguments of pytest: the tests of damaged recordings that the benchmark ``corruption`` runs and counts."""
 
 
 class Cost(NamedTuple):

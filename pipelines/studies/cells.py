@@ -1,4 +1,4 @@
-"""Is the search right about sensors of cells? Simulated sensors, each with one of thirteen hidden effects or none.
+"""How often the search names the effect that is hidden in a simulated tactile sensor of several cells: one of thirteen, or none.
 
 ``python -m pipelines.studies.cells rows.jsonl`` runs the cases that the file lacks, in six CPU-minutes, and prints the tables
 of docs/diagnosis.md. Exact: the hidden effect alone was found; nothing where none is hidden. Named: it is the first or a
@@ -68,7 +68,8 @@ def material(row: Row) -> bool:
 
 
 def counted(rows: Sequence[Row]) -> list[str]:
-    """Lines of Markdown: shares, a line for each hidden effect, and each case that was not exact."""
+    """Lines of Markdown: a table with the share of right answers, a table with a row for each hidden effect, and a list of the
+    cases in which not exactly the hidden effect was found."""
     asked, others = ([r for r in rows if r["hidden"] and (r["hidden"] in ASKED) == one] for one in (True, False))
     seen, clean = [r for r in asked if material(r)], [r for r in rows if not r["hidden"]]
     lines = ["| what | asked | measured |", "|---|---|---|"]

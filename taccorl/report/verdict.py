@@ -202,7 +202,7 @@ def added(d: Diagnosis) -> tuple[str, ...]:
 
 
 def _open(d: Diagnosis) -> list[str]:
-    """Added effects of which the recordings determine no number."""
+    """Names of the added effects none of whose parameters the recordings determine."""
     known = {name.partition(".")[0] for name in d.intervals if name not in d.undetermined}
     unknown = {name.partition(".")[0] for name in d.undetermined} - known
     return [name for name in added(d) if name in unknown]

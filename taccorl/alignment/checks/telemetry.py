@@ -150,7 +150,7 @@ def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> It
 
 @check("warning", "copied_recording")
 def check_copies(measurements: Sequence[Measurement]) -> dict[str, list[Finding]]:
-    """Name of each recording that is a copy of another → a finding."""
+    """Find recordings that hold the same numbers as another. Returns: name of the copy → one warning."""
     why = "number for number: nothing new, and no repeat for the noise floor. Remove it, and its entry in measurements.yaml if it"
     end = "has one (a simulation without noise repeats so as well)"
     of = copies(measurements)

@@ -234,8 +234,10 @@ def split(
         uses.setdefault(name, "validation" if motion[name] in taken else "fit")
     for name, first in copies(measurements).items():
         if uses[name] != uses[first]:
-            said = f"{name} ({uses[name]}) is {first} ({uses[first]}), number for number: it would check what it was used for"
-            raise TaccorlError(f"{said}; remove one of them, in {INDEX}, too")
+            said = (
+                f"{name} ({uses[name]}) is {first} ({uses[first]}), number for number, and would be checked with itself"
+            )
+            raise TaccorlError(f"{said}; remove one of them, and its entry in {INDEX} if it has one")
     sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
     if fit_needed and not sides["fit"]:
         raise TaccorlError(
@@ -264,7 +266,8 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
 
 
 def copies(measurements: Iterable[Measurement]) -> dict[str, str]:
-    """Name of each recording that is a copy → name of the first of its kind: one that others repeat, or that repeats none."""
+    """Find recordings that hold the same numbers as another. Returns: name of the copy → name of the original, which is the one
+    that ``repeat_of`` of others names, else one that repeats none, else the first."""
     measurements = list(measurements)
     firsts, there = {m.repeat_of for m in measurements}, dict[bytes, Measurement]()
     found = {}

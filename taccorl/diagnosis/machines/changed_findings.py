@@ -29,12 +29,12 @@ def payloads(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def lacked(f: Finding) -> tuple[str, ...]:
-    """Names of the effects that a finding adds, and of the numbers of the file that it says are off."""
+    """Names of the effects that a finding adds, and of the numbers in the robot's file that it calls wrong."""
     return (*(n for n in f.diagnosis.names if n not in f.diagnosis.present), *numbers_off(f))
 
 
 def numbers_off(f: Finding) -> tuple[str, ...]:
-    """Names of the numbers of the file that a finding says are off."""
+    """Names of the numbers in the robot's file, such as ``kp``, that a finding calls wrong."""
     return tuple(c.name for c in f.diagnosis.changed)
 
 
@@ -82,9 +82,9 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
 
 
 def placed(f: Finding, model: Fit, stands_for: Mapping[str, Sequence[str]], ties: Sequence[str]) -> Finding:
-    """The finding with the mass, the intervals and the always fitted numbers of ``model``, which has one payload at several
-    joints, and with a remark that names what it explains: ``stands_for``, joint → effects that alone explain as much there.
-    ``ties``: other bodies in which it does as well."""
+    """The finding of one joint with the values of ``model``, a fit of one payload to several joints: its mass, its intervals, and
+    the numbers of the drive that every fit adjusts. A remark names the effects that the payload replaces: ``stands_for``,
+    joint → effects that alone explain as much there. ``ties``: other bodies where the payload explains as much."""
     d, every = f.diagnosis, model.intervals()
     ends = {name: interval for name, interval in every.items() if name.startswith("payload.")}
     own = {name.removeprefix("payload."): interval for name, interval in ends.items()}

@@ -68,7 +68,7 @@ class Arm(NamedTuple):
     noise_effort: np.ndarray
     delay_s: float = 0.0
     steps: bool = False
-    """Whether the joint, and those before it, take steps in place of a chirp."""
+    """Whether the target is a square wave, of the joint and of all joints before it, instead of a chirp of the joint alone."""
 
 
 TWO = Arm(
@@ -334,7 +334,8 @@ def scara_recordings(arm: Arm, joints: Sequence[str] = SCARA_JOINTS) -> Measurem
 
 
 def test_a_joint_is_judged_beside_what_its_neighbour_lacks(tmp_path: Path) -> None:
-    """The shoulder of a SCARA answers 12 ms late. The file's drive begins each of its steps too early, which loads the elbow."""
+    """The shoulder of a SCARA follows its targets 12 ms late. A model without this delay accelerates the shoulder too early, and
+    that acceleration loads the elbow in the model at the wrong time."""
     arm = SCARA._replace(true=SCARA.known, delay_s=DELAY_S, steps=True)
     runs = [recorded(f"m{k}", 1, 0.12, hz, k, None, arm) for k, hz in enumerate((1.5, 1.1))]
     made, robot = Measurements((runs[0],), (runs[1],)), machine(tmp_path, SCARA.known, SCARA_FILE)

@@ -727,7 +727,8 @@ def of_a_wheel(name: str, target: np.ndarray, repeat_of: str | None = None) -> M
 
 
 def test_two_frictions_that_look_like_one_are_not_called_unknown():
-    """One effect is asked for. The law of grease explains both, but is no more than the two: the greater one is named."""
+    """Coulomb and viscous friction are missing, and the search may add one effect. ``power_law_friction`` alone
+    explains no more than these two together, so that the larger of the two is named, not it."""
     t = np.arange(2000) / 250
     chirp, triangle = 3 * np.sin(2 * np.pi * (0.2 * t + 0.2 * t**2)), 8 * np.abs((t / 3 + 0.25) % 1 - 0.5) - 2
     waves = 1.5 * np.sin(2 * np.pi * 0.31 * t) + 1.5 * np.sin(2 * np.pi * 0.77 * t + 1)
