@@ -10,7 +10,13 @@ from typing import Any
 project = "TacCoRL"
 extensions = ["myst_parser"]
 source_suffix = {".md": "markdown", ".ipynb": "markdown"}
-include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/*.md", "notebooks/*.ipynb"]
+include_patterns = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "docs/*.md",
+    "notebooks/*.ipynb",
+]
 root_doc = "README"
 myst_heading_anchors = 4  # anchors of headings as GitHub makes them
 html_theme = "furo"
@@ -33,9 +39,18 @@ NAVIGATION = {
 
 def table_of_contents(notebooks: list[str]) -> str:
     """Hidden tables of contents for the side bar, in MyST."""
-    pages = {caption: [f"docs/{name}" for name in names] for caption, names in NAVIGATION.items()}
-    pages |= {"Notebooks": sorted(notebooks), "Develop": ["docs/architecture", "CONTRIBUTING", "CHANGELOG"]}
-    parts = (f"```{{toctree}}\n:hidden:\n:caption: {name}\n\n" + "\n".join(of) + "\n```" for name, of in pages.items())
+    pages = {
+        caption: [f"docs/{name}" for name in names]
+        for caption, names in NAVIGATION.items()
+    }
+    pages |= {
+        "Notebooks": sorted(notebooks),
+        "Develop": ["docs/architecture", "CONTRIBUTING", "CHANGELOG"],
+    }
+    parts = (
+        f"```{{toctree}}\n:hidden:\n:caption: {name}\n\n" + "\n".join(of) + "\n```"
+        for name, of in pages.items()
+    )
     return "\n\n".join(parts)
 
 
@@ -51,7 +66,11 @@ def notebook_page(text: str) -> str:
         for output in cell["outputs"]:
             data: dict[str, Any] = output.get("data", {})
             if "image/png" in data:
-                blocks.append("![output](data:image/png;base64," + "".join(data["image/png"]).replace("\n", "") + ")")
+                blocks.append(
+                    "![output](data:image/png;base64,"
+                    + "".join(data["image/png"]).replace("\n", "")
+                    + ")"
+                )
             else:
                 shown = "".join(output.get("text", data.get("text/plain", [])))
                 blocks.append(f"````text\n{shown.rstrip()}\n````")

@@ -35,8 +35,17 @@ from taccorl.evaluation.statistics import told_rate, wilson_interval
 ORIGIN = "twin with hidden effects and other cameras, not a robot"
 """Origin that datasets of the simulated robot state."""
 RECORDING_SPEC = "piper_flexitac_mcap"
-SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")
-SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=4,--batch_size=4]")
+SMALL = (
+    "--real=1",
+    "--sources=1",
+    "--augmented=1",
+    "--scored=2",
+    "--episode_length=12",
+)
+SMALL += (
+    "--train=configs/learn/tiny.yaml",
+    "--train_options=[--steps=4,--batch_size=4]",
+)
 
 
 @dataclass(kw_only=True)
@@ -81,7 +90,9 @@ def main(words: list[str]) -> None:
     out, task, store = config.out / config.task, config.task, config.out / "store"
     recipe = config.train or Path(f"configs/cotrain/{task}.yaml")
     if not recipe.is_file():  # before hours of collecting
-        raise SystemExit(f"--train={recipe}: no such file; for a task of your own, copy one of configs/cotrain")
+        raise SystemExit(
+            f"--train={recipe}: no such file; for a task of your own, copy one of configs/cotrain"
+        )
     try:
         name = f"surrogate_{named(config.robot)}"  # another content of the file is another robot
     except TaccorlError as error:
@@ -91,45 +102,97 @@ def main(words: list[str]) -> None:
     sources, many = out / "sources", out / "augmented"
     out.mkdir(parents=True, exist_ok=True)
     shown = CollectConfig(
-        task=task, episodes=config.real, as_recording=True, seed=1, twin=config.robot, origin=ORIGIN, store=store
+        task=task,
+        episodes=config.real,
+        as_recording=True,
+        seed=1,
+        twin=config.robot,
+        origin=ORIGIN,
+        store=store,
     )
     record(recordings, shown)  # seed 1: the two domains do not share their scenes
-    step(ingest.run, IngestConfig(paths=[recordings], spec=RECORDING_SPEC, out=real, store=store))
+    step(
+        ingest.run,
+        IngestConfig(paths=[recordings], spec=RECORDING_SPEC, out=real, store=store),
+    )
     cached = config.cache != "none"
-    step(collect.run, CollectConfig(task=task, episodes=config.sources, images=not cached, out=sources, store=store))
-    made = AugmentConfig(source=sources, task=task, episodes=config.augmented, out=many, store=store)
+    step(
+        collect.run,
+        CollectConfig(
+            task=task,
+            episodes=config.sources,
+            images=not cached,
+            out=sources,
+            store=store,
+        ),
+    )
+    made = AugmentConfig(
+        source=sources, task=task, episodes=config.augmented, out=many, store=store
+    )
     if cached:
-        size = yaml.safe_load(recipe.read_text(encoding="utf-8"))["policy"].get("image_resolution")
-        frames = {"pictures": "cache", "resolution": f"{size[0]}x{size[1]}" if size else None}
-        step(augment.run, dataclasses.replace(made, part_poses=True, rows_per_picture=1, **frames))
-        step(merge.run, MergeConfig(real=[real], sim=[many], out=both, store=store, **frames))
+        size = yaml.safe_load(recipe.read_text(encoding="utf-8"))["policy"].get(
+            "image_resolution"
+        )
+        frames = {
+            "pictures": "cache",
+            "resolution": f"{size[0]}x{size[1]}" if size else None,
+        }
+        step(
+            augment.run,
+            dataclasses.replace(made, part_poses=True, rows_per_picture=1, **frames),
+        )
+        step(
+            merge.run,
+            MergeConfig(real=[real], sim=[many], out=both, store=store, **frames),
+        )
         cache = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}"]
     else:
         step(augment.run, made)
-        step(merge.run, MergeConfig(real=[real], sim=[sources, many], out=both, store=store))
+        step(
+            merge.run,
+            MergeConfig(real=[real], sim=[sources, many], out=both, store=store),
+        )
         cache = []
     training = Training(recipe, both, [*cache, *config.train_options], out)
     lerobot(training.command())
-    limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
+    limit = (
+        [f"--env.episode_length={config.episode_length}"]
+        if config.episode_length
+        else []
+    )
     scored = {"twin": [f"--env.task={task}", *limit]}
     scored["surrogate"] = [*scored["twin"], f"--env.twin={config.robot}"]
     rows = []
     for name, place in scored.items():
         scoring = Scoring(training, place, config.scored)
         lerobot(scoring.command())
-        told = {"task": task, "where": f"{name} (simulated)", "policy": str(training.policy)}
-        rows += [told | {"seed": FIRST_SEED + k, "success": s} for k, s in enumerate(scoring.successes())]
+        told = {
+            "task": task,
+            "where": f"{name} (simulated)",
+            "policy": str(training.policy),
+        }
+        rows += [
+            told | {"seed": FIRST_SEED + k, "success": s}
+            for k, s in enumerate(scoring.successes())
+        ]
     write(rows, config, training, out)
 
 
-def write(rows: list[dict], config: CotrainConfig, training: Training, out: Path) -> None:
+def write(
+    rows: list[dict], config: CotrainConfig, training: Training, out: Path
+) -> None:
     """outcomes.json: a row an episode, and what they come to; outcomes.md: a table."""
     found: dict[str, list[bool]] = {}
     for row in rows:
         found.setdefault(row["where"], []).append(row["success"])
     counts = {where: (sum(each), len(each)) for where, each in found.items()}
     scores = {
-        where: {"successes": k, "attempts": n, "rate": k / n, "interval_95": wilson_interval(k, n)}
+        where: {
+            "successes": k,
+            "attempts": n,
+            "rate": k / n,
+            "interval_95": wilson_interval(k, n),
+        }
         for where, (k, n) in counts.items()
     }
     of_twin = config.augmented + (config.sources if config.cache == "none" else 0)
@@ -137,7 +200,10 @@ def write(rows: list[dict], config: CotrainConfig, training: Training, out: Path
     told = {"data": data, "steps": training.steps, "scores": scores}
     text = json.dumps(told | {"outcomes": rows}, indent=1, ensure_ascii=False)
     (out / "outcomes.json").write_text(text + "\n", encoding="utf-8")
-    lines = [f"{config.task}, {training.steps} steps on {data}. Nothing here is of a robot.", ""]
+    lines = [
+        f"{config.task}, {training.steps} steps on {data}. Nothing here is of a robot.",
+        "",
+    ]
     lines += ["| scored in | successes, 95 % after Wilson |", "|---|---|"]
     lines += [f"| {where} | {told_rate(*count)} |" for where, count in counts.items()]
     (out / "outcomes.md").write_text("\n".join(lines) + "\n", encoding="utf-8")

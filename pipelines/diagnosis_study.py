@@ -52,25 +52,41 @@ def _seeds(first: int, n: float) -> range:
 
 STUDIES: dict[str, Callable[[int, float], Jobs]] = {
     "pack": lambda first, n: study.jobs("single", "pack", REGISTERED, _seeds(first, n)),
-    "chirp": lambda first, n: study.jobs("single", "chirp", REGISTERED, _seeds(first, n)),
-    "pairs": lambda first, n: study.jobs("pairs", "pack", PAIRS, _seeds(first + 1000, n)),
+    "chirp": lambda first, n: study.jobs(
+        "single", "chirp", REGISTERED, _seeds(first, n)
+    ),
+    "pairs": lambda first, n: study.jobs(
+        "pairs", "pack", PAIRS, _seeds(first + 1000, n)
+    ),
     "none": lambda first, n: [
         *study.jobs("none", "chirp", [""], _seeds(first, 11 * n)),
         *study.jobs("none", "pack", [""], _seeds(first, 5.5 * n)),
     ],
-    "loop": lambda first, n: study.jobs("loop", "chirp", [""], _seeds(first + 3500, 2 * n)),
+    "loop": lambda first, n: study.jobs(
+        "loop", "chirp", [""], _seeds(first + 3500, 2 * n)
+    ),
     "outside": lambda first, n: [
         *study.jobs("removed", "chirp", OUTSIDE, _seeds(first + 2000, n / 2)),
         *study.jobs("removed", "pack", OUTSIDE, _seeds(first + 2500, n / 2)),
     ],
-    "removed": lambda first, n: study.jobs("removed", "chirp", REGISTERED, _seeds(first + 2000, n / 5)),
+    "removed": lambda first, n: study.jobs(
+        "removed", "chirp", REGISTERED, _seeds(first + 2000, n / 5)
+    ),
     "dropped": lambda first, n: [
-        *study.jobs("dropped", "chirp", ["dropped_commands"], _seeds(first + 3000, 3 * n)),
-        *study.jobs("dropped", "pack", ["dropped_commands"], _seeds(first + 3000, 3 * n)),
+        *study.jobs(
+            "dropped", "chirp", ["dropped_commands"], _seeds(first + 3000, 3 * n)
+        ),
+        *study.jobs(
+            "dropped", "pack", ["dropped_commands"], _seeds(first + 3000, 3 * n)
+        ),
     ],
-    "touch": lambda first, n: study.jobs("touch", "press", REGISTERED_TOUCH, _seeds(first, n / 2)),
+    "touch": lambda first, n: study.jobs(
+        "touch", "press", REGISTERED_TOUCH, _seeds(first, n / 2)
+    ),
     "touch_none": lambda first, n: study.jobs("none", "press", [""], _seeds(first, n)),
-    "touch_outside": lambda first, n: study.jobs("removed", "press", OUTSIDE_TOUCH, _seeds(first + 2000, n / 2)),
+    "touch_outside": lambda first, n: study.jobs(
+        "removed", "press", OUTSIDE_TOUCH, _seeds(first + 2000, n / 2)
+    ),
 }
 """Name → cases, from the first seed and the number of seeds."""
 EVERY_JOBS = 40
@@ -103,7 +119,11 @@ def parse(words: list[str]) -> tuple[StudyConfig, list[str]]:
     for name in names:
         if name not in STUDIES:
             raise TaccorlError(f"no study {name!r}; {nearest(name, STUDIES)}")
-    options = [word if "=" in word else f"{word}=true" for word in words if word.startswith("--")]
+    options = [
+        word if "=" in word else f"{word}=true"
+        for word in words
+        if word.startswith("--")
+    ]
     return parse_options(StudyConfig, options, prog="diagnosis_study"), names
 
 
@@ -128,7 +148,9 @@ def work(job: study.Job | str) -> dict[str, Any]:
 def ordered(jobs: Jobs, stamp: str) -> list[study.Job | str]:
     """Longest first, so that no core waits at the end, with reference loops among them."""
     out: list[study.Job | str] = []
-    for k, job in enumerate(sorted(jobs, key=lambda j: (-_COST[j.design], -len(j.hidden)))):
+    for k, job in enumerate(
+        sorted(jobs, key=lambda j: (-_COST[j.design], -len(j.hidden)))
+    ):
         if k % EVERY_JOBS == 0:
             out.append(f"reference {stamp} {k // EVERY_JOBS}")
         out.append(job)
@@ -143,21 +165,47 @@ def main(words: list[str]) -> None:
 
         write_page(read_rows(config.rows))
         return
-    there = {row["key"] for row in read_rows(config.rows) if not (config.again and "failed" in row)}
-    jobs = [job for name in names for job in STUDIES[name](config.first_seed, config.seeds) if job.key not in there]
+    there = {
+        row["key"]
+        for row in read_rows(config.rows)
+        if not (config.again and "failed" in row)
+    }
+    jobs = [
+        job
+        for name in names
+        for job in STUDIES[name](config.first_seed, config.seeds)
+        if job.key not in there
+    ]
     if not jobs:
-        print("nothing to run: all rows are there, or no study was named; --page writes the page")
+        print(
+            "nothing to run: all rows are there, or no study was named; --page writes the page"
+        )
         return
     # What Numba compiles is written to its cache once, before many processes need it.
-    warm_up = [study.Job(study="warm-up", hidden=(), seed=300, design=d) for d in sorted({j.design for j in jobs})]
-    _run(warm_up, 1, config.limit_s, lambda row: print(f"{row['key']}: {row.get('failed', 'compiled')}", flush=True))
+    warm_up = [
+        study.Job(study="warm-up", hidden=(), seed=300, design=d)
+        for d in sorted({j.design for j in jobs})
+    ]
+    _run(
+        warm_up,
+        1,
+        config.limit_s,
+        lambda row: print(f"{row['key']}: {row.get('failed', 'compiled')}", flush=True),
+    )
     stamp = time.strftime("%Y-%m-%d %H:%M")
-    head = {"key": f"machine {stamp}", "study": "machine", "machine": machine(), "workers": config.workers}
+    head = {
+        "key": f"machine {stamp}",
+        "study": "machine",
+        "machine": machine(),
+        "workers": config.workers,
+    }
     stored: list[dict[str, Any]] = []
     with Bars(len(jobs)) as bars, config.rows.open("a", encoding="utf-8") as file:
 
         def store(row: dict[str, Any]) -> None:
-            file.write(json.dumps(row, ensure_ascii=False, separators=(",", ":")) + "\n")
+            file.write(
+                json.dumps(row, ensure_ascii=False, separators=(",", ":")) + "\n"
+            )
             file.flush()
             stored.extend([row] if row["study"] not in ("machine", "reference") else [])
             bars.update(row["key"], len(stored), len(jobs))
@@ -165,10 +213,17 @@ def main(words: list[str]) -> None:
         store(head)
         _run(ordered(jobs, stamp), config.workers, config.limit_s, store)
     wrong = sum("failed" in row for row in stored)
-    print(f"{config.rows}: {len(stored)} rows more, {wrong} of them of cases that failed")
+    print(
+        f"{config.rows}: {len(stored)} rows more, {wrong} of them of cases that failed"
+    )
 
 
-def _run(jobs: list[Any], workers: int, limit_s: float, store: Callable[[dict[str, Any]], None]) -> None:
+def _run(
+    jobs: list[Any],
+    workers: int,
+    limit_s: float,
+    store: Callable[[dict[str, Any]], None],
+) -> None:
     """``store`` gets the row of each job as it is done; one that fails, dies or takes too long costs its own row only."""
 
     def take(index: int, outcome: Done | Failed) -> None:

@@ -12,9 +12,15 @@ PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
 def text() -> str:
     """The page, with a section for each registered effect of the project."""
     lines = [PAGE.read_text(encoding="utf-8").split("\n\n## ")[0].rstrip()]
-    for cls in (cls for cls in map(effects.get, effects) if cls.__module__.startswith("taccorl.")):
+    for cls in (
+        cls
+        for cls in map(effects.get, effects)
+        if cls.__module__.startswith("taccorl.")
+    ):
         if not cls.equation:
-            raise TaccorlError(f"{prose.PAGE}: write a section about {cls.name} first, in the form of the others")
+            raise TaccorlError(
+                f"{prose.PAGE}: write a section about {cls.name} first, in the form of the others"
+            )
         lines += section(cls)
     return "\n".join(lines) + "\n"
 
@@ -24,7 +30,13 @@ def section(cls: type[Effect]) -> list[str]:
     part, numbers = f"({', '.join(cls.kinds())})", dict[str, list[str]]()
     for p in cls.parameters():
         unit = "" if p.unit == "1" else p.unit
-        absent = ", shape" if p.absent is None else f", absent at {p.absent:g}" if p.absent else ""
+        absent = (
+            ", shape"
+            if p.absent is None
+            else f", absent at {p.absent:g}"
+            if p.absent
+            else ""
+        )
         text = f"{p.typical:g} ({p.low:g}…{p.high:g}) {unit}".rstrip() + absent
         numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]

@@ -29,18 +29,39 @@ from taccorl.evaluation.statistics import wilson_interval
 from taccorl.sim.task import CLEARANCES_M
 
 ROWS, PAGE, PICTURE, GRIPS, CURVES = (
-    Path("docs") / name for name in ("results.jsonl", "results.md", "transfer.png", "grips.png", "curves.png")
+    Path("docs") / name
+    for name in (
+        "results.jsonl",
+        "results.md",
+        "transfer.png",
+        "grips.png",
+        "curves.png",
+    )
 )
 TWINS = ("nominal", "randomised", "mended", "surrogate")
-ROBOTS = {"late": "commands 30 ms late", "sticky": "friction, 60 % of weight held", "heavy": "no weight held"}
+ROBOTS = {
+    "late": "commands 30 ms late",
+    "sticky": "friction, 60 % of weight held",
+    "heavy": "no weight held",
+}
 SENSORS = {"touch": "cameras and touch", "cameras": "cameras alone"}
 TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
 _SEEDS = "--seeds=[1000,2000,3000]"
 _FOUR = "[nominal,configs/randomised,mended,surrogate]"
 _EACH = f"--sensors=[touch,cameras] {_SEEDS}"
-PLAIN = {"pictures": "clear", "difficulty": "train", "executed": 8, "twin": "", "scored_in": ""}
+PLAIN = {
+    "pictures": "clear",
+    "difficulty": "train",
+    "executed": 8,
+    "twin": "",
+    "scored_in": "",
+}
 DEMONSTRATIONS = (100, 300, 1000, 3500)
-STAGES = {"start": "before", "ppo": "after", "ppo_anchored": "after, with an anchor"}  # PPO: field of a row → text
+STAGES = {
+    "start": "before",
+    "ppo": "after",
+    "ppo_anchored": "after, with an anchor",
+}  # PPO: field of a row → text
 _LONG, _SHORT = (f"--train_options=[--steps={n},--save_freq={n}]" for n in (5400, 2500))
 PARTS = {
     "imitation": [
@@ -51,30 +72,44 @@ PARTS = {
         f"--task={t} --pictures=randomised --difficulty=[train,hard] --executed=[8,16] --episodes=2000 {_SHORT} {_EACH}"
         for t in ("assembly_1", "test_tube")
     ],
-    "grips": [f"--sensors=[touch,cameras] --sources=[10,20,0] --episodes=[100,300,1000] {_SHORT} {_SEEDS}"],
+    "grips": [
+        f"--sensors=[touch,cameras] --sources=[10,20,0] --episodes=[100,300,1000] {_SHORT} {_SEEDS}"
+    ],
     "transfer": [
-        f"--scored_in=[configs/surrogates/{r}.yaml] --twins={_FOUR} --episodes=1200 {_SHORT} {_SEEDS}" for r in ROBOTS
+        f"--scored_in=[configs/surrogates/{r}.yaml] --twins={_FOUR} --episodes=1200 {_SHORT} {_SEEDS}"
+        for r in ROBOTS
     ],
     "cotrained": [
         f"--scored_in=[configs/surrogates/{r}.yaml] --real=50 --sim_weight=[0,0.5,0.95] --episodes=1200 {_SHORT} {_SEEDS}"
         for r in ROBOTS
     ],
     "effects": [
-        f"--scored_in=[configs/surrogates/{r}.yaml] --singly=true --episodes=1000 {_SHORT} {_SEEDS}" for r in ROBOTS
+        f"--scored_in=[configs/surrogates/{r}.yaml] --singly=true --episodes=1000 {_SHORT} {_SEEDS}"
+        for r in ROBOTS
     ],
 }
 """Part of the tables → command-line arguments of each call of ``pipelines.learn`` that measures it."""
 PAPER_STAGES = ("co-trained", "with noise", "RL, untrained", "RL")
 PAPER = {
-    "touch": dict(zip(PAPER_STAGES, ((41, 16, 47, 58), (36, 4, 35, 42), (0,) * 4, (72, 71, 92, 79)), strict=True)),
-    "cameras": dict(zip(PAPER_STAGES, ((42, 12, 39, 39), (35, 5, 25, 25), (0,) * 4, (50, 54, 77, 61)), strict=True)),
+    "touch": dict(
+        zip(
+            PAPER_STAGES,
+            ((41, 16, 47, 58), (36, 4, 35, 42), (0,) * 4, (72, 71, 92, 79)),
+            strict=True,
+        )
+    ),
+    "cameras": dict(
+        zip(
+            PAPER_STAGES,
+            ((42, 12, 39, 39), (35, 5, 25, 25), (0,) * 4, (50, 54, 77, 61)),
+            strict=True,
+        )
+    ),
 }
 """Sensors → stage → completed [%] in simulation, of ``TASKS``: the paper's Table 1, π0.5 and 128 environments."""
 HEADS_1 = f"task | policy | paper: {'; '.join(PAPER_STAGES)} | here: by imitation | with PPO's noise"
 PAPER_BETA = "The paper, of a robot and α = 0.5: 45 % with β = 0, 80 % with 0.1 and with 1, less with 5"
-PAPER_ALPHA = (
-    "The paper, assembly_2 of a robot after PPO without an anchor: 25 % with α = 0, 45 % with 0.5, 40 % with 0.95"
-)
+PAPER_ALPHA = "The paper, assembly_2 of a robot after PPO without an anchor: 25 % with α = 0, 45 % with 0.5, 40 % with 0.95"
 PAPER_REAL = "real-only 35 %, co-trained (α = 0.5) 45 %, after RL 95 %"
 """The paper's Table 2, assembly_1 with touch: of a robot."""
 Rows = list[dict[str, Any]]
@@ -102,12 +137,30 @@ def main(words: list[str]) -> None:
     if not ROWS.exists():
         raise SystemExit(f"{ROWS}: not here; run it in the root of the clone")
     if not (config.only or config.take or config.page):
-        raise SystemExit(f"give --only=[…] of {', '.join(PARTS)} (hours on a GPU each), --take=FOLDER or --page=true")
-    scores = [told.parent for folder in config.take for told in sorted(folder.rglob("settings.json"))]
+        raise SystemExit(
+            f"give --only=[…] of {', '.join(PARTS)} (hours on a GPU each), --take=FOLDER or --page=true"
+        )
+    scores = [
+        told.parent
+        for folder in config.take
+        for told in sorted(folder.rglob("settings.json"))
+    ]
     if config.take and not scores:
-        raise SystemExit(f"--take={', '.join(map(str, config.take))}: no score of pipelines.learn in there")
-    for call in [call for name in config.only for call in PARTS[name]] if not (config.page or config.take) else []:
-        take([score for one in learn.main([*call.split(), f"--out={config.out}"]) for score in one.scores])
+        raise SystemExit(
+            f"--take={', '.join(map(str, config.take))}: no score of pipelines.learn in there"
+        )
+    for call in (
+        [call for name in config.only for call in PARTS[name]]
+        if not (config.page or config.take)
+        else []
+    ):
+        take(
+            [
+                score
+                for one in learn.main([*call.split(), f"--out={config.out}"])
+                for score in one.scores
+            ]
+        )
     take(scores)
     rows = read(ROWS)
     PAGE.write_text(page(rows), encoding="utf-8")
@@ -127,11 +180,20 @@ def take(scores: list[Path], path: Path = ROWS) -> None:
     """Append the rows of ``scores`` that are not there yet. The file is replaced whole: a stop or a full disk costs no row."""
     there = {row["key"] for row in read(path)}
     describe = ["git", "describe", "--always", "--dirty"]
-    commit = subprocess.run(describe, capture_output=True, text=True, check=False).stdout.strip()
+    commit = subprocess.run(
+        describe, capture_output=True, text=True, check=False
+    ).stdout.strip()
     made = {"commit": commit, "date": datetime.now(UTC).date().isoformat()}
-    new = [json.dumps(row | made) + "\n" for row in map(row_of, scores) if row["key"] not in there]
+    new = [
+        json.dumps(row | made) + "\n"
+        for row in map(row_of, scores)
+        if row["key"] not in there
+    ]
     draft = path.with_suffix(".unfinished")
-    draft.write_text("".join([path.read_text(encoding="utf-8") if path.exists() else "", *new]), encoding="utf-8")
+    draft.write_text(
+        "".join([path.read_text(encoding="utf-8") if path.exists() else "", *new]),
+        encoding="utf-8",
+    )
     draft.replace(path)
 
 
@@ -139,20 +201,37 @@ def row_of(score: Path) -> dict[str, Any]:
     """A score of ``pipelines.learn`` as a row; its key follows from the policy, the scenes and the result. After PPO, ``curve``:
     [episodes that ended, completed] of each iteration, of those that began at a reset, under noise; ``flow_loss``: on fixed rows
     of the anchor, after each."""
-    about, told = (json.loads((score / f"{n}.json").read_text("utf-8")) for n in ("settings", "evaluation"))
+    about, told = (
+        json.loads((score / f"{n}.json").read_text("utf-8"))
+        for n in ("settings", "evaluation")
+    )
     (one,), scenes = told["scores"], told["scenes"]
-    row = about | {name: one[name] for name in ("task", "pictures", "hidden", "n", "successes")}
+    row = about | {
+        name: one[name] for name in ("task", "pictures", "hidden", "n", "successes")
+    }
     row |= {
         "difficulty": scenes["difficulty"],
         "executed": int(score.name.split("_")[3]),
         "first_scene": scenes["seed"],
     }
-    words = json.dumps([row, [policy["digest"] for policy in told["policies"]]], sort_keys=True)
+    words = json.dumps(
+        [row, [policy["digest"] for policy in told["policies"]]], sort_keys=True
+    )
     key = {"key": sha256(words.encode()).hexdigest()[:12]}
-    if row.get("stage", "start") != "start" and (progress := score.parent / "progress.jsonl").exists():
+    if (
+        row.get("stage", "start") != "start"
+        and (progress := score.parent / "progress.jsonl").exists()
+    ):
         lines = [json.loads(line) for line in progress.read_text("utf-8").splitlines()]
-        row["curve"] = [[line["episodes"], round(line["episodes"] * (line["success"] or 0))] for line in lines]
-        row |= {"flow_loss": [round(line["drift"], 4) for line in lines]} if "drift" in lines[0] else {}
+        row["curve"] = [
+            [line["episodes"], round(line["episodes"] * (line["success"] or 0))]
+            for line in lines
+        ]
+        row |= (
+            {"flow_loss": [round(line["drift"], 4) for line in lines]}
+            if "drift" in lines[0]
+            else {}
+        )
     return key | row
 
 
@@ -162,8 +241,14 @@ def share(rows: Rows) -> str:
     if not rows:
         return "not run"
     (p,), (low,), (high,) = _shares([rows])
-    each = f"; {', '.join(f'{100 * row["successes"] / row["n"]:.1f}' for row in rows)}" if len(rows) > 1 else "*"
-    updates = "".join(f", updates: {row['updates']}" for row in rows if "updates" in row)
+    each = (
+        f"; {', '.join(f'{100 * row["successes"] / row["n"]:.1f}' for row in rows)}"
+        if len(rows) > 1
+        else "*"
+    )
+    updates = "".join(
+        f", updates: {row['updates']}" for row in rows if "updates" in row
+    )
     losses = (row["flow_loss"] for row in rows if "flow_loss" in row)
     updates += "".join(f", flow loss {of[0]:g} → {of[-1]:g}" for of in losses)
     return f"{p:.0f} % ({low:.0f} … {high:.0f}) of {_counts(rows)[1]}{each}{updates}"
@@ -174,11 +259,35 @@ def page(rows: Rows) -> str:
     seen = [row for row in rows if not row["hidden"]]
     real = [{"stage": "", "beta": 1} | row for row in rows if "real" in row]
     mixed = _grouped(real, "task", "scored_in", "real", "sim_weight", "stage", "beta")
-    plain = [row for row in seen if PLAIN.items() <= row.items() and not {"sources", "corrected"} & row.keys()]
+    plain = [
+        row
+        for row in seen
+        if PLAIN.items() <= row.items() and not {"sources", "corrected"} & row.keys()
+    ]
     own = _grouped(plain, "task", "sensors")
-    harder = [row for row in seen if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])]
-    cells = _grouped(harder, "task", "pictures", "demonstrations", "difficulty", "executed", "sensors")
-    table_1, table_2, table_3, table_4, table_5, table_6, table_7 = [], [], [], [], [], [], []
+    harder = [
+        row
+        for row in seen
+        if not (PLAIN.items() <= row.items() or row["twin"] or row["scored_in"])
+    ]
+    cells = _grouped(
+        harder,
+        "task",
+        "pictures",
+        "demonstrations",
+        "difficulty",
+        "executed",
+        "sensors",
+    )
+    table_1, table_2, table_3, table_4, table_5, table_6, table_7 = (
+        [],
+        [],
+        [],
+        [],
+        [],
+        [],
+        [],
+    )
     learnt_of, new_of = defaultdict(list), defaultdict(list)
     for k, task in enumerate(TASKS):
         for sensors, text in SENSORS.items():
@@ -187,46 +296,111 @@ def page(rows: Rows) -> str:
             trained = [r for r in mine if r["demonstrations"]]
             learnt = _most([r for r in trained if "stage" not in r])
             old, new = (
-                _grouped([r for r in trained if r.get("stage") == s], "demonstrations") for s in ("start", "ppo")
+                _grouped([r for r in trained if r.get("stage") == s], "demonstrations")
+                for s in ("start", "ppo")
             )
             after = [
-                f"{share(new[n])}; of {n[0]} demonstrations" + (f", before {share(old[n])}" if n in old else "")
+                f"{share(new[n])}; of {n[0]} demonstrations"
+                + (f", before {share(old[n])}" if n in old else "")
                 for n in sorted(new, reverse=True)
             ]
             loudest = _most([r for r in mine if "noise" in r])
-            noise = next((row["noise"] | {"demonstrations": row["demonstrations"]} for row in loudest), None)
-            loud = "{without:g} → {with:g} % of {n:g}; of {demonstrations}".format(**noise) if noise else "not run"
-            none = share(
-                [r for r in mine if r.get("stage") == "ppo" and not r["demonstrations"] and r.get("updates", 1)]
+            noise = next(
+                (
+                    row["noise"] | {"demonstrations": row["demonstrations"]}
+                    for row in loudest
+                ),
+                None,
             )
-            first = share(learnt) + (f"; of {learnt[0]['demonstrations']} demonstrations" if learnt else "")
-            table_1.append((task, text, paper, first, loud, none, "; ".join(after) or "not run"))
+            loud = (
+                "{without:g} → {with:g} % of {n:g}; of {demonstrations}".format(**noise)
+                if noise
+                else "not run"
+            )
+            none = share(
+                [
+                    r
+                    for r in mine
+                    if r.get("stage") == "ppo"
+                    and not r["demonstrations"]
+                    and r.get("updates", 1)
+                ]
+            )
+            first = share(learnt) + (
+                f"; of {learnt[0]['demonstrations']} demonstrations" if learnt else ""
+            )
+            table_1.append(
+                (task, text, paper, first, loud, none, "; ".join(after) or "not run")
+            )
             learnt_of[sensors].append(learnt)
             new_of[sensors].append(new[min(new, default=(0,))])
-        few = {key: of for key, of in grips(seen, task).items() if {*DEMONSTRATIONS[:-1]} & {*of}}
-        table_5 += [(task, *key, *(share(of.get(n, [])) for n in DEMONSTRATIONS)) for key, of in few.items()]
+        few = {
+            key: of
+            for key, of in grips(seen, task).items()
+            if {*DEMONSTRATIONS[:-1]} & {*of}
+        }
+        table_5 += [
+            (task, *key, *(share(of.get(n, [])) for n in DEMONSTRATIONS))
+            for key, of in few.items()
+        ]
     for task, pictures, n, clear, executed in sorted({cell[:5] for cell in cells}):
-        here = (share(cells[task, pictures, n, clear, executed, sensors]) for sensors in SENSORS)
-        table_2.append((f"{task}, {n}", pictures, f"{1e3 * CLEARANCES_M[clear]:g} mm, {executed}", *here))
+        here = (
+            share(cells[task, pictures, n, clear, executed, sensors])
+            for sensors in SENSORS
+        )
+        table_2.append(
+            (
+                f"{task}, {n}",
+                pictures,
+                f"{1e3 * CLEARANCES_M[clear]:g} mm, {executed}",
+                *here,
+            )
+        )
     for key, of in transfer(seen).items():
-        table_3.append((", ".join(map(str, key)), *(share(of.get(t, [])) for t in TWINS), gain(of), gain(of, TWINS[1])))
+        table_3.append(
+            (
+                ", ".join(map(str, key)),
+                *(share(of.get(t, [])) for t in TWINS),
+                gain(of),
+                gain(of, TWINS[1]),
+            )
+        )
     for stage, text in STAGES.items():
         for (robot, _), of in transfer(seen, stage).items():
-            table_4.append((robot, text, share(of["nominal"]), share(of["mended"]), gain(of)))
+            table_4.append(
+                (robot, text, share(of["nominal"]), share(of["mended"]), gain(of))
+            )
     for task, robot, few in sorted({key[:3] for key in mixed}):
         name, of = robot.rpartition("_")[0], (task, robot, few)
-        weights = [mixed[*of, *cell, 1] for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))]
+        weights = [
+            mixed[*of, *cell, 1]
+            for cell in ((0, ""), (0.5, ""), (0.95, ""), (0.95, [*STAGES][-1]))
+        ]
         n = max(row["demonstrations"] for row in itertools.chain(*weights))
         alone = transfer(seen, task=task, needed=set()).get((name, n), {})
         shares = [*weights, alone.get("nominal", []), alone.get("mended", [])]
         table_6.append((f"{task}, {name}: {few}, {n}", *map(share, shares)))
-        betas = (("start", 1), ("ppo", 0), *(([*STAGES][-1], beta) for beta in (0.1, 1, 5)))
-        table_7.append((f"{task}, {name}", *(share(mixed[*of, 0.95, *cell]) for cell in betas)))
+        betas = (
+            ("start", 1),
+            ("ppo", 0),
+            *(([*STAGES][-1], beta) for beta in (0.1, 1, 5)),
+        )
+        table_7.append(
+            (f"{task}, {name}", *(share(mixed[*of, 0.95, *cell]) for cell in betas))
+        )
     single = singly(seen)
-    alone = [row for row in seen if any(row in nominal for nominal, _ in single.values())]
+    alone = [
+        row for row in seen if any(row in nominal for nominal, _ in single.values())
+    ]
     costs = sorted(single.items(), key=lambda item: np.divide(*_counts(item[1][1])))
-    table_8 = [(*name, share(of), gain({"nominal": nominal, "mended": of})) for name, (nominal, of) in costs]
-    learnt_more, gains = (np.subtract(PAPER["touch"][s], PAPER["cameras"][s]) for s in ("co-trained", "RL"))
+    table_8 = [
+        (*name, share(of), gain({"nominal": nominal, "mended": of}))
+        for name, (nominal, of) in costs
+    ]
+    learnt_more, gains = (
+        np.subtract(PAPER["touch"][s], PAPER["cameras"][s])
+        for s in ("co-trained", "RL")
+    )
     after = (row for of in new_of.values() for cell in of for row in cell)
     least = " or ".join(map(str, sorted({row["demonstrations"] for row in after})))
     return f"""# The paper's tables, by simulation
@@ -308,7 +482,11 @@ Flow loss: on fixed rows of the surrogate's demonstrations, after the first and 
 
 
 def _table(heads: str, rows: list[tuple]) -> str:
-    lines = [f"| {heads} |", "|---" * (heads.count(" | ") + 1) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
+    lines = [
+        f"| {heads} |",
+        "|---" * (heads.count(" | ") + 1) + "|",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
     return "\n".join(lines)
 
 
@@ -322,22 +500,38 @@ def _grouped(rows: Rows, *names: str) -> defaultdict[tuple, Rows]:
 def _most(rows: Rows) -> Rows:
     """Rows of the policies that learnt from the largest number of demonstrations, in the order of their seeds."""
     most = max((row["demonstrations"] for row in rows), default=0)
-    return sorted((row for row in rows if row["demonstrations"] == most), key=lambda row: row["seed"])
+    return sorted(
+        (row for row in rows if row["demonstrations"] == most),
+        key=lambda row: row["seed"],
+    )
 
 
 def transfer(
-    rows: Rows, stage: str = "", task: str = "assembly_1", needed: Set[str] = frozenset(("nominal", "mended"))
+    rows: Rows,
+    stage: str = "",
+    task: str = "assembly_1",
+    needed: Set[str] = frozenset(("nominal", "mended")),
 ) -> dict[tuple[str, int], dict[str, Rows]]:
     """(surrogate, demonstrations) → twin of the demonstrations → rows; where all of ``needed`` were tried.
     ``stage``: of ``STAGES``, for rows of post-training."""
-    found: dict[tuple[str, int], dict[str, Rows]] = defaultdict(lambda: defaultdict(list))
-    own = (row for row in rows if row["scored_in"] and row["task"] == task and "real" not in row)
+    found: dict[tuple[str, int], dict[str, Rows]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    own = (
+        row
+        for row in rows
+        if row["scored_in"] and row["task"] == task and "real" not in row
+    )
     scored = (row for row in own if row.get("stage", "") == stage)
-    for row in sorted(scored, key=lambda row: (row["scored_in"], -row["demonstrations"], row["seed"])):
+    for row in sorted(
+        scored, key=lambda row: (row["scored_in"], -row["demonstrations"], row["seed"])
+    ):
         kind = (row["twin"] or "nominal").partition("_")[0]
         key = row["scored_in"].rpartition("_")[0], row["demonstrations"]
         found[key][kind if kind in TWINS else "surrogate"].append(row)
-    return {key: of for key, of in found.items() if key[0] in ROBOTS and needed <= of.keys()}
+    return {
+        key: of for key, of in found.items() if key[0] in ROBOTS and needed <= of.keys()
+    }
 
 
 def singly(rows: Rows) -> dict[tuple[str, str], tuple[Rows, Rows]]:
@@ -345,23 +539,45 @@ def singly(rows: Rows) -> dict[tuple[str, str], tuple[Rows, Rows]]:
     alone, in the same scenes."""
     found: dict[tuple[str, str], tuple[Rows, Rows]] = defaultdict(lambda: ([], []))
     differ = {"key", "successes", "commit", "date", "scored_in", "stage"}
-    scenes = [{name: value for name, value in row.items() if name not in differ} for row in rows]
+    scenes = [
+        {name: value for name, value in row.items() if name not in differ}
+        for row in rows
+    ]
     for row, same in zip(rows, scenes, strict=True):
         effect, of, robot = row["scored_in"].rpartition("_")[0].partition("_of_")
         if of:
-            nominal = [r for r, other in zip(rows, scenes, strict=True) if other == same and not r["scored_in"]]
+            nominal = [
+                r
+                for r, other in zip(rows, scenes, strict=True)
+                if other == same and not r["scored_in"]
+            ]
             for side, more in zip(found[effect, robot], (nominal, [row]), strict=True):
                 side += more
     return found
 
 
-def grips(rows: Rows, task: str = "assembly_1") -> dict[tuple[str, str], dict[int, Rows]]:
+def grips(
+    rows: Rows, task: str = "assembly_1"
+) -> dict[tuple[str, str], dict[int, Rows]]:
     """(sensors, grips), in words → demonstrations → rows; of a task, in the nominal twin."""
-    found: dict[tuple[str, str], dict[int, Rows]] = defaultdict(lambda: defaultdict(list))
-    for row in sorted(rows, key=lambda row: (row["sensors"] != "touch", -row.get("sources", 3500), row["seed"])):
+    found: dict[tuple[str, str], dict[int, Rows]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for row in sorted(
+        rows,
+        key=lambda row: (
+            row["sensors"] != "touch",
+            -row.get("sources", 3500),
+            row["seed"],
+        ),
+    ):
         if (PLAIN | {"task": task}).items() <= row.items() and "stage" not in row:
             of = f"{row['sources']} grips" if "sources" in row else "each its own grip"
-            of += f" for {row['corrected']}, then corrections" if "corrected" in row else ""
+            of += (
+                f" for {row['corrected']}, then corrections"
+                if "corrected" in row
+                else ""
+            )
             found[SENSORS[row["sensors"]], of][row["demonstrations"]].append(row)
     return found
 
@@ -376,7 +592,9 @@ def gain(of: dict[str, Rows], over: str = "nominal") -> str:
     text = f"{100 * (b / n - a / m):+.0f}; p = {p:.1g}"
     if min(map(len, sides)) < 3:
         return text
-    nominal, mended = ([100 * row["successes"] / row["n"] for row in side] for side in sides)
+    nominal, mended = (
+        [100 * row["successes"] / row["n"] for row in side] for side in sides
+    )
     low, high = ttest_ind(mended, nominal, equal_var=False).confidence_interval()
     return f"{text.partition(';')[0]}; {low:+.0f} … {high:+.0f}"
 
@@ -387,7 +605,11 @@ def touch_gain(*of: list[Rows]) -> str:
     if not all(itertools.chain(*of)):
         return "not run"
     (p, low, high), (q, floor, top) = map(_shares, of)
-    mean, down, up = (p - q).mean(), np.hypot(p - low, top - q), np.hypot(high - p, q - floor)
+    mean, down, up = (
+        (p - q).mean(),
+        np.hypot(p - low, top - q),
+        np.hypot(high - p, q - floor),
+    )
     return f"{mean:+.0f} ({mean - math.hypot(*down) / len(p):+.0f} … {mean + math.hypot(*up) / len(p):+.0f})"
 
 
@@ -398,28 +620,54 @@ def _counts(rows: Rows) -> tuple[int, int]:
 
 def _shares(cells: Iterable[Rows]) -> np.ndarray:
     """(3, C) share of completed scenes in each of C cells [%], then the lower and upper ends of Wilson's 95 % interval."""
-    return 100 * np.transpose([(done / n, *wilson_interval(done, n)) for done, n in map(_counts, cells)])
+    return 100 * np.transpose(
+        [(done / n, *wilson_interval(done, n)) for done, n in map(_counts, cells)]
+    )
 
 
 def draw(rows: Rows, path: Path) -> None:
     """A picture: completed in each surrogate, with the most demonstrations; intervals of the scenes; a dot for each training."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
-    table = {f"{robot}:\n{ROBOTS[robot]}": of for (robot, _), of in reversed(transfer(rows).items())}
-    table |= {f"{robot},\nafter PPO in the twin": of for (robot, _), of in transfer(rows, "ppo").items()}
+    table = {
+        f"{robot}:\n{ROBOTS[robot]}": of
+        for (robot, _), of in reversed(transfer(rows).items())
+    }
+    table |= {
+        f"{robot},\nafter PPO in the twin": of
+        for (robot, _), of in transfer(rows, "ppo").items()
+    }
     shown = [twin for twin in TWINS if any(twin in of for of in table.values())]
     for k, twin in enumerate(shown):
         off = 0.8 * ((k + 0.5) / len(shown) - 0.5)
         there = {x + off: of[twin] for x, of in enumerate(table.values()) if twin in of}
         height, *ends = _shares(there.values())
         label = "learnt in: " + (twin if twin == "surrogate" else f"{twin} twin")
-        axis.bar(list(there), height, 0.75 / len(shown), yerr=abs(ends - height), capsize=4, label=label)
+        axis.bar(
+            list(there),
+            height,
+            0.75 / len(shown),
+            yerr=abs(ends - height),
+            capsize=4,
+            label=label,
+        )
         for x, mine in there.items():
-            axis.plot([x] * len(mine), [100 * row["successes"] / row["n"] for row in mine], "k.", ms=4, clip_on=False)
+            axis.plot(
+                [x] * len(mine),
+                [100 * row["successes"] / row["n"] for row in mine],
+                "k.",
+                ms=4,
+                clip_on=False,
+            )
         for x in {x + off for x in range(len(table))} - {*there}:
-            axis.text(x, 1, "not run", rotation=90, ha="center", color="gray", fontsize=7)
+            axis.text(
+                x, 1, "not run", rotation=90, ha="center", color="gray", fontsize=7
+            )
     axis.set_xticks(range(len(table)), [*table], fontsize=8)
     axis.set(ylabel="completed [%]", ylim=(0, 100), xlim=(-0.5, len(table) - 0.5))
-    axis.set_title("assembly_1, scored in surrogate robots (simulated); whiskers: 95 % of the scenes", fontsize=9)
+    axis.set_title(
+        "assembly_1, scored in surrogate robots (simulated); whiskers: 95 % of the scenes",
+        fontsize=9,
+    )
     figure.legend(loc="outside lower center", ncols=len(shown), fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -430,8 +678,17 @@ def draw_grips(rows: Rows, path: Path) -> None:
     figure, axis = plt.subplots(figsize=(9, 3.4), layout="constrained")
     for key, of in grips(rows).items():
         height, *ends = _shares(of[n] for n in sorted(of))
-        axis.errorbar(sorted(of), height, abs(ends - height), marker="o", capsize=4, label=", ".join(key))
-    axis.set(xscale="log", ylim=(0, 100), xlabel="demonstrations", ylabel="completed [%]")
+        axis.errorbar(
+            sorted(of),
+            height,
+            abs(ends - height),
+            marker="o",
+            capsize=4,
+            label=", ".join(key),
+        )
+    axis.set(
+        xscale="log", ylim=(0, 100), xlabel="demonstrations", ylabel="completed [%]"
+    )
     axis.set_xticks(DEMONSTRATIONS, map(str, DEMONSTRATIONS), minor=False)
     axis.set_title("assembly_1, simulated; whiskers: 95 % of the scenes", fontsize=9)
     figure.legend(loc="outside right center", fontsize=8)
@@ -442,14 +699,36 @@ def draw_grips(rows: Rows, path: Path) -> None:
 def draw_curves(rows: Rows, path: Path) -> None:
     """A picture: completed under noise in each iteration of PPO in the nominal twin, of Table 1; intervals of the episodes."""
     figure, axis = plt.subplots(figsize=(9, 3.4), layout="constrained")
-    for row in (row for row in rows if row["demonstrations"] and not (row["twin"] or row["scored_in"])):
-        cells = {k: [{"n": n, "successes": done}] for k, (n, done) in enumerate(row.get("curve", []), start=1) if n}
+    for row in (
+        row
+        for row in rows
+        if row["demonstrations"] and not (row["twin"] or row["scored_in"])
+    ):
+        cells = {
+            k: [{"n": n, "successes": done}]
+            for k, (n, done) in enumerate(row.get("curve", []), start=1)
+            if n
+        }
         if cells:
             height, *ends = _shares(cells.values())
             label = f"{row['task']}, {SENSORS[row['sensors']]}, {row['demonstrations']}"
-            axis.errorbar(list(cells), height, abs(ends - height), marker="o", ms=3, capsize=2, lw=1, label=label)
-    axis.set(ylim=(0, 100), xlabel="iteration of PPO", ylabel="completed, with noise [%]")
-    axis.set_title("simulated; episodes that ended in the iteration; whiskers: 95 % of the episodes", fontsize=9)
+            axis.errorbar(
+                list(cells),
+                height,
+                abs(ends - height),
+                marker="o",
+                ms=3,
+                capsize=2,
+                lw=1,
+                label=label,
+            )
+    axis.set(
+        ylim=(0, 100), xlabel="iteration of PPO", ylabel="completed, with noise [%]"
+    )
+    axis.set_title(
+        "simulated; episodes that ended in the iteration; whiskers: 95 % of the episodes",
+        fontsize=9,
+    )
     figure.legend(loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -13,7 +13,9 @@ POSITIONAL = ("paths", "path", "measurements", "effect")
 """Fields that a user types without an option name, in every verb that has them."""
 
 
-def step[ConfigT](verb: Callable[[ConfigT], int], config: ConfigT, accepted: Sequence[int] = (0,)) -> None:
+def step[ConfigT](
+    verb: Callable[[ConfigT], int], config: ConfigT, accepted: Sequence[int] = (0,)
+) -> None:
     """Run a verb of ``taccorl``: ``run`` of a module of ``taccorl.cli``, or another function of one, such as ``lineage.explain``.
     Raises SystemExit: an error, or an exit status that is not ``accepted``."""
     name = verb.__module__.rpartition(".")[2].replace("_", "-") + (
@@ -36,18 +38,26 @@ def lerobot(words: Sequence[str]) -> None:
     if not words:
         return
     print(f"\n$ {shlex.join(words)}", flush=True)
-    if code := subprocess.run([str(Path(sys.executable).parent / words[0]), *words[1:]]).returncode:
+    if code := subprocess.run(
+        [str(Path(sys.executable).parent / words[0]), *words[1:]]
+    ).returncode:
         raise SystemExit(f"{words[0]} ended with {code}")
 
 
 def chosen(words: Sequence[str], small: Sequence[str]) -> list[str]:
     """Words of a pipeline's command line, with those that ``--small`` stands for where the user says nothing else."""
     names = {word.partition("=")[0] for word in words}
-    meant = [word for word in small if "--small" in words and word.partition("=")[0] not in names]
+    meant = [
+        word
+        for word in small
+        if "--small" in words and word.partition("=")[0] not in names
+    ]
     return [*meant, *(word for word in words if word != "--small")]
 
 
-def parsed[ConfigT](config_class: type[ConfigT], words: Sequence[str], prog: str) -> ConfigT:
+def parsed[ConfigT](
+    config_class: type[ConfigT], words: Sequence[str], prog: str
+) -> ConfigT:
     """Configuration of a pipeline. Raises SystemExit: with the error of ``parse``."""
     from taccorl.cli.parse import parse
 

@@ -38,12 +38,23 @@ def mended(robot: Path, out: Path, workers: int) -> Path:
         recorded, found = folder / name, folder / f"{name}_diagnosis"
         if not recorded.exists():
             design = "chirp" if pads == "no" else "pack"  # presses have none
-            step(surrogate.run, SurrogateConfig(secret=0, twin=robot, pads=pads, design=design, out=recorded))
+            step(
+                surrogate.run,
+                SurrogateConfig(
+                    secret=0, twin=robot, pads=pads, design=design, out=recorded
+                ),
+            )
         if not (found / TWIN).exists():
             data = recorded / (SWEEPS if pads == "no" else PRESSES)
-            asked = DiagnoseConfig(measurements=data, twin=twin, until="noise_floor", out=found)
-            asked = dataclasses.replace(asked, workers=workers, accept=["lost_samples"])  # as drivers lose some
-            step(diagnose.run, asked, (0, 1))  # 1: something is left that no effect explains
+            asked = DiagnoseConfig(
+                measurements=data, twin=twin, until="noise_floor", out=found
+            )
+            asked = dataclasses.replace(
+                asked, workers=workers, accept=["lost_samples"]
+            )  # as drivers lose some
+            step(
+                diagnose.run, asked, (0, 1)
+            )  # 1: something is left that no effect explains
         twin = found / TWIN
     shutil.copy(twin, done.with_suffix(".unfinished"))
     return done.with_suffix(".unfinished").rename(done)

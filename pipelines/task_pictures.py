@@ -28,24 +28,43 @@ MOMENTS = (0.0, 0.4, 0.75, 1.0)  # shares of the episode
 SIZE = (240, 320)  # rows, columns of a picture
 OUT = Path("docs")
 PAGE = OUT / "twin.md"
-SHOWN, EVERY, HOLD_MS = "assembly_1", 5, 1500  # task of the GIF; control steps a frame; how long the last one stays
+SHOWN, EVERY, HOLD_MS = (
+    "assembly_1",
+    5,
+    1500,
+)  # task of the GIF; control steps a frame; how long the last one stays
 FULL_COUNTS = 200  # end of the colour scale
 
 
 def with_rows(page: str) -> str:
     """The page with one row for each task in its table of pictures."""
-    rows = [f"| `{name}` | ![{tasks.get(name).instruction}](task_{name}.png) |\n" for name in tasks_with_expert()]
-    return re.sub(r"(?<=^\|---\|---\|\n)(\|.*\n)+", "".join(rows), page, count=1, flags=re.MULTILINE)
+    rows = [
+        f"| `{name}` | ![{tasks.get(name).instruction}](task_{name}.png) |\n"
+        for name in tasks_with_expert()
+    ]
+    return re.sub(
+        r"(?<=^\|---\|---\|\n)(\|.*\n)+",
+        "".join(rows),
+        page,
+        count=1,
+        flags=re.MULTILINE,
+    )
 
 
-def episode(sim: Simulation, plan: CollectPlan, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def episode(
+    sim: Simulation, plan: CollectPlan, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """States (T, row_size) and touch (T, pads, rows, columns), counts, of one successful attempt."""
     for k in range(20):
         sim.reset([seed + k])
         states, counts = [], []
         for targets in plan.source.actions(sim, np.random.default_rng([seed + k, 1])):
             states.append(sim.state_rows()[0])
-            counts.append(sim.touch()[0].reshape(len(ROBOT.pads), ROBOT.pad.rows, ROBOT.pad.columns))
+            counts.append(
+                sim.touch()[0].reshape(
+                    len(ROBOT.pads), ROBOT.pad.rows, ROBOT.pad.columns
+                )
+            )
             sim.step(targets.sent[None].astype(float))
             if sim.judge.outcome.over[0]:
                 break
@@ -54,44 +73,92 @@ def episode(sim: Simulation, plan: CollectPlan, seed: int) -> tuple[np.ndarray, 
     raise SystemExit(f"{plan.task}: no success in 20 attempts")
 
 
-def insertion(sim: Simulation, states: np.ndarray, counts: np.ndarray) -> list[Image.Image]:
+def insertion(
+    sim: Simulation, states: np.ndarray, counts: np.ndarray
+) -> list[Image.Image]:
     """Frames of ``states`` (T, row_size) from the first touch on: the picture of the first camera, the pads (T, pads, rows,
     columns) in counts, the sum of each pad over time."""
     total = counts.clip(min=0).sum((2, 3))
     first, frames = int((total.sum(1) > FULL_COUNTS).argmax()), []
     rows = list(range(first, len(states), EVERY))
     wide, high, across = 452, 339, 78
-    for k, pictures in zip(rows, sim.render_states(states[rows], VIEWS[:1], size=(720, 960)), strict=True):
+    for k, pictures in zip(
+        rows, sim.render_states(states[rows], VIEWS[:1], size=(720, 960)), strict=True
+    ):
         frame = Image.new("RGB", (800, 430), "white")
         draw = ImageDraw.Draw(frame)
         frame.paste(
-            Image.fromarray(pictures[VIEWS[0]][60:510, 180:780]).resize((wide, high), Image.Resampling.LANCZOS), (0, 0)
+            Image.fromarray(pictures[VIEWS[0]][60:510, 180:780]).resize(
+                (wide, high), Image.Resampling.LANCZOS
+            ),
+            (0, 0),
         )
         for n, name in enumerate(ROBOT.pads):
             left = wide + 12 + n * (across + 6)
-            pad = Image.fromarray(heat(counts[k, n] / FULL_COUNTS)).resize((across, 213), Image.Resampling.NEAREST)
+            pad = Image.fromarray(heat(counts[k, n] / FULL_COUNTS)).resize(
+                (across, 213), Image.Resampling.NEAREST
+            )
             frame.paste(pad, (left, 34))
-            draw.text((left + across / 2, 28), name.replace("_", " "), "black", font(16), anchor="ms")
+            draw.text(
+                (left + across / 2, 28),
+                name.replace("_", " "),
+                "black",
+                font(16),
+                anchor="ms",
+            )
             x = 130 + 650 * np.arange(k - first + 1) / (len(states) - 1 - first)
             y = 420 - 70 * total[first : k + 1, n] / total.max()
             draw.line(list(zip(x, y, strict=True)), PAD_COLORS[n], 3)
-            draw.text((left + across / 2, 268), f"{total[k, n]:.0f}", PAD_COLORS[n], font(18), anchor="ms")
-        draw.text((wide + 12, 280), "four tactile pads, 32 x 12 taxels each; sum of", "black", font(15))
-        draw.text((wide + 12, 300), f"counts below, 0 … {FULL_COUNTS} counts a taxel", "black", font(15))
+            draw.text(
+                (left + across / 2, 268),
+                f"{total[k, n]:.0f}",
+                PAD_COLORS[n],
+                font(18),
+                anchor="ms",
+            )
+        draw.text(
+            (wide + 12, 280),
+            "four tactile pads, 32 x 12 taxels each; sum of",
+            "black",
+            font(15),
+        )
+        draw.text(
+            (wide + 12, 300),
+            f"counts below, 0 … {FULL_COUNTS} counts a taxel",
+            "black",
+            font(15),
+        )
         draw.text((8, 366), "touch of each\npad over time", "black", font(15))
-        draw.text((8, 316), f"{sim.task.name}, simulated, {k / 30:.1f} s", "white", font(16))
+        draw.text(
+            (8, 316), f"{sim.task.name}, simulated, {k / 30:.1f} s", "white", font(16)
+        )
         frames.append(frame.quantize(128, dither=Image.Dither.NONE))
     return frames
 
 
 def mended_twin() -> None:
     """Draw the case of ``make demo`` and notebook 3, a surrogate robot with dry friction: the twin before and after."""
-    case = draw_case(["coulomb_friction"], seed=3, signal="left_joint4", strength=12.0, gains_known=True)
+    case = draw_case(
+        ["coulomb_friction"],
+        seed=3,
+        signal="left_joint4",
+        strength=12.0,
+        gains_known=True,
+    )
     measurements = recordings(case, "chirp")
-    found = PiperTwin(case.twin).mended([diagnose_joint(case.twin, case.signal, measurements)])[0].config
-    both = (compare(twin, measurements, name="twin").traces for twin in (case.twin, found))
+    found = (
+        PiperTwin(case.twin)
+        .mended([diagnose_joint(case.twin, case.signal, measurements)])[0]
+        .config
+    )
+    both = (
+        compare(twin, measurements, name="twin").traces for twin in (case.twin, found)
+    )
     before, after = (
-        next(t for t in traces if (t.recording, t.kind) == ("held_triangle", "position")) for traces in both
+        next(
+            t for t in traces if (t.recording, t.kind) == ("held_triangle", "position")
+        )
+        for traces in both
     )
     joint_response(before, after).savefig(OUT / "mended_twin.png", dpi=80)
 
@@ -114,7 +181,14 @@ def main() -> None:
         if task == SHOWN:
             first, *rest = insertion(sim, states, counts)
             times = [100] * len(rest) + [HOLD_MS]
-            first.save(OUT / "insertion.gif", save_all=True, append_images=rest, duration=times, loop=0, optimize=True)
+            first.save(
+                OUT / "insertion.gif",
+                save_all=True,
+                append_images=rest,
+                duration=times,
+                loop=0,
+                optimize=True,
+            )
         sim.close()
     PAGE.write_text(with_rows(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     mended_twin()

@@ -48,7 +48,9 @@ class DeadlockError(TaccorlError):
 
 def printable(text: object) -> str:
     """``value`` as text with control characters (escape sequences, line breaks) escaped, such as ``\\x1b``."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text)
+    )
 
 
 def plain_name(name: str, place: str) -> str:
@@ -77,7 +79,11 @@ def no_such_path(path: Path, what: str = "file or folder") -> str:
         return f"{path}: no such {what}: it is a link to {path.readlink()}"
     if not path.parent.is_dir():
         return f"{path}: no such {what}: there is no folder {path.parent}"
-    siblings = [p.name for p in path.parent.iterdir() if p.name[0] != "." and (p.is_dir() or "file" in what)]
+    siblings = [
+        p.name
+        for p in path.parent.iterdir()
+        if p.name[0] != "." and (p.is_dir() or "file" in what)
+    ]
     return f"{path}: no such {what}; {nearest(path.name, siblings, most=10)}"
 
 

@@ -50,7 +50,9 @@ def raised(exception: str) -> tuple[type[Exception], ...]:
 
 def missing(module: str) -> str:
     """Text for a ``module`` that is not installed, with the way out; empty if it is installed, or belongs to no extra."""
-    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+    extra = next(
+        (extra for extra, modules in EXTRAS.items() if module in modules), None
+    )
     if extra is None or _is_installed(module):
         return ""
     return f'needs {module}, which is not installed: pip install "lerobot_policy_taccorl[{extra}]"'

@@ -31,7 +31,9 @@ class Registry[T]:
         def add(entry: E) -> E:
             # By name, not by identity: a module that failed half-way is imported afresh when somebody asks again.
             if name in self._entries and repr(self._entries[name]) != repr(entry):
-                raise TaccorlError(f"{self.kind} {name!r} is registered twice: {self._entries[name]} and {entry}")
+                raise TaccorlError(
+                    f"{self.kind} {name!r} is registered twice: {self._entries[name]} and {entry}"
+                )
             self._entries[name] = cast("T", entry)
             return entry
 
@@ -61,7 +63,9 @@ class Registry[T]:
         """
         self._load()
         if name not in self._entries:
-            raise TaccorlError(f"no {self.kind} {name!r}; {nearest(name, self._entries)}")
+            raise TaccorlError(
+                f"no {self.kind} {name!r}; {nearest(name, self._entries)}"
+            )
         return self._entries[name]
 
     def __iter__(self) -> Iterator[str]:

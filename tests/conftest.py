@@ -20,7 +20,9 @@ for _threads in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
 SPEC = "piper_flexitac_mcap"
 
 
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+def made_once(
+    factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]
+) -> Path:
     """A folder that ``make`` fills, one for all processes of a run. Tests read it and change copies only."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         folder = factory.mktemp(name)
@@ -29,7 +31,9 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     folder = factory.getbasetemp().parent / name
     with FileLock(folder.with_suffix(".lock")):
         if not folder.with_suffix(".made").exists():
-            shutil.rmtree(folder, ignore_errors=True)  # of a process that failed half-way
+            shutil.rmtree(
+                folder, ignore_errors=True
+            )  # of a process that failed half-way
             folder.mkdir()
             make(folder)
             folder.with_suffix(".made").touch()
@@ -93,7 +97,11 @@ def pictures_once(request: pytest.FixtureRequest) -> Iterator[None]:
     draw, drawn = card.draw_sheet, list[Any]()
     with figures_once(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            card, "draw_sheet", lambda episode: drawn[0] if drawn else drawn.append(draw(episode)) or drawn[0]
+            card,
+            "draw_sheet",
+            lambda episode: (
+                drawn[0] if drawn else drawn.append(draw(episode)) or drawn[0]
+            ),
         )
         yield
 
@@ -105,7 +113,10 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def make(folder: Path) -> None:
         for k in range(2):
-            write_mcap(folder / f"stand_in_{k}.mcap", StandInConfig(duration_s=4.0, seed=k, camera_size=(240, 320)))
+            write_mcap(
+                folder / f"stand_in_{k}.mcap",
+                StandInConfig(duration_s=4.0, seed=k, camera_size=(240, 320)),
+            )
 
     return made_once(tmp_path_factory, "recordings", make)
 
@@ -116,7 +127,11 @@ def dataset(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from taccorl.cli.main import main
 
     def make(folder: Path) -> None:
-        words = [f"--spec={SPEC}", f"--out={folder / 'dataset'}", f"--store={folder / 'store'}"]
+        words = [
+            f"--spec={SPEC}",
+            f"--out={folder / 'dataset'}",
+            f"--store={folder / 'store'}",
+        ]
         assert main(["ingest", str(recordings), *words]) == 0
 
     return made_once(tmp_path_factory, "ingested", make) / "dataset"

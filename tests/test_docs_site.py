@@ -6,7 +6,10 @@ from urllib.parse import unquote
 
 import pytest
 
-pytest.importorskip("sphinx", reason="the site needs the packages of the group dev: make docs sets them up")
+pytest.importorskip(
+    "sphinx",
+    reason="the site needs the packages of the group dev: make docs sets them up",
+)
 from tests.fresh_python import fresh_python
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +30,11 @@ class Page(HTMLParser):
         self.anchors |= {of[name] for name in ("id", "name") if name in of}
         if tag == "a" and "href" in of:
             self.links.append(of["href"])
-        self.resources += [of[name] for name in ("src", "href") if name in of and tag in ("img", "script", "link")]
+        self.resources += [
+            of[name]
+            for name in ("src", "href")
+            if name in of and tag in ("img", "script", "link")
+        ]
 
 
 @pytest.mark.slow
@@ -37,7 +44,11 @@ def test_every_link_and_picture_of_the_site_is_in_it(tmp_path: Path) -> None:
     built = fresh_python(*words)
     assert (built.returncode, built.stderr) == (0, "")
     pages = {path: Page(path) for path in site.rglob("*.html")}
-    sources = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("notebooks/*.ipynb")]
+    sources = [
+        *ROOT.glob("*.md"),
+        *ROOT.glob("docs/*.md"),
+        *ROOT.glob("notebooks/*.ipynb"),
+    ]
     for source in sources:
         assert site / source.relative_to(ROOT).with_suffix(".html") in pages
     assert site / "index.html" in pages
@@ -45,11 +56,21 @@ def test_every_link_and_picture_of_the_site_is_in_it(tmp_path: Path) -> None:
     for path, page in pages.items():
         for target in page.resources + page.links:
             place, _, anchor = target.partition("#")
-            if target.startswith(("data:", "mailto:")) or (target.startswith("http") and target not in page.resources):
+            if target.startswith(("data:", "mailto:")) or (
+                target.startswith("http") and target not in page.resources
+            ):
                 continue
-            there = (path.parent / unquote(place.partition("?")[0])).resolve() if place else path
-            if not there.is_file() or (anchor and unquote(anchor) not in pages[there].anchors):
+            there = (
+                (path.parent / unquote(place.partition("?")[0])).resolve()
+                if place
+                else path
+            )
+            if not there.is_file() or (
+                anchor and unquote(anchor) not in pages[there].anchors
+            ):
                 wrong.append(f"{path.relative_to(site)}: {target}")
     assert wrong == []
-    notebook = (site / "notebooks" / "3_find_the_missing_effect.html").read_text(encoding="utf-8")
+    notebook = (site / "notebooks" / "3_find_the_missing_effect.html").read_text(
+        encoding="utf-8"
+    )
     assert notebook.count("<img") >= 3, "stored pictures of a notebook are shown"

@@ -42,9 +42,13 @@ def install(folder: Path, package: str, code: str, **points: str) -> Path:
     (folder / f"{package}.py").write_text(code)
     info = folder / f"{package}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n"
+    )
     lines = [f"{name} = {value}" for name, value in points.items()]
-    (info / "entry_points.txt").write_text("\n".join([f"[{ENTRY_POINT_GROUP}]", *lines, ""]))
+    (info / "entry_points.txt").write_text(
+        "\n".join([f"[{ENTRY_POINT_GROUP}]", *lines, ""])
+    )
     return folder
 
 
@@ -56,14 +60,24 @@ def find(site: Path, reader: str, path: Path) -> list[str]:
 
 
 def test_an_outside_package_adds_a_reader_by_its_entry_point(tmp_path):
-    site = install(tmp_path / "site", "lines_reader", READER.format(name="lines"), lines="lines_reader")
+    site = install(
+        tmp_path / "site",
+        "lines_reader",
+        READER.format(name="lines"),
+        lines="lines_reader",
+    )
     recording = tmp_path / "demo.lines"
     recording.touch()
     assert find(site, "lines", recording) == ["TextReader", "lines"]
 
 
 def test_a_broken_outside_package_is_named_with_its_reason(tmp_path):
-    site = install(tmp_path / "site", "broken_reader", "import no_such_module_here", mine="broken_reader")
+    site = install(
+        tmp_path / "site",
+        "broken_reader",
+        "import no_such_module_here",
+        mine="broken_reader",
+    )
     (told,) = find(site, "mcap", tmp_path)
     assert told == (
         "TaccorlError: plug-in 'mine' (broken_reader) of entry-point group 'taccorl.plugins' cannot be imported: "
@@ -71,7 +85,9 @@ def test_a_broken_outside_package_is_named_with_its_reason(tmp_path):
     )
 
 
-def folder_of_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, **modules: str) -> Registry:
+def folder_of_plugins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, **modules: str
+) -> Registry:
     """A registry whose plug-in folder is a package in ``tmp_path``; its modules find the registry in ``builtins``."""
     package = tmp_path / name
     package.mkdir()
@@ -87,34 +103,53 @@ def folder_of_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 REGISTER = "@the_registry.register('{0}')\nclass {0}: pass\n"
 
 
-def test_every_module_of_the_folder_is_imported_when_a_name_is_asked_for(tmp_path, monkeypatch):
-    registry = folder_of_plugins(tmp_path, monkeypatch, "plugs_a", b=REGISTER.format("Bee"), a=REGISTER.format("Ant"))
+def test_every_module_of_the_folder_is_imported_when_a_name_is_asked_for(
+    tmp_path, monkeypatch
+):
+    registry = folder_of_plugins(
+        tmp_path,
+        monkeypatch,
+        "plugs_a",
+        b=REGISTER.format("Bee"),
+        a=REGISTER.format("Ant"),
+    )
     assert "plugs_a" not in sys.modules  # nothing is imported before
     assert registry.get("Ant").__name__ == "Ant"
     assert list(registry) == ["Ant", "Bee"]
 
 
 def test_an_unknown_name_names_the_nearest_or_all(tmp_path, monkeypatch):
-    registry = folder_of_plugins(tmp_path, monkeypatch, "plugs_b", a=REGISTER.format("flexitac"))
-    with pytest.raises(TaccorlError, match=r"^no sensor 'flexitack'; did you mean 'flexitac'"):
+    registry = folder_of_plugins(
+        tmp_path, monkeypatch, "plugs_b", a=REGISTER.format("flexitac")
+    )
+    with pytest.raises(
+        TaccorlError, match=r"^no sensor 'flexitack'; did you mean 'flexitac'"
+    ):
         registry.get("flexitack")
     with pytest.raises(TaccorlError, match=r"^no sensor 'camera'; known: flexitac$"):
         registry.get("camera")
 
 
-def test_two_plugins_of_one_name_are_refused_and_the_same_twice_is_not(tmp_path, monkeypatch):
+def test_two_plugins_of_one_name_are_refused_and_the_same_twice_is_not(
+    tmp_path, monkeypatch
+):
     registry = folder_of_plugins(tmp_path, monkeypatch, "plugs_c", a="", b="")
     first = registry.register("x")(int)
     assert first is int  # a decorator that leaves the class as it is
     registry.register("x")(int)
-    with pytest.raises(TaccorlError, match=r"sensor 'x' is registered twice: .*int.* and .*float"):
+    with pytest.raises(
+        TaccorlError, match=r"sensor 'x' is registered twice: .*int.* and .*float"
+    ):
         registry.register("x")(float)
     assert registry.get("x") is int
 
 
 def test_a_plugin_that_fails_half_way_gives_the_same_error_again(tmp_path, monkeypatch):
     registry = folder_of_plugins(
-        tmp_path, monkeypatch, "plugs_e", a=REGISTER.format("Ant") + "import no_such_module_here\n"
+        tmp_path,
+        monkeypatch,
+        "plugs_e",
+        a=REGISTER.format("Ant") + "import no_such_module_here\n",
     )
     for _ in range(2):
         with pytest.raises(ModuleNotFoundError, match="no_such_module_here"):
@@ -123,7 +158,9 @@ def test_a_plugin_that_fails_half_way_gives_the_same_error_again(tmp_path, monke
 
 def test_a_plugin_may_look_others_up_while_it_is_imported(tmp_path, monkeypatch):
     code = REGISTER.format("Ant") + "assert the_registry.get('Ant') is Ant\n"
-    registry = folder_of_plugins(tmp_path, monkeypatch, "plugs_d", a=code, b=REGISTER.format("Bee"))
+    registry = folder_of_plugins(
+        tmp_path, monkeypatch, "plugs_d", a=code, b=REGISTER.format("Bee")
+    )
     assert list(registry) == ["Ant", "Bee"]
 
 

@@ -20,7 +20,9 @@ noting = False
 def noting_instead_of(launch):  # before mujoco_warp imports it
     def noted_launch(kernel, *arguments, **named):
         if noting:
-            block_dim = named.get("block_dim") or kernel.module.options.get("block_dim", 256)
+            block_dim = named.get("block_dim") or kernel.module.options.get(
+                "block_dim", 256
+            )
             noted[id(kernel.module), block_dim] = kernel.module, block_dim
             return None
         return launch(kernel, *arguments, **named)
@@ -40,20 +42,35 @@ class Gpu:
 
 def taken(condition, *bodies, **named):
     """Instead of conditional nodes of a graph: every branch once."""
-    bodies += tuple(named.pop(name) for name in ("on_true", "on_false", "while_body") if name in named)
+    bodies += tuple(
+        named.pop(name)
+        for name in ("on_true", "on_false", "while_body")
+        if name in named
+    )
     for body in filter(callable, bodies):
         body(**{name: value for name, value in named.items() if name != "stream"})
 
 
-wp.launch, wp.launch_tiled = noting_instead_of(wp.launch), noting_instead_of(wp.launch_tiled)
+wp.launch, wp.launch_tiled = (
+    noting_instead_of(wp.launch),
+    noting_instead_of(wp.launch_tiled),
+)
 import mujoco_warp as mjw  # noqa: E402
 
 from taccorl.sim import warp_batch  # noqa: E402
 from taccorl.sim.vector_env import TaccorlVectorEnv  # noqa: E402
 
-batch = TaccorlVectorEnv((sys.argv[2:] or ["assembly_1"])[0], 4, physics="warp:device=cpu", num_threads=2).sim.batch
-varied = [name for name in warp_batch.MODEL_FIELDS if warp_batch._varies(name) and batch.expanded(name) is not None]
-worlds = warp_batch._Worlds(warp_batch._for_warp(batch.model), 2048, batch.settings, varied)
+batch = TaccorlVectorEnv(
+    (sys.argv[2:] or ["assembly_1"])[0], 4, physics="warp:device=cpu", num_threads=2
+).sim.batch
+varied = [
+    name
+    for name in warp_batch.MODEL_FIELDS
+    if warp_batch._varies(name) and batch.expanded(name) is not None
+]
+worlds = warp_batch._Worlds(
+    warp_batch._for_warp(batch.model), 2048, batch.settings, varied
+)
 get_device = wp.get_device
 wp.capture_if = wp.capture_while = taken
 wp.get_device = lambda *name: Gpu(get_device(*name))
@@ -65,6 +82,10 @@ for number, (module, block_dim) in enumerate(noted.values()):
     module.get_module_hash(block_dim)
     options = module.resolve_options(wp.config, block_dim=block_dim)
     arch = int((sys.argv[3:] or ["90"])[0])
-    if not any(Path(sys.argv[1]).glob(f"*/{module.get_module_identifier(block_dim)}/*.sm{arch}.cubin")):
+    if not any(
+        Path(sys.argv[1]).glob(
+            f"*/{module.get_module_identifier(block_dim)}/*.sm{arch}.cubin"
+        )
+    ):
         module._compile(None, None, output_arch=arch, options=options)
     print(f"{number + 1} of {len(noted)}: {module.name}", flush=True)

@@ -15,7 +15,11 @@ from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
-from taccorl.episodes.sources.mimicgen.spec import NoiseSpec, load_mimic_spec, with_options
+from taccorl.episodes.sources.mimicgen.spec import (
+    NoiseSpec,
+    load_mimic_spec,
+    with_options,
+)
 from taccorl.evaluation.statistics import wilson_interval
 from taccorl.lineage.store import Store
 from taccorl.sim.twin import TwinConfig
@@ -35,9 +39,17 @@ def expert_rows() -> Iterator[Row]:
         score = score_expert(task, EXPERT_EPISODES)
         n = len(score.outcomes)
         rate = score.success_rate
-        failures = ", ".join(f"{count} {name}" for name, count in score.failures.items()) or "no failures"
-        name, spread_pc = f"{task}: success, {failures}", 100 * (rate * (1 - rate) / n) ** 0.5
-        yield Row(name=name, value=100 * rate, unit="%", goal="≥ 90", n=n, spread=spread_pc)
+        failures = (
+            ", ".join(f"{count} {name}" for name, count in score.failures.items())
+            or "no failures"
+        )
+        name, spread_pc = (
+            f"{task}: success, {failures}",
+            100 * (rate * (1 - rate) / n) ** 0.5,
+        )
+        yield Row(
+            name=name, value=100 * rate, unit="%", goal="≥ 90", n=n, spread=spread_pc
+        )
         yield against_reference(
             f"{task}: cost of an episode of {mean(score.duration_s):.1f} s with {mean(score.corrections):.1f} "
             "corrections, without pictures",
@@ -60,7 +72,9 @@ def _mimicgen_sources(task: str, num_sources: int) -> Any:
     """Demonstrations of the expert in the nominal twin, read back from the dataset that ``taccorl collect`` makes of them."""
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
         plan = CollectPlan(task=task, episodes=num_sources, images=False)
-        produce(plan, Path(name) / "sources", Store(Path(name) / "store"), lambda _: None)
+        produce(
+            plan, Path(name) / "sources", Store(Path(name) / "store"), lambda _: None
+        )
         return read_sources(Path(name) / "sources", load_mimic_spec(task))
 
 
@@ -70,14 +84,22 @@ def mimicgen_cost() -> Iterator[Row]:
     Simulated."""
     for task in tasks_with_expert():
         made = score_generation(
-            load_mimic_spec(task), _mimicgen_sources(task, COST_SOURCES), TwinConfig(), COST_ATTEMPTS
+            load_mimic_spec(task),
+            _mimicgen_sources(task, COST_SOURCES),
+            TwinConfig(),
+            COST_ATTEMPTS,
         )
         shown = score_expert(task, COST_ATTEMPTS)
         name = f"{task}: physics, failed attempts too, for 15 s of kept episodes of {mean(made.duration_s):.1f} s"
         whole = 15.0 * sum(made.cpu_s) / sum(made.duration_s)
         row = against_reference(name, [whole], "≤ 150,000")
-        yield dataclasses.replace(row, n=COST_ATTEMPTS, spread=row.value * spread(made.cpu_s) / whole)
-        yield against_reference(f"{task}: the expert, for 15 s", [15.0 * sum(shown.cpu_s) / sum(shown.duration_s)])
+        yield dataclasses.replace(
+            row, n=COST_ATTEMPTS, spread=row.value * spread(made.cpu_s) / whole
+        )
+        yield against_reference(
+            f"{task}: the expert, for 15 s",
+            [15.0 * sum(shown.cpu_s) / sum(shown.duration_s)],
+        )
 
 
 def mimicgen_cells(task: str) -> Iterator[Row]:
@@ -96,15 +118,25 @@ def mimicgen_cells(task: str) -> Iterator[Row]:
     )  # fmt: skip
     noise = NoiseSpec(position_m=0.0025, rotation_rad=math.radians(1.4))
     cells = (
-        ("MimicGen's noise of 2.5 mm and 1.4° a step in transport", with_options(ours, noise=noise), twin, "≥ 70", ""),
+        (
+            "MimicGen's noise of 2.5 mm and 1.4° a step in transport",
+            with_options(ours, noise=noise),
+            twin,
+            "≥ 70",
+            "",
+        ),
         ("stiffness halved", ours, stiffened(twin, 0.5), "≥ 75", "≤ 30"),
         ("stiffness doubled", ours, stiffened(twin, 2.0), "≥ 75", "≤ 30"),
     )
     for words, spec, place, goal, replay_goal in cells:
         held = score_generation(spec, sources, place, num_attempts)
-        replay = score_generation(with_options(spec, retarget="eef_command"), sources, place, num_attempts)
+        replay = score_generation(
+            with_options(spec, retarget="eef_command"), sources, place, num_attempts
+        )
         yield _yield_row(f"yield, {words}", held, goal)
-        yield _yield_row(f"yield of replayed end-effector poses, {words}", replay, replay_goal)
+        yield _yield_row(
+            f"yield of replayed end-effector poses, {words}", replay, replay_goal
+        )
         if place is twin:
             yield Row(
                 name=f"yield over that of replayed poses (its 0 counts as 1), {words}",
@@ -117,7 +149,10 @@ def _yield_row(name: str, score: Any, goal: str) -> Row:
     """Value and 95 % interval (Wilson) of a yield."""
     done, n = score.outcomes.count("success"), len(score.outcomes)
     low, high = wilson_interval(done, n)
-    failures = ", ".join(f"{count} {what}" for what, count in score.failures.items()) or "no failures"
+    failures = (
+        ", ".join(f"{count} {what}" for what, count in score.failures.items())
+        or "no failures"
+    )
     return Row(
         name=f"{name} (95 %: {100 * low:.0f} … {100 * high:.0f}); {failures}",
         value=100 * done / n, unit="%", goal=goal, n=n, spread=50 * (high - low),

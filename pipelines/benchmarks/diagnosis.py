@@ -13,9 +13,21 @@ from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate.cases import case_of
 from taccorl.surrogate.recordings import robot_recordings
 
-HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
+HIDDEN = (
+    "coulomb_friction",
+    "backlash",
+    "command_delay",
+    "gravity_mismatch",
+    "cogging",
+)
 
-HIDDEN_IN_PADS = ("taxel_saturation", "taxel_creep", "taxel_gain_spread", "pad_shift", "taxel_crosstalk")
+HIDDEN_IN_PADS = (
+    "taxel_saturation",
+    "taxel_creep",
+    "taxel_gain_spread",
+    "pad_shift",
+    "taxel_crosstalk",
+)
 ARMS = (410, 420)
 """Seeds of whole arms."""
 STICKY = Path("configs/surrogates/sticky.yaml")
@@ -26,7 +38,10 @@ STICKY = Path("configs/surrogates/sticky.yaml")
 def diagnosis() -> Iterator[Row]:
     """Cost of the diagnosis of one joint from the paper's 10 s chirp, and of a whole arm on two cores; surrogate recordings."""
     run(Job(study="warm-up", hidden=(), seed=0, design="chirp"))
-    jobs = [Job(study="cost", hidden=(name,), seed=400 + k, design="chirp") for k, name in enumerate(HIDDEN)]
+    jobs = [
+        Job(study="cost", hidden=(name,), seed=400 + k, design="chirp")
+        for k, name in enumerate(HIDDEN)
+    ]
     costs = [float(run(job)["cpu_s"]) for job in jobs]
     yield against_reference(
         "one joint, 10 s chirp twice and four validation motions at 200 Hz, 26 candidates, gains unknown, surrogate",
@@ -36,7 +51,9 @@ def diagnosis() -> Iterator[Row]:
     walls = []
     twin = load_twin(STICKY)
     for seed in ARMS:
-        cases = [case_of(twin, f"left_{joint}", seed, "chirp") for joint in ROBOT.joints]
+        cases = [
+            case_of(twin, f"left_{joint}", seed, "chirp") for joint in ROBOT.joints
+        ]
         made, machine = robot_recordings(cases), PiperTwin(cases[0].twin)
         before = time.perf_counter()
         diagnose_parts(machine, [case.signal for case in cases], made, workers=2)
@@ -47,7 +64,10 @@ def diagnosis() -> Iterator[Row]:
         unit="s (wall)",
     )
     run_touch(Job(study="warm-up", hidden=(), seed=0, design="press"))
-    pads = [Job(study="cost", hidden=(name,), seed=430 + k, design="press") for k, name in enumerate(HIDDEN_IN_PADS)]
+    pads = [
+        Job(study="cost", hidden=(name,), seed=430 + k, design="press")
+        for k, name in enumerate(HIDDEN_IN_PADS)
+    ]
     # 40 CPU-s where 200 thousand reference steps took 2.4.
     yield against_reference(
         "one arm's pads, four fit and two validation recordings, 13 candidates, surrogate",

@@ -44,7 +44,12 @@ class Score:
 
 
 def score_expert(
-    task: str, num_episodes: int, *, difficulty: str = "train", seed: int = 0, every_step: bool = False
+    task: str,
+    num_episodes: int,
+    *,
+    difficulty: str = "train",
+    seed: int = 0,
+    every_step: bool = False,
 ) -> Score:
     """Run the expert of ``task`` as ``taccorl collect`` does, under the paper's randomisation, and return success, cost and
     contact forces.
@@ -61,7 +66,9 @@ def score_expert(
         before = cpu_s()
         episode_seed = plan.attempt_seed(k)
         sim.reset([episode_seed])
-        expert = expert_of(sim.task)(sim, np.random.default_rng([episode_seed, 1]), plan.source.hands)
+        expert = expert_of(sim.task)(
+            sim, np.random.default_rng([episode_seed, 1]), plan.source.hands
+        )
         expert.start()
         depth_m = force_n = 0.0
 
@@ -69,9 +76,16 @@ def score_expert(
             nonlocal depth_m, force_n
             for pair in sim.task.mating:
                 contact = sim.contact(*pair)
-                depth_m, force_n = max(depth_m, contact.penetration_m[0]), max(force_n, contact.force_n[0])
+                depth_m, force_n = (
+                    max(depth_m, contact.penetration_m[0]),
+                    max(force_n, contact.force_n[0]),
+                )
 
-        steps = range(1, sim.config.physics.steps_per_control_step + 1) if every_step else ()
+        steps = (
+            range(1, sim.config.physics.steps_per_control_step + 1)
+            if every_step
+            else ()
+        )
         outcome = ""
         while not sim.judge.outcome.over[0] and not outcome:
             try:

@@ -58,7 +58,11 @@ def stiffened(twin: TwinConfig, factor: float) -> TwinConfig:
     """The twin with ``factor`` times the stiffness K_p in every joint of both arms; K_d and T_ref stay."""
 
     def controller(of: ControllerConfig) -> ControllerConfig:
-        return dataclasses.replace(of, kp_nm_per_rad=[factor * kp for kp in of.kp_nm_per_rad])
+        return dataclasses.replace(
+            of, kp_nm_per_rad=[factor * kp for kp in of.kp_nm_per_rad]
+        )
 
     arms = {arm: controller(of) for arm, of in twin.arm_controllers.items()}
-    return dataclasses.replace(twin, controller=controller(twin.controller), arm_controllers=arms)
+    return dataclasses.replace(
+        twin, controller=controller(twin.controller), arm_controllers=arms
+    )

@@ -41,7 +41,9 @@ _CPUS = len(os.sched_getaffinity(0))
 def physics_on_gpu() -> Iterator[Row]:
     """Benchmark of control steps with parts in both hands, of those with three pictures a chunk, and of the physics alone."""
     if importlib.util.find_spec("mujoco_warp") is None:
-        print('  physics_on_gpu needs the extra gpu (pip install ".[gpu]"): nothing measured')
+        print(
+            '  physics_on_gpu needs the extra gpu (pip install ".[gpu]"): nothing measured'
+        )
         return
     on_gpu = torch.cuda.is_available()
     twin = TwinConfig(physics=PhysicsConfig(steps_per_control_step=STEPS))
@@ -61,7 +63,10 @@ def physics_on_gpu() -> Iterator[Row]:
             ),
             ("physics alone", _physics_s, ""),
         ):
-            turns = [(one(envs, held, targets), one(on_cpu, held, targets)) for _ in range(1 + REPEATS)][1:]
+            turns = [
+                (one(envs, held, targets), one(on_cpu, held, targets))
+                for _ in range(1 + REPEATS)
+            ][1:]
             yield Row.of(
                 [(num / ours) / (NUM_ENVS / theirs) for ours, theirs in turns],
                 name=f"{where} over {NUM_ENVS} environments on {_CPUS} threads, control steps/s of {STEPS} physics steps: {what}",
@@ -71,7 +76,9 @@ def physics_on_gpu() -> Iterator[Row]:
                 rival_value=NUM_ENVS * ACTIONS / median(theirs for _, theirs in turns),
             )
             yield Row.of(
-                [num * ACTIONS / ours for ours, _ in turns], name=f"{where}: {what}", unit="control steps/s (wall)"
+                [num * ACTIONS / ours for ours, _ in turns],
+                name=f"{where}: {what}",
+                unit="control steps/s (wall)",
             )
         envs.close()
     on_cpu.close()
@@ -84,8 +91,17 @@ def _moving(goal: np.ndarray) -> np.ndarray:
     return (goal[:, None] + SHIFT_RAD * share * is_joint).astype(np.float32)
 
 
-def _environments(twin: TwinConfig, held: Snapshot, physics: str, num: int) -> TaccorlVectorEnv:
-    envs = TaccorlVectorEnv("assembly_1", num, twin=twin, physics=physics, num_threads=_CPUS, images="on_request")
+def _environments(
+    twin: TwinConfig, held: Snapshot, physics: str, num: int
+) -> TaccorlVectorEnv:
+    envs = TaccorlVectorEnv(
+        "assembly_1",
+        num,
+        twin=twin,
+        physics=physics,
+        num_threads=_CPUS,
+        images="on_request",
+    )
     envs.reset(seed=0)
     _place(envs, held)
     return envs
@@ -98,7 +114,10 @@ def _repeated(values: Any, num: int) -> Any:
 
 
 def _place(envs: TaccorlVectorEnv, held: Snapshot) -> None:
-    of_all = {f.name: _repeated(getattr(held, f.name), envs.num_envs) for f in fields(Snapshot)}
+    of_all = {
+        f.name: _repeated(getattr(held, f.name), envs.num_envs)
+        for f in fields(Snapshot)
+    }
     envs.sim.restore(replace(held, **of_all))
 
 
@@ -131,19 +150,43 @@ def _physics_s(envs: TaccorlVectorEnv, held: Snapshot, targets: np.ndarray) -> f
 
 
 def _agreement(
-    envs: TaccorlVectorEnv, on_cpu: TaccorlVectorEnv, held: Snapshot, targets: np.ndarray, where: str
+    envs: TaccorlVectorEnv,
+    on_cpu: TaccorlVectorEnv,
+    held: Snapshot,
+    targets: np.ndarray,
+    where: str,
 ) -> Iterator[Row]:
     """After one chunk: distance of the parts from those of MuJoCo C, and worlds that diverged."""
     for one in (envs, on_cpu):
         _whole_s(one, held, targets)
     num = min(envs.num_envs, NUM_ENVS)
     apart_um = [
-        1e6 * np.linalg.norm(envs.sim.poses(part)[:num, :3, 3] - on_cpu.sim.poses(part)[:num, :3, 3], axis=1)
+        1e6
+        * np.linalg.norm(
+            envs.sim.poses(part)[:num, :3, 3] - on_cpu.sim.poses(part)[:num, :3, 3],
+            axis=1,
+        )
         for part in envs.sim.task.parts
     ]
     name = f"{where}: parts in the hands off MuJoCo C's after {ACTIONS} control steps"
-    yield Row.of(np.concatenate(apart_um).tolist(), name=f"{name}, median", unit="µm", goal="≤ 10")
-    yield Row(name=f"{name}, largest", value=float(np.max(apart_um)), unit="µm", n=num, spread=0.0)
+    yield Row.of(
+        np.concatenate(apart_um).tolist(),
+        name=f"{name}, median",
+        unit="µm",
+        goal="≤ 10",
+    )
     yield Row(
-        name=f"{where}: diverged", value=float(envs.sim.diverged.sum()), unit="worlds", goal="≤ 0", n=1, spread=0.0
+        name=f"{name}, largest",
+        value=float(np.max(apart_um)),
+        unit="µm",
+        n=num,
+        spread=0.0,
+    )
+    yield Row(
+        name=f"{where}: diverged",
+        value=float(envs.sim.diverged.sum()),
+        unit="worlds",
+        goal="≤ 0",
+        n=1,
+        spread=0.0,
     )

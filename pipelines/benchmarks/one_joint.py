@@ -20,12 +20,22 @@ from taccorl.sim.twin import TwinConfig
 
 
 def in_mujoco(
-    motion: JointMotion, signal: str, gains: Gains, effects: Sequence[Effect] = (), config: TwinConfig | None = None
+    motion: JointMotion,
+    signal: str,
+    gains: Gains,
+    effects: Sequence[Effect] = (),
+    config: TwinConfig | None = None,
 ) -> JointResponse:
     """Response of joint ``signal`` to the T targets of ``motion`` from rest, with ``effects`` as in the twin ``config``; a link
     that hangs in a gear's play or spring starts in equilibrium."""
-    config, (arm, joint), effects = config or TwinConfig(), split_signal(signal), of_joint(effects, signal)
-    spec = arm_spec(config, arm, motion.pose, [joint], motion.payload_kg, motion.payload_at_m)
+    config, (arm, joint), effects = (
+        config or TwinConfig(),
+        split_signal(signal),
+        of_joint(effects, signal),
+    )
+    spec = arm_spec(
+        config, arm, motion.pose, [joint], motion.payload_kg, motion.payload_at_m
+    )
     kp, kd, torque_ff = gains
     motor = spec.actuator(signal)
     motor.gainprm[0], motor.biasprm[:3] = kp, [torque_ff, -kp, -kd]
@@ -59,13 +69,18 @@ def in_mujoco(
     steps = np.arange(len(motion.target) * hold) / hold
     coupling_nm = np.interp(steps, np.arange(len(motion.target)), motion.coupling_nm)
     # The coupling is a torque on the link about the joint's axis, which does not move.
-    link, axis = model.body(f"{arm}_link{joint[-1]}").id, batch.get_data(0).xaxis[model.joint(signal).id].copy()
+    link, axis = (
+        model.body(f"{arm}_link{joint[-1]}").id,
+        batch.get_data(0).xaxis[model.joint(signal).id].copy(),
+    )
     encoder, seen = model.sensor(f"{signal}_pos").adr[0], []
     for n, load_nm in enumerate(coupling_nm):
         if n % hold == 0:
             seen.append((sensed[0, encoder], effort()[0, 0]))
             targets[0, column] = motion.target[n // hold]
-            ctrl[0, motor_id] = hooks.command(targets, np.array([hold * model.opt.timestep]))[0, column]
+            ctrl[0, motor_id] = hooks.command(
+                targets, np.array([hold * model.opt.timestep])
+            )[0, column]
         xfrc[0, link, 3:] = -load_nm * axis
         batch.step(stage=mujoco.mjtStage.mjSTAGE_ACC)
         hooks.feel(only, model.opt.timestep)
@@ -81,7 +96,9 @@ def _hanging(model: mujoco.MjModel, signal: str, angle: float) -> np.ndarray:
     held.opt.tolerance = 0.0  # so heavy a joint would make the solver content too soon
     data = mujoco.MjData(held)
     data.qpos[motor.qposadr[0]] = angle
-    for step_s in (0.02, model.opt.timestep) if model.nv > 1 else ():  # far, and then exactly
+    for step_s in (
+        (0.02, model.opt.timestep) if model.nv > 1 else ()
+    ):  # far, and then exactly
         held.opt.timestep = step_s
         for _ in range(300):
             mujoco.mj_step(held, data)

@@ -25,12 +25,19 @@ def touch_cost() -> Iterator[Row]:
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    rows, repeats = (32, 4 * REPEATS) if device == "cuda" else (2, REPEATS)  # there they take 50 ms, as Python likes
-    feeling, blind = (random_policy("small", device, tactile=tactile) for tactile in (True, False))
+    rows, repeats = (
+        (32, 4 * REPEATS) if device == "cuda" else (2, REPEATS)
+    )  # there they take 50 ms, as Python likes
+    feeling, blind = (
+        random_policy("small", device, tactile=tactile) for tactile in (True, False)
+    )
     batch = random_batch(rows, device, prompt_tokens=200)
     for label, of in (("training step", _training_step), ("chunk", _chunk)):
         with_touch, without = (of(policy, batch) for policy in (feeling, blind))
-        pairs = [(_time_s(with_touch, device), _time_s(without, device)) for _ in range(repeats + 2)][2:]
+        pairs = [
+            (_time_s(with_touch, device), _time_s(without, device))
+            for _ in range(repeats + 2)
+        ][2:]
         added = [100 * (a / b - 1) for a, b in pairs]
         yield Row(
             name=f"touch in a {label} of the small preset, {rows} rows, {device}",
@@ -48,13 +55,18 @@ def full_size() -> Iterator[Row]:
     if not torch.cuda.is_available():
         print("  full_size needs a GPU: nothing measured")
         return
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = True  # as lerobot-train sets them
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = (
+        True  # as lerobot-train sets them
+    )
     yield from _chunk_rows(torch.cuda.get_device_name())
     yield from _training_rows(torch.cuda.get_device_name())
 
 
 def _chunk_rows(gpu: str) -> Iterator[Row]:
-    policy, batch = random_policy("full", "cuda", tactile=True), random_batch(1, "cuda", prompt_tokens=200)
+    policy, batch = (
+        random_policy("full", "cuda", tactile=True),
+        random_batch(1, "cuda", prompt_tokens=200),
+    )
     graphed, eager = _chunk(policy, batch), _chunk(policy, batch, cuda_graph=False)
     ours, theirs = graphed(), eager()
     difference = float((ours - theirs).abs().max() / theirs.abs().max())
@@ -64,7 +76,10 @@ def _chunk_rows(gpu: str) -> Iterator[Row]:
         unit="1",
         goal="≤ 0.02",
     )
-    for label, compute, goal in (("as one CUDA graph", graphed, "≤ 60"), ("step by step", eager, "")):
+    for label, compute, goal in (
+        ("as one CUDA graph", graphed, "≤ 60"),
+        ("step by step", eager, ""),
+    ):
         times_ms = [1e3 * _time_s(compute, "cuda") for _ in range(REPEATS + 1)][1:]
         yield Row(
             name=f"one chunk, 4 denoising steps, batch 1, bf16, {label}, {gpu}",
@@ -75,11 +90,16 @@ def _chunk_rows(gpu: str) -> Iterator[Row]:
 def _training_rows(gpu: str) -> Iterator[Row]:
     import torch
 
-    policy, batch = random_policy("full", "cuda", tactile=True), random_batch(8, "cuda", prompt_tokens=200)
+    policy, batch = (
+        random_policy("full", "cuda", tactile=True),
+        random_batch(8, "cuda", prompt_tokens=200),
+    )
     torch.cuda.reset_peak_memory_stats()
     times_s = _step_times_s(policy, batch)
     peak_gb = torch.cuda.max_memory_allocated() / 1e9
-    ours, theirs = _gradient_errors(policy, _contact_in_every_other({k: v[:2] for k, v in batch.items()}))
+    ours, theirs = _gradient_errors(
+        policy, _contact_in_every_other({k: v[:2] for k, v in batch.items()})
+    )
     del policy
     blind_s = median(_step_times_s(random_policy("full", "cuda", tactile=False), batch))
     lerobots_s = median(_step_times_s(_lerobots_pi05(), batch))
@@ -88,7 +108,11 @@ def _training_rows(gpu: str) -> Iterator[Row]:
         value=median(times_s), unit="s", goal="≤ 0.36", n=REPEATS, spread=spread(times_s),
         rival="LeRobot's pi05, without touch or image randomisation, s", rival_value=lerobots_s,
     )  # fmt: skip
-    yield Row.of([peak_gb], name=f"weights, gradients, AdamW and activations of it, {gpu}", unit="GB")
+    yield Row.of(
+        [peak_gb],
+        name=f"weights, gradients, AdamW and activations of it, {gpu}",
+        unit="GB",
+    )
     added = [100 * (t / blind_s - 1) for t in times_s]
     yield Row(
         name=f"touch in that step, {gpu}",
@@ -116,7 +140,9 @@ def full_adapters() -> Iterator[Row]:
     yield from adapter_rows("full", 32, torch.cuda.get_device_name())
 
 
-def adapter_rows(backbone: str, rows: int, where: str, device: str = "cuda") -> Iterator[Row]:
+def adapter_rows(
+    backbone: str, rows: int, where: str, device: str = "cuda"
+) -> Iterator[Row]:
     """Time and memory of training steps of adapters and touch, as of ``lerobot-train --peft.method_type=LORA``, with ``rows``
     on each GPU; the rate of all GPUs over that of one. On a CPU two processes stand for GPUs."""
     import torch
@@ -126,7 +152,12 @@ def adapter_rows(backbone: str, rows: int, where: str, device: str = "cuda") -> 
     for n, (times_s, peak_gb) in per_gpu.items():
         name = f"training step of adapters (LoRA), batch {rows}, {n} × {where}"
         yield Row.of(times_s, name=name, unit="s")
-        yield Row.of([peak_gb], name=f"GPU memory of it, {n} × {where}", unit="GB", goal="< 80" * (device == "cuda"))
+        yield Row.of(
+            [peak_gb],
+            name=f"GPU memory of it, {n} × {where}",
+            unit="GB",
+            goal="< 80" * (device == "cuda"),
+        )
     many = max(per_gpu)
     if many > 1:
         one_s = median(per_gpu[1][0])
@@ -146,7 +177,9 @@ def _adapter_steps(num: int, *arguments: Any) -> tuple[list[float], float]:
         return tuple(json.loads((Path(folder) / "found.json").read_text()))
 
 
-def _adapter_process(rank: int, num: int, folder: str, backbone: str, rows: int, device: str) -> None:
+def _adapter_process(
+    rank: int, num: int, folder: str, backbone: str, rows: int, device: str
+) -> None:
     import torch
     from torch.nn.parallel import DistributedDataParallel
 
@@ -156,11 +189,20 @@ def _adapter_process(rank: int, num: int, folder: str, backbone: str, rows: int,
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = True
     place = {"init_method": f"file://{folder}/store", "rank": rank, "world_size": num}
     torch.distributed.init_process_group("nccl" if cuda else "gloo", **place)
-    policy = random_policy(backbone, device, tactile=True, gradient_checkpointing=True)  # as configs/cotrain
+    policy = random_policy(
+        backbone, device, tactile=True, gradient_checkpointing=True
+    )  # as configs/cotrain
     policy.config.base_checkpoint = "random weights"
     adapted = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA"})
-    shared = DistributedDataParallel(adapted, find_unused_parameters=True) if num > 1 else adapted  # as Accelerate's
-    step, times_s = _training_step(policy, random_batch(rows, device, prompt_tokens=200), shared), []
+    shared = (
+        DistributedDataParallel(adapted, find_unused_parameters=True)
+        if num > 1
+        else adapted
+    )  # as Accelerate's
+    step, times_s = (
+        _training_step(policy, random_batch(rows, device, prompt_tokens=200), shared),
+        [],
+    )
     for _ in range(REPEATS + 3):
         times_s.append(_time_s(step, device))
     peak_gb = torch.cuda.max_memory_allocated() / 1e9 if cuda else 0.0
@@ -174,7 +216,11 @@ def random_policy(backbone: str, device: str, *, tactile: bool, **settings: Any)
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TACTILE, TactileFormat, TactilePI05Config
+    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
+        TACTILE,
+        TactileFormat,
+        TactilePI05Config,
+    )
     from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
     known = _features()
@@ -183,8 +229,13 @@ def random_policy(backbone: str, device: str, *, tactile: bool, **settings: Any)
         device=device,
         dtype="bfloat16" if device == "cuda" else "float32",
         tactile=tactile,
-        tactile_format=TactileFormat("flexitac_v2", ROBOT.pads, *ROBOT.pad.shape, "fixed_scale", 1 / 75),
-        input_features={**known["input_features"], TACTILE: PolicyFeature(FeatureType.STATE, (ROBOT.num_taxels,))},
+        tactile_format=TactileFormat(
+            "flexitac_v2", ROBOT.pads, *ROBOT.pad.shape, "fixed_scale", 1 / 75
+        ),
+        input_features={
+            **known["input_features"],
+            TACTILE: PolicyFeature(FeatureType.STATE, (ROBOT.num_taxels,)),
+        },
         output_features=known["output_features"],
         **settings,
     )
@@ -199,7 +250,9 @@ def _lerobots_pi05() -> Any:
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
     from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 
-    config = PI05Config(device="cuda", dtype="bfloat16", chunk_size=10, n_action_steps=10, **_features())
+    config = PI05Config(
+        device="cuda", dtype="bfloat16", chunk_size=10, n_action_steps=10, **_features()
+    )
     torch.manual_seed(0)
     with torch.device("cuda"):
         return PI05Policy(config)
@@ -209,10 +262,18 @@ def _features() -> dict[str, Any]:
     """State, three cameras and actions."""
     from lerobot.configs import FeatureType, PolicyFeature
 
-    images = {f"observation.images.{c}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for c in ROBOT.cameras}
+    images = {
+        f"observation.images.{c}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))
+        for c in ROBOT.cameras
+    }
     return {
-        "input_features": {"observation.state": PolicyFeature(FeatureType.STATE, (ROBOT.num_actions,)), **images},
-        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ROBOT.num_actions,))},
+        "input_features": {
+            "observation.state": PolicyFeature(FeatureType.STATE, (ROBOT.num_actions,)),
+            **images,
+        },
+        "output_features": {
+            "action": PolicyFeature(FeatureType.ACTION, (ROBOT.num_actions,))
+        },
     }
 
 
@@ -223,10 +284,15 @@ def random_batch(rows: int, device: str, *, prompt_tokens: int) -> dict[str, Any
     torch.manual_seed(0)
     with torch.device(device):
         return {
-            **{f"observation.images.{c}": torch.rand(rows, 3, 224, 224) for c in ROBOT.cameras},
+            **{
+                f"observation.images.{c}": torch.rand(rows, 3, 224, 224)
+                for c in ROBOT.cameras
+            },
             "observation.state": torch.rand(rows, ROBOT.num_actions),
             "observation.language.tokens": torch.randint(2, 258, (rows, prompt_tokens)),
-            "observation.language.attention_mask": (torch.arange(prompt_tokens) < prompt_tokens // 2).expand(rows, -1),
+            "observation.language.attention_mask": (
+                torch.arange(prompt_tokens) < prompt_tokens // 2
+            ).expand(rows, -1),
             "observation.tactile": 2 * torch.rand(rows, 10, ROBOT.num_taxels),
             "action": torch.randn(rows, 10, ROBOT.num_actions),
         }
@@ -238,7 +304,9 @@ def _contact_in_every_other(batch: dict[str, Any]) -> dict[str, Any]:
     return {**batch, "observation.tactile": touch}
 
 
-def _training_step(policy: Any, batch: dict[str, Any], called: Any = None) -> Callable[[], Any]:
+def _training_step(
+    policy: Any, batch: dict[str, Any], called: Any = None
+) -> Callable[[], Any]:
     """One step as ``update_policy`` of lerobot-train makes it: in autocast for the policy's dtype; loss and gradient norm are
     read for the log. ``called``: module whose forward is run, if it is not the policy itself but a wrapper (DDP)."""
     import torch
@@ -284,10 +352,16 @@ def _gradient_errors(policy: Any, batch: dict[str, Any]) -> tuple[float, float]:
     def gradient(*, compiled: bool) -> dict[str, Any]:
         backbone.compiles_layers = compiled
         torch.manual_seed(0)
-        with torch.autocast("cuda", torch.bfloat16, enabled=policy.config.dtype == "bfloat16"):
+        with torch.autocast(
+            "cuda", torch.bfloat16, enabled=policy.config.dtype == "bfloat16"
+        ):
             loss, _ = policy.train().forward(batch)
         loss.backward()
-        gradients = {k: p.grad.float() for k, p in policy.named_parameters() if p.grad is not None}
+        gradients = {
+            k: p.grad.float()
+            for k, p in policy.named_parameters()
+            if p.grad is not None
+        }
         policy.zero_grad()
         return gradients
 
@@ -298,18 +372,27 @@ def _gradient_errors(policy: Any, batch: dict[str, Any]) -> tuple[float, float]:
     torch.backends.cuda.matmul.allow_tf32 = True
     size = math.sqrt(sum(float(g.square().sum()) for g in exact.values()))
 
-    def error(of: dict[str, Any]) -> float:  # a weight that nothing needs has a gradient of zeros, or none
-        return math.sqrt(sum(float((g - of.get(k, 0)).square().sum()) for k, g in exact.items())) / size
+    def error(
+        of: dict[str, Any],
+    ) -> float:  # a weight that nothing needs has a gradient of zeros, or none
+        return (
+            math.sqrt(
+                sum(float((g - of.get(k, 0)).square().sum()) for k, g in exact.items())
+            )
+            / size
+        )
 
     return error(ours), error(theirs)
 
 
-def _chunk(policy: Any, batch: dict[str, Any], *, cuda_graph: bool = True) -> Callable[[], Any]:
+def _chunk(
+    policy: Any, batch: dict[str, Any], *, cuda_graph: bool = True
+) -> Callable[[], Any]:
     import torch
 
-    noise = torch.randn(len(batch["action"]), 10, 32, generator=torch.Generator().manual_seed(1)).to(
-        policy.config.device
-    )
+    noise = torch.randn(
+        len(batch["action"]), 10, 32, generator=torch.Generator().manual_seed(1)
+    ).to(policy.config.device)
 
     def chunk() -> Any:
         policy.config.cuda_graph = cuda_graph

@@ -25,7 +25,10 @@ RIVAL_ROWS = 150
 measured."""
 REPEATS = 3
 NATIVE = [480, 640, 3]
-CORRUPTION, DAMAGE = ("tests/end_to_end/test_corruption.py",), ("tests/end_to_end/test_random_damage.py",)
+CORRUPTION, DAMAGE = (
+    ("tests/end_to_end/test_corruption.py",),
+    ("tests/end_to_end/test_random_damage.py",),
+)
 """Arguments of pytest: the tests of damaged recordings that the benchmark ``corruption`` runs and counts."""
 
 
@@ -47,9 +50,15 @@ def _native_spec(folder: Path) -> Path:
     specs = data_specs_folder()
     for part in ("sensors", "recordings"):
         (folder / part).mkdir(parents=True)
-    dataset = (specs / "taccorl_bimanual.yaml").read_text().replace("[224, 224, 3]", str(NATIVE))
+    dataset = (
+        (specs / "taccorl_bimanual.yaml")
+        .read_text()
+        .replace("[224, 224, 3]", str(NATIVE))
+    )
     (folder / "taccorl_bimanual.yaml").write_text(dataset)
-    (folder / "sensors/flexitac_v2.yaml").write_text((specs / "sensors/flexitac_v2.yaml").read_text())
+    (folder / "sensors/flexitac_v2.yaml").write_text(
+        (specs / "sensors/flexitac_v2.yaml").read_text()
+    )
     recording = folder / "recordings/piper_flexitac_mcap.yaml"
     recording.write_text((specs / "recordings/piper_flexitac_mcap.yaml").read_text())
     return recording
@@ -74,13 +83,19 @@ def ingest_speed() -> Iterator[Row]:
         folder = Path(name)
         recording = _stand_in(folder / "recording.mcap", RECORDING_S)
         native = _native_spec(folder / "data_specs")
-        yield from _ingest_rows("480×640 kept", recording, load_recording_spec(native), folder, goal="≥ 4")
+        yield from _ingest_rows(
+            "480×640 kept", recording, load_recording_spec(native), folder, goal="≥ 4"
+        )
         # No goal against the rival here: it is handed pictures already scaled down, and we decode them at 480 × 640.
         shipped = load_recording_spec("piper_flexitac_mcap")
-        yield from _ingest_rows("224×224, as shipped", recording, shipped, folder, goal="")
+        yield from _ingest_rows(
+            "224×224, as shipped", recording, shipped, folder, goal=""
+        )
 
 
-def _ingest_rows(label: str, path: Path, spec: Any, folder: Path, goal: str) -> Iterator[Row]:
+def _ingest_rows(
+    label: str, path: Path, spec: Any, folder: Path, goal: str
+) -> Iterator[Row]:
     ours, theirs, parsing = [], [], []
     for k in range(REPEATS):
         rows, cost = _our_ingest(path, spec, folder / f"ours_{label[:3]}_{k}")
@@ -90,14 +105,24 @@ def _ingest_rows(label: str, path: Path, spec: Any, folder: Path, goal: str) -> 
     per_cpu = [rows / cost.cpu_s for rows, cost in ours]
     rival = [RIVAL_ROWS / cost.cpu_s for cost in theirs]
     ratios = [a / b for a, b in zip(per_cpu, rival, strict=True)]
-    wall = [(r / c.wall_s) / (RIVAL_ROWS / t.wall_s) for (r, c), t in zip(ours, theirs, strict=True)]
+    wall = [
+        (r / c.wall_s) / (RIVAL_ROWS / t.wall_s)
+        for (r, c), t in zip(ours, theirs, strict=True)
+    ]
     default_rate = mean([RIVAL_ROWS / cost.wall_s for cost in theirs])
     stock = "LeRobot default, rows/CPU-s, same frames, without decoding"
     rows_of = partial(Row.of, by=mean)
     name = f"rows per CPU-second over LeRobot's default writer, {label}"
-    yield rows_of(ratios, name=name, unit="×", goal=goal, rival=stock, rival_value=mean(rival))
-    name, stock = f"rows per second (wall) over LeRobot's default writer, {label}", "LeRobot default, rows/s"
-    yield rows_of(wall, name=name, unit="×", goal=goal, rival=stock, rival_value=default_rate)
+    yield rows_of(
+        ratios, name=name, unit="×", goal=goal, rival=stock, rival_value=mean(rival)
+    )
+    name, stock = (
+        f"rows per second (wall) over LeRobot's default writer, {label}",
+        "LeRobot default, rows/s",
+    )
+    yield rows_of(
+        wall, name=name, unit="×", goal=goal, rival=stock, rival_value=default_rate
+    )
     speed = [rows / 30 / cost.wall_s for rows, cost in ours]
     yield rows_of(speed, name=f"speed, {label}", unit="× real time", goal="≥ 1.5")
     yield rows_of(per_cpu, name=f"rows per CPU-second, {label}", unit="rows/CPU-s")
@@ -112,7 +137,9 @@ def _our_ingest(path: Path, spec: Any, folder: Path) -> tuple[int, Cost]:
     jobs = find_jobs([path], spec, "bench", folder / "store", dry_run=False)
     report: dict[str, Any] = {}
     cost = _timed(lambda: report.update(ingest(jobs, folder / "dataset", store)))
-    assert report["outcomes"]["written"] + report["outcomes"]["split"] == 1, report["recordings"][0]["reason"]
+    assert report["outcomes"]["written"] + report["outcomes"]["split"] == 1, report[
+        "recordings"
+    ][0]["reason"]
     return report["rows"], cost
 
 
@@ -126,10 +153,14 @@ def _default_writer(path: Path, spec: Any, root: Path) -> Cost:
     with open_episodes(path, spec) as episodes, quiet_lerobot():
         episode = episodes[0]
         rows = [row for row, _ in zip(_rows(episode), range(RIVAL_ROWS), strict=False)]
-        features = lerobot_features(episode.spec, [k for k in episode.spec.features if k in rows[0]])
+        features = lerobot_features(
+            episode.spec, [k for k in episode.spec.features if k in rows[0]]
+        )
 
         def write() -> None:
-            dataset = LeRobotDataset.create("local/rival", episode.spec.fps, features, root=root)
+            dataset = LeRobotDataset.create(
+                "local/rival", episode.spec.fps, features, root=root
+            )
             for row in rows:
                 dataset.add_frame(dict(row))
             dataset.save_episode()
@@ -144,11 +175,15 @@ def _parse_only(path: Path, spec: Any) -> Cost:
 
     def parse() -> None:
         with opened(find_sources(path)[0][1], spec) as recording:
-            cameras = [spec.features[key].channels[0] for key in spec.target.keys("video")]
+            cameras = [
+                spec.features[key].channels[0] for key in spec.target.keys("video")
+            ]
             ids = {}
             for name in cameras:
                 channel = recording.channels[name]
-                ids[name] = list(zip(channel.log_ns.tolist(), channel.stamp_ns.tolist(), strict=True))  # pyright: ignore
+                ids[name] = list(
+                    zip(channel.log_ns.tolist(), channel.stamp_ns.tolist(), strict=True)  # pyright: ignore
+                )
             for _ in recording.pictures(ids):
                 pass
 
@@ -168,19 +203,43 @@ def ingest_memory() -> Iterator[Row]:
         importing = _peak_mb([sys.executable, "-c", f"import {imports}"])
         for duration_s in (RECORDING_S, LONG_RECORDING_S):
             recording = _stand_in(folder / f"recording_{duration_s:g}.mcap", duration_s)
-            command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(recording), f"--spec={native}"]
-            command += [f"--out={folder / f'out_{duration_s:g}'}", f"--store={folder / 'store'}"]
+            command = [
+                sys.executable,
+                "-m",
+                "taccorl.cli.main",
+                "ingest",
+                str(recording),
+                f"--spec={native}",
+            ]
+            command += [
+                f"--out={folder / f'out_{duration_s:g}'}",
+                f"--store={folder / 'store'}",
+            ]
             peaks[duration_s] = _peak_mb(command)
             recording.unlink()
     for duration_s, peak in peaks.items():
-        name, rival = f"peak memory, {duration_s:g} s at 3 × 480×640", "import of LeRobot alone"
-        yield Row.of([peak], name=name, unit="MB", goal="< 1000", rival=rival, rival_value=importing)
+        name, rival = (
+            f"peak memory, {duration_s:g} s at 3 × 480×640",
+            "import of LeRobot alone",
+        )
+        yield Row.of(
+            [peak],
+            name=name,
+            unit="MB",
+            goal="< 1000",
+            rival=rival,
+            rival_value=importing,
+        )
 
 
-def _used(command: list[str], stderr: int | None = None) -> tuple[int, resource.struct_rusage]:
+def _used(
+    command: list[str], stderr: int | None = None
+) -> tuple[int, resource.struct_rusage]:
     """Exit status of a command, and what it used."""
     env = {**os.environ, "HF_HUB_OFFLINE": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, env=env)
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=stderr, env=env
+    )
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     return process.returncode, usage
@@ -197,11 +256,20 @@ def corruption() -> Iterator[Row]:
     """Benchmark that runs the corruption suites: 31 planned cases (tests/end_to_end/test_corruption.py), and files with random
     damage in four formats (test_random_damage.py)."""
     suite = _pytest(*CORRUPTION)
-    yield _share("cases in their right outcome", sum(suite.cases.values()), len(suite.cases), "≥ 100")
+    yield _share(
+        "cases in their right outcome",
+        sum(suite.cases.values()),
+        len(suite.cases),
+        "≥ 100",
+    )
     found = _pytest(*DAMAGE).properties
     kinds = list(dict.fromkeys(name.partition(": ")[0] for name in found))
-    files, wrong = (sum(found[f"{kind}: {name}"] for kind in kinds) for name in ("files", "wrong"))
-    yield _share("files with random damage in their right outcome", files - wrong, files, "≥ 100")
+    files, wrong = (
+        sum(found[f"{kind}: {name}"] for kind in kinds) for name in ("files", "wrong")
+    )
+    yield _share(
+        "files with random damage in their right outcome", files - wrong, files, "≥ 100"
+    )
     for kind in kinds:
         silent = found.get(f"{kind}: changed, and the format cannot show it", 0)
         text = f"{kind}: random damage that changes rows and that the format cannot show; the report states so"
@@ -227,10 +295,19 @@ def _pytest(*words: str) -> _Suite:
         command = [sys.executable, "-m", "pytest", "-q", *words, f"--junitxml={result}"]
         subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
         suite = ElementTree.parse(result).getroot()[0]
-    properties = {p.attrib["name"]: int(p.attrib["value"]) for p in suite.iter("property")}
-    outcomes = {c.attrib["name"]: {part.tag for part in c} for c in suite.iter("testcase")}
+    properties = {
+        p.attrib["name"]: int(p.attrib["value"]) for p in suite.iter("property")
+    }
+    outcomes = {
+        c.attrib["name"]: {part.tag for part in c} for c in suite.iter("testcase")
+    }
     return _Suite(
-        properties, {k: not tags & {"failure", "error"} for k, tags in outcomes.items() if "skipped" not in tags}
+        properties,
+        {
+            k: not tags & {"failure", "error"}
+            for k, tags in outcomes.items()
+            if "skipped" not in tags
+        },
     )
 
 
@@ -245,12 +322,28 @@ def start_up() -> Iterator[Row]:
         check = [program, "check", str(empty), "--spec=piper_flexitac_mcap"]
         for label, words, rival, code, goal in (
             ("list of verbs", [program], "an empty Python", "pass", "< 8"),
-            ("taccorl check on a recording", check, "Python with NumPy", "import numpy", "< 9"),
+            (
+                "taccorl check on a recording",
+                check,
+                "Python with NumPy",
+                "import numpy",
+                "< 9",
+            ),
         ):
             bare = [sys.executable, "-c", code]
             pairs = [(_cpu_s(words), _cpu_s(bare)) for _ in range(7)][2:]
-            ratios, bare_s = [ours / theirs for ours, theirs in pairs], median([theirs for _, theirs in pairs])
-            yield Row.of(ratios, name=label, unit=f"× {rival}", goal=goal, rival=f"{rival}, CPU-s", rival_value=bare_s)
+            ratios, bare_s = (
+                [ours / theirs for ours, theirs in pairs],
+                median([theirs for _, theirs in pairs]),
+            )
+            yield Row.of(
+                ratios,
+                name=label,
+                unit=f"× {rival}",
+                goal=goal,
+                rival=f"{rival}, CPU-s",
+                rival_value=bare_s,
+            )
 
 
 def _cpu_s(command: list[str]) -> float:

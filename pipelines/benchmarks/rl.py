@@ -32,13 +32,29 @@ class _Shards:
         self.parts = np.array_split(np.arange(NUM_SIMS), num)
         self.shards, self._states = [], []
         for part in self.parts:
-            envs = {"task": "assembly_1", "num_envs": len(part), "twin": TwinConfig(), "num_threads": _CPUS // num}
-            make = partial(make_shard, envs, history=10, starts=StartStates(), privileged=True, first=int(part[0]))
+            envs = {
+                "task": "assembly_1",
+                "num_envs": len(part),
+                "twin": TwinConfig(),
+                "num_threads": _CPUS // num,
+            }
+            make = partial(
+                make_shard,
+                envs,
+                history=10,
+                starts=StartStates(),
+                privileged=True,
+                first=int(part[0]),
+            )
             self.shards.append(ProcessShard(make))
         self.each("restart", [(0,)] * num)
-        for part, state in zip(self.parts, self.each("state_dict", [()] * num), strict=True):
+        for part, state in zip(
+            self.parts, self.each("state_dict", [()] * num), strict=True
+        ):
             snapshot = sim.snapshot(part)
-            fields = {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)}
+            fields = {
+                f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)
+            }
             self._states.append((state | {"snapshot": fields},))
 
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
@@ -57,9 +73,15 @@ class _Shards:
     def _cpu_s(self) -> float:
         """CPU-seconds of this process and of the workers, all threads."""
         stats = [
-            Path(f"/proc/{shard.process.pid}/stat").read_text().rpartition(")")[2].split() for shard in self.shards
+            Path(f"/proc/{shard.process.pid}/stat")
+            .read_text()
+            .rpartition(")")[2]
+            .split()
+            for shard in self.shards
         ]
-        ticks = sum(int(fields[11]) + int(fields[12]) for fields in stats)  # utime, stime
+        ticks = sum(
+            int(fields[11]) + int(fields[12]) for fields in stats
+        )  # utime, stime
         return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
     def close(self) -> None:
@@ -86,8 +108,14 @@ def rollout_speed() -> Iterator[Row]:
 
     for num_actions in _CHUNKS:
         chunks = np.repeat(goal.astype(np.float32)[:, None], num_actions, axis=1)
-        turns = [(bare_s(num_actions), one.chunk_s(chunks), many.chunk_s(chunks)) for _ in range(1 + REPEATS)][1:]
-        for place, where, goal_text in ((1, "one process", ""), (2, f"{_CPUS} processes", "≥ 0.9")):
+        turns = [
+            (bare_s(num_actions), one.chunk_s(chunks), many.chunk_s(chunks))
+            for _ in range(1 + REPEATS)
+        ][1:]
+        for place, where, goal_text in (
+            (1, "one process", ""),
+            (2, f"{_CPUS} processes", "≥ 0.9"),
+        ):
             for kind, time_of in enumerate(("wall time", "CPU time")):
                 shares = [turn[0][kind] / turn[place][kind] for turn in turns]
                 yield Row.of(
@@ -97,7 +125,9 @@ def rollout_speed() -> Iterator[Row]:
                     unit="1",
                     goal=goal_text if time_of == "CPU time" else "",
                     rival=f"Batch.step, control steps/s of {time_of}",
-                    rival_value=NUM_SIMS * num_actions / median(turn[0][kind] for turn in turns),
+                    rival_value=NUM_SIMS
+                    * num_actions
+                    / median(turn[0][kind] for turn in turns),
                 )
     one.close()
     many.close()
@@ -115,12 +145,18 @@ def full_post_training() -> Iterator[Row]:
         return
     gpu = torch.cuda.get_device_name()
     torch.backends.cuda.matmul.allow_tf32 = True  # --policy.tf32=true
-    yield from post_training_rows("full", "cuda", f"TF32, {gpu}", num_envs=128, num_decisions=512)
+    yield from post_training_rows(
+        "full", "cuda", f"TF32, {gpu}", num_envs=128, num_decisions=512
+    )
     torch.backends.cuda.matmul.allow_tf32 = False
-    yield from post_training_rows("full", "cuda", f"float32, {gpu}", num_envs=32, num_decisions=32)
+    yield from post_training_rows(
+        "full", "cuda", f"float32, {gpu}", num_envs=32, num_decisions=32
+    )
 
 
-def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int, num_decisions: int) -> Iterator[Row]:
+def post_training_rows(
+    backbone: str, device: str, where: str, *, num_envs: int, num_decisions: int
+) -> Iterator[Row]:
     """Rows of ``full_post_training``, of any backbone and device.
 
     Args:
@@ -143,14 +179,29 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
     sde = FlowSDE(FlowSDESettings())
     actor = TactileFlowPolicy(policy, PolicySettings(), sde.num_steps)
     batch = random_batch(num_envs, device, prompt_tokens=200)
-    batch = {k: (x * 255).to(torch.uint8) if "images" in k else x for k, x in batch.items() if k != "action"}
+    batch = {
+        k: (x * 255).to(torch.uint8) if "images" in k else x
+        for k, x in batch.items()
+        if k != "action"
+    }
     generator = torch.Generator().manual_seed(0)
-    groups = [{k: x[rows] for k, x in batch.items()} for rows in torch.arange(num_envs).split(32)]  # in memory at once
-    draws = sde.draw(num_envs, (policy.config.chunk_size, policy.config.max_action_dim), generator, device)
+    groups = [
+        {k: x[rows] for k, x in batch.items()}
+        for rows in torch.arange(num_envs).split(32)
+    ]  # in memory at once
+    draws = sde.draw(
+        num_envs,
+        (policy.config.chunk_size, policy.config.max_action_dim),
+        generator,
+        device,
+    )
 
     def decide() -> tuple[Any, ...]:
         parts = torch.arange(num_envs, device=device).split(32)
-        return tuple(actor.sample(group, sde, draws.rows(part)) for group, part in zip(groups, parts, strict=True))
+        return tuple(
+            actor.sample(group, sde, draws.rows(part))
+            for group, part in zip(groups, parts, strict=True)
+        )
 
     def timed(work: Callable[[], Any]) -> float:
         before = time.perf_counter()
@@ -163,7 +214,11 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
         torch.cuda.reset_peak_memory_stats()
     times_s = [timed(decide) for _ in range(4)][1:]
     label = f"{backbone}, {where}"
-    yield Row.of(times_s, name=f"one decision of {num_envs} environments, policy alone, {label}", unit="s")
+    yield Row.of(
+        times_s,
+        name=f"one decision of {num_envs} environments, policy alone, {label}",
+        unit="s",
+    )
     if cuda:
         peak_gb = torch.cuda.max_memory_allocated() / 1e9
         yield Row.of([peak_gb], name=f"GPU memory of it, {label}", unit="GB")
@@ -172,7 +227,8 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
     repeats = num_decisions // num_envs
     many = torch.arange(num_envs, device=device).repeat(repeats)
     before, after, log_prob = (
-        torch.cat([getattr(s, k) for s in sampled])[many] for k in ("before_BSHD", "after_BSHD", "log_prob_B")
+        torch.cat([getattr(s, k) for s in sampled])[many]
+        for k in ("before_BSHD", "after_BSHD", "log_prob_B")
     )
     decisions = Decisions(
         batch={k: x[many] for k, x in batch.items()},
@@ -186,18 +242,31 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
         return_M=torch.rand(num_decisions, device=device),
     )
     critic = Critic(actor.num_features).to(device)
-    ppo = PPO(actor, critic, sde, PPOSettings(batch_size=num_decisions, micro_batch=micro_batch, kl_stop=math.inf))
+    ppo = PPO(
+        actor,
+        critic,
+        sde,
+        PPOSettings(
+            batch_size=num_decisions, micro_batch=micro_batch, kl_stop=math.inf
+        ),
+    )
     ppo.ratio_guard = math.inf
     if cuda:
         torch.cuda.reset_peak_memory_stats()
     found: list[dict[str, float]] = []
-    times_s = [timed(lambda: found.append(ppo.update(decisions, generator))) for _ in range(3)][1:]
+    times_s = [
+        timed(lambda: found.append(ppo.update(decisions, generator))) for _ in range(3)
+    ][1:]
     yield Row.of(
         times_s,
         name=f"one optimiser step of {num_decisions} decisions and the KL after it, micro-batches of {micro_batch}, {label}",
         unit="s",
     )
-    yield Row.of([found[0]["first_ratio_error"]], name=f"largest |ratio − 1| before the first step, {label}", unit="1")
+    yield Row.of(
+        [found[0]["first_ratio_error"]],
+        name=f"largest |ratio − 1| before the first step, {label}",
+        unit="1",
+    )
     if cuda:
         peak_gb = torch.cuda.max_memory_allocated() / 1e9
         name = f"GPU memory of it: weights, gradients, AdamW, activations, {label}"

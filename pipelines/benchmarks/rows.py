@@ -41,15 +41,25 @@ class Row:
     date: str = ""
 
     @classmethod
-    def of(cls, values: Sequence[float], *, by: Callable[[list[float]], float] = median, **facts: Any) -> Self:
+    def of(
+        cls,
+        values: Sequence[float],
+        *,
+        by: Callable[[list[float]], float] = median,
+        **facts: Any,
+    ) -> Self:
         """The row of measurements ``values`` (n,) in the row's unit: its value is ``by`` of them."""
-        return cls(value=by(list(values)), n=len(values), spread=spread(values), **facts)
+        return cls(
+            value=by(list(values)), n=len(values), spread=spread(values), **facts
+        )
 
 
 BENCHMARKS: dict[str, Callable[[], Iterator[Row]]] = {}
 
 
-def benchmark(name: str) -> Callable[[Callable[[], Iterator[Row]]], Callable[[], Iterator[Row]]]:
+def benchmark(
+    name: str,
+) -> Callable[[Callable[[], Iterator[Row]]], Callable[[], Iterator[Row]]]:
     """Register a function that yields rows under ``name``."""
 
     def add(fn: Callable[[], Iterator[Row]]) -> Callable[[], Iterator[Row]]:
@@ -89,7 +99,9 @@ def reference_step_s(repeats: int = 3) -> float:
     ]
     option = '<option timestep="0.001" integrator="implicitfast"/>'
     chain = "".join(links) + "</body>" * REFERENCE_LINKS
-    model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{chain}</worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco>{option}<worldbody>{chain}</worldbody></mujoco>"
+    )
 
     def swing() -> None:
         data = mujoco.MjData(model)
@@ -103,7 +115,13 @@ def against_reference(name: str, cpu_s: Sequence[float], goal: str = "") -> Row:
     """Row with the costs just measured, in steps of the reference loop, which is measured in the same run."""
     step_s = reference_step_s()
     rival = {"rival": "one reference step, µs CPU", "rival_value": 1e6 * step_s}
-    return Row.of([cost / step_s for cost in cpu_s], name=name, unit="reference steps", goal=goal, **rival)
+    return Row.of(
+        [cost / step_s for cost in cpu_s],
+        name=name,
+        unit="reference steps",
+        goal=goal,
+        **rival,
+    )
 
 
 def meets(value: float, goal: str) -> bool | None:
@@ -113,8 +131,14 @@ def meets(value: float, goal: str) -> bool | None:
     sign, _, bound = goal.partition(" ")
     try:
         limit = float(bound.split()[0].replace(",", ""))
-        return {"≥": value >= limit, "≤": value <= limit, "<": value < limit, ">": value > limit, "=": value == limit}[
-            sign
-        ]
+        return {
+            "≥": value >= limit,
+            "≤": value <= limit,
+            "<": value < limit,
+            ">": value > limit,
+            "=": value == limit,
+        }[sign]
     except (KeyError, ValueError, IndexError) as error:
-        raise TaccorlError(f"goal {goal!r} cannot be read; write it like '≥ 4' or '< 1.5'") from error
+        raise TaccorlError(
+            f"goal {goal!r} cannot be read; write it like '≥ 4' or '< 1.5'"
+        ) from error

@@ -23,13 +23,17 @@ NUM_SIMS = 128
 REPEATS = 7
 
 
-def _in_turns(*works: Callable[[], object], repeats: int = REPEATS) -> list[list[float]]:
+def _in_turns(
+    *works: Callable[[], object], repeats: int = REPEATS
+) -> list[list[float]]:
     """CPU-seconds of each, measured in turns, because a scene's cost drifts and so does a shared machine."""
     times = [[cpu_times_s(work, 1)[0] for work in works] for _ in range(repeats)]
     return [list(column) for column in zip(*times, strict=True)]
 
 
-def holding(num_sims: int, config: TwinConfig | None = None) -> tuple[Simulation, np.ndarray]:
+def holding(
+    num_sims: int, config: TwinConfig | None = None
+) -> tuple[Simulation, np.ndarray]:
     """Simulations of Assembly #1 in which both hands hold their part on the table, and the targets that keep them in place."""
     sim = Simulation(tasks.get("assembly_1")(), config, num_sims=num_sims)
     sim.reset(np.arange(num_sims))
@@ -42,9 +46,14 @@ def holding(num_sims: int, config: TwinConfig | None = None) -> tuple[Simulation
         pose = sim.tcp(arm) @ np.linalg.inv(grasp)
         for i in range(num_sims):
             qpos[i, joint : joint + 3] = pose[i, :3, 3]
-            mujoco.mju_mat2Quat(qpos[i, joint + 3 : joint + 7], np.ascontiguousarray(pose[i, :3, :3]).ravel())
+            mujoco.mju_mat2Quat(
+                qpos[i, joint + 3 : joint + 7],
+                np.ascontiguousarray(pose[i, :3, :3]).ravel(),
+            )
         for finger in ROBOT.fingers:
-            qpos[:, sim.model.joint(f"{arm}_finger_{finger}").qposadr[0]] = width_m / 2 + 0.0001
+            qpos[:, sim.model.joint(f"{arm}_finger_{finger}").qposadr[0]] = (
+                width_m / 2 + 0.0001
+            )
         goal[:, ROBOT.gripper_index(arm)] = width_m - 0.02
     sim.batch.forward()
     for _ in range(15):
@@ -69,16 +78,32 @@ def twin_speed() -> Iterator[Row]:
         f"≤ {1e5 / 300 / step_ms:.0f}",
     )
     shares = [b / f for f, b in zip(full, bare, strict=True)]
-    rival = {"rival": "Batch.step, env steps/CPU-s", "rival_value": NUM_SIMS / median(bare)}
-    yield Row.of(shares, name="share of a bare Batch.step loop's speed", unit="1", goal="≥ 0.9", **rival)
-    touch = [t / NUM_SIMS for t in cpu_times_s(lambda: sim.pads.touch(sim.batch), REPEATS)]
+    rival = {
+        "rival": "Batch.step, env steps/CPU-s",
+        "rival_value": NUM_SIMS / median(bare),
+    }
+    yield Row.of(
+        shares,
+        name="share of a bare Batch.step loop's speed",
+        unit="1",
+        goal="≥ 0.9",
+        **rival,
+    )
+    touch = [
+        t / NUM_SIMS for t in cpu_times_s(lambda: sim.pads.touch(sim.batch), REPEATS)
+    ]
     # Its goal is the share of a control step, below: memory bounds both, and a step of the reference loop stays in the cache.
     taxels = f"{len(ROBOT.pads)} × {ROBOT.pad.num_taxels} taxels"
     name = f"touch, depth and rate of {taxels}, per env in a batch of {NUM_SIMS}"
     yield Row.of([1e6 * t for t in touch], name=name, unit="µs/env")
     alone, goal_alone = holding(1)
     alone.step(goal_alone)
-    single = [1e6 * t / 20 for t in cpu_times_s(lambda: [alone.pads.touch(alone.batch) for _ in range(20)], REPEATS)]
+    single = [
+        1e6 * t / 20
+        for t in cpu_times_s(
+            lambda: [alone.pads.touch(alone.batch) for _ in range(20)], REPEATS
+        )
+    ]
     yield Row.of(single, name="touch of a single env, not in a batch", unit="µs")
     share = [100 * t / (median(full) / NUM_SIMS) for t in touch]
     yield Row.of(share, name="touch", unit="% of a control step", goal="≤ 10")
@@ -88,10 +113,17 @@ def twin_speed() -> Iterator[Row]:
     actions = goal.astype(np.float32)
     # What the environment adds: its own Python, without MuJoCo and without touch.
     stepped, bare, felt = _in_turns(
-        lambda: env.step(actions), lambda: env.sim.batch.step(nstep=steps), lambda: env.sim.touch()
+        lambda: env.step(actions),
+        lambda: env.sim.batch.step(nstep=steps),
+        lambda: env.sim.touch(),
     )
     added = [100 * (t - b - f) / t for t, b, f in zip(stepped, bare, felt, strict=True)]
-    yield Row.of(added, name="vector env: Python outside of MuJoCo and touch", unit="% of a control step", goal="≤ 20")
+    yield Row.of(
+        added,
+        name="vector env: Python outside of MuJoCo and touch",
+        unit="% of a control step",
+        goal="≤ 20",
+    )
 
 
 @benchmark("grip")
@@ -103,16 +135,23 @@ def grip() -> Iterator[Row]:
         before = in_hand_m(data)
         rest(model, data, 2.0)
         creeps.append(float(np.linalg.norm(in_hand_m(data) - before)) / 2.0 * 1e3)
-    yield Row.of(creeps, name="creep of a 40 g part at 10 N", unit="mm/s", goal="≤ 0.02")
+    yield Row.of(
+        creeps, name="creep of a 40 g part at 10 N", unit="mm/s", goal="≤ 0.02"
+    )
     for swing_rad, goal in ((0.06, "≤ 1"), (0.2, "")):
-        slips = [shake(*gripped(mass_kg, 10.0), swing_rad=swing_rad) * 1e3 for mass_kg in (0.04, 0.07, 0.1)]
+        slips = [
+            shake(*gripped(mass_kg, 10.0), swing_rad=swing_rad) * 1e3
+            for mass_kg in (0.04, 0.07, 0.1)
+        ]
         name = f"slip in a 3 s shake of {swing_rad:g} rad at 10 N, largest of 40, 70 and 100 g"
         yield Row.of(slips, by=max, name=name, unit="mm", goal=goal)
     for pads, goal in (("sprung", "≤ 5"), ("rigid", "")):
         peaks = [_peak_reading(mass_kg, pads) for mass_kg in (0.04, 0.1, 0.3)]
         differs = 100 * (max(peaks) - min(peaks)) / min(peaks)
         name = f"reading at 10 N, 40 → 300 g, {pads} pads: largest over smallest"
-        yield Row(name=name, value=differs, unit="%", goal=goal, n=len(peaks), spread=0.0)
+        yield Row(
+            name=name, value=differs, unit="%", goal=goal, n=len(peaks), spread=0.0
+        )
 
 
 def _peak_reading(mass_kg: float, pads: str) -> float:
@@ -154,5 +193,8 @@ def tiled_pictures() -> Iterator[Row]:
             rates.append(NUM_SIMS * len(names) / (time.perf_counter() - before))
         driver = renderer.driver
     software = "llvmpipe" in driver or "softpipe" in driver
-    name, goal = f"96² views tiled, {driver.split('(')[0].strip()}", "" if software else "≥ 10000"
+    name, goal = (
+        f"96² views tiled, {driver.split('(')[0].strip()}",
+        "" if software else "≥ 10000",
+    )
     yield Row.of(rates, name=name, unit="images/s (wall)", goal=goal)

@@ -27,9 +27,14 @@ def loading_speed() -> Iterator[Row]:
     from taccorl.training.reading import FastReader
 
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as folder:
-        for label, cameras, goal in (("3 × 224² video", 3, "≥ 2"), ("no video", 0, "≥ 5")):
+        for label, cameras, goal in (
+            ("3 × 224² video", 3, "≥ 2"),
+            ("no video", 0, "≥ 5"),
+        ):
             root = _write(Path(folder) / f"cameras_{cameras}", cameras)
-            loaders = {reader: _loader(root, reader) for reader in (FastReader, DatasetReader)}
+            loaders = {
+                reader: _loader(root, reader) for reader in (FastReader, DatasetReader)
+            }
             backend = loaders[FastReader].dataset.reader._video_backend  # pyright: ignore[reportAttributeAccessIssue]
             # One epoch of each in turn: other work on the machine meets both. The first, in which workers start, is not counted.
             figures = {reader: [] for reader in loaders}
@@ -56,7 +61,9 @@ def _cached(root: Path, store: Path, stock: float) -> Iterator[Row]:
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     place = "gpu" if device == "cuda" else "host"
-    reading._requested = CacheRequest(place=place, resolution=(CACHED_PX, CACHED_PX), store=store, device=device)
+    reading._requested = CacheRequest(
+        place=place, resolution=(CACHED_PX, CACHED_PX), store=store, device=device
+    )
     try:
         reading.install()
         loader = _loader(root, reading.FastReader, batch=CACHED_BATCH, workers=0)
@@ -65,8 +72,18 @@ def _cached(root: Path, store: Path, stock: float) -> Iterator[Row]:
         reading._requested = None
     ratios = [figure / stock for figure in figures]
     frames = f"3 × {CACHED_PX}² frames cached ({place})"
-    name = f"rows per second over LeRobot's reader, {frames}, H = {HORIZON}, L = {HISTORY}"
-    yield Row.of(ratios, by=mean, name=name, unit="×", goal="≥ 15", rival="LeRobot, rows/s", rival_value=stock)
+    name = (
+        f"rows per second over LeRobot's reader, {frames}, H = {HORIZON}, L = {HISTORY}"
+    )
+    yield Row.of(
+        ratios,
+        by=mean,
+        name=name,
+        unit="×",
+        goal="≥ 15",
+        rival="LeRobot, rows/s",
+        rival_value=stock,
+    )
 
 
 def _write(root: Path, cameras: int) -> Path:
@@ -81,23 +98,31 @@ def _write(root: Path, cameras: int) -> Path:
     for key in spec.keys("video")[cameras:]:
         del features[key]
     touch = "observation.tactile"
-    spec = dataclasses.replace(spec, features=features, sensors={touch: spec.sensors[touch]})
+    spec = dataclasses.replace(
+        spec, features=features, sensors={touch: spec.sensors[touch]}
+    )
     rng = np.random.default_rng(0)
     row, column = np.mgrid[0:224, 0:224]
 
     def pictures() -> Iterator[Pictures]:
         for k in range(EPISODE_ROWS):
             wave = 128 + 80 * np.sin((row + 3 * k) / 17) * np.cos((column - 2 * k) / 23)
-            picture = np.clip(wave[:, :, None] + rng.normal(0, 4, (224, 224, 3)), 0, 255).astype(np.uint8)
+            picture = np.clip(
+                wave[:, :, None] + rng.normal(0, 4, (224, 224, 3)), 0, 255
+            ).astype(np.uint8)
             yield {key: picture.copy() for key in spec.keys("video")}
 
     def episode(seed: int) -> Episode:
         numbers = np.random.default_rng(seed)
         arrays: dict[str, np.ndarray] = {
-            key: numbers.normal(size=(EPISODE_ROWS, ROBOT.num_actions)).astype(np.float32)
+            key: numbers.normal(size=(EPISODE_ROWS, ROBOT.num_actions)).astype(
+                np.float32
+            )
             for key in ("observation.state", "action")
         }
-        arrays[touch] = numbers.integers(-15, 15, (EPISODE_ROWS, ROBOT.num_taxels)).astype(np.int16)
+        arrays[touch] = numbers.integers(
+            -15, 15, (EPISODE_ROWS, ROBOT.num_taxels)
+        ).astype(np.int16)
         return Episode(
             name=f"benchmark {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=tuple(spec.keys("video")),
             pictures=pictures if cameras else lambda: iter([{}] * EPISODE_ROWS), instruction="insert the plug",
@@ -120,13 +145,20 @@ def _loader(root: Path, reader: Any, batch: int = BATCH, workers: int = WORKERS)
             "observation.tactile": [k / 30 for k in range(1 - HISTORY, 1)],
             "action": [k / 30 for k in range(HORIZON)],
         }
-        dataset = lerobot_dataset.LeRobotDataset("local/bench", root=root, delta_timestamps=windows, return_uint8=True)
+        dataset = lerobot_dataset.LeRobotDataset(
+            "local/bench", root=root, delta_timestamps=windows, return_uint8=True
+        )
     finally:
         lerobot_dataset.DatasetReader = before
     if not workers:
         return torch.utils.data.DataLoader(dataset, batch, shuffle=True)
     return torch.utils.data.DataLoader(
-        dataset, batch, shuffle=True, num_workers=workers, persistent_workers=True, multiprocessing_context="spawn"
+        dataset,
+        batch,
+        shuffle=True,
+        num_workers=workers,
+        persistent_workers=True,
+        multiprocessing_context="spawn",
     )
 
 

@@ -17,7 +17,14 @@ from taccorl.diagnosis.search.search import diagnose
 from taccorl.surrogate.cells import HIDDEN, draw_cells, simulated
 
 ASKED = (
-    *("taxel_saturation", "taxel_power_law", "taxel_threshold", "taxel_hysteresis", "taxel_creep", "touch_lag"),
+    *(
+        "taxel_saturation",
+        "taxel_power_law",
+        "taxel_threshold",
+        "taxel_hysteresis",
+        "taxel_creep",
+        "touch_lag",
+    ),
     *("touch_delay", "baseline_drift", "taxel_play"),
 )
 """Nine effects of a single cell that reads nothing but a load; the others need a long hold, a temperature or neighbours."""
@@ -40,11 +47,25 @@ def run(job: tuple[int, str]) -> Row:
     measurements = simulated(case)
     began = time.process_time()
     problem = CellsProblem(case.config(), measurements)
-    d = diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start, config=SearchConfig())
+    d = diagnose(
+        problem,
+        problem.fit,
+        problem.validation,
+        problem.test,
+        start=problem.start,
+        config=SearchConfig(),
+    )
     cpu_s = time.process_time() - began
-    alike = {n for name in d.names[:1] for n in (name, *d.rivals.get(name, ()), *d.twins.get(name, {}))}
+    alike = {
+        n
+        for name in d.names[:1]
+        for n in (name, *d.rivals.get(name, ()), *d.twins.get(name, {}))
+    }
     own = [
-        getattr(e, name) / value for e in d.effects if e.name == hidden for name, value in [*case.values.items()][:1]
+        getattr(e, name) / value
+        for e in d.effects
+        if e.name == hidden
+        for name, value in [*case.values.items()][:1]
     ]
     return {
         "seed": seed,
@@ -70,14 +91,27 @@ def material(row: Row) -> bool:
 def counted(rows: Sequence[Row]) -> list[str]:
     """Lines of Markdown: a table with the share of right answers, a table with a row for each hidden effect, and a list of the
     cases in which not exactly the hidden effect was found."""
-    asked, others = ([r for r in rows if r["hidden"] and (r["hidden"] in ASKED) == one] for one in (True, False))
-    seen, clean = [r for r in asked if material(r)], [r for r in rows if not r["hidden"]]
+    asked, others = (
+        [r for r in rows if r["hidden"] and (r["hidden"] in ASKED) == one]
+        for one in (True, False)
+    )
+    seen, clean = (
+        [r for r in asked if material(r)],
+        [r for r in rows if not r["hidden"]],
+    )
     lines = ["| what | asked | measured |", "|---|---|---|"]
     lines += [
         share_row("nine effects of one cell: exact", "≥ 85 %", seen, exact),
         share_row("… exact, counting those that are not material", "", asked, exact),
-        share_row("… named (with ties, rivals and near-twins)", "", seen, lambda r: r["named"]),
-        share_row("effects of a long hold, a temperature or neighbours: exact", "", [*filter(material, others)], exact),
+        share_row(
+            "… named (with ties, rivals and near-twins)", "", seen, lambda r: r["named"]
+        ),
+        share_row(
+            "effects of a long hold, a temperature or neighbours: exact",
+            "",
+            [*filter(material, others)],
+            exact,
+        ),
         share_row("nothing hidden: silent", "≥ 98 %", clean, exact),
         "\n| hidden | cases | material | exact | before, validation | after, test | error of its number |",
         "|---|---|---|---|---|---|---|",
@@ -86,9 +120,18 @@ def counted(rows: Sequence[Row]) -> list[str]:
         own = [r for r in rows if r["hidden"] == hidden]
         shown = [r for r in own if material(r)] if hidden else own
         known = [r["error"] for r in shown if r["error"] is not None]
-        middle = (f"{median_high(r[name] for r in own):.2f}" for name in ("before", "after"))
-        cells = hidden or "nothing", len(own), sum(map(material, own)), f"{sum(map(exact, shown))} of {len(shown)}"
-        lines.append(f"| {' | '.join(map(str, (*cells, *middle, f'{median_high(known):.1%}' if known else '–')))} |")
+        middle = (
+            f"{median_high(r[name] for r in own):.2f}" for name in ("before", "after")
+        )
+        cells = (
+            hidden or "nothing",
+            len(own),
+            sum(map(material, own)),
+            f"{sum(map(exact, shown))} of {len(shown)}",
+        )
+        lines.append(
+            f"| {' | '.join(map(str, (*cells, *middle, f'{median_high(known):.1%}' if known else '–')))} |"
+        )
     wrong = [r for r in rows if not exact(r)]
     told = [
         f"{r['hidden'] or 'nothing'} (seed {r['seed']}): {' and '.join(r['found']) or 'nothing'}, {r['status']}"

@@ -12,29 +12,52 @@ from taccorl.data.origin import Origin
 from taccorl.report.figure_style import AFTER, BEFORE, FLOOR, new_figure, tidy
 
 
-def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[Origin], title: str) -> Figure:
+def confusion_matrix(
+    counts: Mapping[str, Mapping[str, int]], origins: Sequence[Origin], title: str
+) -> Figure:
     """Confusion matrix: hidden effect × named effect. Rows add up to the number of seeds.
 
     Args:
         counts: hidden → named → number of seeds; names other than hidden effects ("nothing", "something else") come last.
     """
     hidden = list(counts)
-    named = [*hidden, *dict.fromkeys(n for row in counts.values() for n in row if n not in counts)]
-    named = [n for n in named if n in hidden or any(row.get(n) for row in counts.values())]
-    table = np.array([[counts[h].get(n, 0) for n in named] for h in hidden], dtype=float)
+    named = [
+        *hidden,
+        *dict.fromkeys(n for row in counts.values() for n in row if n not in counts),
+    ]
+    named = [
+        n for n in named if n in hidden or any(row.get(n) for row in counts.values())
+    ]
+    table = np.array(
+        [[counts[h].get(n, 0) for n in named] for h in hidden], dtype=float
+    )
     share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
-    figure = new_figure(3.4 + 0.42 * len(named), 3.0 + 0.32 * len(hidden), title, origins)
+    figure = new_figure(
+        3.4 + 0.42 * len(named), 3.0 + 0.32 * len(hidden), title, origins
+    )
     axes = figure.subplots()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
     for i, j in zip(*np.nonzero(table), strict=True):
         color = "white" if share[i, j] > 0.6 else "#111111"
-        axes.text(j, i, f"{table[i, j]:.0f}", ha="center", va="center", fontsize=7.5, color=color)
+        axes.text(
+            j,
+            i,
+            f"{table[i, j]:.0f}",
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color=color,
+        )
         if hidden[i] == named[j]:
-            axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, ec="#0f766e", lw=1.4))
+            axes.add_patch(
+                Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, ec="#0f766e", lw=1.4)
+            )
     axes.set_xticks(range(len(named)), named, rotation=60, ha="right", fontsize=7.5)
     seeds = table.sum(axis=1)
     axes.set_yticks(
-        range(len(hidden)), [f"{h} (n = {n:.0f})" for h, n in zip(hidden, seeds, strict=True)], fontsize=7.5
+        range(len(hidden)),
+        [f"{h} (n = {n:.0f})" for h, n in zip(hidden, seeds, strict=True)],
+        fontsize=7.5,
     )
     axes.set_xlabel("named", fontsize=8)
     axes.set_ylabel("hidden", fontsize=8)
@@ -48,7 +71,9 @@ SLOPE = 5.0
 """Slope of all detection curves, in log odds over log signal: from 10 to 90 % within a factor of 2.4 of the signal."""
 
 
-def half_detected(signals: np.ndarray, found: np.ndarray, slope: float = SLOPE) -> tuple[float, float, float]:
+def half_detected(
+    signals: np.ndarray, found: np.ndarray, slope: float = SLOPE
+) -> tuple[float, float, float]:
     """Signal-to-noise ratio at which half the seeds find an effect, with its 95 % interval: maximum-likelihood s½ of p = 1 / (1
     + (s½ / s)^slope).
 
@@ -70,7 +95,10 @@ def half_detected(signals: np.ndarray, found: np.ndarray, slope: float = SLOPE) 
 
 
 def detection_curves(
-    points: Mapping[str, tuple[np.ndarray, np.ndarray]], origins: Sequence[Origin], title: str, edges: Sequence[float]
+    points: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    origins: Sequence[Origin],
+    title: str,
+    edges: Sequence[float],
 ) -> Figure:
     """Detection curves, one panel per effect: share of seeds that found it over signal-to-noise, with 95 % Wilson intervals.
 
@@ -83,7 +111,9 @@ def detection_curves(
     figure = new_figure(12.0, 1.2 + 1.75 * rows, title, origins)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     line = np.geomspace(edges[0], edges[-1], 200)
-    for axes, (name, (signals, found)) in zip(panels.flat, points.items(), strict=False):
+    for axes, (name, (signals, found)) in zip(
+        panels.flat, points.items(), strict=False
+    ):
         axes.axvline(1.0, color=FLOOR, lw=2.5)
         axes.axhline(0.5, color="#64748b", lw=0.8, ls="--")
         bins = np.digitize(signals, edges)

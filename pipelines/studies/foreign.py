@@ -99,7 +99,11 @@ _SCARA2 = (
     Link("scara_1", (0, 0, 1), (0.30, 0, 0), 4.0, 0.08, 0.4),
     Link("scara_2", (0, 0, 1), (0.25, 0, 0), 2.5, 0.04, -0.6),
 )
-ROBOTS: Mapping[str, tuple[Link, ...]] = {"arm of 7 joints": _ARM7, "leg": _LEG3, "SCARA": _SCARA2}
+ROBOTS: Mapping[str, tuple[Link, ...]] = {
+    "arm of 7 joints": _ARM7,
+    "leg": _LEG3,
+    "SCARA": _SCARA2,
+}
 """Name of a robot → its links, from the base."""
 EXAMPLE = "arm of 6 joints"
 """Robot of the example in docs/your_robot.md."""
@@ -140,7 +144,9 @@ def _mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
         )
         joint = f'<joint name="{link.joint}" axis="{axis}" range="-3 3" armature="{link.armature:g}"/>'
         if link.joint in gear:
-            second = f'<joint name="{link.joint}_gear" axis="{axis}" {gear[link.joint]}/>'
+            second = (
+                f'<joint name="{link.joint}_gear" axis="{axis}" {gear[link.joint]}/>'
+            )
             small = '<inertial pos="0 0 0" mass="1e-3" diaginertia="1e-6 1e-6 1e-6"/>'
             inner = f'<body pos="{pos}">{joint}{small}<body>{second}{inertial}{inner}</body></body>'
         else:
@@ -186,7 +192,14 @@ def draw(seed: int, hidden: str) -> Case:
     robot = list(ROBOTS)[seed % len(ROBOTS)]
     strength = float(np.exp(rng.uniform(*np.log(KINDS.get(hidden, (1.0, 1.0))))))
     joint = ROBOTS[robot][int(rng.integers(len(ROBOTS[robot])))].joint
-    return Case(robot=robot, joint=joint, hidden=hidden, strength=strength, seed=seed, effort=bool(rng.integers(2)))
+    return Case(
+        robot=robot,
+        joint=joint,
+        hidden=hidden,
+        strength=strength,
+        seed=seed,
+        effort=bool(rng.integers(2)),
+    )
 
 
 @dataclass
@@ -208,15 +221,26 @@ class Plant:
         mass = np.empty((model.nv, model.nv))
         mujoco.mj_fullM(model, data, mass)
         self.inertia = np.diag(mass).copy()
-        omega, zeta = rng.uniform(14.0, 26.0, len(links)), rng.uniform(0.6, 1.1, len(links))
-        self.kp, self.kd = np.round(self.inertia * omega**2, 4), np.round(2 * zeta * self.inertia * omega, 4)
+        omega, zeta = (
+            rng.uniform(14.0, 26.0, len(links)),
+            rng.uniform(0.6, 1.1, len(links)),
+        )
+        self.kp, self.kd = (
+            np.round(self.inertia * omega**2, 4),
+            np.round(2 * zeta * self.inertia * omega, 4),
+        )
         self.carries = float(self.case.robot in CARRIES_WEIGHT)
 
     def robot_file(self, folder: Path) -> Path:
         """Write the user's model and robot file into ``folder``: without the hidden effect, with the commanded gains. Returns the
         path of the robot file."""
         (folder / "robot.xml").write_text(_mjcf(self.case.links), encoding="utf-8")
-        lines = ["kind: robot", "model: robot.xml", f"gravity_compensation: {self.carries}", "joints:"]
+        lines = [
+            "kind: robot",
+            "model: robot.xml",
+            f"gravity_compensation: {self.carries}",
+            "joints:",
+        ]
         for link, kp, kd in zip(self.case.links, self.kp, self.kd, strict=True):
             known = f"kp: {kp}, kd: {kd}, rotor_inertia: {link.armature}, loop_hz: {LOOP_HZ}.0"
             lines.append(f"  {link.joint}: {{{known}}}")
@@ -224,7 +248,9 @@ class Plant:
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return path
 
-    def record(self, name: str, target: np.ndarray, seed: int, repeat_of: str | None = None) -> Measurement:
+    def record(
+        self, name: str, target: np.ndarray, seed: int, repeat_of: str | None = None
+    ) -> Measurement:
         """Simulate a recording of the targets ``target`` (T, J) [rad].
 
         Args:
@@ -232,7 +258,9 @@ class Plant:
             seed: seed of noise and disturbances.
             repeat_of: name of the recording that it repeats; None if it is no repeat.
         """
-        measured, effort = _simulate(self, target, np.random.default_rng([self.case.seed, seed]))
+        measured, effort = _simulate(
+            self, target, np.random.default_rng([self.case.seed, seed])
+        )
         return Measurement(
             name=name,
             time_s=np.arange(len(target)) / RATE_HZ,
@@ -256,8 +284,14 @@ def recordings(plant: Plant) -> Measurements:
             plant.record("triangle", _targets(plant, _triangle(8.0, 0.5)), 3),
         ),
         validation=(
-            plant.record("held_chirp", _targets(plant, _chirp(8.0, 0.15, 2.0, 0.25)), 4),
-            plant.record("held_steps", _targets(plant, _steps((0.0, 0.2, -0.25, 0.35, 0.3, -0.35, 0.1, 0.0))), 5),
+            plant.record(
+                "held_chirp", _targets(plant, _chirp(8.0, 0.15, 2.0, 0.25)), 4
+            ),
+            plant.record(
+                "held_steps",
+                _targets(plant, _steps((0.0, 0.2, -0.25, 0.35, 0.3, -0.35, 0.1, 0.0))),
+                5,
+            ),
         ),
         rule="by name",
     )
@@ -282,20 +316,39 @@ def _targets(plant: Plant, motion: np.ndarray) -> np.ndarray:
             rows[:, j] += motion
         elif plant.case.robot in MOVE_TOGETHER:  # slower, and not in step
             time_s = np.arange(len(motion)) / RATE_HZ
-            rows[:, j] += 0.25 * np.sin(2 * np.pi * (0.5 + 0.23 * j) * time_s) * np.clip(time_s - 0.5, 0.0, 1.0)
+            rows[:, j] += (
+                0.25
+                * np.sin(2 * np.pi * (0.5 + 0.23 * j) * time_s)
+                * np.clip(time_s - 0.5, 0.0, 1.0)
+            )
     return rows
 
 
-def _chirp(seconds: float, low_hz: float, high_hz: float, amplitude: float) -> np.ndarray:
+def _chirp(
+    seconds: float, low_hz: float, high_hz: float, amplitude: float
+) -> np.ndarray:
     time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     active = np.clip(time_s - 0.5, 0.0, None)
-    phase = 2 * np.pi * (low_hz * active + (high_hz - low_hz) * active**2 / (2 * seconds))
-    return amplitude * np.sin(phase) * np.clip(active / 0.5, 0.0, 1.0) * np.clip((seconds - time_s) / 0.5, 0.0, 1.0)
+    phase = (
+        2 * np.pi * (low_hz * active + (high_hz - low_hz) * active**2 / (2 * seconds))
+    )
+    return (
+        amplitude
+        * np.sin(phase)
+        * np.clip(active / 0.5, 0.0, 1.0)
+        * np.clip((seconds - time_s) / 0.5, 0.0, 1.0)
+    )
 
 
 def _triangle(seconds: float, amplitude: float) -> np.ndarray:
-    share = np.clip((np.arange(round(seconds * RATE_HZ)) / RATE_HZ - 0.5) / (seconds - 1.0), 0.0, 1.0)
-    return amplitude * np.interp(2 * share % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
+    share = np.clip(
+        (np.arange(round(seconds * RATE_HZ)) / RATE_HZ - 0.5) / (seconds - 1.0),
+        0.0,
+        1.0,
+    )
+    return amplitude * np.interp(
+        2 * share % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0]
+    )
 
 
 def _steps(levels: Sequence[float]) -> np.ndarray:
@@ -310,11 +363,16 @@ def _steps(levels: Sequence[float]) -> np.ndarray:
 def _numbers(plant: Plant, j: int) -> dict[str, float]:
     """Strengths of the hidden effects in SI units of joint ``j``."""
     every = ((plant.case.hidden, plant.case.strength), *plant.case.beside)
-    numbers = [_number(name, strength, plant.kp[j], plant.kd[j], plant.inertia[j]) for name, strength in every]
+    numbers = [
+        _number(name, strength, plant.kp[j], plant.kd[j], plant.inertia[j])
+        for name, strength in every
+    ]
     return {key: value for own in numbers for key, value in own.items()}
 
 
-def _number(name: str, s: float, kp: float, kd: float, inertia: float) -> dict[str, float]:
+def _number(
+    name: str, s: float, kp: float, kd: float, inertia: float
+) -> dict[str, float]:
     torque = 0.35 * kp * s
     return {
         "coulomb_friction": {"coulomb": torque},
@@ -344,7 +402,9 @@ def _number(name: str, s: float, kp: float, kd: float, inertia: float) -> dict[s
     }[name]
 
 
-def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _simulate(
+    plant: Plant, target: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """(T, J) logged angles and (T, J) efforts: row k before target k acts. From rest at the first target."""
     links, num = plant.case.links, len(plant.case.links)
     j = [link.joint for link in links].index(plant.case.joint)
@@ -354,9 +414,14 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
         limits = f'limited="true" range="{-h["play"] / 2} {h["play"] / 2}"'
         gear[links[j].joint] = f'{limits} solreflimit="0.003 1" damping="1e-3"'
     if "compliance" in h:
-        gear[links[j].joint] = f'stiffness="{1 / h["compliance"]}" damping="{0.003 / h["compliance"]}"'
+        gear[links[j].joint] = (
+            f'stiffness="{1 / h["compliance"]}" damping="{0.003 / h["compliance"]}"'
+        )
     model = mujoco.MjModel.from_xml_string(_mjcf(links, gear))
-    model.opt.timestep, model.opt.integrator = STEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.timestep, model.opt.integrator = (
+        STEP_S,
+        mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    )
     believed = mujoco.MjModel.from_xml_string(_mjcf(links))
     data, belief = mujoco.MjData(model), mujoco.MjData(believed)
     dofs = np.array([model.joint(link.joint).dofadr[0] for link in links])
@@ -395,10 +460,14 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
         late = n - h.get("delay_s", 0.0) * LOOP_HZ
         goal[j] = target[min(max(math.floor(late / per_row), 0), len(target) - 1), j]
         if "lag_s" in h:
-            lagging += (goal[j] - lagging) * (1.0 - math.exp(-1.0 / (LOOP_HZ * h["lag_s"])))
+            lagging += (goal[j] - lagging) * (
+                1.0 - math.exp(-1.0 / (LOOP_HZ * h["lag_s"]))
+            )
             goal[j] = lagging
         if "slew" in h:
-            slewed += min(max(goal[j] - slewed, -h["slew"] / LOOP_HZ), h["slew"] / LOOP_HZ)
+            slewed += min(
+                max(goal[j] - slewed, -h["slew"] / LOOP_HZ), h["slew"] / LOOP_HZ
+            )
             goal[j] = slewed
         error = goal - now
         if "deadband" in h:
@@ -406,7 +475,12 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
         torque = kp * error - kd * speed
         if "feedforward" in h:  # of the rows, as the driver knows them
             row = max(n, 0) // per_row
-            torque[j] += h["feedforward"] * kd[j] * (target[row, j] - target[max(row - 1, 0), j]) * RATE_HZ
+            torque[j] += (
+                h["feedforward"]
+                * kd[j]
+                * (target[row, j] - target[max(row - 1, 0), j])
+                * RATE_HZ
+            )
         if "integral" in h:
             integral += h["integral"] * kp[j] * error[j] / LOOP_HZ
             torque[j] += integral
@@ -417,7 +491,9 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
         torque[j] *= h.get("scale", 1.0)
         if "torque_lag_s" in h:
             filtered = torque[j] if filtered is None else filtered
-            filtered += (torque[j] - filtered) * (1.0 - math.exp(-1.0 / (LOOP_HZ * h["torque_lag_s"])))
+            filtered += (torque[j] - filtered) * (
+                1.0 - math.exp(-1.0 / (LOOP_HZ * h["torque_lag_s"]))
+            )
             torque[j] = filtered
         if peak < math.inf:
             torque[j] = min(max(torque[j], -peak), peak)
@@ -428,7 +504,9 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
             applied[j] -= h["spring"] * (q - links[j].middle_rad)
         if "cogging" in h:
             applied[j] += h["cogging"] * math.sin(24.0 * q + 0.7)
-        limit = h.get("coulomb", 0.0) + h.get("stick", 0.0) * math.exp(-((v / 0.06) ** 2))
+        limit = h.get("coulomb", 0.0) + h.get("stick", 0.0) * math.exp(
+            -((v / 0.06) ** 2)
+        )
         limit += h.get("grease", 0.0) * abs(v / 0.1) ** h.get("exponent", 1.0)
         limit *= 1.0 + math.copysign(h.get("one_way", 0.0), v)
         if "load_share" in h:
@@ -441,7 +519,9 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
     return measured, effort
 
 
-def _weight(model: mujoco.MjModel, data: mujoco.MjData, angles: np.ndarray) -> np.ndarray:
+def _weight(
+    model: mujoco.MjModel, data: mujoco.MjData, angles: np.ndarray
+) -> np.ndarray:
     data.qpos[:], data.qvel[:] = angles, 0.0
     mujoco.mj_fwdPosition(model, data)
     mujoco.mj_fwdVelocity(model, data)
@@ -458,7 +538,14 @@ def write_example(folder: Path) -> Plant:
     Raises:
         TaccorlError: the folder exists.
     """
-    case = Case(robot=EXAMPLE, joint="elbow", hidden="coulomb_friction", strength=0.02, seed=6, effort=True)
+    case = Case(
+        robot=EXAMPLE,
+        joint="elbow",
+        hidden="coulomb_friction",
+        strength=0.02,
+        seed=6,
+        effort=True,
+    )
     plant = Plant(case)
     if folder.exists():
         raise TaccorlError(f"{folder}: already exists; name a new folder")
@@ -470,10 +557,19 @@ def write_example(folder: Path) -> Plant:
     lines = ["recordings:"]
     for use, side in (("fit", made.fit), ("validation", made.validation)):
         for m in side:
-            lines.append(f"  {m.name}.csv: {{use: {use}{f', repeat_of: {m.repeat_of}.csv' * bool(m.repeat_of)}}}")
+            lines.append(
+                f"  {m.name}.csv: {{use: {use}{f', repeat_of: {m.repeat_of}.csv' * bool(m.repeat_of)}}}"
+            )
             keys = {"q": m.measured, "q_target": m.target, "tau": m.effort}
             header = ["t", *(f"{name}.{key}" for name in m.signals for key in keys)]
-            rows = [m.time_s, *(values[:, j] for j in range(len(m.signals)) for values in keys.values())]
+            rows = [
+                m.time_s,
+                *(
+                    values[:, j]
+                    for j in range(len(m.signals))
+                    for values in keys.values()
+                ),
+            ]
             np.savetxt(
                 folder / "sweeps" / f"{m.name}.csv",
                 np.column_stack(rows),
@@ -482,7 +578,9 @@ def write_example(folder: Path) -> Plant:
                 header=origin_lines(m.origin) + ",".join(header),
                 comments="",
             )
-    (folder / "sweeps" / "measurements.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "sweeps" / "measurements.yaml").write_text(
+        "\n".join(lines) + "\n", encoding="utf-8"
+    )
     return plant
 
 
@@ -490,7 +588,9 @@ def main(argv: Sequence[str]) -> int:
     """Command line ``python -m pipelines.studies.foreign my_arm``: write the example, and print the gains of its drives. Returns
     the exit status 0."""
     plant = write_example(Path(argv[0]))
-    print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, not measured on a robot. Its drives run:")
+    print(
+        f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, not measured on a robot. Its drives run:"
+    )
     for link, kp, kd in zip(plant.case.links, plant.kp, plant.kd, strict=True):
         print(f"  {link.joint}: kp: {kp}, kd: {kd}")
     return 0

@@ -91,10 +91,18 @@ def conditions(job: Job) -> Conditions:
         k = job.seed
         sampled = k // 3 % 3 == 0
         return Conditions(
-            effort=k // 27 % 2 == 0 and not sampled, loaded=k % 3 == 0, sampled=sampled, coloured=k // 9 % 3 == 0
+            effort=k // 27 % 2 == 0 and not sampled,
+            loaded=k % 3 == 0,
+            sampled=sampled,
+            coloured=k // 9 % 3 == 0,
         )
     k = job.seed + zlib.crc32("+".join(job.hidden).encode())
-    return Conditions(effort=k % 2 == 0, sampled=k // 2 % 2 == 0, coloured=k // 4 % 4 == 0, loaded=False)
+    return Conditions(
+        effort=k % 2 == 0,
+        sampled=k // 2 % 2 == 0,
+        coloured=k // 4 % 4 == 0,
+        loaded=False,
+    )
 
 
 def run_job(job: Job) -> dict[str, Any]:
@@ -117,23 +125,43 @@ def run(job: Job) -> dict[str, Any]:
     )
     made = recordings(case, job.design)
     recorded = time.process_time()
-    problem = JointProblem(case.twin, case.signal, made, gains="fitted", effort=how.effort)
-    sides, config = (problem.fit, problem.validation, problem.test), SearchConfig(max_effects=len(job.hidden) + 1)
-    found = diagnose(problem, *sides, start=problem.start, without=job.without, config=config)
+    problem = JointProblem(
+        case.twin, case.signal, made, gains="fitted", effort=how.effort
+    )
+    sides, config = (
+        (problem.fit, problem.validation, problem.test),
+        SearchConfig(max_effects=len(job.hidden) + 1),
+    )
+    found = diagnose(
+        problem, *sides, start=problem.start, without=job.without, config=config
+    )
     done = time.process_time()
     truth = case.values()
-    if how.loaded:  # some millimetres off its place a mass adds a constant torque of its own
+    if (
+        how.loaded
+    ):  # some millimetres off its place a mass adds a constant torque of its own
         del truth["torque_ff"]
     loop = (
-        {} if case.loop is None else {"loop_hz": round(1 / case.loop.period_s), "filter_s": _short(case.loop.filter_s)}
+        {}
+        if case.loop is None
+        else {
+            "loop_hz": round(1 / case.loop.period_s),
+            "filter_s": _short(case.loop.filter_s),
+        }
     )
     return {
         **_head(job, case.signal, case),
-        "conditions": [name for name, on in dataclasses.asdict(how).items() if on and (name != "sampled" or case.loop)],
+        "conditions": [
+            name
+            for name, on in dataclasses.asdict(how).items()
+            if on and (name != "sampled" or case.loop)
+        ],
         **loop,
         **told(found),
         "findings": findings(made.all, case.signal),
-        "numbers": numbers(found, truth, commanded=problem.commanded, effort=problem.effort),
+        "numbers": numbers(
+            found, truth, commanded=problem.commanded, effort=problem.effort
+        ),
         "recording_cpu_s": round(recorded - began, 2),
         "cpu_s": round(done - recorded, 2),
     }
@@ -145,15 +173,30 @@ def run_touch(job: Job) -> dict[str, Any]:
     case = draw_touch_case(job.hidden, job.seed, strength=job.strength)
     made = touch_recordings(case)
     sides = made.fit, made.validation, made.test
-    motions = [[touch_motion(m, case.twin, m.pressed) for m in side if m.pressed is not None] for side in sides]
+    motions = [
+        [touch_motion(m, case.twin, m.pressed) for m in side if m.pressed is not None]
+        for side in sides
+    ]
     recorded = time.process_time()
     problem = TouchProblem([m for side in motions for m in side], case.twin)
     fit_to, validation, test = problem.recordings(*motions)
     config = SearchConfig(max_effects=len(job.hidden) + 1)
-    found = diagnose(problem, fit_to, validation, test, start=problem.start, without=job.without, config=config)
+    found = diagnose(
+        problem,
+        fit_to,
+        validation,
+        test,
+        start=problem.start,
+        without=job.without,
+        config=config,
+    )
     done = time.process_time()
     truth = {"k_n": case.k_n, "k_d": case.k_d}
-    truth |= {f"{h.name}.{name}": value for h in case.hidden for name, value in h.values.items()}
+    truth |= {
+        f"{h.name}.{name}": value
+        for h in case.hidden
+        for name, value in h.values.items()
+    }
     return {
         **_head(job, f"{case.arm} pads", case),
         "conditions": [],
@@ -193,12 +236,17 @@ def told(found: Diagnosis) -> dict[str, Any]:
         "first": next((r.added for r in found.rounds), None),
         "ties": ties,
         "rivals": {name: list(others) for name, others in found.rivals.items()},
-        "errors": {k: {use: round(e, 4) for use, e in of.items()} for k, of in found.errors.items()},
+        "errors": {
+            k: {use: round(e, 4) for use, e in of.items()}
+            for k, of in found.errors.items()
+        },
         "remarks": [str(remark)[:160] for remark in found.remarks],
     }
 
 
-def numbers(found: Diagnosis, truth: Mapping[str, float], *, commanded: bool, effort: bool) -> dict[str, list[float]]:
+def numbers(
+    found: Diagnosis, truth: Mapping[str, float], *, commanded: bool, effort: bool
+) -> dict[str, list[float]]:
     """Identifiable number → value, 95 % interval, truth. Effects that are not hidden have no truth; theirs are not here."""
     out = {}
     for n in identifiable_numbers(found.after, commanded, effort):
@@ -231,14 +279,24 @@ def named(row: dict[str, Any]) -> bool:
     """Each hidden effect is found, or named as a tie, rival or near-twin of one that is."""
     said = set(row["found"])
     for name in row["found"]:
-        said |= {*row["ties"].get(name, ()), *row["rivals"].get(name, ()), *registry.get(name).near_twins}
-    return all(h in said or (h not in registry and h in KINDS and said & set(KINDS[h].near)) for h in row["hidden"])
+        said |= {
+            *row["ties"].get(name, ()),
+            *row["rivals"].get(name, ()),
+            *registry.get(name).near_twins,
+        }
+    return all(
+        h in said or (h not in registry and h in KINDS and said & set(KINDS[h].near))
+        for h in row["hidden"]
+    )
 
 
 def exact_but_for_algebra(row: dict[str, Any]) -> bool:
     """``exact``, where effects that give identical positions (``IDENTICAL``) count as the same effect."""
     found = row["found"] if len(row["hidden"]) > 1 else row["found"][:1]
-    return all(any(h == f or any({h, f} <= group for group in IDENTICAL) for f in found) for h in row["hidden"])
+    return all(
+        any(h == f or any({h, f} <= group for group in IDENTICAL) for f in found)
+        for h in row["hidden"]
+    )
 
 
 AT_FLOOR = ("at_floor", "gains_moved")
@@ -247,7 +305,11 @@ AT_FLOOR = ("at_floor", "gains_moved")
 
 def silently_wrong(row: dict[str, Any]) -> bool:
     """Whether the search reached the noise floor, and so reports success, although it neither found nor named a hidden effect."""
-    return row["status"] in AT_FLOOR and not set(row["found"]) & set(row["hidden"]) and not named(row)
+    return (
+        row["status"] in AT_FLOOR
+        and not set(row["found"]) & set(row["hidden"])
+        and not named(row)
+    )
 
 
 def drop_said(row: dict[str, Any]) -> bool:
@@ -269,12 +331,21 @@ def inside(row: dict[str, Any], *, hidden_only: bool = False) -> list[bool]:
     return [held[name] for name in held if not hidden_only or name.startswith(own)]
 
 
-def jobs(study: str, design: str, hidden: Sequence[str], seeds: Sequence[int]) -> list[Job]:
+def jobs(
+    study: str, design: str, hidden: Sequence[str], seeds: Sequence[int]
+) -> list[Job]:
     """One case for each seed and each entry of ``hidden``: the name of an effect, two names joined by +, or "" for no hidden
     effect. In the study ``removed`` these effects are taken out of the search."""
     made = [
-        Job(study=study, hidden=tuple(filter(None, h.split("+"))), seed=s, design=design) for s in seeds for h in hidden
+        Job(
+            study=study, hidden=tuple(filter(None, h.split("+"))), seed=s, design=design
+        )
+        for s in seeds
+        for h in hidden
     ]
     if study != "removed":
         return made
-    return [dataclasses.replace(job, without=tuple(h for h in job.hidden if h in registry)) for job in made]
+    return [
+        dataclasses.replace(job, without=tuple(h for h in job.hidden if h in registry))
+        for job in made
+    ]

@@ -23,7 +23,9 @@ from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine
-from taccorl.diagnosis.experiment_design.machine_surrogate import recordings as slide_recordings
+from taccorl.diagnosis.experiment_design.machine_surrogate import (
+    recordings as slide_recordings,
+)
 from taccorl.diagnosis.experiment_design.motions import ground_of
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import Machine
@@ -64,13 +66,26 @@ effort_limit: 400.0
 def jobs() -> list[tuple[int, str]]:
     """(seed, both hidden effects joined by +): of robots all pairs with dry friction and every third other pair, of the slide
     those with dry friction. A gear is either loose or soft."""
-    pairs = [p for p in itertools.combinations(STRENGTHS, 2) if p != ("backlash", "joint_compliance")]
-    robots = [(FIRST_SEED + k, "+".join(p)) for k, p in enumerate(pairs) if p[0] == "coulomb_friction" or k % 3 == 1]
-    slides = [(FIRST_SLIDE_SEED + k, f"coulomb_friction+{other}") for k, other in enumerate(OF_SLIDES)]
+    pairs = [
+        p
+        for p in itertools.combinations(STRENGTHS, 2)
+        if p != ("backlash", "joint_compliance")
+    ]
+    robots = [
+        (FIRST_SEED + k, "+".join(p))
+        for k, p in enumerate(pairs)
+        if p[0] == "coulomb_friction" or k % 3 == 1
+    ]
+    slides = [
+        (FIRST_SLIDE_SEED + k, f"coulomb_friction+{other}")
+        for k, other in enumerate(OF_SLIDES)
+    ]
     return [*robots, *slides]
 
 
-def made(seed: int, one: str, other: str, folder: Path) -> tuple[Machine, str, Measurements]:
+def made(
+    seed: int, one: str, other: str, folder: Path
+) -> tuple[Machine, str, Measurements]:
     """The user's machine, its joint, and recordings of the simulated one."""
     if seed >= FIRST_SLIDE_SEED:
         (folder / "slide.yaml").write_text(SLIDE, encoding="utf-8")
@@ -82,15 +97,27 @@ def made(seed: int, one: str, other: str, folder: Path) -> tuple[Machine, str, M
     robot = "arm of 7 joints" if weighted else list(ROBOTS)[seed % len(ROBOTS)]
     joints = WEIGHTED if weighted else tuple(link.joint for link in ROBOTS[robot])
     joint = joints[int(rng.integers(len(joints)))]
-    strength, beside = (STRENGTHS[name] * math.exp(rng.uniform(-0.5, 0.5)) for name in (one, other))
+    strength, beside = (
+        STRENGTHS[name] * math.exp(rng.uniform(-0.5, 0.5)) for name in (one, other)
+    )
     effort = bool(rng.integers(2))
     plant = Plant(
         Case(
-            robot=robot, joint=joint, hidden=one, strength=strength, seed=seed, effort=effort, beside=((other, beside),)
+            robot=robot,
+            joint=joint,
+            hidden=one,
+            strength=strength,
+            seed=seed,
+            effort=effort,
+            beside=((other, beside),),
         )
     )
     machine = RobotMachine(load_robot(plant.robot_file(folder)), "robot")
-    return machine, joint, dataclasses.replace(recordings(plant), test=(unseen_sweep(plant),))
+    return (
+        machine,
+        joint,
+        dataclasses.replace(recordings(plant), test=(unseen_sweep(plant),)),
+    )
 
 
 def run(job: tuple[int, str]) -> dict[str, Any]:
@@ -103,7 +130,9 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
         left = {}
         for name, fitted in ((one, other), (other, one)):
             alone = fit(problem, problem.fit, [fitted], problem.start)
-            left[name] = rms(stacked(problem, alone.values, alone.effects, problem.validation))
+            left[name] = rms(
+                stacked(problem, alone.values, alone.effects, problem.validation)
+            )
         finding = machine.diagnose(part, measurements)
     d = finding.diagnosis
     said = verdict(part, d, can_tell=finding.can_tell, known=finding.known)
@@ -118,7 +147,10 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
         "rivals": {name: list(others) for name, others in d.rivals.items()},
         "status": d.status,
         "confidence": said.level,
-        "errors": {stage: {use: round(e, 3) for use, e in of.items()} for stage, of in d.errors.items()},
+        "errors": {
+            stage: {use: round(e, 3) for use, e in of.items()}
+            for stage, of in d.errors.items()
+        },
         "cpu_s": round(d.cpu_s, 1),
     }
 
@@ -137,7 +169,10 @@ def held(row: dict[str, Any], name: str) -> bool:
 def both(row: dict[str, Any]) -> bool:
     """Both hidden effects, or what counts as them, are found."""
     found = row["found"]
-    return all(h in found or any({h, f} == pair for f in found for pair in ALIKE) for h in row["hidden"].split("+"))
+    return all(
+        h in found or any({h, f} == pair for f in found for pair in ALIKE)
+        for h in row["hidden"].split("+")
+    )
 
 
 def exactly(row: dict[str, Any]) -> bool:
@@ -165,19 +200,32 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
         if not own:
             continue
         counts = {
-            "first effect is one of the two": lambda r: r["first"] is not None and held(r, r["first"]),
+            "first effect is one of the two": lambda r: (
+                r["first"] is not None and held(r, r["first"])
+            ),
             "both found and nothing else": exactly,
             "both found": both,
-            "a false effect besides or instead": lambda r: not all(held(r, n) for n in r["found"]),
+            "a false effect besides or instead": lambda r: (
+                not all(held(r, n) for n in r["found"])
+            ),
             "high confidence in a wrong result": sure_and_wrong,
         }
         for k, (name, good) in enumerate(counts.items()):
-            cells = share_row(f"{what}: {name}" if k == 0 else f"… {name}", "", own, good).split("|")
+            cells = share_row(
+                f"{what}: {name}" if k == 0 else f"… {name}", "", own, good
+            ).split("|")
             lines.append(f"|{cells[1]}|{cells[3]}|")
         shares = sorted(map(removed, own))
-        lines.append(f"| … share of the test error removed: least, median | {shares[0]:.0%}, {median(shares):.1%} |")
-        lines.append(f"| … CPU-s a diagnosis, median / 90th percentile | {cpu_words(own, 0)} |")
-    lines += [f"| one of the two too weak to show beside the other | {len(rows) - len(shown)} |", ""]
+        lines.append(
+            f"| … share of the test error removed: least, median | {shares[0]:.0%}, {median(shares):.1%} |"
+        )
+        lines.append(
+            f"| … CPU-s a diagnosis, median / 90th percentile | {cpu_words(own, 0)} |"
+        )
+    lines += [
+        f"| one of the two too weak to show beside the other | {len(rows) - len(shown)} |",
+        "",
+    ]
     for r in shown:
         if not exactly(r):
             errors = r["errors"]["fitted"]["test"], r["errors"]["after"]["test"]

@@ -36,7 +36,11 @@ def jobs() -> list[tuple[int, str]]:
     kinds = list(KINDS)
     hidden = [(FIRST_SEED + k, kinds[k % len(kinds)]) for k in range(NUM_HIDDEN)]
     clean = [(FIRST_CLEAN_SEED + k, "") for k in range(NUM_CLEAN)]
-    return [job for k, one in enumerate(hidden) for job in (one, *clean[k // 2 : k // 2 + 1 - k % 2])]
+    return [
+        job
+        for k, one in enumerate(hidden)
+        for job in (one, *clean[k // 2 : k // 2 + 1 - k % 2])
+    ]
 
 
 def run(job: tuple[int, str]) -> dict[str, Any]:
@@ -47,10 +51,16 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         robot, measurements = with_robot(case, Path(folder))
         recorded = time.process_time()
-        found = diagnose_joint(robot, case.joint, measurements, search=SearchConfig(max_effects=1)).diagnosis
+        found = diagnose_joint(
+            robot, case.joint, measurements, search=SearchConfig(max_effects=1)
+        ).diagnosis
     first = found.rounds[0] if found.rounds else None
     added = first.added if first is not None else None
-    beside = {*found.rivals.get(added, ()), *effects.get(added).near_twins} if added else set[str]()
+    beside = (
+        {*found.rivals.get(added, ()), *effects.get(added).near_twins}
+        if added
+        else set[str]()
+    )
     return {
         "seed": seed,
         "hidden": hidden,
@@ -69,7 +79,9 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
 
 def is_exact(row: dict[str, Any]) -> bool:
     """The hidden effect was added, or one that is counted as the same."""
-    return row["added"] == row["hidden"] or any({row["added"], row["hidden"]} == pair for pair in ALIKE)
+    return row["added"] == row["hidden"] or any(
+        {row["added"], row["hidden"]} == pair for pair in ALIKE
+    )
 
 
 def is_named(row: dict[str, Any]) -> bool:
@@ -84,10 +96,24 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     shares = [
         share_row("one hidden effect: exact", "≥ 80 %", hidden, is_exact),
         share_row("… named", "≥ 95 %", hidden, is_named),
-        *(share_row(f"… {name}: exact", "", [r for r in hidden if r["robot"] == name], is_exact) for name in ROBOTS),
-        share_row("nothing hidden: silent", "≥ 98 %", clean, lambda r: r["added"] is None),
+        *(
+            share_row(
+                f"… {name}: exact",
+                "",
+                [r for r in hidden if r["robot"] == name],
+                is_exact,
+            )
+            for name in ROBOTS
+        ),
+        share_row(
+            "nothing hidden: silent", "≥ 98 %", clean, lambda r: r["added"] is None
+        ),
     ]
-    failed = [r for r in [*hidden, *clean] if not (is_named(r) if r["hidden"] else r["added"] is None)]
+    failed = [
+        r
+        for r in [*hidden, *clean]
+        if not (is_named(r) if r["hidden"] else r["added"] is None)
+    ]
     return table(shares, rows, len(hidden), failed, "≤ 15")
 
 
@@ -127,21 +153,38 @@ def cpu_words(rows: Sequence[dict[str, Any]], digits: int) -> str:
 def share(count: int, n: int) -> str:
     """``87 % (34 of 39; 73 … 94)``, with Wilson's 95 % interval."""
     low, high = (100 * end for end in wilson_interval(count, n))
-    return f"{count / n:.0%} ({count} of {n}; {low:.0f} … {high:.0f})" if n else "not measured yet"
+    return (
+        f"{count / n:.0%} ({count} of {n}; {low:.0f} … {high:.0f})"
+        if n
+        else "not measured yet"
+    )
 
 
-def share_row(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Callable[[dict[str, Any]], bool]) -> str:
+def share_row(
+    what: str,
+    asked: str,
+    rows: Sequence[dict[str, Any]],
+    good: Callable[[dict[str, Any]], bool],
+) -> str:
     return f"| {what} | {asked} | {share(sum(map(good, rows)), len(rows))} |"
 
 
 def run_missing(
-    path: Path, jobs: Sequence[tuple[int, str]], run: Callable[[tuple[int, str]], dict[str, Any]]
+    path: Path,
+    jobs: Sequence[tuple[int, str]],
+    run: Callable[[tuple[int, str]], dict[str, Any]],
 ) -> list[dict[str, Any]]:
     """Append a row to ``path`` for each job (seed, hidden) whose seed has none, one on each core; returns all rows."""
-    done = {r["seed"] for r in map(json.loads, path.read_text().splitlines())} if path.exists() else ()
+    done = (
+        {r["seed"] for r in map(json.loads, path.read_text().splitlines())}
+        if path.exists()
+        else ()
+    )
     missing = [job for job in jobs if job[0] not in done]
     with (
-        ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(
+            len(os.sched_getaffinity(0)), mp_context=get_context("spawn")
+        ) as pool,
         path.open("a") as file,
     ):
         for row in pool.map(run, missing):

@@ -135,7 +135,8 @@ def write(servo: Servo, folder: Path) -> None:
     swings = folder / "swings"
     swings.mkdir(parents=True)
     (folder / "SIMULATED.txt").write_text(
-        f"Everything here is simulated: {ORIGIN}. No servo was near.\n", encoding="utf-8"
+        f"Everything here is simulated: {ORIGIN}. No servo was near.\n",
+        encoding="utf-8",
     )
     (folder / "servo.yaml").write_text(_servo_file(servo), encoding="utf-8")
     (swings / "columns.yaml").write_text(COLUMNS, encoding="utf-8")
@@ -146,9 +147,18 @@ def write(servo: Servo, folder: Path) -> None:
             motion = list(MOTIONS)[(k + j) % len(MOTIONS)]
             held = f"payload_kg: {{servo: {mass}}}, lever_m: {{servo: {lever}}}, arm_kg: {{servo: {_arm_kg(servo, lever):.4f}}}"
             _record(servo, swings / f"{name}.csv", motion, k, gain, 100 * k + j)
-            lines.append(f"  {name}.csv: {{use: {USES[k]}, {held}, kp: {{servo: {gain}}}}}")
+            lines.append(
+                f"  {name}.csv: {{use: {USES[k]}, {held}, kp: {{servo: {gain}}}}}"
+            )
             if (k, j) in REPEATED:
-                _record(servo, swings / f"{name}_again.csv", motion, k, gain, 100 * k + j + 50)
+                _record(
+                    servo,
+                    swings / f"{name}_again.csv",
+                    motion,
+                    k,
+                    gain,
+                    100 * k + j + 50,
+                )
                 lines.append(
                     f"  {name}_again.csv: {{use: {USES[k]}, repeat_of: {name}.csv, {held}, kp: {{servo: {gain}}}}}"
                 )
@@ -207,11 +217,15 @@ def _arm_kg(servo: Servo, lever_m: float) -> float:
 def _chirp(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     active = np.clip(t - 0.3, 0.0, None)
     fade = np.clip(active / 0.4, 0.0, 1.0) * np.clip((5.0 - t) / 0.4, 0.0, 1.0)
-    return 0.7 * np.sin(2 * np.pi * (0.2 * active + 0.13 * active**2)) * fade, np.ones(len(t))
+    return 0.7 * np.sin(2 * np.pi * (0.2 * active + 0.13 * active**2)) * fade, np.ones(
+        len(t)
+    )
 
 
 def _up_and_down(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.interp(t, [0.3, 1.9, 2.3, 4.0, 4.4, 5.2], [0.0, 1.5, 1.5, -0.9, -0.9, 0.0]), np.ones(len(t))
+    return np.interp(
+        t, [0.3, 1.9, 2.3, 4.0, 4.4, 5.2], [0.0, 1.5, 1.5, -0.9, -0.9, 0.0]
+    ), np.ones(len(t))
 
 
 def _lift_and_drop(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -225,22 +239,36 @@ def _steps(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return levels[np.clip((t / 0.7).astype(int), 0, len(levels) - 1)], np.ones(len(t))
 
 
-MOTIONS = {"chirp": _chirp, "up_and_down": _up_and_down, "lift_and_drop": _lift_and_drop, "steps": _steps}
+MOTIONS = {
+    "chirp": _chirp,
+    "up_and_down": _up_and_down,
+    "lift_and_drop": _lift_and_drop,
+    "steps": _steps,
+}
 """Motions: goal [rad] and whether the torque is enabled, at times [s]; at angle 0 the load hangs down."""
 DURATION_S = 5.5
 """Duration of a recording [s]."""
 
 
-def _record(servo: Servo, path: Path, motion: str, load: int, gain: int, seed: int) -> None:
+def _record(
+    servo: Servo, path: Path, motion: str, load: int, gain: int, seed: int
+) -> None:
     rng = np.random.default_rng([servo.seed, 93, seed])
     nominal = np.arange(round(DURATION_S * servo.rate_hz)) / servo.rate_hz
     # A script that sleeps wakes late, now and then by a third of a period.
-    times = nominal + np.abs(rng.normal(0.0, 0.1, len(nominal))).clip(0.0, 0.35) / servo.rate_hz
+    times = (
+        nominal
+        + np.abs(rng.normal(0.0, 0.1, len(nominal))).clip(0.0, 0.35) / servo.rate_hz
+    )
     goal, on = MOTIONS[motion](nominal)
     goal_tick = MIDDLE_TICK + np.round(goal / TICK_RAD)
     cycles = np.floor(times / (STEP_S * LOOP_STEPS)).astype(np.int64)
     length = int(cycles[-1]) + 2
-    kicks = rng.normal(size=length) * DISTURBANCE_SHARE * math.sqrt(1 - math.exp(-2 * 1e-3 / 0.05))
+    kicks = (
+        rng.normal(size=length)
+        * DISTURBANCE_SHARE
+        * math.sqrt(1 - math.exp(-2 * 1e-3 / 0.05))
+    )
     mass, lever = LOADS[load]
     arm = _arm_kg(servo, lever)
     h = servo.numbers()
@@ -249,14 +277,36 @@ def _record(servo: Servo, path: Path, motion: str, load: int, gain: int, seed: i
         goal_tick,
         on,
         kicks,
-        np.array([servo.inertia, servo.torque_nm_per_a, servo.emf_v_s_per_rad, servo.resistance_ohm]),
-        np.array([mass * lever**2 + arm * lever**2 / 3, (mass + arm / 2) * lever * GRAVITY]),
-        np.array([h.get("coulomb", servo.dry_nm), *(h.get(key, 0.0) for key in ("stick", "share", "play"))]),
+        np.array(
+            [
+                servo.inertia,
+                servo.torque_nm_per_a,
+                servo.emf_v_s_per_rad,
+                servo.resistance_ohm,
+            ]
+        ),
+        np.array(
+            [mass * lever**2 + arm * lever**2 / 3, (mass + arm / 2) * lever * GRAVITY]
+        ),
+        np.array(
+            [
+                h.get("coulomb", servo.dry_nm),
+                *(h.get(key, 0.0) for key in ("stick", "share", "play")),
+            ]
+        ),
         float(gain),
     )
-    lines = ["# domain: surrogate", f"# origin: {ORIGIN}", "ms,goal,position,volts,torque_enable"]
-    for t, goal_k, position, volt, enabled in zip(times, goal_tick, tick, volts, on, strict=True):
-        lines.append(f"{1e3 * t:.2f},{goal_k:.0f},{position:.0f},{10 * volt:.0f},{enabled:.0f}")
+    lines = [
+        "# domain: surrogate",
+        f"# origin: {ORIGIN}",
+        "ms,goal,position,volts,torque_enable",
+    ]
+    for t, goal_k, position, volt, enabled in zip(
+        times, goal_tick, tick, volts, on, strict=True
+    ):
+        lines.append(
+            f"{1e3 * t:.2f},{goal_k:.0f},{position:.0f},{10 * volt:.0f},{enabled:.0f}"
+        )
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -292,7 +342,9 @@ def _swing(
             ticks[row], volts[row] = seen, supply
             row += 1
         steps = gain * (goal - seen) / 128.0
-        duty = math.copysign(min(math.floor(abs(steps)), DUTY_STEPS), steps) / DUTY_STEPS
+        duty = (
+            math.copysign(min(math.floor(abs(steps)), DUTY_STEPS), steps) / DUTY_STEPS
+        )
         for _ in range(LOOP_STEPS):
             current = (supply * duty - k_e * v) / ohm if enabled > 0.0 else 0.0
             torque = k_t * current
@@ -309,8 +361,15 @@ def _swing(
                 outer, moved = passed, inertia
             else:
                 outer, moved = -weight * math.sin(q), inertia + mounted
-            limit = coulomb + stick * math.exp(-((v / STICK_RAD_PER_S) ** 2)) + share * abs(torque - outer)
-            free = v + STEP_S * (torque + outer + noise * (abs(torque) + abs(outer))) / moved
+            limit = (
+                coulomb
+                + stick * math.exp(-((v / STICK_RAD_PER_S) ** 2))
+                + share * abs(torque - outer)
+            )
+            free = (
+                v
+                + STEP_S * (torque + outer + noise * (abs(torque) + abs(outer))) / moved
+            )
             stops = STEP_S * limit / moved
             v = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             q += STEP_S * v

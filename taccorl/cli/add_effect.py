@@ -61,10 +61,14 @@ def run(config: AddEffectConfig) -> int:
 
     machine, hand, made_by, said = load_machine(config.twin), config.values, [], {}
     if key := next((key for key in hand if {*":="} & {*key}), ""):
-        raise TaccorlError(f"--values: {key!r} is one word; YAML needs a colon and a space: '{{torque_nm: 0.4}}'")
+        raise TaccorlError(
+            f"--values: {key!r} is one word; YAML needs a colon and a space: '{{torque_nm: 0.4}}'"
+        )
     names = list(dict.fromkeys(config.effect.split(",")))
     if hand and len(names) > 1:
-        raise TaccorlError(f"--values={hand}: of which effect? Add one of {', '.join(names)} at a time")
+        raise TaccorlError(
+            f"--values={hand}: of which effect? Add one of {', '.join(names)} at a time"
+        )
     if hand:
         added = machine.by_hand(names[0], config.joints, config.pads, hand)
     else:
@@ -75,18 +79,32 @@ def run(config: AddEffectConfig) -> int:
         show(_changes(a.part, machine.numbers(a.part), mended.numbers(a.part)), words)
     mended.save(out)
     against = None if config.in_place else out
-    show(Section(text=[f"wrote {out}; next: {compare_words(made_by, [a.part for a in added], config.twin, against)}"]))
+    show(
+        Section(
+            text=[
+                f"wrote {out}; next: {compare_words(made_by, [a.part for a in added], config.twin, against)}"
+            ]
+        )
+    )
     return 0
 
 
-def compare_words(made_by: list[str], parts: list[str], twin: Path | None, against: Path | None) -> str:
+def compare_words(
+    made_by: list[str], parts: list[str], twin: Path | None, against: Path | None
+) -> str:
     """Command that compares ``twin``, and ``against`` beside it, with the recordings of the diagnosis whose words ``made_by``
     are; if it was of some joints, with those of ``parts``."""
     words = made_by[2:3] or ["YOUR_RECORDINGS"]
-    words += [w for w in made_by if w.startswith(("--spec=", "--columns=", "--validation_every=", "--accept="))]
+    words += [
+        w
+        for w in made_by
+        if w.startswith(("--spec=", "--columns=", "--validation_every=", "--accept="))
+    ]
     if any(w.startswith("--joints=") for w in made_by):
         words.append(f"--joints=[{','.join(dict.fromkeys(parts))}]")
-    words += [f"--twin={twin}"] * (twin is not None) + [f"--against={against}"] * (against is not None)
+    words += [f"--twin={twin}"] * (twin is not None) + [f"--against={against}"] * (
+        against is not None
+    )
     return shlex.join(["taccorl", "compare", *words])
 
 
@@ -94,10 +112,14 @@ def _place(config: AddEffectConfig) -> Path:
     """Where to write, before any work is done."""
     if config.in_place:
         if config.twin is None or config.out is not None:
-            raise TaccorlError("--in_place=true changes the file of --twin=…; give that option, and do not give --out")
+            raise TaccorlError(
+                "--in_place=true changes the file of --twin=…; give that option, and do not give --out"
+            )
         return config.twin
     source = config.twin or Path("twin.yaml")
-    out = config.out or source.with_name(f"{source.stem}+{config.effect.replace(',', '+')}.yaml")
+    out = config.out or source.with_name(
+        f"{source.stem}+{config.effect.replace(',', '+')}.yaml"
+    )
     if out.exists():
         raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
     return out
@@ -115,8 +137,13 @@ def _diagnosed(
     path = numbers_of(config.diagnosis)
     if not path.is_file():
         own = effects.get(names[0]).parameters()[:1] if names[0] in effects else ()
-        by_hand = [f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'" for number in own]
-        raise TaccorlError(f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(by_hand)}")
+        by_hand = [
+            f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
+            for number in own
+        ]
+        raise TaccorlError(
+            f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(by_hand)}"
+        )
     report = json.loads(path.read_text(encoding="utf-8"))
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
         made_with = report.get("provenance", {}).get("twin", "another twin")
@@ -126,12 +153,19 @@ def _diagnosed(
         )
     diagnoses = report["diagnoses"]
     parts = machine.select(list(diagnoses), config.joints, config.pads)
-    told = {part: {*_found(diagnoses[part]), *_changed(diagnoses[part])} for part in parts}
+    told = {
+        part: {*_found(diagnoses[part]), *_changed(diagnoses[part])} for part in parts
+    }
     found = {name for own in told.values() for name in own}
     for name in {*names} - found:
-        if any(name in {*diagnoses[part]["base"], *machine.numbers(part)} for part in parts):
+        if any(
+            name in {*diagnoses[part]["base"], *machine.numbers(part)} for part in parts
+        ):
             gains = name in ("kp", "kd") and {*parts} & {*machine.fitted_gains}
-            way = "; fitted gains are written by `taccorl diagnose` with --until=noise_floor" * bool(gains)
+            way = (
+                "; fitted gains are written by `taccorl diagnose` with --until=noise_floor"
+                * bool(gains)
+            )
             raise TaccorlError(
                 f"{path}: {name} is not off in that diagnosis; what it found: {', '.join(sorted(found)) or 'nothing'}{way}"
             )
@@ -139,7 +173,11 @@ def _diagnosed(
     additions, refused, left_out, written, said = [], [], [], set(), {}
     for part in parts:
         # An effect or number that the diagnosis of any joint reports is written for the joints that report it, for no others.
-        wanted = {n for n in names if n in told[part] or (n not in found and n in _fitted(diagnoses[part]))}
+        wanted = {
+            n
+            for n in names
+            if n in told[part] or (n not in found and n in _fitted(diagnoses[part]))
+        }
         try:
             fit = _fit_of(wanted or {*names}, part, diagnoses[part])
         except TaccorlError as error:
@@ -150,7 +188,11 @@ def _diagnosed(
             continue
         additions.append(_addition(machine, part, fit))
         written |= {*(e["effect"] for e in fit["effects"]), *_off(diagnoses[part])}
-        said[part] = report["verdicts"][part]["finding"] if fit is diagnoses[part] else fit["effects"][-1]["evidence"]
+        said[part] = (
+            report["verdicts"][part]["finding"]
+            if fit is diagnoses[part]
+            else fit["effects"][-1]["evidence"]
+        )
     left = [name for name in names if name not in written]
     if refused and (config.joints or config.pads or not additions):
         raise refused[0]
@@ -159,14 +201,28 @@ def _diagnosed(
     for error in left_out:
         print(f"not written: {error}")
     if left:
-        tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]} | found)
-        raise TaccorlError(f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}")
+        tried = sorted(
+            {
+                e["name"]
+                for d in diagnoses.values()
+                for r in d["rounds"]
+                for e in r["evidence"]
+            }
+            | found
+        )
+        raise TaccorlError(
+            f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}"
+        )
     return additions, shlex.split(report["provenance"].get("command", "")), said
 
 
 def _found(diagnosis: dict[str, Any]) -> list[str]:
     """Effects that a diagnosis of one part added."""
-    return [e["effect"] for e in diagnosis["effects"] if e["effect"] not in diagnosis["present"]]
+    return [
+        e["effect"]
+        for e in diagnosis["effects"]
+        if e["effect"] not in diagnosis["present"]
+    ]
 
 
 def _off(diagnosis: dict[str, Any]) -> list[str]:
@@ -174,26 +230,46 @@ def _off(diagnosis: dict[str, Any]) -> list[str]:
     efforts, which no file has."""
     from taccorl.diagnosis.search.problem import EFFORT_SCALE
 
-    return [c["name"] for c in diagnosis.get("changed", ()) if "." not in c["name"] and c["name"] != EFFORT_SCALE]
+    return [
+        c["name"]
+        for c in diagnosis.get("changed", ())
+        if "." not in c["name"] and c["name"] != EFFORT_SCALE
+    ]
 
 
 def _changed(diagnosis: dict[str, Any]) -> set[str]:
     """Names of the numbers and effects in the machine's file whose values the diagnosis of one joint found to be wrong."""
-    return {*_off(diagnosis), *(c["name"].rpartition(".")[0] for c in diagnosis.get("changed", ()) if "." in c["name"])}
+    return {
+        *_off(diagnosis),
+        *(
+            c["name"].rpartition(".")[0]
+            for c in diagnosis.get("changed", ())
+            if "." in c["name"]
+        ),
+    }
 
 
 def _fitted(diagnosis: dict[str, Any]) -> set[str]:
     """Effects of the file and of all fits of one part that can be written."""
-    return {*diagnosis["present"], *(name for offer in diagnosis.get("offers", ()) for name in offer["added"])}
+    return {
+        *diagnosis["present"],
+        *(name for offer in diagnosis.get("offers", ()) for name in offer["added"]),
+    }
 
 
-def _fit_of(wanted: set[str], part: str, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
+def _fit_of(
+    wanted: set[str], part: str, diagnosis: dict[str, Any]
+) -> dict[str, Any] | None:
     """The fit with exactly the effects ``wanted`` beside those of the file; None if the diagnosis looked at none of them.
     Raises TaccorlError: the diagnosis refused one of them, or did not fit them together."""
     own, new = {*_found(diagnosis)}, wanted - {*diagnosis["present"], *_off(diagnosis)}
     if new == own:
         for name in wanted if not new else ():
-            if name not in {n for c in diagnosis.get("changed", []) for n in (c["name"], c["name"].rpartition(".")[0])}:
+            if name not in {
+                n
+                for c in diagnosis.get("changed", [])
+                for n in (c["name"], c["name"].rpartition(".")[0])
+            }:
                 raise TaccorlError(
                     f"{part}: the numbers of {name} in the file explain the recordings as well as refitted ones; give "
                     "--values={…} to change them nevertheless"
@@ -234,8 +310,13 @@ def _addition(machine: "Machine", part: str, fit: dict[str, Any]) -> "Addition":
             f"warning: {part}: the fit ended with {', '.join(ends)} at the end of its range, so the other numbers may be "
             "wrong, too: check units, gains and time stamps, or look for more effects (--until=noise_floor)"
         )
-    made = [machine.effect(e["effect"], part, {k: v for k, v in e.items() if k != "effect"}) for e in fit["effects"]]
-    return Addition(part, [e for e in made if e is not None], fit["base"], fit["intervals"])
+    made = [
+        machine.effect(e["effect"], part, {k: v for k, v in e.items() if k != "effect"})
+        for e in fit["effects"]
+    ]
+    return Addition(
+        part, [e for e in made if e is not None], fit["base"], fit["intervals"]
+    )
 
 
 def _changes(part: str, old: "Numbers", new: "Numbers") -> Section:
@@ -246,15 +327,34 @@ def _changes(part: str, old: "Numbers", new: "Numbers") -> Section:
     def value(number: tuple[float, str] | None) -> str:
         return "–" if number is None else f"{number[0]:.5g}"
 
-    changed = [name for name in new if name not in old] + [name for name in old if old[name] != new.get(name)]
-    listed, families = summarised({name: new[name][0] for name in changed if name in new})
+    changed = [name for name in new if name not in old] + [
+        name for name in old if old[name] != new.get(name)
+    ]
+    listed, families = summarised(
+        {name: new[name][0] for name in changed if name in new}
+    )
     rows = [
-        [f"  {name}", value(old.get(name)), value(new.get(name)), unit_words((new.get(name) or old[name])[1]).strip()]
+        [
+            f"  {name}",
+            value(old.get(name)),
+            value(new.get(name)),
+            unit_words((new.get(name) or old[name])[1]).strip(),
+        ]
         for name in changed
         if name in {*old, *listed}
     ]
     notes = [f"  {name}: {words}" for name, words in families.items()]
-    stay, families = summarised({name: new[name][0] for name in new if name not in changed})
-    words = [f"{name} {number:.4g}{unit_words(new[name][1])}" for name, number in stay.items()]
+    stay, families = summarised(
+        {name: new[name][0] for name in new if name not in changed}
+    )
+    words = [
+        f"{name} {number:.4g}{unit_words(new[name][1])}"
+        for name, number in stay.items()
+    ]
     notes += [f"  stay: {', '.join([*words, *families])}"] if words or families else []
-    return Section(heads=(f"{part}:", "old", "new", ""), rows=rows, right=(1, 2), parts=[Section(text=notes)])
+    return Section(
+        heads=(f"{part}:", "old", "new", ""),
+        rows=rows,
+        right=(1, 2),
+        parts=[Section(text=notes)],
+    )

@@ -57,7 +57,9 @@ def main(argv: list[str]) -> int:
 
     if not is_free(config.out):
         held = "holds files already" if config.out.is_dir() else "is a file"
-        raise TaccorlError(f"--out={config.out}: {held}; nothing was changed: give another folder")
+        raise TaccorlError(
+            f"--out={config.out}: {held}; nothing was changed: give another folder"
+        )
     from taccorl.diagnosis.align import aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
@@ -72,7 +74,11 @@ def main(argv: list[str]) -> int:
         )
     _check_cameras(config, machine)
     check_writable(config.out)
-    found = _joints_and_pads(config, machine) if config.joints or config.pads or not config.cameras else []
+    found = (
+        _joints_and_pads(config, machine)
+        if config.joints or config.pads or not config.cameras
+        else []
+    )
     if found is None:
         return 1
     found += _cameras(config, machine)
@@ -87,24 +93,47 @@ def main(argv: list[str]) -> int:
         "parts": [one.record() for one in found],
     }
     config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / REPORT).write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (config.out / REPORT).write_text(
+        json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     _write_overlays(config.out, found)
     if not good:
-        show(Section(text=[f"wrote {config.out / REPORT}; no twin, since nothing was aligned"]))
+        show(
+            Section(
+                text=[
+                    f"wrote {config.out / REPORT}; no twin, since nothing was aligned"
+                ]
+            )
+        )
         return 1
     save_twin(twin, config.out / TWIN)
-    options = {name: getattr(config, name) for name in ("spec", "columns", "validation_every")}
-    given = [f"--{name}={value}" for name, value in options.items() if value is not None]
-    if any(one.floors_left >= FAR_ABOVE_FLOOR for one in found):  # fitted gains hide a part of what is to be found
+    options = {
+        name: getattr(config, name) for name in ("spec", "columns", "validation_every")
+    }
+    given = [
+        f"--{name}={value}" for name, value in options.items() if value is not None
+    ]
+    if any(
+        one.floors_left >= FAR_ABOVE_FLOOR for one in found
+    ):  # fitted gains hide a part of what is to be found
         given += [f"--twin={config.twin}"] * (config.twin is not None)
     else:
         given.append(f"--twin={config.out / TWIN}")
     words = shlex.join(["taccorl", "diagnose", str(config.measurements), *given])
-    show(Section(text=[f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}", f"next: {words}"]))
+    show(
+        Section(
+            text=[
+                f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}",
+                f"next: {words}",
+            ]
+        )
+    )
     return int(len(good) < len(found) or bool(disagree))
 
 
-def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment] | None":
+def _joints_and_pads(
+    config: AlignConfig, machine: "PiperTwin"
+) -> "list[Alignment] | None":
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.cli.progress import Bars
@@ -116,12 +145,21 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
         with Bars(len(measurements.all)) as bars:
             return machine.compare(measurements, progress=bars.update)
 
-    beside = replayed(machine, measurements, "not aligned", config.accept, replay, "changes every gain")
+    beside = replayed(
+        machine,
+        measurements,
+        "not aligned",
+        config.accept,
+        replay,
+        "changes every gain",
+    )
     if beside is None:
         return None
     before = beside.comparison
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
-    troubled = {} if SHIFTED in config.accept else _come_late(before, beside.late, selected)
+    troubled = (
+        {} if SHIFTED in config.accept else _come_late(before, beside.late, selected)
+    )
     parts = [part for part in selected if part not in troubled]
     with Bars(len(parts), f"fitting {len(parts)} parts") as bars:
         count = itertools.count(1)
@@ -133,14 +171,20 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
             workers=config.workers,
             done=lambda part: bars.update(part, next(count), len(parts)),
         )
-    floors = {(s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"}
+    floors = {
+        (s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"
+    }
     use = "validation" if measurements.validation else "fit"
-    found += [Alignment(part=part, trouble=trouble) for part, trouble in troubled.items()]
+    found += [
+        Alignment(part=part, trouble=trouble) for part, trouble in troubled.items()
+    ]
     found.sort(key=lambda one: selected.index(one.part))
     return [_beside_floor(one, floors.get((one.part, use))) for one in found]
 
 
-def _come_late(before: "Comparison", late: "Mapping[str, Sequence[Finding]]", parts: Sequence[str]) -> dict[str, str]:
+def _come_late(
+    before: "Comparison", late: "Mapping[str, Sequence[Finding]]", parts: Sequence[str]
+) -> dict[str, str]:
     """Joint → why its gains are not fitted: most of its recordings come ``LATE_S`` or more after the replay."""
     import numpy as np
 
@@ -150,11 +194,20 @@ def _come_late(before: "Comparison", late: "Mapping[str, Sequence[Finding]]", pa
     found = {}
     for part in parts:
         traces = before.of(part)
-        shifted = [t for t in traces if any((f.check, f.feature) == (SHIFTED, part) for f in late.get(t.recording, ()))]
+        shifted = [
+            t
+            for t in traces
+            if any(
+                (f.check, f.feature) == (SHIFTED, part)
+                for f in late.get(t.recording, ())
+            )
+        ]
         if 2 * len(shifted) <= len(traces):
             continue
         delays_s = [
-            delay_between(t.target, t.measured, t.replayed, float(np.median(np.diff(t.time_s)))).delay_s
+            delay_between(
+                t.target, t.measured, t.replayed, float(np.median(np.diff(t.time_s)))
+            ).delay_s
             for t in shifted
         ]
         if (delay_s := float(np.median(delays_s))) >= LATE_S:
@@ -168,7 +221,11 @@ def _come_late(before: "Comparison", late: "Mapping[str, Sequence[Finding]]", pa
 
 def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
     """With the error that is left in noise floors, and a remark if that is much more than noise."""
-    left = (one.before if one.trouble or one.unchanged else one.after) / floor if floor else math.nan
+    left = (
+        (one.before if one.trouble or one.unchanged else one.after) / floor
+        if floor
+        else math.nan
+    )
     if not left >= FAR_ABOVE_FLOOR:
         return dataclasses.replace(one, floors_left=left)
     remark = (
@@ -187,12 +244,16 @@ def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
     known = [camera.name for camera in machine.config.cameras]
     for name in config.cameras:
         if name not in known:
-            raise TaccorlError(f"--cameras={name}: the twin has no such camera; {nearest(name, known)}")
+            raise TaccorlError(
+                f"--cameras={name}: the twin has no such camera; {nearest(name, known)}"
+            )
     try:
         with opened_episode(config.measurements, 0, config.spec, "--spec"):
             pass
     except TaccorlError as error:
-        raise TaccorlError(f"--cameras={','.join(config.cameras)} needs one recording or dataset: {error}") from error
+        raise TaccorlError(
+            f"--cameras={','.join(config.cameras)} needs one recording or dataset: {error}"
+        ) from error
 
 
 def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
@@ -215,7 +276,9 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
 
 def _section(one: "Alignment") -> Section:
     lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
-    lines += ["the recordings agree with the twin's numbers, which stay as they are"] * bool(one.unchanged)
+    lines += [
+        "the recordings agree with the twin's numbers, which stay as they are"
+    ] * bool(one.unchanged)
     if not one.numbers:
         return Section(title=one.part, text=lines)
     rows = []
@@ -228,7 +291,10 @@ def _section(one: "Alignment") -> Section:
     ]
     return Section(
         title=one.part,
-        text=[*lines, f"fitted to {listed([*one.fitted_to], 3)}; judged by {listed([*one.judged_by], 3)}"],
+        text=[
+            *lines,
+            f"fitted to {listed([*one.fitted_to], 3)}; judged by {listed([*one.judged_by], 3)}",
+        ],
         heads=("number", "before", "fitted", "95 % interval", "unit"),
         rows=rows,
         right=range(1, 4),
@@ -241,4 +307,7 @@ def _write_overlays(folder: Path, found: "Sequence[Alignment]") -> None:
         for stage, picture in one.overlays.items():
             import cv2
 
-            cv2.imwrite(str(folder / f"{one.part.replace(' ', '_')}_{stage}.png"), picture[..., ::-1])
+            cv2.imwrite(
+                str(folder / f"{one.part.replace(' ', '_')}_{stage}.png"),
+                picture[..., ::-1],
+            )

@@ -16,7 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import verb
-from taccorl.cli.produced import OriginOptions, PictureOptions, Place, SceneOptions, own_first, settings
+from taccorl.cli.produced import (
+    OriginOptions,
+    PictureOptions,
+    Place,
+    SceneOptions,
+    own_first,
+    settings,
+)
 from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
@@ -52,25 +59,46 @@ def run(config: AugmentConfig) -> int:
     from taccorl.lineage.store import Store
 
     plan = _plan(config, Store(config.store))
-    place = Place.of(config, plan, config.out or Path("outputs") / f"{config.task}_augmented", [config.source])
+    place = Place.of(
+        config,
+        plan,
+        config.out or Path("outputs") / f"{config.task}_augmented",
+        [config.source],
+    )
     store = place.store
-    produced = produce(plan, place.out, store, Attempts(plan.episodes, is_success), config.engine)
+    produced = produce(
+        plan, place.out, store, Attempts(plan.episodes, is_success), config.engine
+    )
     report = produced.report
-    lines = [f"yield:   {told_rate(report['episodes'], report['attempts'])}", *view_commands(plan, produced, store)]
+    lines = [
+        f"yield:   {told_rate(report['episodes'], report['attempts'])}",
+        *view_commands(plan, produced, store),
+    ]
     lines.append(f"sources: {grips_words(report['grips'])}")
-    lines += [f"warning: {': '.join(grips_warning(plan.task))}"] * bool(report["grips"]["few"])
+    lines += [f"warning: {': '.join(grips_warning(plan.task))}"] * bool(
+        report["grips"]["few"]
+    )
     place.written(plan, produced, lines)
     print(f"next:    {place.next_command(plan)}")
     return 0
 
 
-def view_commands(plan: "AugmentPlan", produced: "Produced", store: "Store") -> list[str]:
+def view_commands(
+    plan: "AugmentPlan", produced: "Produced", store: "Store"
+) -> list[str]:
     """Lines, one for each cause of failure: the command that opens the first attempt that failed so and has actions."""
-    first = {each.entry["outcome"]: each for each in reversed(produced.made) if each.entry["rows"] and not each.success}
+    first = {
+        each.entry["outcome"]: each
+        for each in reversed(produced.made)
+        if each.entry["rows"] and not each.success
+    }
     lines = []
     for outcome, each in sorted(first.items()):
         k = each.entry["attempt"]
-        physics = store.find(plan.steps[0].stage, plan.config(k), plan.inputs(k)) or each.artefact
+        physics = (
+            store.find(plan.steps[0].stage, plan.config(k), plan.inputs(k))
+            or each.artefact
+        )
         lines.append(
             f"view:    {shlex.join(['taccorl', 'view', str(physics.path)])}  ({outcome}: {each.entry['reason']})"
         )
@@ -88,7 +116,11 @@ def _plan(config: AugmentConfig, store: "Store") -> "AugmentPlan":
     task = tasks.get(config.task)(config.difficulty)
     spec = load_mimic_spec(config.spec or config.task)
     if spec.task != config.task:
-        raise TaccorlError(f"--spec={config.spec} is of task {spec.task}, --task={config.task}")
+        raise TaccorlError(
+            f"--spec={config.spec} is of task {spec.task}, --task={config.task}"
+        )
     check_task(spec, task)
     open_sources(config.source, config.task)
-    return AugmentPlan(**settings(config, AugmentPlan, spec=spec, sources=store.dataset(config.source)))
+    return AugmentPlan(
+        **settings(config, AugmentPlan, spec=spec, sources=store.dataset(config.source))
+    )

@@ -75,15 +75,34 @@ def _repair(config: CheckConfig) -> int:
 
 
 def _why(error: TaccorlError | MemoryError) -> str:
-    return f"reading it takes more memory than there is ({error})" if isinstance(error, MemoryError) else str(error)
+    return (
+        f"reading it takes more memory than there is ({error})"
+        if isinstance(error, MemoryError)
+        else str(error)
+    )
 
 
 def _probes(dataset: "Dataset") -> list[int]:
     """First and last row of the first, the last and some episodes between them."""
     number = dataset.num_episodes
-    some = sorted({round(k * (number - 1) / (MOST_PROBED - 1)) for k in range(MOST_PROBED)}) if number else []
-    first = list(itertools.accumulate((dataset.num_rows(i) for i in range(number)), initial=0))
-    return sorted({row for i in some if dataset.num_rows(i) for row in (first[i], first[i + 1] - 1)})
+    some = (
+        sorted(
+            {round(k * (number - 1) / (MOST_PROBED - 1)) for k in range(MOST_PROBED)}
+        )
+        if number
+        else []
+    )
+    first = list(
+        itertools.accumulate((dataset.num_rows(i) for i in range(number)), initial=0)
+    )
+    return sorted(
+        {
+            row
+            for i in some
+            if dataset.num_rows(i)
+            for row in (first[i], first[i + 1] - 1)
+        }
+    )
 
 
 def _bookkeeping(dataset: "Dataset", quick: bool) -> list[Finding]:
@@ -97,12 +116,21 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> list[Finding]:
             findings += check(dataset)
         except (TaccorlError, MemoryError) as error:  # LeRobot reads all rows, too
             return [*findings, Finding("unreadable", "error", "rows", _why(error))]
-    why = "--quick=true" if quick else "its pictures are only in the cache of training" * bool(dataset.unstored)
+    why = (
+        "--quick=true"
+        if quick
+        else "its pictures are only in the cache of training" * bool(dataset.unstored)
+    )
     if why := why or missing("lerobot"):
         return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
     problems = read_as_lerobot(dataset.root, _probes(dataset))
-    text = "; ".join(problems[:1]) + (f" ({len(problems)} such rows)" if len(problems) > 1 else "")
-    return [*findings, *([Finding("lerobot", "error", "dataset", text)] if problems else [])]
+    text = "; ".join(problems[:1]) + (
+        f" ({len(problems)} such rows)" if len(problems) > 1 else ""
+    )
+    return [
+        *findings,
+        *([Finding("lerobot", "error", "dataset", text)] if problems else []),
+    ]
 
 
 def _check_dataset(config: CheckConfig) -> int:
@@ -115,7 +143,9 @@ def _check_dataset(config: CheckConfig) -> int:
     if not missing("av"):
         import av.logging
 
-        av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
+        av.logging.set_libav_level(
+            av.logging.FATAL
+        )  # what is wrong with a video is said below, in our words
     stored = [] if config.quick else _stored_findings(config.path)
     worst = _worst(stored)
     if worst:  # said before a changed file may prevent the rest
@@ -123,8 +153,14 @@ def _check_dataset(config: CheckConfig) -> int:
     dataset = Dataset(config.path)
     findings = [] if worst else stored
     findings += _bookkeeping(dataset, config.quick)
-    findings += [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
-    findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
+    findings += [
+        Finding("video_count", "error", "video", text)
+        for text in dataset.video_problems()
+    ]
+    findings += [
+        Finding("skipped_feature", "note", key, f"{key}: {why}")
+        for key, why in dataset.skipped.items()
+    ]
     episodes: dict[int, Episode] = {}
     for index in range(dataset.num_episodes):
         try:
@@ -140,11 +176,16 @@ def _check_dataset(config: CheckConfig) -> int:
             bars.update(f"episode {number}", done, len(episodes))
             try:
                 found = check_episode(episode, pictures=config.pictures)
-            except (TaccorlError, MemoryError) as error:  # a video without its rows: the other episodes may be sound
+            except (
+                TaccorlError,
+                MemoryError,
+            ) as error:  # a video without its rows: the other episodes may be sound
                 found = [Finding("unreadable", "error", "video", _why(error))]
             for k, f in enumerate(found):
                 if LEAVE_OUT in f.text:
-                    text = f.text.replace(LEAVE_OUT, leave_out(config.path.resolve(), number))
+                    text = f.text.replace(
+                        LEAVE_OUT, leave_out(config.path.resolve(), number)
+                    )
                     found[k] = dataclasses.replace(f, text=text)
             checked.append((f"  episode {number}: {episode.num_rows} rows", found))
     show(*(found_in(label, found) for label, found in checked))
@@ -162,11 +203,17 @@ def _stored_findings(folder: Path) -> list[Finding]:
         return [Finding("damaged_manifest", "error", "files", str(error))]
     if found is None:
         text = "no manifest of taccorl lies in meta/taccorl"
-        if (folder / "meta" / "taccorl" / "episodes.json").is_file():  # a spec alone may be the user's
+        if (
+            folder / "meta" / "taccorl" / "episodes.json"
+        ).is_file():  # a spec alone may be the user's
             text += ", although taccorl wrote this dataset: copy it again"
             return [Finding("no_manifest", "warning", "files", text)]
         return [not_judged("files", "whether files are as they were written", text)]
-    if found.changed == ("meta/stats.json",) and not found.missing + found.unreadable and _same_pictures(folder):
+    if (
+        found.changed == ("meta/stats.json",)
+        and not found.missing + found.unreadable
+        and _same_pictures(folder)
+    ):
         text = "meta/stats.json was computed anew since (lerobot-edit-dataset recompute_stats); it is compared with the rows"
         return [Finding("changed_statistics", "note", "files", text)]
     advice = "copy the dataset again, or make it again from its sources"
@@ -179,7 +226,14 @@ def _stored_findings(folder: Path) -> list[Finding]:
         if names:
             text = f"{len(names)} of {found.num_files} files {what}: {listed([*names])}; {advice}"
             findings.append(Finding(check, "error", "files", text))
-    return findings or [Finding("verified", "note", "files", f"all {found.num_files} files are as they were written")]
+    return findings or [
+        Finding(
+            "verified",
+            "note",
+            "files",
+            f"all {found.num_files} files are as they were written",
+        )
+    ]
 
 
 def _same_pictures(folder: Path) -> bool:
@@ -190,9 +244,15 @@ def _same_pictures(folder: Path) -> bool:
     from taccorl.data.lerobot_format import picture_statistics
 
     try:
-        stated = json.loads((folder / "meta" / "stats.json").read_text(encoding="utf-8"))
+        stated = json.loads(
+            (folder / "meta" / "stats.json").read_text(encoding="utf-8")
+        )
         due = picture_statistics(folder, Dataset(folder).spec.keys("video"))
-        return all(np.allclose(stated[k][n], v, 1e-3, 1e-6) for k, of in due.items() for n, v in of.items())
+        return all(
+            np.allclose(stated[k][n], v, 1e-3, 1e-6)
+            for k, of in due.items()
+            for n, v in of.items()
+        )
     except (TaccorlError, ValueError, KeyError, TypeError):
         return False
 
@@ -212,7 +272,9 @@ def _check_recordings(config: CheckConfig) -> int:
             "dataset is checked against the spec that is stored in it"
         )
     skipped: list[str] = []
-    sources = find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped)
+    sources = find_sources(
+        config.path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped
+    )
     show(Section(text=[f"not read: {line}" for line in skipped]))
     checked: list[tuple[str, list[Finding]]] = []
     with Bars(len(sources)) as bars:
@@ -223,27 +285,43 @@ def _check_recordings(config: CheckConfig) -> int:
                     cutter = Cutter(recording)
                     try:
                         checked += _recording_findings(cutter, config.pictures)
-                    except BrokenPicture:  # as ingest does: leave it out, look at the rest
+                    except (
+                        BrokenPicture
+                    ):  # as ingest does: leave it out, look at the rest
                         cutter.drop_broken_pictures()
                         checked += _recording_findings(cutter, config.pictures)
             except (TaccorlError, MemoryError) as error:
-                checked.append((source.name, [Finding("unreadable", "error", "file", _why(error))]))
+                checked.append(
+                    (source.name, [Finding("unreadable", "error", "file", _why(error))])
+                )
     show(*(found_in(label, findings) for label, findings in checked))
     return max((_worst(findings) for _, findings in checked), default=0)
 
 
-def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, list[Finding]]]:
+def _recording_findings(
+    cutter: "Cutter", pictures: bool
+) -> list[tuple[str, list[Finding]]]:
     """(what, findings): the recording first, then each of its episodes."""
     from taccorl.data.checks import check_episode, check_recording_episodes
 
     recording, cut = cutter.recording, cutter.cut()
-    findings = [Finding("damage", "warning" if d.lost else "note", "file", str(d)) for d in recording.damage]
+    findings = [
+        Finding("damage", "warning" if d.lost else "note", "file", str(d))
+        for d in recording.damage
+    ]
     for channel, times_s in cutter.broken_pictures_s.items():
         text = f"{channel}: {len(times_s)} pictures do not decode, first at {times_s[0]:.2f} s"
         findings.append(Finding("broken_picture", "warning", channel, text))
     for loss in cut.losses:
         text = f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}"
-        findings.append(Finding("lost", "warning" if loss.wanted and not loss.within_slack else "note", "rows", text))
+        findings.append(
+            Finding(
+                "lost",
+                "warning" if loss.wanted and not loss.within_slack else "note",
+                "rows",
+                text,
+            )
+        )
     findings += check_recording_episodes(cut.episodes) if len(cut.episodes) > 1 else []
     found = [(recording.source.name, findings)]
     for episode in cut.episodes:

@@ -25,7 +25,14 @@ from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import verb
-from taccorl.cli.produced import OriginOptions, PictureOptions, Place, RandomizedOptions, own_first, settings
+from taccorl.cli.produced import (
+    OriginOptions,
+    PictureOptions,
+    Place,
+    RandomizedOptions,
+    own_first,
+    settings,
+)
 from taccorl.episodes.attempt import Source
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources import teleop
@@ -71,15 +78,22 @@ def run(config: CollectConfig) -> int:
     if not config.task:
         from taccorl.sim.task import tasks
 
-        raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
+        raise TaccorlError(
+            f"missing --task=, one of {', '.join(tasks)}; --help says more"
+        )
     plan = CollectPlan(**settings(config, CollectPlan, task=config.task or ""))
     if config.engine != LocalEngine() and (config.as_recording or not plan.repeatable):
         why = "--as_recording=true" if config.as_recording else "a person demonstrates"
-        raise TaccorlError(f"--engine: with several processes the attempts have no order, and {why}: remove --engine")
+        raise TaccorlError(
+            f"--engine: with several processes the attempts have no order, and {why}: remove --engine"
+        )
     teleop.use_leader_driver(_lerobot_leader)
     from taccorl.cli.progress import Attempts, is_success
 
-    out, progress = config.out or Path("outputs") / plan.task, Attempts(plan.episodes, is_success)
+    out, progress = (
+        config.out or Path("outputs") / plan.task,
+        Attempts(plan.episodes, is_success),
+    )
     if config.as_recording:
         if plan.cached_rows is not None or plan.part_poses:
             raise TaccorlError(
@@ -87,8 +101,16 @@ def run(config: CollectConfig) -> int:
             )
         hold(out)
         written = collect_recordings(plan, out, progress)
-        print(f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}")
-        words = ["taccorl", "ingest", str(out), "--spec=piper_flexitac_mcap", f"--out={out}_dataset"]
+        print(
+            f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}"
+        )
+        words = [
+            "taccorl",
+            "ingest",
+            str(out),
+            "--spec=piper_flexitac_mcap",
+            f"--out={out}_dataset",
+        ]
         print(f"next: {shlex.join(words)}")
         return 0
     place = Place.of(config, plan, out)
@@ -110,10 +132,18 @@ def _drawn(plan: CollectPlan, place: Place) -> "Iterator[DrawnFrames | None]":
     from taccorl.training.frame_cache import FRAMES
     from taccorl.training.rendered_frames import DrawnFrames
 
-    spec = plan.published(plan.make())  # what does not fit is refused before anything is written
+    spec = plan.published(
+        plan.make()
+    )  # what does not fit is refused before anything is written
     store, free = place.store, is_free(place.out)
-    with store.scratch(FRAMES, {"of": str(place.out.absolute())}) as folder:  # also removes what a killed run has left
-        yield DrawnFrames(spec, plan.rows_per_picture, place.resolution, store, folder) if free else None
+    with store.scratch(
+        FRAMES, {"of": str(place.out.absolute())}
+    ) as folder:  # also removes what a killed run has left
+        yield (
+            DrawnFrames(spec, plan.rows_per_picture, place.resolution, store, folder)
+            if free
+            else None
+        )
 
 
 def _memory(plan: CollectPlan, resolution: tuple[int, int] | None) -> str:
@@ -122,8 +152,12 @@ def _memory(plan: CollectPlan, resolution: tuple[int, int] | None) -> str:
 
     rows = tasks.get(plan.task)(plan.difficulty).time_limit_s * CONTROL_HZ
     pixels = math.prod(resolution or IMAGE_SHAPE[:2])
-    episode = rows * (_NUMBERS_BYTES + 3 * pixels * len(ROBOT.cameras) / plan.rows_per_picture)
-    fits = ", ".join(f"{int(_SHARE * gb * 1e9 / episode)} on a GPU of {gb} GB" for gb in (24, 80))
+    episode = rows * (
+        _NUMBERS_BYTES + 3 * pixels * len(ROBOT.cameras) / plan.rows_per_picture
+    )
+    fits = ", ".join(
+        f"{int(_SHARE * gb * 1e9 / episode)} on a GPU of {gb} GB" for gb in (24, 80)
+    )
     return (
         f"memory of training: at most {plan.episodes * episode / 1e9:.1f} GB ({plan.episodes} episodes as long as the time limit "
         f"of {rows / CONTROL_HZ:g} s; experts take about half of it). Episodes of that length that fit beside training: {fits}"

@@ -72,17 +72,30 @@ def run(config: CompareConfig) -> int:
     from taccorl.report.compared import cell_numbers, how_far, not_compared, where
     from taccorl.report.terminal import show
 
-    twins = [load_machine(path) for path in (config.twin, config.against)[: 1 + (config.against is not None)]]
+    twins = [
+        load_machine(path)
+        for path in (config.twin, config.against)[: 1 + (config.against is not None)]
+    ]
     measurements = config.read(twins[0], fit_needed=False)
     signals = sorted({signal for m in measurements.all for signal in m.signals})
     for name in config.joints:  # before the replays, which take minutes
         if name not in signals:
-            raise TaccorlError(f"--joints: {name!r} is in no recording; {nearest(name, signals)}")
+            raise TaccorlError(
+                f"--joints: {name!r} is in no recording; {nearest(name, signals)}"
+            )
     kin = twins[0].of_joints == twins[-1].of_joints
-    for name in (s for s in signals if not kin or (s in twins[0].units and s not in twins[-1].units)):
+    for name in (
+        s
+        for s in signals
+        if not kin or (s in twins[0].units and s not in twins[-1].units)
+    ):
         own = f"is of another machine: it has no {name!r}, which {config.twin or 'the nominal twin'} has and recordings move"
-        raise TaccorlError(f"--against={config.against}: {own}; give a file of the same machine")
-    moved = of_joints(measurements, config.joints)  # what is wrong with recordings of others holds nothing up
+        raise TaccorlError(
+            f"--against={config.against}: {own}; give a file of the same machine"
+        )
+    moved = of_joints(
+        measurements, config.joints
+    )  # what is wrong with recordings of others holds nothing up
     measurements = moved if moved.all else measurements
     comparisons: list[Comparison] = []
 
@@ -94,9 +107,14 @@ def run(config: CompareConfig) -> int:
     if beside is None:
         return 1
     first, last = comparisons[0], comparisons[-1]
-    show(how_far(*comparisons), where(first, ()), cell_numbers(last), not_compared(first))
+    show(
+        how_far(*comparisons), where(first, ()), cell_numbers(last), not_compared(first)
+    )
     off = far_off(last, twins[-1].fitted_gains, beside.findings)
-    show(Section(text=[origin_words(first.origins), *off]), *_write(config, comparisons, beside.findings, twins))
+    show(
+        Section(text=[origin_words(first.origins), *off]),
+        *_write(config, comparisons, beside.findings, twins),
+    )
     return 0
 
 
@@ -116,12 +134,16 @@ def _check_outputs(config: CompareConfig) -> None:
         check_free(config.rerun)
 
 
-def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements") -> list["Comparison"]:
+def _compared(
+    config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements"
+) -> list["Comparison"]:
     from taccorl.alignment.measurements.pressed import indenter
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.comparison.result import only
 
-    pressed = None if config.pressed.shape == "nothing" else indenter(**vars(config.pressed))
+    pressed = (
+        None if config.pressed.shape == "nothing" else indenter(**vars(config.pressed))
+    )
     found = []
     for twin, label in zip(twins, _labels(config, twins), strict=True):
         with Bars(len(measurements.all)) as bars:
@@ -130,7 +152,9 @@ def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "
                     measurements,
                     name=label,
                     pressed=pressed,
-                    progress=lambda recording, *at, name=label: bars.update(f"{name}: {recording}", *at),
+                    progress=lambda recording, *at, name=label: bars.update(
+                        f"{name}: {recording}", *at
+                    ),
                 )
             )
     return [only(c, config.joints) for c in found] if config.joints else found
@@ -142,7 +166,14 @@ def _labels(config: CompareConfig, twins: "Sequence[Machine]") -> list[str]:
     if config.twin is None or config.against is None or len(set(names)) == len(names):
         return names
     parts = [path.with_suffix("").parts for path in (config.twin, config.against)]
-    depth = next((k for k in range(1, max(map(len, parts)) + 1) if parts[0][-k:] != parts[1][-k:]), 1)
+    depth = next(
+        (
+            k
+            for k in range(1, max(map(len, parts)) + 1)
+            if parts[0][-k:] != parts[1][-k:]
+        ),
+        1,
+    )
     return ["/".join(own[-depth:]) for own in parts]
 
 
@@ -159,11 +190,23 @@ def _write(
         provenance = {"command": shlex.join(command("compare", config, "measurements"))}
         for twin, label in zip(twins, _labels(config, twins), strict=True):
             provenance[f"{label}, SHA-256"] = twin.digest()
-        title = f"{first.twin} beside {config.measurements.name}" + (f", and {after.twin}" if after else "")
-        report = Report(title=title, comparison=first, after=after, findings=findings, provenance=provenance)
+        title = f"{first.twin} beside {config.measurements.name}" + (
+            f", and {after.twin}" if after else ""
+        )
+        report = Report(
+            title=title,
+            comparison=first,
+            after=after,
+            findings=findings,
+            provenance=provenance,
+        )
         yield write_report(report, config.out)
     if config.rerun is not None:
         from taccorl.views.compare_view import save_comparison
 
         save_comparison(first, config.rerun, after)
-        yield Section(text=[f"wrote {config.rerun}: look at it with rerun {shlex.quote(str(config.rerun))}"])
+        yield Section(
+            text=[
+                f"wrote {config.rerun}: look at it with rerun {shlex.quote(str(config.rerun))}"
+            ]
+        )

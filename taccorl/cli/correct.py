@@ -25,7 +25,13 @@ from typing import TYPE_CHECKING
 
 from taccorl.cli.evaluate import PolicyChoice, open_policy, open_saved
 from taccorl.cli.parse import parse
-from taccorl.cli.produced import PictureOptions, Place, RandomizedOptions, own_first, settings
+from taccorl.cli.produced import (
+    PictureOptions,
+    Place,
+    RandomizedOptions,
+    own_first,
+    settings,
+)
 from taccorl.errors import TaccorlError
 from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
@@ -69,7 +75,9 @@ class CorrectConfig(PictureOptions, RandomizedOptions):
 def main(argv: list[str]) -> int:
     """Run ``taccorl correct`` with the words ``argv`` after it; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
-    os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
+    os.environ.setdefault(
+        "TQDM_DISABLE", "1"
+    )  # read when tqdm is imported: LeRobot's bars
     from taccorl.cli.progress import Attempts, Steps
     from taccorl.episodes.produce import check_out, produce
     from taccorl.episodes.sources.correct import CorrectionPlan
@@ -77,21 +85,41 @@ def main(argv: list[str]) -> int:
     from taccorl.evaluation.rollouts import checked_pictures
     from taccorl.evaluation.statistics import wilson_interval
 
-    plan = CorrectionPlan(**settings(config, CorrectionPlan, policy="", policy_digest=""))
+    plan = CorrectionPlan(
+        **settings(config, CorrectionPlan, policy="", policy_digest="")
+    )
     if config.policy.path is None:
         raise TaccorlError("missing --policy.path=CHECKPOINT, the policy to correct")
     for name in ("num_envs", "policy_workers"):
         if (value := getattr(config, name)) < 1:
             raise TaccorlError(f"--{name}={value}: at least 1")
     checked_pictures(config.policy_pictures, "--policy_pictures")
-    place = Place.of(config, plan, config.out or Path("outputs") / f"{config.task}_corrections")
-    opened = open_policy(config.policy, plan.twin_config(), tasks=(plan.task,), pictures=config.policy_pictures)
+    place = Place.of(
+        config, plan, config.out or Path("outputs") / f"{config.task}_corrections"
+    )
+    opened = open_policy(
+        config.policy,
+        plan.twin_config(),
+        tasks=(plan.task,),
+        pictures=config.policy_pictures,
+    )
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
     check_out(plan, place.out, place.store)  # before the policy acts
-    load = functools.partial(load_actor, config.policy.path, config.policy.device, config.seed)
-    acted = policy_episodes(plan, load, config.num_envs, place.store, Steps(every_s=10), workers=config.policy_workers)
+    load = functools.partial(
+        load_actor, config.policy.path, config.policy.device, config.seed
+    )
+    acted = policy_episodes(
+        plan,
+        load,
+        config.num_envs,
+        place.store,
+        Steps(every_s=10),
+        workers=config.policy_workers,
+    )
     plan = dataclasses.replace(plan, acted=tuple(acted))
-    produced = produce(plan, place.out, place.store, Attempts(len(plan.takeovers()[0])), config.engine)
+    produced = produce(
+        plan, place.out, place.store, Attempts(len(plan.takeovers()[0])), config.engine
+    )
     report = produced.report
     over, successes = report["taken_over"], report["episodes"]
     low, high = (100 * end for end in wilson_interval(successes, over))

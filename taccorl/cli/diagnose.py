@@ -65,15 +65,35 @@ def run(config: DiagnoseConfig) -> int:
     if machine.of_joints:
         refuse_long(measurements)
     compare = partial(machine.compare, measurements)
-    beside = replayed(machine, measurements, "not diagnosed", config.accept, compare, clocks=False)
+    beside = replayed(
+        machine, measurements, "not diagnosed", config.accept, compare, clocks=False
+    )
     if beside is None:
         return 1
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
-    off = {f.feature: f.text for own in beside.findings.values() for f in own if f.check == "other_gains"}
-    parts = [part for part in selected if part not in off or "other_gains" in config.accept]  # else an effect stands in
+    off = {
+        f.feature: f.text
+        for own in beside.findings.values()
+        for f in own
+        if f.check == "other_gains"
+    }
+    parts = [
+        part for part in selected if part not in off or "other_gains" in config.accept
+    ]  # else an effect stands in
     way = "--accept=other_gains diagnoses it with the stated ones"
-    refused = [f"{part}: not diagnosed: {off[part]}. {way}" for part in selected if part not in parts]
-    show(Section(text=[*far_off(beside.comparison, machine.fitted_gains, beside.findings), *refused]))
+    refused = [
+        f"{part}: not diagnosed: {off[part]}. {way}"
+        for part in selected
+        if part not in parts
+    ]
+    show(
+        Section(
+            text=[
+                *far_off(beside.comparison, machine.fitted_gains, beside.findings),
+                *refused,
+            ]
+        )
+    )
     if not parts:
         return 1
     found = _diagnosed(config, machine, parts, measurements)
@@ -85,24 +105,44 @@ def run(config: DiagnoseConfig) -> int:
     report = _report(config, machine, found, beside, measurements, mended)
     verdicts = report.verdicts()
     show(*(brief(f, verdicts[f.part], report.options) for f in found))
-    clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
+    clocks = [
+        f"{f.part}: {beside.unjudged[f.part]}"
+        for f in found
+        if f.part in beside.unjudged and _of_time(f)
+    ]
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
-    written = write_report(report, config.out)  # makes the folder of the corrected twin, too
-    text = [*_next(config, held, found, machine, mended), *([disagree] if disagree else [])]
+    written = write_report(
+        report, config.out
+    )  # makes the folder of the corrected twin, too
+    text = [
+        *_next(config, held, found, machine, mended),
+        *([disagree] if disagree else []),
+    ]
     show(Section(text=[*refused, *clocks]), written, Section(text=text))
-    done = all(f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor") for f in found)
+    done = all(
+        f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor")
+        for f in found
+    )
     return int(not done or bool(disagree or refused))
 
 
 def _diagnosed(
-    config: DiagnoseConfig, machine: "Machine", parts: Sequence[str], measurements: "Measurements"
+    config: DiagnoseConfig,
+    machine: "Machine",
+    parts: Sequence[str],
+    measurements: "Measurements",
 ) -> "list[Finding]":
     from taccorl.cli.progress import Bars, Steps
     from taccorl.diagnosis.machines.machine import diagnose_parts
     from taccorl.diagnosis.search.result import SearchConfig
 
-    search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-    with Bars(len(parts), f"diagnosing {len(parts)} parts") as bars, Steps().until_interrupted() as steps:
+    search = (
+        SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
+    )
+    with (
+        Bars(len(parts), f"diagnosing {len(parts)} parts") as bars,
+        Steps().until_interrupted() as steps,
+    ):
         count = itertools.count(1)
         return diagnose_parts(
             machine,
@@ -129,14 +169,21 @@ def _report(
     from taccorl.report.report import Report
     from taccorl.report.verdict import added
 
-    some = any(added(f.diagnosis) for f in found)  # else the twin as it was is the reference
+    some = any(
+        added(f.diagnosis) for f in found
+    )  # else the twin as it was is the reference
     return Report(
         title=f"What {beside.comparison.twin} lacks, from {config.measurements.name}",
         comparison=beside.comparison,
-        refitted=machine.refitted(found).compare(measurements, name="refitted twin") if some else None,
+        refitted=machine.refitted(found).compare(measurements, name="refitted twin")
+        if some
+        else None,
         after=mended.compare(measurements, name="corrected twin"),
         found=found,
-        options=[shlex.quote(word) for word in (f"--measurements={config.measurements}", *_given(config))],
+        options=[
+            shlex.quote(word)
+            for word in (f"--measurements={config.measurements}", *_given(config))
+        ],
         findings=beside.findings,
         provenance={
             "command": shlex.join(command("diagnose", config, "measurements")),
@@ -151,7 +198,9 @@ def _of_time(found: "Finding") -> bool:
     from taccorl.sim.effects import effects
 
     names = {*(d := found.diagnosis).names, *itertools.chain(*d.rivals.values())}
-    return d.status == "something_else" or any(p.unit == "s" for n in names for p in effects.get(n).parameters())
+    return d.status == "something_else" or any(
+        p.unit == "s" for n in names for p in effects.get(n).parameters()
+    )
 
 
 def _given(config: DiagnoseConfig) -> list[str]:
@@ -161,7 +210,11 @@ def _given(config: DiagnoseConfig) -> list[str]:
 
 
 def _next(
-    config: DiagnoseConfig, held: Sequence[str], found: "Sequence[Finding]", machine: "Machine", mended: "Machine"
+    config: DiagnoseConfig,
+    held: Sequence[str],
+    found: "Sequence[Finding]",
+    machine: "Machine",
+    mended: "Machine",
 ) -> Iterator[str]:
     """Write the corrected machine if it was asked for; what was written, or what to do next. ``held``: parts whose recordings
     are to be corrected first."""
@@ -169,36 +222,81 @@ def _next(
     from taccorl.report.evidence_words import may_stand_in, unit_words, untested_words
     from taccorl.report.verdict import added
 
-    found = sorted(found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"])  # the largest first
+    found = sorted(
+        found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"]
+    )  # the largest first
     names = list(dict.fromkeys(name for f in found for name in added(f.diagnosis)))
-    off = [(f.part, c) for f in found for c in f.diagnosis.changed if c.name != EFFORT_SCALE]  # which no file has
-    refitted = [c for f in found if f.diagnosis.status == "numbers_off" or not names for c in f.diagnosis.changed]
+    off = [
+        (f.part, c)
+        for f in found
+        for c in f.diagnosis.changed
+        if c.name != EFFORT_SCALE
+    ]  # which no file has
+    refitted = [
+        c
+        for f in found
+        if f.diagnosis.status == "numbers_off" or not names
+        for c in f.diagnosis.changed
+    ]
     of_file = [c.effect or c.name for c in refitted if c.name != EFFORT_SCALE]
     undecided = any(c.instead for c in refitted)
     whole = machine.changes_as_a_whole(found)
-    further = shlex.join(command("diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"))
+    further = shlex.join(
+        command(
+            "diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"
+        )
+    )
     if config.until == "noise_floor":
         mended.save(path := config.out / mended.file_name)
         done = [name for name in names if name in mended.effects]
-        done += [f"{c.name} of {part} {c.was} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
+        done += [
+            f"{c.name} of {part} {c.was} → {c.after:.4g}{unit_words(c.unit)}"
+            for part, c in off
+        ]
         yield f"wrote {path}: {', '.join([*done, *whole]) or 'refitted numbers, no effect'}; {mended.saved_words}"
         yield f"next: {compare_words(command('diagnose', config, 'measurements'), [f.part for f in found], config.twin, path)}"
         for f in found:
             yield from (
-                f"{f.part}: {doubt}" for doubt in (may_stand_in(f.diagnosis), untested_words(f.diagnosis)) if doubt
+                f"{f.part}: {doubt}"
+                for doubt in (may_stand_in(f.diagnosis), untested_words(f.diagnosis))
+                if doubt
             )
     elif held:
         yield f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
     elif any(f.diagnosis.status == "too_many" for f in found) or whole:
         yield f"next: {further}"
     elif names := list(dict.fromkeys([*names, *of_file])):
-        alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
-        words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
-        words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
+        alone = [
+            n
+            for n in names
+            if not any(
+                machine.option_of(f.part) for f in found if n in f.diagnosis.names
+            )
+        ]
+        words = [
+            "taccorl",
+            "add-effect",
+            ",".join(alone) if names[0] in alone else names[0],
+        ]
+        words += [
+            w
+            for f in found
+            if names[0] in f.diagnosis.names
+            for w in machine.option_of(f.part)
+        ]
         tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
-        tied += [f"payload in {body}" for f in found for body in f.diagnosis.or_in if names[0] == "payload"]
+        tied += [
+            f"payload in {body}"
+            for f in found
+            for body in f.diagnosis.or_in
+            if names[0] == "payload"
+        ]
         yield from ["next: record what decides, see Record next"] * undecided
         yield f"{'to write what was refitted' if undecided else 'next'}: {shlex.join([*words, *_given(config)])}"
-        yield from [f"{' or '.join(tied)} does as well as {names[0]}: see Record next"] * bool(tied)
-    elif any(f.part in machine.fitted_gains or machine.option_of(f.part) for f in found):
+        yield from [
+            f"{' or '.join(tied)} does as well as {names[0]}: see Record next"
+        ] * bool(tied)
+    elif any(
+        f.part in machine.fitted_gains or machine.option_of(f.part) for f in found
+    ):
         yield f"a twin with the refitted numbers: {further}"

@@ -60,10 +60,16 @@ def main(argv: list[str]) -> int:
     if config.name:
         cls = effects.get(config.name)
         if config.for_ and config.name not in names_for(config.for_):
-            raise TaccorlError(f"{config.name} acts on {', '.join(cls.kinds())}, not on {config.for_}; leave --for out")
+            raise TaccorlError(
+                f"{config.name} acts on {', '.join(cls.kinds())}, not on {config.for_}; leave --for out"
+            )
         print("\n".join(full(cls)))
         return 0
-    print("\n\n".join("\n".join(brief(effects.get(name))) for name in names_for(config.for_)))
+    print(
+        "\n\n".join(
+            "\n".join(brief(effects.get(name))) for name in names_for(config.for_)
+        )
+    )
     return 0
 
 
@@ -75,13 +81,19 @@ def _new(argv: list[str]) -> int:
     check_new("effect", config.name, effects)
     out = config.out or Path(f"{config.name}.py")
     if not out.stem.isidentifier() or out.suffix != ".py":
-        raise TaccorlError(f"--out={out}: must be a Python module, such as {config.name}.py")
+        raise TaccorlError(
+            f"--out={out}: must be a Python module, such as {config.name}.py"
+        )
     try:
         write_new(out, example(config.name, out.stem, config.for_))
     except FileExistsError:
-        raise TaccorlError(f"{out}: already exists; give another --out, or remove it") from None
+        raise TaccorlError(
+            f"{out}: already exists; give another --out, or remove it"
+        ) from None
     print(f"wrote {out}; its test: python -m pytest {out}")
-    print("to use it, publish the module in your package's pyproject.toml and install the package:")
+    print(
+        "to use it, publish the module in your package's pyproject.toml and install the package:"
+    )
     print(f'  [project.entry-points."taccorl.plugins"]\n  {config.name} = "{out.stem}"')
     return 0
 
@@ -90,6 +102,10 @@ def check_new(kind: str, name: str, known: "Registry[Any]") -> None:
     """Raises TaccorlError: ``name`` cannot be that of a plug-in of this ``kind``, or ``known`` has it already."""
     if not name.isidentifier() or name != name.lower() or keyword.iskeyword(name):
         valid = f"use small letters, digits and underscores, such as my_{kind}"
-        raise TaccorlError(f"{name!r} is not a valid name of a{'n' * (kind == 'effect')} {kind}; {valid}")
+        raise TaccorlError(
+            f"{name!r} is not a valid name of a{'n' * (kind == 'effect')} {kind}; {valid}"
+        )
     if name in known:
-        raise TaccorlError(f"the {kind} {name} exists already ({known.get(name).__module__}); choose another name")
+        raise TaccorlError(
+            f"the {kind} {name} exists already ({known.get(name).__module__}); choose another name"
+        )

@@ -127,7 +127,9 @@ def main(argv: list[str]) -> int:
     config = parse(EvaluateConfig, argv, positional=None)
     config.robot |= robot
     given = given_names(argv)
-    if config.robot and (useless := next((name for name in _OF_TWIN if name in given), None)):
+    if config.robot and (
+        useless := next((name for name in _OF_TWIN if name in given), None)
+    ):
         raise TaccorlError(f"--{useless} has no effect with --robot.type: remove it")
     if config.physics != "c" and "failures" not in given:
         config.failures = 0
@@ -142,10 +144,14 @@ def with_robot(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
 
     argv, robot = joined(argv), {}
     for name, _, value in (
-        word.removeprefix("--robot.").partition("=") for word in argv if word.startswith("--robot.")
+        word.removeprefix("--robot.").partition("=")
+        for word in argv
+        if word.startswith("--robot.")
     ):
         *outer, last = name.split(".")
-        functools.reduce(lambda inner, key: inner.setdefault(key, {}), outer, robot)[last] = yaml.safe_load(value)
+        functools.reduce(lambda inner, key: inner.setdefault(key, {}), outer, robot)[
+            last
+        ] = yaml.safe_load(value)
     return [word for word in argv if not word.startswith("--robot.")], robot
 
 
@@ -163,7 +169,11 @@ def run(config: EvaluateConfig) -> int:
     scenes = Scenes(**shared_fields(config, Scenes) | own)
     scenes.twin_config()  # read it before anything is loaded
     against = Path(config.against) if config.against else None
-    stored = read_stored(against, scenes) if against is not None and is_stored(against) else None
+    stored = (
+        read_stored(against, scenes)
+        if against is not None and is_stored(against)
+        else None
+    )
     other = None
     if against is not None and stored is None:
         if str(against) != EXPERT and not against.is_dir():
@@ -171,28 +181,43 @@ def run(config: EvaluateConfig) -> int:
                 f"--against={against}: no such folder; give a checkpoint (pretrained_model), the folder of an earlier "
                 f"evaluation, or {EXPERT}"
             )
-        other = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
+        other = (
+            PolicyChoice(type=EXPERT)
+            if str(against) == EXPERT
+            else PolicyChoice(path=against)
+        )
         other.device = config.policy.device
     kind = config.robot.get("type")
     paired = kind == "taccorl_surrogate"  # a robot's scenes are never the same
-    useless = other or config.policy.path is None or len(scenes.tasks) > 1 or (against and not paired)
+    useless = (
+        other
+        or config.policy.path is None
+        or len(scenes.tasks) > 1
+        or (against and not paired)
+    )
     if config.robot and (not kind or useless):
-        line = (
-            "give it, one --policy.path, one --task; on a surrogate --against=FOLDER of an earlier evaluation at most"
-        )
+        line = "give it, one --policy.path, one --task; on a surrogate --against=FOLDER of an earlier evaluation at most"
         raise TaccorlError(f"--robot.type: {line}")
     env: dict[str, Any] = {"tasks": scenes.tasks, "pictures": scenes.pictures}
-    twin = None if kind == "touch_robot" else scenes.twin_config()  # its robot is not the twin's
+    twin = (
+        None if kind == "touch_robot" else scenes.twin_config()
+    )  # its robot is not the twin's
     opened = [open_policy(config.policy, twin, **env)]
     if other is not None:
         opened.append(open_policy(other, scenes.twin_config(), "--against", **env))
     if scenes.hidden and config.policy.path is None:
         raise TaccorlError("--hide: the expert reads no sensor; give --policy.path")
-    if scenes.pictures == "randomised" and not any(c.what == "pictures" for one in opened for c in one.checks):
-        print("note: --pictures=randomised has no effect: no policy that is evaluated here uses cameras")
+    if scenes.pictures == "randomised" and not any(
+        c.what == "pictures" for one in opened for c in one.checks
+    ):
+        print(
+            "note: --pictures=randomised has no effect: no policy that is evaluated here uses cameras"
+        )
     names = [one.name for one in opened] + ([stored.policy] if stored else [])
     if len(set(names)) < len(names):
-        raise TaccorlError(f"--against={config.against}: is the evaluated policy itself; give another policy")
+        raise TaccorlError(
+            f"--against={config.against}: is the evaluated policy itself; give another policy"
+        )
     if not is_free(config.out) and not config.robot:
         text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
         raise TaccorlError(text)
@@ -200,24 +225,39 @@ def run(config: EvaluateConfig) -> int:
     config.out.mkdir(parents=True, exist_ok=True)
     begun_s = time.monotonic()
     executed = {one.name: text for one in opened if (text := one.executed)}
-    found = Evaluation(scenes=scenes, policies=opened, executed=executed, against=config.against)
+    found = Evaluation(
+        scenes=scenes, policies=opened, executed=executed, against=config.against
+    )
     rollouts, rows = [], []
     if config.robot:
         from taccorl.robot_plugin.trials import evaluate_on_robot
 
-        recordings = config.out / "trials" if config.failures and config.images else None
-        found = evaluate_on_robot(found, opened[0].checkpoint.config, config.robot, config.out, recordings)
+        recordings = (
+            config.out / "trials" if config.failures and config.images else None
+        )
+        found = evaluate_on_robot(
+            found, opened[0].checkpoint.config, config.robot, config.out, recordings
+        )
         rows, rollouts = [found.rows], [[*map(Rollout, found.rows)]]
     for one in () if config.robot else opened:
         rollouts.append(_scored(config, scenes, one))
         rows.append([rollout.row for rollout in rollouts[-1]])
-        write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
+        write_rows(
+            [row for own in rows for row in own], config.out / ROWS_FILE
+        )  # kept if the next policy fails
     aimed = {}
     if config.before_mate:
         from taccorl.evaluation.before_mate import aims_of
 
         asked = [one.checkpoint for one in opened if one.checkpoint is not None]
-        aimed = aims_of(scenes, asked, config.before_mate, config.policy.device, config.seed, Steps(every_s=10))
+        aimed = aims_of(
+            scenes,
+            asked,
+            config.before_mate,
+            config.policy.device,
+            config.seed,
+            Steps(every_s=10),
+        )
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     found = dataclasses.replace(
@@ -228,7 +268,14 @@ def run(config: EvaluateConfig) -> int:
         wall_s=wall_s,
     )
     write_rows(found.rows, config.out / ROWS_FILE)
-    write({config.out / SUMMARY_FILE: json.dumps(found.to_json(), indent=1, ensure_ascii=False) + "\n"})
+    write(
+        {
+            config.out / SUMMARY_FILE: json.dumps(
+                found.to_json(), indent=1, ensure_ascii=False
+            )
+            + "\n"
+        }
+    )
     show(found.lines())
     show(_write_page(config, found, rollouts[0]))
     return 0
@@ -253,7 +300,9 @@ class OpenedPolicy:
     def executed(self) -> str:
         """``8 of 16``: executed actions of a chunk; empty if the policy states no chunks."""
         config = getattr(self.checkpoint, "config", None)
-        executed, predicted = (getattr(config, name, None) for name in ("n_action_steps", "chunk_size"))
+        executed, predicted = (
+            getattr(config, name, None) for name in ("n_action_steps", "chunk_size")
+        )
         return f"{executed} of {predicted}" if executed and predicted else ""
 
     def load(self, seed: int) -> "Actor":
@@ -277,14 +326,22 @@ def open_policy(
     messages. Raises TaccorlError: neither or both of policy.path and policy.type are given, or the checkpoint cannot be used or
     does not fit."""
     if (choice.path is None) == (choice.type is None):
-        raise TaccorlError("give --policy.path=CHECKPOINT or --policy.type=expert, one of them")
+        raise TaccorlError(
+            "give --policy.path=CHECKPOINT or --policy.type=expert, one of them"
+        )
     if choice.path is None:
         if choice.type != EXPERT:
             known = nearest(str(choice.type), [EXPERT])
-            raise TaccorlError(f"--policy.type={choice.type}: {known}; a checkpoint is --policy.path=…")
+            raise TaccorlError(
+                f"--policy.type={choice.type}: {known}; a checkpoint is --policy.path=…"
+            )
         if choice.n_action_steps is not None:
-            raise TaccorlError("--policy.n_action_steps has no effect with --policy.type=expert: remove it")
-        return OpenedPolicy(EXPERT, "the scripted expert, which sees the simulator's poses", [])
+            raise TaccorlError(
+                "--policy.n_action_steps has no effect with --policy.type=expert: remove it"
+            )
+        return OpenedPolicy(
+            EXPERT, "the scripted expert, which sees the simulator's poses", []
+        )
     from taccorl.evaluation.preflight import preflight, refuse_differences
     from taccorl.evaluation.rollouts import checked_pictures
     from taccorl.report.evaluated import preflight as checked
@@ -293,7 +350,9 @@ def open_policy(
     checkpoint = open_saved(choice, option)
     if twin is None:
         return OpenedPolicy(str(choice.path), checkpoint.digest, [], checkpoint, choice)
-    checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
+    checks = preflight(
+        checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures)
+    )
     show(checked(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
     return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint, choice)
@@ -315,23 +374,37 @@ def open_saved(choice: PolicyChoice, option: str = "--policy.path") -> Any:
     from taccorl.evaluation.policy_actor import open_checkpoint
 
     assert choice.path is not None
-    return open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
+    return open_checkpoint(
+        choice.path, choice.device, option, n_action_steps=choice.n_action_steps
+    )
 
 
-def _scored(config: EvaluateConfig, scenes: "Scenes", policy: OpenedPolicy) -> "list[Rollout]":
+def _scored(
+    config: EvaluateConfig, scenes: "Scenes", policy: OpenedPolicy
+) -> "list[Rollout]":
     """All episodes of a policy, task by task, in the order of their seeds."""
     if config.workers == 1:
         return _score_share((scenes, policy, config.seed, 0, None))
     threads = max(1, len(os.sched_getaffinity(0)) // config.workers)
-    sent = dataclasses.replace(policy, checks=[], checkpoint=None)  # the worker opens it
-    items = [(part, sent, config.seed, k, threads) for k, part in enumerate(scenes.shares(config.workers))]
-    found = LocalEngine(workers=config.workers).map(_score_share, items, name=lambda item: str(item[0].seeds))
+    sent = dataclasses.replace(
+        policy, checks=[], checkpoint=None
+    )  # the worker opens it
+    items = [
+        (part, sent, config.seed, k, threads)
+        for k, part in enumerate(scenes.shares(config.workers))
+    ]
+    found = LocalEngine(workers=config.workers).map(
+        _score_share, items, name=lambda item: str(item[0].seeds)
+    )
     return sorted(
-        itertools.chain.from_iterable(found), key=lambda one: (scenes.tasks.index(one.row.task), one.row.seed)
+        itertools.chain.from_iterable(found),
+        key=lambda one: (scenes.tasks.index(one.row.task), one.row.seed),
     )
 
 
-def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "list[Rollout]":
+def _score_share(
+    item: "tuple[Scenes, OpenedPolicy, int, int, int | None]",
+) -> "list[Rollout]":
     """Run episodes in this process. ``item``: scenes, policy, seed, stream of its random numbers, threads of the physics."""
     from taccorl.evaluation.evaluate import score
 
@@ -341,9 +414,15 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
         import torch
 
         if policy.checkpoint.config.device == "cuda":
-            policy.checkpoint.config.device = f"cuda:{(worker_number() or 0) % torch.cuda.device_count()}"
-        torch.set_num_threads(threads or torch.get_num_threads())  # its share of the cores, as for the physics
-    return score(scenes, policy.load(seed), Steps(every_s=10), stream=stream, num_threads=threads)
+            policy.checkpoint.config.device = (
+                f"cuda:{(worker_number() or 0) % torch.cuda.device_count()}"
+            )
+        torch.set_num_threads(
+            threads or torch.get_num_threads()
+        )  # its share of the cores, as for the physics
+    return score(
+        scenes, policy.load(seed), Steps(every_s=10), stream=stream, num_threads=threads
+    )
 
 
 def _check_places(config: EvaluateConfig) -> None:
@@ -365,7 +444,9 @@ def _check_places(config: EvaluateConfig) -> None:
     if warp is not None:
         open_device(warp.device)  # before weights are loaded
     if config.before_mate < 0 or config.before_mate == 1:
-        raise TaccorlError(f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared")
+        raise TaccorlError(
+            f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared"
+        )
     if config.before_mate and config.policy.path is None:
         line = f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
         raise TaccorlError(line)
@@ -373,12 +454,26 @@ def _check_places(config: EvaluateConfig) -> None:
 
 def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:
     """``report.html`` and ``failures/*.rrd``, and the line that names them."""
-    from taccorl.evaluation.failed_episodes import choose_failures, execute_again, recorded_failures
+    from taccorl.evaluation.failed_episodes import (
+        choose_failures,
+        execute_again,
+        recorded_failures,
+    )
     from taccorl.views.episode import save_episode
 
-    chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []
+    chosen, images, notes = (
+        choose_failures(rollouts, config.failures),
+        config.images,
+        [],
+    )
     if config.robot:
-        write({config.out / "report.html": found.html(recorded_failures(chosen, config.out / "trials"))})
+        write(
+            {
+                config.out / "report.html": found.html(
+                    recorded_failures(chosen, config.out / "trials")
+                )
+            }
+        )
         line = f"wrote {config.out}: episodes.jsonl, evaluation.json, report.html, trials/*.mcap"
         return Section(text=[line])
     try:
@@ -390,10 +485,19 @@ def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> 
         failed = [execute_again(found.scenes, one, images=False) for one in chosen]
     rrds = []
     for row, one in ((one.rollout.row, one) for one in failed):
-        rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
+        rrds.append(
+            config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd"
+        )
         rrds[-1].parent.mkdir(exist_ok=True)
         assert one.episode is not None, "it was executed again"
         save_episode(one.episode, rrds[-1])
-    write({config.out / "report.html": found.html(list(zip(failed, rrds, strict=True)))})
-    files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]
+    write(
+        {config.out / "report.html": found.html(list(zip(failed, rrds, strict=True)))}
+    )
+    files = [
+        "episodes.jsonl",
+        "evaluation.json",
+        "report.html",
+        *(str(p.relative_to(config.out)) for p in rrds),
+    ]
     return Section(text=[*notes, f"wrote {config.out}: {', '.join(files)}"])

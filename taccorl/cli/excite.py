@@ -90,12 +90,20 @@ def main(argv: list[str]) -> int:
     from taccorl.diagnosis.machines.piper import PiperTwin
 
     machine = load_machine(config.twin)
-    name = _part_of_piper(config) if isinstance(machine, PiperTwin) else _part(config, machine)
+    name = (
+        _part_of_piper(config)
+        if isinstance(machine, PiperTwin)
+        else _part(config, machine)
+    )
     rivals, diagnosis = _rivals(config, machine, name)
     if not is_free(config.out):
-        raise TaccorlError(f"{config.out}: already exists; give another --out, or remove it")
+        raise TaccorlError(
+            f"{config.out}: already exists; give another --out, or remove it"
+        )
     check_writable(config.out)
-    recorded = None if config.measurements is None else machine.read(config.measurements)
+    recorded = (
+        None if config.measurements is None else machine.read(config.measurements)
+    )
     if isinstance(machine, CellsMachine):
         made = _cells(config, machine, recorded)
     elif not isinstance(machine, PiperTwin):
@@ -107,7 +115,12 @@ def main(argv: list[str]) -> int:
     return _search(config, made, rivals, diagnosis)
 
 
-def _search(config: ExciteConfig, part: "Part", rivals: Sequence[str], diagnosis: Mapping[str, Any]) -> int:
+def _search(
+    config: ExciteConfig,
+    part: "Part",
+    rivals: Sequence[str],
+    diagnosis: Mapping[str, Any],
+) -> int:
     from taccorl.cli.plan_words import words
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.experiment_design.plan import plan
@@ -116,10 +129,21 @@ def _search(config: ExciteConfig, part: "Part", rivals: Sequence[str], diagnosis
 
     rows = [e for r in diagnosis.get("rounds", [])[:1] for e in r["evidence"]]
     with Bars(1, "scoring") as bars:
-        found = plan(part, rivals, {e["name"]: e["base"] | e["values"] for e in rows}, bars.update)
+        found = plan(
+            part,
+            rivals,
+            {e["name"]: e["base"] | e["values"] for e in rows},
+            bars.update,
+        )
     show(planned(found, part, words))
     if found.separates_nothing:
-        show(Section(text=[f"wrote nothing: no recording that was tried separates {', '.join(found.rivals)}"]))
+        show(
+            Section(
+                text=[
+                    f"wrote nothing: no recording that was tried separates {', '.join(found.rivals)}"
+                ]
+            )
+        )
         return 1
     show(Section(text=[write_plan(config.out, found, part, words, config.num)]))
     return 0
@@ -133,15 +157,25 @@ def _part_of_piper(config: ExciteConfig) -> str:
     why = "applies to robot and axis files only (the limits of the PiPER are known); remove it"
     refuse(config, ("span", "speed"), why)
     if config.joint is not None and config.pads is not None:
-        raise TaccorlError(f"--joint={config.joint} and --pads={config.pads}: give one of them")
+        raise TaccorlError(
+            f"--joint={config.joint} and --pads={config.pads}: give one of them"
+        )
     if config.joint is not None:
         joint_number(config.joint)
         return config.joint
     if config.pads is None:
-        raise TaccorlError("missing --joint=left_joint5, or --pads=left for the pads of that arm")
+        raise TaccorlError(
+            "missing --joint=left_joint5, or --pads=left for the pads of that arm"
+        )
     if config.pads not in ROBOT.arms:
-        raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
-    refuse(config, ("gains", "floor_rad", "pose"), f"applies to joints only; remove it with --pads={config.pads}")
+        raise TaccorlError(
+            f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}"
+        )
+    refuse(
+        config,
+        ("gains", "floor_rad", "pose"),
+        f"applies to joints only; remove it with --pads={config.pads}",
+    )
     return f"{config.pads} pads"
 
 
@@ -151,21 +185,33 @@ def _part(config: ExciteConfig, machine: "Machine") -> str:
 
     names = [*machine.units]
     if config.pads:
-        raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
+        raise TaccorlError(
+            f"--pads={config.pads}: {machine.name} has no pads; remove --pads"
+        )
     if isinstance(machine, CellsMachine):
         for name in ("joint", "gains", "floor_rad", "pose"):
-            refuse(config, (name,), f": {machine.name} is a sensor of cells and has no joints; remove --{name}")
+            refuse(
+                config,
+                (name,),
+                f": {machine.name} is a sensor of cells and has no joints; remove --{name}",
+            )
         return machine.config.name
     if not names:
         machine.drive("")  # says why
     if config.joint is None and len(names) > 1:
-        raise TaccorlError(f"missing the {machine.part_word} to move: {', '.join(names)}")
+        raise TaccorlError(
+            f"missing the {machine.part_word} to move: {', '.join(names)}"
+        )
     if config.joint is not None and config.joint not in names:
-        raise TaccorlError(f"{machine.name}: no {machine.part_word} {config.joint!r}; it has {', '.join(names)}")
+        raise TaccorlError(
+            f"{machine.name}: no {machine.part_word} {config.joint!r}; it has {', '.join(names)}"
+        )
     return config.joint or names[0]
 
 
-def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[str], dict[str, Any]]:
+def _rivals(
+    config: ExciteConfig, machine: "Machine", part: str
+) -> tuple[list[str], dict[str, Any]]:
     """Effects to tell apart, and the diagnosis of the part in --diagnosis, empty if there is none. Raises TaccorlError: none
     are given, an effect is unknown, or it is in the machine's file."""
     import json
@@ -176,19 +222,29 @@ def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[s
 
     path, found = numbers_of(config.diagnosis), {}
     if path.is_file():
-        found = json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
-    names = config.effects or [n for name, others in found.get("rivals", {}).items() for n in (name, *others)]
+        found = (
+            json.loads(path.read_text(encoding="utf-8"))
+            .get("diagnoses", {})
+            .get(part, {})
+        )
+    names = config.effects or [
+        n for name, others in found.get("rivals", {}).items() for n in (name, *others)
+    ]
     names = names or [n for c in found.get("changed", ()) for n in c.get("instead", ())]
     if not config.effects and len(names) < 2:
         example = OF_TOUCH if config.pads or not machine.of_joints else OF_JOINTS
-        raise TaccorlError(f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}")
+        raise TaccorlError(
+            f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}"
+        )
     for name in names:
         effects.get(name)
     there = next((name for name in in_file(machine, part) if name in names), None)
     try:
         check_rivals(machine, part, names)
     except TaccorlError as error:
-        raise TaccorlError(str(error) + (_ways_out(config, machine, part, there) if there else "")) from error
+        raise TaccorlError(
+            str(error) + (_ways_out(config, machine, part, there) if there else "")
+        ) from error
     return names, found
 
 
@@ -199,31 +255,66 @@ def _ways_out(config: ExciteConfig, machine: "Machine", part: str, name: str) ->
     source = config.twin or Path(machine.file_name)
     bare = source.with_name(f"{source.stem}_without_{name}.yaml")
     where = machine.option_of(part) or [f"--joints={part}"] * machine.of_joints
-    absent = {p.name: p.absent for p in effects.get(name).parameters() if p.absent is not None}
+    absent = {
+        p.name: p.absent for p in effects.get(name).parameters() if p.absent is not None
+    }
     given = f"--values={{{', '.join(f'{key}: {str(float(x)).replace("inf", ".inf")}' for key, x in absent.items())}}}"
-    refit = ["taccorl", "diagnose", str(config.measurements or "YOUR_RECORDINGS"), f"--twin={source}"]
-    remove = ["taccorl", "add-effect", name, f"--twin={source}", *where, given, f"--out={bare}"]
+    refit = [
+        "taccorl",
+        "diagnose",
+        str(config.measurements or "YOUR_RECORDINGS"),
+        f"--twin={source}",
+    ]
+    remove = [
+        "taccorl",
+        "add-effect",
+        name,
+        f"--twin={source}",
+        *where,
+        given,
+        f"--out={bare}",
+    ]
     return (
         f". `{shlex.join(refit)}` refits it. To ask for another effect in its place, `{shlex.join(remove)}` takes it out, and "
         f"--twin={bare} plans without it"
     )
 
 
-def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str, measurements: "Measurements | None") -> "Part":
+def _arm_joint(
+    config: ExciteConfig,
+    twin: "TwinConfig",
+    joint: str,
+    measurements: "Measurements | None",
+) -> "Part":
     """A joint of the PiPER."""
     from taccorl.diagnosis.comparison.replays import BENCH_REST
-    from taccorl.diagnosis.experiment_design.motions import JointPart, arm_ground, posed, rest_pose
+    from taccorl.diagnosis.experiment_design.motions import (
+        JointPart,
+        arm_ground,
+        posed,
+        rest_pose,
+    )
 
-    swept = [m.on_robot(BENCH_REST) for m in measurements.all if joint in m.signals] if measurements else None
+    swept = (
+        [m.on_robot(BENCH_REST) for m in measurements.all if joint in m.signals]
+        if measurements
+        else None
+    )
     if measurements is not None and not swept:
         raise TaccorlError(f"{config.measurements}: no recording has {joint}")
     floor_rad = _floor(config, joint, "rad", swept)
-    ground = arm_ground(twin, joint, posed(joint, rest_pose(joint, measurements), config.pose))
+    ground = arm_ground(
+        twin, joint, posed(joint, rest_pose(joint, measurements), config.pose)
+    )
     return JointPart(ground, floor_rad, measurements, gains=config.gains)
 
 
 def _joint(
-    config: ExciteConfig, machine: "Machine", part: str, diagnosis: Mapping[str, Any], recorded: "Measurements | None"
+    config: ExciteConfig,
+    machine: "Machine",
+    part: str,
+    diagnosis: Mapping[str, Any],
+    recorded: "Measurements | None",
 ) -> "Part":
     """A joint of a robot file, or an axis."""
     from taccorl.diagnosis.experiment_design.motions import JointPart, ground_of
@@ -233,32 +324,48 @@ def _joint(
     ground = ground_of(machine, part, recorded, span=config.span, speed=config.speed)
     others = [*next(iter((diagnosis.get("one_pose") or {}).values()), [])]
     if config.pose:
-        ground = replace(ground, pose=stated_pose(machine, part, ground.like, ground.span, config.pose))
+        ground = replace(
+            ground,
+            pose=stated_pose(machine, part, ground.like, ground.span, config.pose),
+        )
     elif others and recorded is not None:
         stood = f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
         show(Section(text=[stood]))
-        ground = replace(ground, pose=chosen_pose(machine, part, ground.like, ground.span, others))
+        ground = replace(
+            ground, pose=chosen_pose(machine, part, ground.like, ground.span, others)
+        )
     floor = _floor(config, part, machine.drive(part).unit, recorded and recorded.all)
     return JointPart(ground, floor, recorded, gains=config.gains)
 
 
-def _floor(config: ExciteConfig, part: str, unit: str, recordings: "Sequence[Measurement] | None") -> float:
+def _floor(
+    config: ExciteConfig,
+    part: str,
+    unit: str,
+    recordings: "Sequence[Measurement] | None",
+) -> float:
     """Noise floor of a position [rad, m]: that of recordings, else as given."""
     if recordings is not None:
         from taccorl.alignment.measurements.noise_floor import noise_floor
 
         return noise_floor(recordings)[part].value
     if config.floor_rad is None and unit == "m":
-        raise TaccorlError(f"--floor_rad: the noise of {part} is not known without recordings; give it in m")
+        raise TaccorlError(
+            f"--floor_rad: the noise of {part} is not known without recordings; give it in m"
+        )
     return FLOOR_RAD if config.floor_rad is None else config.floor_rad
 
 
-def _cells(config: ExciteConfig, machine: "CellsMachine", measurements: "Measurements | None") -> "Part":
+def _cells(
+    config: ExciteConfig, machine: "CellsMachine", measurements: "Measurements | None"
+) -> "Part":
     """A sensor of cells; loads have the names and units of its recordings."""
     from taccorl.diagnosis.experiment_design.loads import CellsPart, load_range
 
     if measurements is None:
         why = f"recordings of {machine.name} state its noise, gain and rate; record a press first"
         raise TaccorlError(f"missing --measurements=: {why}")
-    allowed = load_range(machine.config, measurements, span=config.span, speed=config.speed)
+    allowed = load_range(
+        machine.config, measurements, span=config.span, speed=config.speed
+    )
     return CellsPart(machine.config, measurements, allowed)

@@ -40,29 +40,44 @@ SHOWN = {
 """Verb → options that its short help shows, in this order; required ones are always shown."""
 
 
-def print_help(config_class: type, positional: str | None, prog: str | None, everything: bool) -> None:
+def print_help(
+    config_class: type, positional: str | None, prog: str | None, everything: bool
+) -> None:
     """Print the docstring of the verb's module and its options, each with the docstring of its field. ``{tasks}`` there is
     replaced by the names of all tasks that have parts. Arguments as for ``parse``; ``everything``: all options."""
     from draccus.argparsing import ArgumentParser
 
     module = sys.modules[config_class.__module__]
     nothing, fields = dataclasses.MISSING, dataclasses.fields(config_class)  # pyright: ignore[reportArgumentType]
-    required = [f.name for f in fields if f.default is nothing and f.default_factory is nothing]
+    required = [
+        f.name for f in fields if f.default is nothing and f.default_factory is nothing
+    ]
     words = []
     if positional is not None:
-        several = typing.get_origin(typing.get_type_hints(config_class)[positional]) is list
+        several = (
+            typing.get_origin(typing.get_type_hints(config_class)[positional]) is list
+        )
         word = positional.upper() + " …" * several
         words = [word if positional in required else f"[{word}]"]
     words += [f"--{name}=…" for name in required if name != positional]
     prog = prog or f"taccorl {module.__name__.rpartition('.')[2]}".replace("_", "-")
-    usage, said = " ".join([prog, *words, "[options]"]), (module.__doc__ or "").strip().replace("``", "")
+    usage, said = (
+        " ".join([prog, *words, "[options]"]),
+        (module.__doc__ or "").strip().replace("``", ""),
+    )
     parser = ArgumentParser(config_class, usage=usage, description=said).parser
     for action in parser._actions:
-        if action.dest.endswith(".type") and action.choices:  # draccus: "Which type of Source to use"
+        if (
+            action.dest.endswith(".type") and action.choices
+        ):  # draccus: "Which type of Source to use"
             action.help = _docstring(config_class, action.dest.removesuffix(".type"))
-        elif not (action.help or "").strip():  # draccus overlooks the docstring of a field with choices
+        elif not (
+            action.help or ""
+        ).strip():  # draccus overlooks the docstring of a field with choices
             action.help = _docstring(config_class, action.dest) or action.help
-        if "{tasks}" in (action.help or ""):  # imported for the few verbs that have it: it takes a second
+        if "{tasks}" in (
+            action.help or ""
+        ):  # imported for the few verbs that have it: it takes a second
             from taccorl.sim.task import tasks
 
             named = ", ".join(name for name in tasks if tasks.get(name).parts)
@@ -75,10 +90,18 @@ def print_help(config_class: type, positional: str | None, prog: str | None, eve
     if everything:
         parser.print_help()
     else:
-        known = {name.removeprefix("--"): a for a in reversed(parser._actions) for name in a.option_strings}
+        known = {
+            name.removeprefix("--"): a
+            for a in reversed(parser._actions)
+            for name in a.option_strings
+        }
         shown = SHOWN.get(prog.removeprefix("taccorl "), " ".join(known)).split()
         shown = [*(name for name in required if name not in shown), *shown]
-        table = (_line(name, known[name], name == positional) for name in shown if name in known)
+        table = (
+            _line(name, known[name], name == positional)
+            for name in shown
+            if name in known
+        )
         print("\n".join([f"usage: {usage}", "", _wrapped(said), "", *table]))
         print(f"\nall {len(known.keys() - {'help', '-h'})} options: {prog} --help=all")
     sys.stdout.flush()
@@ -91,17 +114,29 @@ def _line(name: str, action: argparse.Action, is_word: bool) -> str:
     if action.default not in (argparse.SUPPRESS, None, "", False) and action.default:
         text += f" (default: {action.default})"
     begin = f"  {name.upper()} " if is_word else f"  --{name} "
-    return textwrap.fill(text, WIDTH, initial_indent=begin.ljust(20), subsequent_indent=" " * 20)
+    return textwrap.fill(
+        text, WIDTH, initial_indent=begin.ljust(20), subsequent_indent=" " * 20
+    )
 
 
 def _wrapped(text: str) -> str:
     """``text`` with paragraphs of at most ``WIDTH`` columns; those that fit already stay as they are."""
     done = []
     for paragraph in text.split("\n\n"):
-        lines = re.sub(r"\n(?!taccorl )" if paragraph.startswith("taccorl ") else r"\n", " ", paragraph).splitlines()
+        lines = re.sub(
+            r"\n(?!taccorl )" if paragraph.startswith("taccorl ") else r"\n",
+            " ",
+            paragraph,
+        ).splitlines()
         fits = max(map(len, paragraph.splitlines())) <= WIDTH
         done += (
-            [paragraph] if fits else ["\n".join(textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in lines)]
+            [paragraph]
+            if fits
+            else [
+                "\n".join(
+                    textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in lines
+                )
+            ]
         )
     return "\n\n".join(done)
 
@@ -111,10 +146,22 @@ def _docstring(config_class: type, field: str) -> str:
     outer, _, inner = field.partition(".")
     if inner:
         kind = typing.get_type_hints(config_class).get(outer)
-        return _docstring(kind, inner) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else ""
-    for cls in [cls for cls in config_class.__mro__ if "__dataclass_fields__" in vars(cls)]:
+        return (
+            _docstring(kind, inner)
+            if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+            else ""
+        )
+    for cls in [
+        cls for cls in config_class.__mro__ if "__dataclass_fields__" in vars(cls)
+    ]:
         (node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        for one, below in itertools.pairwise(node.body if isinstance(node, ast.ClassDef) else []):
-            if isinstance(one, ast.AnnAssign) and ast.unparse(one.target) == field and isinstance(below, ast.Expr):
+        for one, below in itertools.pairwise(
+            node.body if isinstance(node, ast.ClassDef) else []
+        ):
+            if (
+                isinstance(one, ast.AnnAssign)
+                and ast.unparse(one.target) == field
+                and isinstance(below, ast.Expr)
+            ):
                 return " ".join(str(ast.literal_eval(below.value)).split())
     return ""

@@ -70,7 +70,14 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl ingest`` with the words ``argv`` after it; returns the exit status, 0: all recordings were written or split,
     1: some were quarantined or refused."""
     if argv and argv[0] == "inspect":
-        return inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
+        return inspect(
+            parse(
+                InspectConfig,
+                argv[1:],
+                positional="paths",
+                prog="taccorl ingest inspect",
+            )
+        )
     return run(parse(IngestConfig, argv, positional="paths"))
 
 
@@ -99,14 +106,18 @@ def run(config: IngestConfig) -> int:
     from taccorl.report.terminal import show
 
     if config.domain not in (None, *DOMAINS):
-        raise TaccorlError(f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}")
+        raise TaccorlError(
+            f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}"
+        )
     if config.spec is None:
         config = dataclasses.replace(config, spec=chosen_spec(config.paths))
     assert config.spec is not None
     spec = load_recording_spec(config.spec)
     skipped: list[str] = []
     domain = cast("Domain | None", config.domain)
-    jobs = find_jobs(config.paths, spec, config.spec, config.store, config.dry_run, skipped, domain)
+    jobs = find_jobs(
+        config.paths, spec, config.spec, config.store, config.dry_run, skipped, domain
+    )
     for line in skipped:
         print(f"not read: {printable(line)}")
     _check_out(config, jobs)
@@ -117,7 +128,14 @@ def run(config: IngestConfig) -> int:
     replace = moved.append if config.replace else None
     with Bars(len(jobs)) as bars:
         try:
-            report = ingest(jobs, config.out, store, engine=config.engine, progress=bars.update, replace=replace)
+            report = ingest(
+                jobs,
+                config.out,
+                store,
+                engine=config.engine,
+                progress=bars.update,
+                replace=replace,
+            )
         except InTheWayError as error:
             raise InTheWayError(f"{error} --replace=true moves it aside.") from error
     path = _write_report(report, config)
@@ -125,7 +143,11 @@ def run(config: IngestConfig) -> int:
     for aside in moved:
         print(f"what was at {config.out} is now at {aside}")
     _say_where(report, config, path)
-    bad = report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"]
+    bad = (
+        report["episodes_quarantined"]
+        + report["outcomes"]["quarantined"]
+        + report["outcomes"]["refused"]
+    )
     return 1 if bad else 0
 
 
@@ -146,10 +168,23 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     out, whole, store = config.out, config.out.resolve(), config.store.resolve()
     if out.name in ("", ".."):
         raise DatasetError(f"--out={out} is not the name of a folder: give a name")
-    if inside := [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]:
-        raise DatasetError(f"{inside[0]} is an input, and lies in --out={out}: give another --out")
-    if within := [path for path in config.paths if path.is_dir() and whole.is_relative_to(path.resolve())]:
-        raise TaccorlError(f"--out={out} lies in {within[0]}, which is read: give another folder")
+    if inside := [
+        file
+        for job in jobs
+        for file in job.source.files
+        if file.resolve().is_relative_to(whole)
+    ]:
+        raise DatasetError(
+            f"{inside[0]} is an input, and lies in --out={out}: give another --out"
+        )
+    if within := [
+        path
+        for path in config.paths
+        if path.is_dir() and whole.is_relative_to(path.resolve())
+    ]:
+        raise TaccorlError(
+            f"--out={out} lies in {within[0]}, which is read: give another folder"
+        )
     check_apart(out, [("--store", config.store)])
     check_path(store)
     if config.dry_run:
@@ -167,16 +202,23 @@ def _check_same(out: Path, jobs: "list[Job]") -> None:
     try:
         made_by = json.loads(manifest.read_text())["config"]
         there = {(name, part) for name, part, _ in made_by["recordings"]}
-        same_spec = (made_by["spec"], made_by.get("domain")) == (jobs[0].spec.digest, jobs[0].domain)
+        same_spec = (made_by["spec"], made_by.get("domain")) == (
+            jobs[0].spec.digest,
+            jobs[0].domain,
+        )
     except (OSError, ValueError, KeyError, TypeError):
-        raise DatasetError(f"{out} exists and is not a dataset of taccorl: {way_out}") from None
+        raise DatasetError(
+            f"{out} exists and is not a dataset of taccorl: {way_out}"
+        ) from None
     wanted = {(job.source.path.name, job.source.part) for job in jobs}
     if there != wanted or not same_spec:
         new, gone = len(wanted - there), len(there - wanted)
         why = f"{new} recordings are new, {gone} are missing"
         why = why if new or gone else "it was made with another spec or domain"
         kept = "Finished recordings are then taken from --store, not ingested again"
-        raise DatasetError(f"{out} exists and holds another dataset ({why}): {way_out}. {kept}")
+        raise DatasetError(
+            f"{out} exists and holds another dataset ({why}): {way_out}. {kept}"
+        )
 
 
 def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
@@ -185,7 +227,9 @@ def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
     if not config.dry_run:
         path.parent.mkdir(parents=True, exist_ok=True)
         temp = path.with_name(f".{path.name}.{os.getpid()}")
-        temp.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        temp.write_text(
+            json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
         temp.replace(path)
     return path
 
@@ -196,13 +240,24 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
         return
     print(f"report:  {path}")
     if report["episodes"]:
-        print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)")
-        origins = Counter(
-            str(Origin.read(e)) for r in report["recordings"] for e in r["episodes"] if e["outcome"] == "written"
+        print(
+            f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)"
         )
-        print(f"origin:  {printable('; '.join(f'{label} ({num} episodes)' for label, num in origins.most_common()))}")
-        if any(e["domain"] is None for r in report["recordings"] for e in r["episodes"]):
-            print("         --domain=real states that a robot made the recordings that do not say so")
+        origins = Counter(
+            str(Origin.read(e))
+            for r in report["recordings"]
+            for e in r["episodes"]
+            if e["outcome"] == "written"
+        )
+        print(
+            f"origin:  {printable('; '.join(f'{label} ({num} episodes)' for label, num in origins.most_common()))}"
+        )
+        if any(
+            e["domain"] is None for r in report["recordings"] for e in r["episodes"]
+        ):
+            print(
+                "         --domain=real states that a robot made the recordings that do not say so"
+            )
         add_card(config.out)
         print(f"look:    taccorl view {shlex.quote(str(config.out))} --episode=0")
 
@@ -218,7 +273,9 @@ def inspect(config: InspectConfig) -> int:
     draft = config.draft
     for path in draft_paths(draft) if draft is not None else ():
         if os.path.lexists(path):
-            raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
+            raise TaccorlError(
+                f"{path} exists; give another --draft, it would be overwritten"
+            )
     found, failed = _find_all(config)
     printed: dict[tuple[str, ...], str] = {}
     shown: dict[tuple[Any, ...], str] = {}
@@ -229,9 +286,17 @@ def inspect(config: InspectConfig) -> int:
             print(printable(f"{source.name}: {without_place(str(error), source.name)}"))
             failed += 1
             continue
-        alike = (source.path, *((t.topic, t.type, t.names) for t in inventory.topics), *inventory.damage)
+        alike = (
+            source.path,
+            *((t.topic, t.type, t.names) for t in inventory.topics),
+            *inventory.damage,
+        )
         if source.part is not None and alike in shown:  # an episode of many in one file
-            print(printable(f"{source.name}: {inventory.duration_s:.2f} s, the same topics as {shown[alike]}"))
+            print(
+                printable(
+                    f"{source.name}: {inventory.duration_s:.2f} s, the same topics as {shown[alike]}"
+                )
+            )
             continue
         shown[alike] = source.name
         failed += (is_damaged := any(damage.lost for damage in inventory.damage))
@@ -258,7 +323,9 @@ def _find_all(config: InspectConfig) -> tuple[list[tuple[Path, str, "Source"]], 
     for path in config.paths:
         skipped: list[str] = []
         try:
-            sources = find_sources(path, reader=config.reader, split_bag=config.split_bag, skipped=skipped)
+            sources = find_sources(
+                path, reader=config.reader, split_bag=config.split_bag, skipped=skipped
+            )
         except TaccorlError as error:
             if len(config.paths) == 1:
                 raise
@@ -275,9 +342,13 @@ def _find_all(config: InspectConfig) -> tuple[list[tuple[Path, str, "Source"]], 
 def _say_fit(inventory: "Inventory", path: Path) -> None:
     for fit in inventory.fits[:1]:
         if inventory.faults:
-            print(f"has the topics of the shipped spec {fit}, but {'; '.join(inventory.faults)}\n")
+            print(
+                f"has the topics of the shipped spec {fit}, but {'; '.join(inventory.faults)}\n"
+            )
         else:
-            print(f"fits the shipped spec: taccorl ingest {shlex.quote(str(path))} --spec={fit}\n")
+            print(
+                f"fits the shipped spec: taccorl ingest {shlex.quote(str(path))} --spec={fit}\n"
+            )
 
 
 def _write_drafts(inventory: "Inventory", path: Path) -> None:
@@ -286,8 +357,13 @@ def _write_drafts(inventory: "Inventory", path: Path) -> None:
     files = draft_specs(inventory, path).files(path)
     for place, text in files.items():
         write_new(place, text)
-    named = zip(("draft spec", "and of its dataset", "and of its pads"), files, strict=False)
-    print("\n".join(f"{what}: {place}" for what, place in named) + "\nreplace the TODOs in all of them\n")
+    named = zip(
+        ("draft spec", "and of its dataset", "and of its pads"), files, strict=False
+    )
+    print(
+        "\n".join(f"{what}: {place}" for what, place in named)
+        + "\nreplace the TODOs in all of them\n"
+    )
 
 
 def _print_drafts(inventory: "Inventory", printed: dict[tuple[str, ...], str]) -> None:
@@ -297,12 +373,20 @@ def _print_drafts(inventory: "Inventory", printed: dict[tuple[str, ...], str]) -
 
     path = Path("draft.yaml")
     files = draft_specs(inventory, path).files(path)
-    first = printed.setdefault(tuple(text.split("\n", 1)[1] for text in files.values()), inventory.source.name)
+    first = printed.setdefault(
+        tuple(text.split("\n", 1)[1] for text in files.values()), inventory.source.name
+    )
     if first != inventory.source.name:
-        print(f"no shipped spec fits; the drafts for {printable(first)} above are right for it, too\n")
+        print(
+            f"no shipped spec fits; the drafts for {printable(first)} above are right for it, too\n"
+        )
         return
-    print(f"no shipped spec fits; drafts of {len(files)} specs (--draft={path} writes them):\n")
+    print(
+        f"no shipped spec fits; drafts of {len(files)} specs (--draft={path} writes them):\n"
+    )
     for what, (place, text) in zip(
-        ("how it is read", "what its dataset holds", "its pads"), files.items(), strict=False
+        ("how it is read", "what its dataset holds", "its pads"),
+        files.items(),
+        strict=False,
     ):
         print(f"# ---- {place}: {what} ----\n{text}")

@@ -33,7 +33,9 @@ def main(argv: list[str]) -> int:
     beside = out.with_name("columns.yaml")
     for path in (out, beside) if config.dataset else (out,):
         if path.exists():
-            raise TaccorlError(f"{path}: already exists; give another --out, or remove it")
+            raise TaccorlError(
+                f"{path}: already exists; give another --out, or remove it"
+            )
     from taccorl.alignment.machines.robot_draft import columns_draft, robot_draft
     from taccorl.alignment.machines.robot_file import TODO
 
@@ -45,7 +47,9 @@ def main(argv: list[str]) -> int:
         try:
             write_new(path, written)
         except OSError as error:
-            raise TaccorlError(f"{path}: cannot be written: {error.strerror or error}") from error
+            raise TaccorlError(
+                f"{path}: cannot be written: {error.strerror or error}"
+            ) from error
     for remark in robot.remarks:
         print(f"note: {remark}")
     print(f"wrote {out}: {len(robot.joints)} joints ({', '.join(robot.joints)})")
@@ -54,16 +58,26 @@ def main(argv: list[str]) -> int:
     if config.dataset is not None:
         print(f"wrote {beside}: names and units of the columns of {config.dataset}")
         if spare:
-            print(f"note: no joint of the model is called {', '.join(spare)}; not in {beside}")
+            print(
+                f"note: no joint of the model is called {', '.join(spare)}; not in {beside}"
+            )
         _print_todo(texts[beside], TODO)
         options = shlex.join([f"--twin={out}", f"--columns={beside}"])
         print(f"next: taccorl compare {shlex.quote(str(config.dataset))} {options}")
         return 0
-    print(f"record each joint: tables with columns t, {name}.q, {name}.q_target, and where you have them .qd and .tau")
+    print(
+        f"record each joint: tables with columns t, {name}.q, {name}.q_target, and where you have them .qd and .tau"
+    )
     print(f"next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}")
     return 0
 
 
 def _print_todo(text: str, todo: str) -> None:
-    left = [number for number, line in enumerate(text.splitlines(), 1) if f": {todo}" in line]
-    print(f"write {len(left)} values where it says {todo}: lines {', '.join(map(str, left))}")
+    left = [
+        number
+        for number, line in enumerate(text.splitlines(), 1)
+        if f": {todo}" in line
+    ]
+    print(
+        f"write {len(left)} values where it says {todo}: lines {', '.join(map(str, left))}"
+    )

@@ -48,7 +48,14 @@ def main(argv: list[str]) -> int:
         print(__doc__)
         return 0
     if argv[0] == "explain":
-        return explain(parse(ExplainConfig, argv[1:], positional="path", prog="taccorl lineage explain"))
+        return explain(
+            parse(
+                ExplainConfig,
+                argv[1:],
+                positional="path",
+                prog="taccorl lineage explain",
+            )
+        )
     if argv[0] == "prune":
         return _prune(parse(PruneConfig, argv[1:], prog="taccorl lineage prune"))
     raise TaccorlError(f"no verb {argv[0]!r}; {nearest(argv[0], ('explain', 'prune'))}")
@@ -78,13 +85,17 @@ def _prune(config: PruneConfig) -> int:
         note = "  (left by a run that died)" if folder.is_leftover else ""
         print(f"{_megabytes(folder.size_bytes)}  {folder.path}{note}")
     total = _megabytes(sum(folder.size_bytes for folder in folders)).strip()
-    num_kept = len({path.resolve() for path in (*store.destinations.present(), *config.keep)})
+    num_kept = len(
+        {path.resolve() for path in (*store.destinations.present(), *config.keep)}
+    )
     print(
         f"not needed for {_count(num_kept, 'dataset')}: {len(folders)} of {_count(len(store.folders()), 'folder')} "
         f"in {store.root}, {total}"
     )
     if gone := store.destinations.gone():
-        print(f"{_count(len(gone), 'dataset')} gone or moved; name moved ones with --keep=DATASET:")
+        print(
+            f"{_count(len(gone), 'dataset')} gone or moved; name moved ones with --keep=DATASET:"
+        )
         for path in gone[:SHOWN_GONE]:
             print(f"  {path}")
     if not folders or not config.yes:
@@ -94,7 +105,10 @@ def _prune(config: PruneConfig) -> int:
     busy = delete(store, folders)
     print(f"Deleted {_count(len(folders) - len(busy), 'folder')}.")
     for folder in busy:
-        print(f"Not deleted, because a run is using it now: {folder.path}", file=sys.stderr)
+        print(
+            f"Not deleted, because a run is using it now: {folder.path}",
+            file=sys.stderr,
+        )
     return 0
 
 

@@ -34,10 +34,17 @@ VERBS = {
         "merge": "real and simulated datasets → one for co-training, with each row marked, and exact statistics",
         "view": "an episode in Rerun: pictures, touch, joints, arms",
     },
-    "store": {"lineage": "inputs of every result: `lineage explain PATH`; delete unneeded ones: `lineage prune`"},
+    "store": {
+        "lineage": "inputs of every result: `lineage explain PATH`; delete unneeded ones: `lineage prune`"
+    },
 }
 """Heading of the list of commands → verb → description."""
-SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune"), "task": ("new",)}
+SECOND_WORDS = {
+    "effects": ("new",),
+    "ingest": ("inspect",),
+    "lineage": ("explain", "prune"),
+    "task": ("new",),
+}
 """Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 
 ONE_THREAD = ("compare", "align", "diagnose", "excite")
@@ -55,9 +62,13 @@ def main(argv: list[str] | None = None) -> int:
     verb and its arguments; None: those of the process."""
     if argv is None:  # we are the program and not a guest in somebody's process
         os.environ["TACCORL_PROGRAM"] = "1"
-        signal.signal(signal.SIGTERM, _ended)  # what is unfinished is removed, as after Ctrl-C
+        signal.signal(
+            signal.SIGTERM, _ended
+        )  # what is unfinished is removed, as after Ctrl-C
         argv = sys.argv[1:]
-        for library in ("OMP", "OPENBLAS", "MKL") if argv and argv[0] in ONE_THREAD else ():  # before NumPy is imported
+        for library in (
+            ("OMP", "OPENBLAS", "MKL") if argv and argv[0] in ONE_THREAD else ()
+        ):  # before NumPy is imported
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     words = argv
     if words == ["--version"]:
@@ -68,13 +79,26 @@ def main(argv: list[str] | None = None) -> int:
     known = [verb for group in VERBS.values() for verb in group]
     listing = not words or words[0] in ("-h", "--help")
     if not listing and words[0] not in known:
-        print(f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}", file=sys.stderr)
+        print(
+            f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}",
+            file=sys.stderr,
+        )
         return 2
-    typed = " ".join(["taccorl", *words[:1], *(w for w in words[1:2] if w in SECOND_WORDS.get(words[0], ()))])
+    typed = " ".join(
+        [
+            "taccorl",
+            *words[:1],
+            *(w for w in words[1:2] if w in SECOND_WORDS.get(words[0], ())),
+        ]
+    )
     try:
         with released_at_the_end():
             module = "" if listing else words[0].replace("-", "_")
-            code = _list_verbs() if listing else importlib.import_module(f"taccorl.cli.{module}").main(words[1:])
+            code = (
+                _list_verbs()
+                if listing
+                else importlib.import_module(f"taccorl.cli.{module}").main(words[1:])
+            )
         sys.stdout.flush()  # a closed pipe shows here at the latest
         return code
     except ModuleNotFoundError as error:
@@ -89,7 +113,11 @@ def main(argv: list[str] | None = None) -> int:
             raise
         return 128 + _signals[0]
     except KeyboardInterrupt:
-        kept = "; what was finished is kept, run again to go on" if words[0] in _KEEPS else ""
+        kept = (
+            "; what was finished is kept, run again to go on"
+            if words[0] in _KEEPS
+            else ""
+        )
         print(f"\n{typed}: stopped{kept}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `taccorl … | head`
@@ -112,7 +140,12 @@ def _ended(number: int, frame: object) -> None:
 def _of_machine(error: OSError) -> str:
     """What the machine refused, and where; of a copy of many files (``shutil.Error``) the first one."""
     text, place = error.strerror or str(error), error.filename
-    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list) and error.args[0]:
+    if (
+        isinstance(error, shutil.Error)
+        and error.args
+        and isinstance(error.args[0], list)
+        and error.args[0]
+    ):
         _, place, text = error.args[0][0]
     full = os.strerror(errno.ENOSPC)
     advice = "; make room, then run the same command again" if full in text else ""
@@ -120,12 +153,16 @@ def _of_machine(error: OSError) -> str:
 
 
 def _list_verbs() -> int:
-    print("usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n")
+    print(
+        "usage: taccorl <verb> [what] [--option=value …]      taccorl <verb> --help\n"
+    )
     for group, verbs in VERBS.items():
         print(group)
         for verb, line in verbs.items():
             print(f"  {verb:16s}{line}")
-    print("\ntraining is LeRobot's own command: lerobot-train; lerobot-eval scores as taccorl evaluate does")
+    print(
+        "\ntraining is LeRobot's own command: lerobot-train; lerobot-eval scores as taccorl evaluate does"
+    )
     return 0
 
 

@@ -59,7 +59,13 @@ class MeasuredConfig:
 
         check_names(self.accept)
         every = self.validation_every
-        return machine.read(self.measurements, spec=self.spec, columns=self.columns, validation_every=every, **how)
+        return machine.read(
+            self.measurements,
+            spec=self.spec,
+            columns=self.columns,
+            validation_every=every,
+            **how,
+        )
 
 
 @dataclass(kw_only=True)
@@ -81,7 +87,9 @@ class PartsConfig(MeasuredConfig):
 
         found = super().read(machine, **how)
         if self.joints and not self.pads:
-            return of_joints(found, machine.select(machine.parts(found), self.joints, []))
+            return of_joints(
+                found, machine.select(machine.parts(found), self.joints, [])
+            )
         return found
 
 
@@ -119,33 +127,58 @@ def replayed(
     comparison = replay()
     findings = without_explained(findings, comparison)
     late = of_replays(comparison, findings, accept)
-    checks = {f.check for found in (findings, late) for own in found.values() for f in own}
+    checks = {
+        f.check for found in (findings, late) for own in found.values() for f in own
+    }
     unused = [
-        f"--accept={n}: no recording has that finding; leave it out" for n in dict.fromkeys(accept) if n not in checks
+        f"--accept={n}: no recording has that finding; leave it out"
+        for n in dict.fromkeys(accept)
+        if n not in checks
     ]
     shown = of_recordings(comparison, findings, late)
     unjudged = [f for own in shown.values() for f in own if f.check == "not_judged"]
-    shown = {name: [f for f in own if clocks or f not in unjudged] for name, own in shown.items()}
+    shown = {
+        name: [f for f in own if clocks or f not in unjudged]
+        for name, own in shown.items()
+    }
     show(Section(text=unused), *found_in_recordings(shown))
     if clock_is_off(late, len(measurements.all)):
         text = f"{verdict}: time stamps of most recordings are off, see above; an offset of one row {why}"
         show(Section(text=[text]))
         return None
-    every = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
-    return Replayed(comparison, every, late, {f.feature: f.text for f in reversed(unjudged)})
+    every = {
+        name: [*findings.get(name, []), *late.get(name, [])]
+        for name in (*findings, *late)
+    }
+    return Replayed(
+        comparison, every, late, {f.feature: f.text for f in reversed(unjudged)}
+    )
 
 
 def checked(
-    machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
+    machine: "Machine",
+    measurements: "Measurements",
+    verdict: str,
+    accept: Sequence[str] = (),
 ) -> dict[str, list["Finding"]] | None:
     """Run the checks of telemetry and of the machine, and print their findings. ``verdict``: text with which the message
     begins if there are errors. ``accept``: checks whose errors become warnings. Returns: name of a recording → its findings;
     None if there are errors."""
-    from taccorl.alignment.checks.telemetry import accepted, check_copies, check_measurements, one_cause
+    from taccorl.alignment.checks.telemetry import (
+        accepted,
+        check_copies,
+        check_measurements,
+        one_cause,
+    )
     from taccorl.cli.progress import LINE_EVERY_S, Steps
     from taccorl.report.terminal import show
 
-    rows, seconds = (sum(each) for each in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True))
+    rows, seconds = (
+        sum(each)
+        for each in zip(
+            *((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True
+        )
+    )
     if rows > MANY_ROWS:
         print(
             f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take minutes; 10 s of each motion are enough",
@@ -155,22 +188,47 @@ def checked(
     found = check_copies(measurements.all)
     if machine.of_joints:
         limits, rates = machine.effort_limits, machine.command_rates
-        found = check_measurements(measurements.all, accept=accept, limits=limits, rates=rates, progress=steps)
-    uneven = [f for own in found.values() for f in own if f.feature == "time" and f.severity == "error"]
-    timed = not uneven and all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
+        found = check_measurements(
+            measurements.all, accept=accept, limits=limits, rates=rates, progress=steps
+        )
+    uneven = [
+        f
+        for own in found.values()
+        for f in own
+        if f.feature == "time" and f.severity == "error"
+    ]
+    timed = not uneven and all(
+        m.period_s > 0 for m in measurements.all
+    )  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
-    of_sweeps = ("no_motion", "short", "too_short")  # a press need not move a joint as far or as long
+    of_sweeps = (
+        "no_motion",
+        "short",
+        "too_short",
+    )  # a press need not move a joint as far or as long
     found = {
-        m.name: [f for f in found.get(m.name, []) if m.pressed is None or f.check not in of_sweeps]
+        m.name: [
+            f
+            for f in found.get(m.name, [])
+            if m.pressed is None or f.check not in of_sweeps
+        ]
         + accepted(own.get(m.name, []), accept)
         for m in measurements.all
     }
     found = one_cause(found, measurements.all, machine.command_rates)
-    wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
-    show(*found_in_recordings({name: [f for f in own if not _waits(f)] for name, own in found.items()}))
+    wrong = sorted(
+        {name for name, own in found.items() if any(f.severity == "error" for f in own)}
+    )
+    show(
+        *found_in_recordings(
+            {name: [f for f in own if not _waits(f)] for name, own in found.items()}
+        )
+    )
     lines = [f"not read: {line}" for line in measurements.skipped]
     if measurements.unlisted:
-        lines.append(f"not listed in measurements.yaml, taken as use: fit: {', '.join(measurements.unlisted)}")
+        lines.append(
+            f"not listed in measurements.yaml, taken as use: fit: {', '.join(measurements.unlisted)}"
+        )
     if wrong:
         lines.append(
             f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "
@@ -193,7 +251,9 @@ def refuse_long(measurements: "Measurements") -> None:
 
 
 def of_replays(
-    comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
+    comparison: "Comparison",
+    findings: dict[str, list["Finding"]],
+    accept: Sequence[str],
 ) -> dict[str, list["Finding"]]:
     """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift
     is only a warning for an arm whose pose is unknown, and for a joint with other gains. ``findings``: of earlier checks; the
@@ -203,9 +263,16 @@ def of_replays(
 
     late = {}
     for name, clock in comparison.clock.items():
-        found = [f for f in findings.get(name, []) if f.check in ("pose_unknown", "other_gains", "other_scale")]
+        found = [
+            f
+            for f in findings.get(name, [])
+            if f.check in ("pose_unknown", "other_gains", "other_scale")
+        ]
         if clock:
-            late[name] = [_beside(f, found) if f.check == SHIFTED else f for f in accepted(clock, accept)]
+            late[name] = [
+                _beside(f, found) if f.check == SHIFTED else f
+                for f in accepted(clock, accept)
+            ]
     return late
 
 
@@ -218,14 +285,19 @@ def _beside(shift: "Finding", found: Sequence["Finding"]) -> "Finding":
     return shift
 
 
-def without_explained(findings: dict[str, list["Finding"]], comparison: "Comparison") -> dict[str, list["Finding"]]:
+def without_explained(
+    findings: dict[str, list["Finding"]], comparison: "Comparison"
+) -> dict[str, list["Finding"]]:
     """``findings`` without late answers that the replay shows as well: the file's own friction or inertia holds a joint back."""
 
     def explained(f: "Finding", name: str) -> bool:
         traces = comparison.of(f.feature) if f.check == "late_answer" else ()
         return any(_as_late(t) for t in traces if t.recording == name)
 
-    return {name: [f for f in own if not explained(f, name)] for name, own in findings.items()}
+    return {
+        name: [f for f in own if not explained(f, name)]
+        for name, own in findings.items()
+    }
 
 
 def _as_late(t: "Trace") -> bool:
@@ -234,21 +306,42 @@ def _as_late(t: "Trace") -> bool:
 
     period_s = (t.time_s[-1] - t.time_s[0]) / (len(t.time_s) - 1)
     rows = [(t.target, q, period_s) for q in (t.measured, t.replayed)]
-    measured, replayed = ((far_delay(*of) or fit_first_order(*of)).delay_s for of in rows)
+    measured, replayed = (
+        (far_delay(*of) or fit_first_order(*of)).delay_s for of in rows
+    )
     return measured - replayed < 0.5 * period_s
 
 
 def of_recordings(
-    comparison: "Comparison", findings: dict[str, list["Finding"]], late: dict[str, list["Finding"]]
+    comparison: "Comparison",
+    findings: dict[str, list["Finding"]],
+    late: dict[str, list["Finding"]],
 ) -> dict[str, list["Finding"]]:
     """Findings of replays to be shown, with the joints whose clock neither they nor the checks before could judge."""
-    judged = {f.feature for own in late.values() for f in own if f.check in ("same_onset", "shifted_from_twin")}
+    judged = {
+        f.feature
+        for own in late.values()
+        for f in own
+        if f.check in ("same_onset", "shifted_from_twin")
+    }
     shown: dict[str, list[Finding]] = {}
     for name in dict.fromkeys([*findings, *late]):
-        open_ = [f for f in late.get(name, []) if not (_waits(f) and f.feature in judged)]
+        open_ = [
+            f for f in late.get(name, []) if not (_waits(f) and f.feature in judged)
+        ]
         unjudged = {f.feature for f in open_ if _waits(f)}
-        before = [f for f in findings.get(name, []) if _waits(f) and (f.feature not in judged or f.severity != "note")]
-        stays = [f for f in before if f.check == "late_answer" or f.feature in unjudged or name not in comparison.clock]
+        before = [
+            f
+            for f in findings.get(name, [])
+            if _waits(f) and (f.feature not in judged or f.severity != "note")
+        ]
+        stays = [
+            f
+            for f in before
+            if f.check == "late_answer"
+            or f.feature in unjudged
+            or name not in comparison.clock
+        ]
         open_ = [*stays, *open_]
         if open_ or name in late:
             shown[f"replay of {name}"] = open_
@@ -262,22 +355,38 @@ def _waits(f: "Finding") -> bool:
     return f.check == "late_answer" or (f.check == "not_judged" and f.topic == CLOCK)
 
 
-def far_off(comparison: "Comparison", fitted: Collection[str], findings: Mapping[str, list["Finding"]]) -> list[str]:
+def far_off(
+    comparison: "Comparison",
+    fitted: Collection[str],
+    findings: Mapping[str, list["Finding"]],
+) -> list[str]:
     """Lines to print, one for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the
     measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation,
     test). ``fitted``: signals whose gains are only the start of a fit. ``findings``: name of a recording → its findings."""
     import numpy as np
 
     lines: dict[str, str] = {}
-    late = {f.feature for own in findings.values() for f in own if f.check == "late_answer" and f.topic}
+    late = {
+        f.feature
+        for own in findings.values()
+        for f in own
+        if f.check == "late_answer" and f.topic
+    }
     for s in comparison.scores():
         if s.kind != "position" or s.ratio < FEWEST_FLOORS:
             continue
         traces = comparison.of(s.signal, "position", s.use)
-        of_target = math.sqrt(np.nansum([np.nansum(np.square(t.measured - t.target)) for t in traces]) / max(s.n, 1))
+        of_target = math.sqrt(
+            np.nansum([np.nansum(np.square(t.measured - t.target)) for t in traces])
+            / max(s.n, 1)
+        )
         # A drive that takes no position has the replay in place of a target.
-        has_target = not any(np.array_equal(t.target, t.replayed, equal_nan=True) for t in traces)
-        if s.nrmse > FAR_OFF or (has_target and s.rmse > AS_FAR_AS_TARGET * of_target > 0):
+        has_target = not any(
+            np.array_equal(t.target, t.replayed, equal_nan=True) for t in traces
+        )
+        if s.nrmse > FAR_OFF or (
+            has_target and s.rmse > AS_FAR_AS_TARGET * of_target > 0
+        ):
             share = s.rmse / of_target if has_target and of_target > 0 else 0.0
             of = f", {share:.0%} of what the target by itself is off" * bool(share)
             off = np.concatenate([t.measured - t.replayed for t in traces])
@@ -288,7 +397,9 @@ def far_off(comparison: "Comparison", fitted: Collection[str], findings: Mapping
                 why = "with the gains of the file, which are only a start (gains: fitted); diagnose --until=noise_floor writes "
                 why += "those that the recordings determine"
             if s.signal in late or (s.signal in fitted and not is_constant):
-                lines[s.signal] = f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion, {why}"
+                lines[s.signal] = (
+                    f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion, {why}"
+                )
                 continue
             constant = (
                 f"Most of it is a constant: measured positions stand {mean:+.3g} {traces[0].unit} from the replay. Give the "
@@ -296,7 +407,11 @@ def far_off(comparison: "Comparison", fitted: Collection[str], findings: Mapping
                 if is_constant
                 else "A wrong number is more likely than a missing effect: check"
             )
-            per = "per rad, not per degree" if traces[0].unit == "rad" else "per m, not per mm"
+            per = (
+                "per rad, not per degree"
+                if traces[0].unit == "rad"
+                else "per m, not per mm"
+            )
             lines[s.signal] = (
                 f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. "
                 f"{constant} unit or factor of its columns, kp and kd ({per}), inertia, loop_hz "
@@ -311,6 +426,12 @@ def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
     recording → findings of ``of_replays``."""
     from taccorl.alignment.checks.clock import UNDECIDED
 
-    shifted = {name for name, found in late.items() if any(f.severity == "error" for f in found)}
-    undecided = {name for name, found in late.items() if any(f.check == UNDECIDED for f in found)} - shifted
+    shifted = {
+        name
+        for name, found in late.items()
+        if any(f.severity == "error" for f in found)
+    }
+    undecided = {
+        name for name, found in late.items() if any(f.check == UNDECIDED for f in found)
+    } - shifted
     return 2 * len(shifted) > num_recordings - len(undecided)

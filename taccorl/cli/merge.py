@@ -44,7 +44,9 @@ class MergeConfig:
 @verb(MergeConfig)
 def run(config: MergeConfig) -> int:
     """Merge the datasets. Returns the exit status 0."""
-    os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
+    os.environ.setdefault(
+        "TQDM_DISABLE", "1"
+    )  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.cli.progress import Bars
     from taccorl.data.dataset import Dataset
     from taccorl.data.ingest import moved_aside
@@ -52,7 +54,9 @@ def run(config: MergeConfig) -> int:
     from taccorl.training.cotrain import Part, check_domains, publish
 
     if config.pictures not in ("video", "cache"):
-        raise TaccorlError(f"--pictures={config.pictures}: {nearest(config.pictures, ('video', 'cache'))}")
+        raise TaccorlError(
+            f"--pictures={config.pictures}: {nearest(config.pictures, ('video', 'cache'))}"
+        )
     resolution = cached_resolution(config.resolution, config.pictures)
     _check_places(config)
     store = Store(config.store)
@@ -65,13 +69,22 @@ def run(config: MergeConfig) -> int:
     with Bars(1, "comparing digests") as bars:
 
         def made() -> list[Part]:
-            return publish(config.real, config.sim, config.out, store, bars.update, videos=not cached)
+            return publish(
+                config.real,
+                config.sim,
+                config.out,
+                store,
+                bars.update,
+                videos=not cached,
+            )
 
         try:
             parts = made()
         except InTheWayError as error:
             if not config.replace:
-                raise InTheWayError(f"{error} --replace=true moves it aside.") from error
+                raise InTheWayError(
+                    f"{error} --replace=true moves it aside."
+                ) from error
             with moved_aside(config.out) as aside:
                 parts = made()
             print(f"what was at {config.out} is now at {aside}")
@@ -81,11 +94,16 @@ def run(config: MergeConfig) -> int:
         said = f" ({'; '.join(origins)})" if origins else ""
         return f"{sum(p.episodes for p in of)} episodes, {sum(p.rows for p in of)} rows{said}"
 
-    domains = {"real": [p for p in parts if not p.is_sim], "simulated": [p for p in parts if p.is_sim]}
+    domains = {
+        "real": [p for p in parts if not p.is_sim],
+        "simulated": [p for p in parts if p.is_sim],
+    }
     print(f"dataset:   {config.out}")
     if lack := _without_poses(config):
         lacking = ", ".join(map(str, lack))
-        print(f"left out:  the parts' poses ({PARTS_KEY}), which {lacking} lacks: --part_poses=true there")
+        print(
+            f"left out:  the parts' poses ({PARTS_KEY}), which {lacking} lacks: --part_poses=true there"
+        )
     for name, of in domains.items():
         print(f"{name + ':':11s}{told(of)}")
     add_card(config.out)
@@ -94,10 +112,23 @@ def run(config: MergeConfig) -> int:
         folder = join_frames(config.out, [*config.real, *config.sim], resolution, store)
         print(f"frames:    {folder}")
         frames = f" --dataset.cache=gpu --dataset.cache_store={config.store}"
-        size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
-    alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
-    policy = f"tactile_pi05 --policy.backbone={'small' if cached else 'tiny'}{alone}{size}"
-    if not any(key.startswith("observation.tactile") for key in Dataset(config.out).spec.features):
+        size = (
+            ""
+            if resolution is None
+            else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
+        )
+    alone = (
+        ""
+        if all(domains.values())
+        else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
+    )
+    policy = (
+        f"tactile_pi05 --policy.backbone={'small' if cached else 'tiny'}{alone}{size}"
+    )
+    if not any(
+        key.startswith("observation.tactile")
+        for key in Dataset(config.out).spec.features
+    ):
         policy = "act"  # one with touch would refuse it
     print(
         f"next:      lerobot-train --policy.type={policy} --policy.push_to_hub=false "
@@ -115,7 +146,10 @@ def _without_poses(config: MergeConfig) -> list[Path]:
 
 
 def _check_places(config: MergeConfig) -> None:
-    given = [*(("--real", place) for place in config.real), *(("--sim", place) for place in config.sim)]
+    given = [
+        *(("--real", place) for place in config.real),
+        *(("--sim", place) for place in config.sim),
+    ]
     check_apart(config.out, given)
     places = [place.resolve() for _, place in given]
     if twice := [str(place) for place in places if places.count(place) > 1]:

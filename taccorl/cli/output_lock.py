@@ -53,7 +53,11 @@ def hold(out: Path) -> None:
         by = "another process"
         with contextlib.suppress(OSError):  # it may have ended meanwhile
             by = path.read_text("utf-8", "replace") or by
-        print(f"waiting for --out={out}, held by {by}; Ctrl-C ends this run", file=sys.stderr, flush=True)
+        print(
+            f"waiting for --out={out}, held by {by}; Ctrl-C ends this run",
+            file=sys.stderr,
+            flush=True,
+        )
         lock.acquire()
     except OSError:  # what writes there says so; or a file system without locks
         return
@@ -73,13 +77,17 @@ def check_apart(out: Path, places: Iterable[tuple[str, Path]]) -> None:
     for option, place in places:
         other = place.resolve()
         if whole.is_relative_to(other) or other.is_relative_to(whole):
-            raise DatasetError(f"--out={out} and {option}={place} contain one another: choose another --out")
+            raise DatasetError(
+                f"--out={out} and {option}={place} contain one another: choose another --out"
+            )
 
 
 def lock_file(out: Path) -> Path:
     """Lock file of a place: beside it, or in the nearest folder above that exists."""
     whole = out.absolute()
-    folder = next((parent for parent in whole.parents if parent.is_dir()), whole.parent).resolve()
+    folder = next(
+        (parent for parent in whole.parents if parent.is_dir()), whole.parent
+    ).resolve()
     if folder == whole.parent.resolve():
         return folder / f".{whole.name}.lock"
     return folder / f".{hashlib.sha256(str(whole).encode()).hexdigest()[:16]}.lock"

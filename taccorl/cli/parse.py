@@ -26,14 +26,22 @@ HELP = ("-h", "--help", "--help=all")
 """Options that print the help: the most used options, or all."""
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
-_FORMS = {"int": "a whole number", "float": "a number", "dict": "names and numbers, '{name: 0.4}'"}
+_FORMS = {
+    "int": "a whole number",
+    "float": "a number",
+    "dict": "names and numbers, '{name: 0.4}'",
+}
 _WRONG = re.compile(  # draccus' words
     r"`([\w.]+)`: (?:.*?Couldn't parse '(.*?)' into an? (int|float)\b|.*?value='(.*?)' .*? of type (dict|list|tuple)\b)"
 )
 
 
 def parse[ConfigT](
-    config_class: type[ConfigT], argv: Sequence[str], *, positional: str | None = None, prog: str | None = None
+    config_class: type[ConfigT],
+    argv: Sequence[str],
+    *,
+    positional: str | None = None,
+    prog: str | None = None,
 ) -> ConfigT:
     """Parse ``argv`` into a ``config_class``. Paths and texts are taken as typed; other values are YAML, as in LeRobot. The
     place that ``--out`` names is locked until the command ends (``output_lock``). ``positional``: name of the field that words
@@ -53,26 +61,39 @@ def parse[ConfigT](
         _check_option(option, hints)
     if words:
         if positional is None:
-            raise TaccorlError(f"did not expect {words[0]!r}; options: {', '.join(f'--{n}=' for n in hints)}")
+            raise TaccorlError(
+                f"did not expect {words[0]!r}; options: {', '.join(f'--{n}=' for n in hints)}"
+            )
         if any(o.startswith(f"--{positional}=") for o in options):
             text = f"{words[0]!r} and --{positional}=…: give {positional} either with or without the option's name"
             raise TaccorlError(text)
         if not all(words):
-            raise TaccorlError(f"{positional} is empty: a shell variable that is not set?")
+            raise TaccorlError(
+                f"{positional} is empty: a shell variable that is not set?"
+            )
         if len(words) > 1 and _text_kind(hints[positional]) != "list":
-            raise TaccorlError(f"only one {positional} can be given, found {' '.join(words)}")
+            raise TaccorlError(
+                f"only one {positional} can be given, found {' '.join(words)}"
+            )
         options += [f"--{positional}={word}" for word in words]
     texts, rest = _take_texts(options, hints)
     given = {o.lstrip("-").partition("=")[0] for o in options}
     fields = {f.name: f for f in dataclasses.fields(config_class)}  # pyright: ignore[reportArgumentType]
     missing = [n for n in _required(config_class) if n not in given]
     if missing and "config_path" not in given:
-        place = " (give a file or folder)" if positional and Path in _kinds(hints[positional]) else ""
+        place = (
+            " (give a file or folder)"
+            if positional and Path in _kinds(hints[positional])
+            else ""
+        )
         named = [f"--{n}={place if n == positional else ''}" for n in missing]
         raise TaccorlError(f"missing {', '.join(named)}; --help says more")
     rest += _implied_types(rest, fields)
     # YAML would read a path 2024-01-01 as a date, and cut "run #3" at the number sign.
-    rest += [f"--{name}={json.dumps(['x'] if isinstance(value, list) else 'x')}" for name, value in texts.items()]
+    rest += [
+        f"--{name}={json.dumps(['x'] if isinstance(value, list) else 'x')}"
+        for name, value in texts.items()
+    ]
     config = dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
     if isinstance(out := getattr(config, "out", None), Path):
         hold(out)
@@ -80,14 +101,19 @@ def parse[ConfigT](
 
 
 def verb[ConfigT](
-    config_class: type[ConfigT], *, positional: str | None = None, prog: str | None = None
+    config_class: type[ConfigT],
+    *,
+    positional: str | None = None,
+    prog: str | None = None,
 ) -> Callable[[Callable[[ConfigT], int]], Callable[[ConfigT], int]]:
     """Decorator of a verb's ``run(config)``: its module gets the function ``main(argv)``, which parses the words after the verb
     and returns the exit status of ``run``. Arguments as for ``parse``."""
 
     def add(run: Callable[[ConfigT], int]) -> Callable[[ConfigT], int]:
         module = sys.modules[run.__module__]
-        vars(module)["main"] = lambda argv: run(parse(config_class, argv, positional=positional, prog=prog))
+        vars(module)["main"] = lambda argv: run(
+            parse(config_class, argv, positional=positional, prog=prog)
+        )
         return run
 
     return add
@@ -100,7 +126,9 @@ def command(verb: str, config: Any, positional: str | None = None) -> list[str]:
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.name == positional:
-            words += [str(v) for v in value] if isinstance(value, list) else [str(value)]
+            words += (
+                [str(v) for v in value] if isinstance(value, list) else [str(value)]
+            )
         elif value != _default(field):
             words += _options(field.name.rstrip("_"), value, _default(field))
     return words
@@ -130,8 +158,13 @@ def _options(name: str, value: Any, default: Any) -> list[str]:
         same = type(value) is type(default)
         words = [] if same else [f"--{name}.type={value.get_choice_name(type(value))}"]  # pyright: ignore
         for field in dataclasses.fields(value):
-            own, usual = getattr(value, field.name), getattr(default, field.name) if same else _default(field)
-            words += [] if own == usual else _options(f"{name}.{field.name}", own, usual)
+            own, usual = (
+                getattr(value, field.name),
+                getattr(default, field.name) if same else _default(field),
+            )
+            words += (
+                [] if own == usual else _options(f"{name}.{field.name}", own, usual)
+            )
         return words
     if isinstance(value, list) and value and isinstance(value[0], Path):
         return [f"--{name}={path}" for path in value]
@@ -146,7 +179,9 @@ def joined(argv: Sequence[str]) -> list[str]:
     found: list[str] = []
     for word in argv:
         before = found[-1] if found else ""
-        takes_value = before.startswith("--") and "=" not in before and before not in HELP
+        takes_value = (
+            before.startswith("--") and "=" not in before and before not in HELP
+        )
         if takes_value and (not word.startswith("-") or _NEGATIVE.fullmatch(word)):
             found[-1] = f"{before}={word}"
         else:
@@ -157,7 +192,9 @@ def joined(argv: Sequence[str]) -> list[str]:
 def _as_field(option: str, hints: dict[str, Any]) -> str:
     """``--for=x`` as ``--for_=x``: a trailing underscore keeps a field free of Python's own words."""
     name, equals, value = option.partition("=")
-    return f"{name}_{equals}{value}" if f"{name.removeprefix('--')}_" in hints else option
+    return (
+        f"{name}_{equals}{value}" if f"{name.removeprefix('--')}_" in hints else option
+    )
 
 
 def given_names(argv: Sequence[str]) -> set[str]:
@@ -169,7 +206,9 @@ def given_names(argv: Sequence[str]) -> set[str]:
     for option in joined(argv):
         name, _, value = option.removeprefix("--").partition("=")
         if name == "config_path":
-            names |= set(_flat(yaml.safe_load(_path(value).read_text(encoding="utf-8"))))
+            names |= set(
+                _flat(yaml.safe_load(_path(value).read_text(encoding="utf-8")))
+            )
         elif option.startswith("--"):
             names.add(name)
     return names
@@ -178,7 +217,11 @@ def given_names(argv: Sequence[str]) -> set[str]:
 def _flat(values: dict[str, Any], prefix: str = "") -> list[str]:
     names = []
     for key, value in values.items():
-        names += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+        names += (
+            _flat(value, f"{prefix}{key}.")
+            if isinstance(value, dict)
+            else [f"{prefix}{key}"]
+        )
     return names
 
 
@@ -186,7 +229,9 @@ def _required(config_class: type) -> list[str]:
     """Fields without a default."""
     nothing = dataclasses.MISSING
     fields = dataclasses.fields(config_class)
-    return [f.name for f in fields if f.default is nothing and f.default_factory is nothing]
+    return [
+        f.name for f in fields if f.default is nothing and f.default_factory is nothing
+    ]
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:
@@ -197,15 +242,29 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
 def _check_option(option: str, hints: dict[str, Any]) -> None:
     """A known name with a value."""
     name, equals, value = option.lstrip("-").partition("=")
-    known = ["config_path", *hints, *(f"{n}.{inner}" for n, hint in hints.items() for inner in _inner_names(hint))]
+    known = [
+        "config_path",
+        *hints,
+        *(f"{n}.{inner}" for n, hint in hints.items() for inner in _inner_names(hint)),
+    ]
     if name not in known or not option.startswith("--"):
-        raise TaccorlError(f"unknown option {option!r}; {nearest(name, [n.rstrip('_') for n in known])}")
+        raise TaccorlError(
+            f"unknown option {option!r}; {nearest(name, [n.rstrip('_') for n in known])}"
+        )
     if not equals or not value:
-        raise TaccorlError(f"option {option!r} needs a value: --{name}={'true' if hints.get(name) is bool else '…'}")
+        raise TaccorlError(
+            f"option {option!r} needs a value: --{name}={'true' if hints.get(name) is bool else '…'}"
+        )
     if hints.get(name) is bool and value.lower() not in _BOOLEANS:
-        raise TaccorlError(f"option --{name} takes true or false, found {value!r}: --{name}=true")
-    if (kinds := getattr(hints.get(name), "get_known_choices", dict)()) and not value.startswith("{"):
-        raise TaccorlError(f"{option}: choose one, --{name}.type={f' or --{name}.type='.join(kinds)}")
+        raise TaccorlError(
+            f"option --{name} takes true or false, found {value!r}: --{name}=true"
+        )
+    if (
+        kinds := getattr(hints.get(name), "get_known_choices", dict)()
+    ) and not value.startswith("{"):
+        raise TaccorlError(
+            f"{option}: choose one, --{name}.type={f' or --{name}.type='.join(kinds)}"
+        )
 
 
 def _inner_names(hint: Any) -> list[str]:
@@ -216,7 +275,13 @@ def _inner_names(hint: Any) -> list[str]:
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             hints = typing.get_type_hints(kind)
             for field in dataclasses.fields(kind):
-                names += [field.name, *(f"{field.name}.{inner}" for inner in _inner_names(hints[field.name]))]
+                names += [
+                    field.name,
+                    *(
+                        f"{field.name}.{inner}"
+                        for inner in _inner_names(hints[field.name])
+                    ),
+                ]
     return list(dict.fromkeys(names))
 
 
@@ -230,16 +295,23 @@ def _text_kind(hint: Any) -> str | None:
     return "one" if hint in (Path, str) else None
 
 
-def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def _take_texts(
+    options: list[str], hints: dict[str, Any]
+) -> tuple[dict[str, Any], list[str]]:
     """Values of fields that are paths or texts, and the options that draccus is to read."""
     texts: dict[str, Any] = {}
     numbers: dict[str, list[str]] = {}
     rest: list[str] = []
     for name, hint in hints.items():
         typed = [option for option in options if option.startswith(f"--{name}=")]
-        listed = any(option.startswith(f"--{name}=[") and option.endswith("]") for option in typed)
+        listed = any(
+            option.startswith(f"--{name}=[") and option.endswith("]")
+            for option in typed
+        )
         if typing.get_origin(hint) is list and len(typed) > 1 and listed:
-            raise TaccorlError(f"{typed[0]} and {typed[1]}: give --{name}=[…] once, or repeat it without brackets")
+            raise TaccorlError(
+                f"{typed[0]} and {typed[1]}: give --{name}=[…] once, or repeat it without brackets"
+            )
     for option in options:
         name, _, value = option.removeprefix("--").partition("=")
         hint = hints.get(name)
@@ -248,13 +320,20 @@ def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, An
         if hint == list[int] and value.isdecimal():
             numbers.setdefault(name, []).append(value)
         elif kind == "list" and not (value.startswith("[") and value.endswith("]")):
-            names = convert is str and re.fullmatch(r"\w+(,\w+)+", value)  # not such as x=[1,2]
-            texts.setdefault(name, []).extend(map(convert, value.split(",") if names else [value]))
+            names = convert is str and re.fullmatch(
+                r"\w+(,\w+)+", value
+            )  # not such as x=[1,2]
+            texts.setdefault(name, []).extend(
+                map(convert, value.split(",") if names else [value])
+            )
         elif kind == "one" and not (value == "null" and hint not in (Path, str)):
             texts[name] = convert(value)
         else:
             rest.append(option)
-    return texts, [*rest, *(f"--{name}=[{','.join(each)}]" for name, each in numbers.items())]
+    return texts, [
+        *rest,
+        *(f"--{name}=[{','.join(each)}]" for name, each in numbers.items()),
+    ]
 
 
 def _path(value: str) -> Path:
@@ -293,13 +372,17 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
     except (DraccusException, argparse.ArgumentError, yaml.YAMLError) as error:
         cause: BaseException | None = error
         while cause is not None:
-            if isinstance(cause, TaccorlError):  # a config's own check says it better than draccus, which wraps it
+            if isinstance(
+                cause, TaccorlError
+            ):  # a config's own check says it better than draccus, which wraps it
                 raise cause from None
             cause = cause.__cause__ or cause.__context__
         text = " ".join(str(error).split())
         if wrong := _WRONG.match(text):
             form = _FORMS.get(wrong[3] or wrong[5], "numbers, such as [0.1, 0.4]")
-            raise TaccorlError(f"--{wrong[1]}={wrong[2] or wrong[4]}: expected {form}") from error
+            raise TaccorlError(
+                f"--{wrong[1]}={wrong[2] or wrong[4]}: expected {form}"
+            ) from error
         raise TaccorlError(text) from error
 
 
@@ -309,7 +392,9 @@ def _check_size(name: str, value: str) -> None:
         text = f"{name}: {len(value):,} characters, at most {LONGEST_VALUE:,} are read: give it by --config_path"
         raise TaccorlError(text)
     if sum(map(value.count, "[{")) > DEEPEST_VALUE:
-        raise TaccorlError(f"{name}: more than {DEEPEST_VALUE} brackets in a value: give it by --config_path")
+        raise TaccorlError(
+            f"{name}: more than {DEEPEST_VALUE} brackets in a value: give it by --config_path"
+        )
 
 
 def _check_config_file(path: Path) -> None:
@@ -317,7 +402,9 @@ def _check_config_file(path: Path) -> None:
 
     found = load_yaml(path)
     if not isinstance(found, dict):
-        raise TaccorlError(f"{path}: expected options and their values, found {type(found).__name__}")
+        raise TaccorlError(
+            f"{path}: expected options and their values, found {type(found).__name__}"
+        )
 
 
 MOST_PX = 2048
@@ -334,5 +421,7 @@ def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None
         raise TaccorlError(line)
     found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
     if not found or max(int(found[1]), int(found[2])) > MOST_PX:
-        raise TaccorlError(f"--resolution={text}: rows x columns, at most {MOST_PX} each, e.g. 112x112")
+        raise TaccorlError(
+            f"--resolution={text}: rows x columns, at most {MOST_PX} each, e.g. 112x112"
+        )
     return int(found[1]), int(found[2])

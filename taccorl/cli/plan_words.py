@@ -30,7 +30,10 @@ def _of_joint(part: JointPart) -> Words:
     pose, place = ground.pose, {"pose": part.pose} if of_piper else {}
     checked = "Collisions are not checked: look where the motion goes. "
     if pose is not None:
-        hidden = f"; {pose.unchecked} moving links have no shape in it and are not checked" * bool(pose.unchecked)
+        hidden = (
+            f"; {pose.unchecked} moving links have no shape in it and are not checked"
+            * bool(pose.unchecked)
+        )
         checked = (
             f"On the way to the pose and during the motions no shapes of the model touch that did not touch before{hidden}. "
             "What stands around the robot is not checked: look where the motion goes. "
@@ -39,8 +42,14 @@ def _of_joint(part: JointPart) -> Words:
     if ground.mounted_kg:
         place["payload_kg"] = {part.name: ground.mounted_kg}
     there = "there, too" if pose is None else "as `pose` says"
-    stand = "Gains as in the file; other joints stand where the model's zero pose has them"
-    stand = f"Masses and gains as in {ground.like.name}, other joints {there}" if ground.like else stand
+    stand = (
+        "Gains as in the file; other joints stand where the model's zero pose has them"
+    )
+    stand = (
+        f"Masses and gains as in {ground.like.name}, other joints {there}"
+        if ground.like
+        else stand
+    )
     kind = unit + "/s" * part.column.endswith("qd_target")
     units = f"t in s, {part.column} and range in {kind}, peak_effort in {ground.effort_unit}"
     how = f"{checked}Begin and end at rest; record one motion twice. {stand}"
@@ -53,12 +62,26 @@ def _of_joint(part: JointPart) -> Words:
 
     def entry(p: Planned) -> dict[str, Any]:
         target = p.columns[part.column]
-        seconds, ends = round(len(target) / ground.rate_hz, 1), (float(target.min()), float(target.max()))
+        seconds, ends = (
+            round(len(target) / ground.rate_hz, 1),
+            (float(target.min()), float(target.max())),
+        )
         if of_piper:
-            own = {"gains": f"{p.item.gain:g} times the usual", "payload_kg": p.item.payload_kg, "seconds": seconds}
-            return own | {"range_rad": [round(x, 4) for x in ends], "peak_torque_nm": round(p.peak, 3)}
+            own = {
+                "gains": f"{p.item.gain:g} times the usual",
+                "payload_kg": p.item.payload_kg,
+                "seconds": seconds,
+            }
+            return own | {
+                "range_rad": [round(x, 4) for x in ends],
+                "peak_torque_nm": round(p.peak, 3),
+            }
         ends = [float(f"{x:.6g}") for x in ends]
-        return {"seconds": seconds, "range": ends, "peak_effort": float(f"{p.peak:.4g}")}
+        return {
+            "seconds": seconds,
+            "range": ends,
+            "peak_effort": float(f"{p.peak:.4g}"),
+        }
 
     def row(p: Planned) -> tuple[str, ...]:
         payload_kg = p.item.payload_kg or ground.mounted_kg
@@ -85,7 +108,9 @@ def _of_joint(part: JointPart) -> Words:
         facts={"units": units, **place, "how": how},
         entry=entry,
         row=row,
-        way={} if pose is None else {f"{name}.q_target": q for name, q in pose.way(ground.rate_hz).items()},
+        way={}
+        if pose is None
+        else {f"{name}.q_target": q for name, q in pose.way(ground.rate_hz).items()},
         remarks=remarks,
     )
 
@@ -143,7 +168,10 @@ def _of_cells(part: CellsPart) -> Words:
             "how": "apply the load over time as well as your press can, record the load that acts and the readings, one press "
             "twice; the recording need not follow the table exactly",
         },
-        entry=lambda p: {"seconds": round(lasts_s(p), 1), "highest_load": float(f"{p.peak:.4g}")},
+        entry=lambda p: {
+            "seconds": round(lasts_s(p), 1),
+            "highest_load": float(f"{p.peak:.4g}"),
+        },
         row=lambda p: (f"{p.peak:.3g} {unit}", f"{lasts_s(p):.0f} s"),
         remarks=remarks,
     )

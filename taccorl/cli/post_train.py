@@ -28,7 +28,10 @@ def main(argv: list[str]) -> int:
     if config.resume:
         from taccorl.rl import run_settings
 
-        config = parse(PostTrainConfig, [*argv, *run_settings.stored_options(config.out, given_names(argv))])
+        config = parse(
+            PostTrainConfig,
+            [*argv, *run_settings.stored_options(config.out, given_names(argv))],
+        )
     import logging
     import shutil
 
@@ -38,9 +41,15 @@ def main(argv: list[str]) -> int:
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
-        folder = post_train(config, lambda text: print(text, flush=True), save_episode if config.rerun else None)
+        folder = post_train(
+            config,
+            lambda text: print(text, flush=True),
+            save_episode if config.rerun else None,
+        )
     finally:
-        for left in (config.out / "checkpoints").glob(".*.unfinished"):  # of a checkpoint that a signal ended
+        for left in (config.out / "checkpoints").glob(
+            ".*.unfinished"
+        ):  # of a checkpoint that a signal ended
             shutil.rmtree(left, ignore_errors=True)
     print(f"wrote {folder}")
     return 0
@@ -48,7 +57,9 @@ def main(argv: list[str]) -> int:
 
 def _refuse_touch(argv: list[str]) -> None:
     """Raises TaccorlError: ``--policy.tactile`` is given, an option of ``lerobot-train``."""
-    path = next((word for word in argv if word.startswith("--policy.path=")), "--policy.path")
+    path = next(
+        (word for word in argv if word.startswith("--policy.path=")), "--policy.path"
+    )
     for word in argv:
         if word.partition("=")[0] == "--policy.tactile":
             raise TaccorlError(

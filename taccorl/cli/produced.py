@@ -84,7 +84,12 @@ class OriginOptions:
 def own_first[ConfigT](config_class: type[ConfigT]) -> type[ConfigT]:
     """Decorator of a configuration: help and commands name its own options before those that it shares with other verbs."""
     every = vars(config_class)["__dataclass_fields__"]
-    names = [name for one in config_class.__mro__ for name in vars(one).get("__annotations__", ()) if name in every]
+    names = [
+        name
+        for one in config_class.__mro__
+        for name in vars(one).get("__annotations__", ())
+        if name in every
+    ]
     config_class.__dataclass_fields__ = {name: every[name] for name in names}  # pyright: ignore[reportAttributeAccessIssue]
     return config_class
 
@@ -112,18 +117,31 @@ class Place:
     """Whether something is at ``out`` before the run; ``produce`` then accepts only the result of this plan."""
 
     @classmethod
-    def of(cls, config: Any, plan: "Plan", out: Path, sources: Sequence[Path] = ()) -> "Place":
+    def of(
+        cls, config: Any, plan: "Plan", out: Path, sources: Sequence[Path] = ()
+    ) -> "Place":
         """Lock the place ``out`` until the command ends. Raises TaccorlError: ``out`` and the store or one of ``sources``
         contain one another, or --resolution has no effect."""
         from taccorl.lineage.store import Store
 
-        resolution = cached_resolution(getattr(config, "resolution", None), plan.stored_as)
+        resolution = cached_resolution(
+            getattr(config, "resolution", None), plan.stored_as
+        )
         hold(out)
-        check_apart(out, [*(("--source", source) for source in sources), ("--store", config.store)])
-        return cls(out, Store(config.store), config.engine, resolution, not is_free(out))
+        check_apart(
+            out,
+            [*(("--source", source) for source in sources), ("--store", config.store)],
+        )
+        return cls(
+            out, Store(config.store), config.engine, resolution, not is_free(out)
+        )
 
     def written(
-        self, plan: "Plan", produced: "Produced", lines: Sequence[str] = (), drawn: "DrawnFrames | None" = None
+        self,
+        plan: "Plan",
+        produced: "Produced",
+        lines: Sequence[str] = (),
+        drawn: "DrawnFrames | None" = None,
     ) -> None:
         """Say what was made, render the frames of a dataset with cached pictures, and write its card. ``lines``: what the verb
         says of its own. ``drawn``: frames that were drawn while attempts ran."""
@@ -135,11 +153,21 @@ class Place:
             seconds |= self._render(drawn)
         made = f"({report['episodes']} episodes, {report['rows']} rows): {report['domain']}: {report['origin']}"
         counts = report.get("outcomes", {}) | report.get("dropped", {})
-        failed = ", ".join(f"{num} {outcome}" for outcome, num in counts.items() if outcome != "success")
-        took = ", ".join(f"{part} {s:.2f} s" for part, s in seconds.items()) * (not self.was_there)
-        own = [f"failed:  {failed}"] * bool(failed) + [f"took:    {took} for each episode"] * bool(took)
+        failed = ", ".join(
+            f"{num} {outcome}"
+            for outcome, num in counts.items()
+            if outcome != "success"
+        )
+        took = ", ".join(f"{part} {s:.2f} s" for part, s in seconds.items()) * (
+            not self.was_there
+        )
+        own = [f"failed:  {failed}"] * bool(failed) + [
+            f"took:    {took} for each episode"
+        ] * bool(took)
         is_dataset = (self.out / "meta" / "info.json").is_file()
-        kind = ("dataset" if is_dataset else "actions") + ", made before" * self.was_there
+        kind = (
+            "dataset" if is_dataset else "actions"
+        ) + ", made before" * self.was_there
         show(Section(text=[f"{kind}: {self.out}  {made}", *lines, *own]))
         if is_dataset:
             add_card(self.out)
@@ -149,9 +177,13 @@ class Place:
         from taccorl.training.rendered_frames import render_frames
 
         began_s = time.monotonic()
-        frames, seconds = render_frames(self.out, self.resolution, self.store, self.engine, drawn=drawn)
+        frames, seconds = render_frames(
+            self.out, self.resolution, self.store, self.engine, drawn=drawn
+        )
         size = sum(path.stat().st_size for path in frames.path.glob("*.npy"))
-        print(f"frames:  {frames.path}, {size / 1e9:.1f} GB, made in {time.monotonic() - began_s:.0f} s")
+        print(
+            f"frames:  {frames.path}, {size / 1e9:.1f} GB, made in {time.monotonic() - began_s:.0f} s"
+        )
         return seconds
 
     def next_command(self, plan: "Plan") -> str:
@@ -159,8 +191,18 @@ class Place:
         videos."""
         if plan.cached_rows is None:
             return shlex.join(["taccorl", "view", str(self.out), "--episode=0"])
-        words = ["lerobot-train", "--policy.type=tactile_pi05", "--policy.backbone=small", "--policy.push_to_hub=false"]
+        words = [
+            "lerobot-train",
+            "--policy.type=tactile_pi05",
+            "--policy.backbone=small",
+            "--policy.push_to_hub=false",
+        ]
         if self.resolution is not None:
             words.append("--policy.image_resolution=[{},{}]".format(*self.resolution))
-        words += [f"--dataset.repo_id=local/{self.out.name}", f"--dataset.root={self.out}"]
-        return shlex.join([*words, "--dataset.cache=gpu", f"--dataset.cache_store={self.store.root}"])
+        words += [
+            f"--dataset.repo_id=local/{self.out.name}",
+            f"--dataset.root={self.out}",
+        ]
+        return shlex.join(
+            [*words, "--dataset.cache=gpu", f"--dataset.cache_store={self.store.root}"]
+        )

@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from taccorl.errors import printable
 
@@ -37,7 +44,9 @@ class Bars:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self._progress = Progress(*columns, transient=True, console=Console(stderr=True))
+        self._progress = Progress(
+            *columns, transient=True, console=Console(stderr=True)
+        )
         self._begin_text = begin or f"reading ({num_recordings} recordings)"
         self._task: Any = None
         self._line_s = time.monotonic()
@@ -57,7 +66,9 @@ class Bars:
     def update(self, name: str, done: int, total: int) -> None:
         """Set the progress of the recording ``name``: ``done`` of ``total`` rows."""
         short = name if len(name) <= 48 else f"…{name[-47:]}"
-        self._progress.update(self._task, description=printable(short), completed=done, total=total)
+        self._progress.update(
+            self._task, description=printable(short), completed=done, total=total
+        )
         if self._progress.console.is_terminal:
             return
         now_s = time.monotonic()
@@ -67,8 +78,16 @@ class Bars:
             self._line_s = now_s
             _, first, first_s = self._begin
             rate_hz = (done - first) / (now_s - first_s) if now_s > first_s else 0.0
-            left = f", {rate_hz:.3g}/s, {(total - done) / rate_hz:.0f} s left" if rate_hz else ""
-            print(f"{printable(name)}: {done} of {total}{left}", file=sys.stderr, flush=True)
+            left = (
+                f", {rate_hz:.3g}/s, {(total - done) / rate_hz:.0f} s left"
+                if rate_hz
+                else ""
+            )
+            print(
+                f"{printable(name)}: {done} of {total}{left}",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 @dataclass
@@ -88,7 +107,9 @@ class Steps:
     def until_interrupted(self) -> Iterator["Steps"]:
         """Context manager. After the first Ctrl-C, calls of this object raise ``Stopped``, in worker processes, too; a second one
         ends the command."""
-        if threading.current_thread() is not threading.main_thread():  # in which alone signals can be handled
+        if (
+            threading.current_thread() is not threading.main_thread()
+        ):  # in which alone signals can be handled
             yield self
             return
         with tempfile.TemporaryDirectory() as folder:
@@ -97,7 +118,11 @@ class Steps:
             def ask(*_: object) -> None:
                 asked.touch()
                 signal.signal(signal.SIGINT, before)
-                print("\nstopping with what was found; Ctrl-C again ends without it", file=sys.stderr, flush=True)
+                print(
+                    "\nstopping with what was found; Ctrl-C again ends without it",
+                    file=sys.stderr,
+                    flush=True,
+                )
 
             before = signal.signal(signal.SIGINT, ask)
             try:
@@ -110,7 +135,9 @@ class Steps:
         if self.asked is not None:
             from taccorl.diagnosis.search.problem import Stopped
 
-            if multiprocessing.parent_process() is not None:  # a worker, which its parent stops
+            if (
+                multiprocessing.parent_process() is not None
+            ):  # a worker, which its parent stops
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             if self.asked.exists():
                 raise Stopped
@@ -124,9 +151,18 @@ class Steps:
 class Attempts:
     """Prints the lines of attempts, each with the rate of those that count and the time left."""
 
-    def __init__(self, total: int | None = None, counts: Callable[[str], bool] = lambda line: True) -> None:
+    def __init__(
+        self,
+        total: int | None = None,
+        counts: Callable[[str], bool] = lambda line: True,
+    ) -> None:
         """``total``: number of lines that count at the end; None: unknown. ``counts``: whether a line counts."""
-        self._total, self._counts, self._done, self._begin_s = total, counts, 0, time.monotonic()
+        self._total, self._counts, self._done, self._begin_s = (
+            total,
+            counts,
+            0,
+            time.monotonic(),
+        )
 
     def __call__(self, line: str) -> None:
         self._done += self._counts(line)

@@ -71,11 +71,15 @@ def run(config: SurrogateConfig) -> int:
         print(json.dumps(reveal(config.reveal), indent=2, ensure_ascii=False))
         return 0
     if config.secret is None:
-        raise TaccorlError("missing --secret=, a whole number of at least 0; --help says more")
+        raise TaccorlError(
+            "missing --secret=, a whole number of at least 0; --help says more"
+        )
     if config.secret < 0:
         raise TaccorlError(f"--secret={config.secret}: at least 0")
     if config.strength is not None and not 0 < config.strength < math.inf:
-        raise TaccorlError(f"--strength={config.strength:g}: a number of noise floors above 0")
+        raise TaccorlError(
+            f"--strength={config.strength:g}: a number of noise floors above 0"
+        )
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
     hold(out)
     if not is_free(out):
@@ -91,7 +95,11 @@ def run(config: SurrogateConfig) -> int:
         why = f"applies to a drawn robot; {config.twin} states its own"
         refuse(config, ("cells", "effects", "strength", "gains_known"), why)
         robot = machine.config
-    refuse(config, ("span", "speed"), "applies to a machine's file only; give --twin= of one, or remove it")
+    refuse(
+        config,
+        ("span", "speed"),
+        "applies to a machine's file only; give --twin= of one, or remove it",
+    )
     if config.cells:
         return _cells(config, config.secret, out)
     is_arm = config.pads == "no"
@@ -103,35 +111,60 @@ def run(config: SurrogateConfig) -> int:
 
 
 def _print_next(recordings: Path, twin: Path, out: Path) -> None:
-    print(f"next: {shlex.join(['taccorl', 'compare', str(recordings), f'--twin={twin}'])}")
-    print(f"then: {shlex.join(['taccorl', 'diagnose', str(recordings), f'--twin={twin}'])}")
+    print(
+        f"next: {shlex.join(['taccorl', 'compare', str(recordings), f'--twin={twin}'])}"
+    )
+    print(
+        f"then: {shlex.join(['taccorl', 'diagnose', str(recordings), f'--twin={twin}'])}"
+    )
     print(f"last: {shlex.join(['taccorl', 'surrogate', f'--reveal={out}'])}")
 
 
 def _cells(
-    config: SurrogateConfig, secret: int, out: Path, sensor: "CellsConfig | None" = None, twin: Path | None = None
+    config: SurrogateConfig,
+    secret: int,
+    out: Path,
+    sensor: "CellsConfig | None" = None,
+    twin: Path | None = None,
 ) -> int:
     """Record a made-up sensor of cells, or that of a file."""
-    from taccorl.surrogate.cells import HIDDEN, OF_GRIDS, SENSOR, draw_cells, write_cells
+    from taccorl.surrogate.cells import (
+        HIDDEN,
+        OF_GRIDS,
+        SENSOR,
+        draw_cells,
+        write_cells,
+    )
     from taccorl.surrogate.writing import PRESSES
 
     with_option = "--cells=true" if twin is None else f"--twin={twin}"
     of_robots = ("pads", "signal", "strength", "gains_known", "design", "span", "speed")
     refuse(config, of_robots, f"applies to robots only; remove it with {with_option}")
     possible = [n for n in HIDDEN if sensor is None or n not in OF_GRIDS]
-    hidden = [possible[secret % len(possible)]] if config.effects is None else config.effects
+    hidden = (
+        [possible[secret % len(possible)]] if config.effects is None else config.effects
+    )
     if len(hidden) > 1:
-        raise TaccorlError(f"--effects: {len(hidden)} effects; a simulated sensor of cells has one or none")
+        raise TaccorlError(
+            f"--effects: {len(hidden)} effects; a simulated sensor of cells has one or none"
+        )
     count = write_cells(draw_cells("".join(hidden), secret, sensor), out)
     twin = twin or out / SENSOR
-    print(f"{count} recordings of a sensor of cells in {out / PRESSES}: simulated, not a real one")
+    print(
+        f"{count} recordings of a sensor of cells in {out / PRESSES}: simulated, not a real one"
+    )
     _print_next(out / PRESSES, twin, out)
     return 0
 
 
-def _machine(config: SurrogateConfig, secret: int, machine: "Machine", out: Path) -> int:
+def _machine(
+    config: SurrogateConfig, secret: int, machine: "Machine", out: Path
+) -> int:
     """Record the machine of a file."""
-    from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine, write_machine
+    from taccorl.diagnosis.experiment_design.machine_surrogate import (
+        draw_machine,
+        write_machine,
+    )
     from taccorl.diagnosis.experiment_design.motions import ground_of
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.surrogate.writing import SWEEPS
@@ -144,13 +177,19 @@ def _machine(config: SurrogateConfig, secret: int, machine: "Machine", out: Path
     names = list(machine.units)
     part = config.signal or names[secret % len(names)]
     ground = ground_of(machine, part, span=config.span, speed=config.speed)
-    made = write_machine(draw_machine(ground, secret, config.effects, config.strength), out)
-    print(f"{len(made.all)} recordings of {part} in {out / SWEEPS}: simulated, not real; by the twin's own equations")
+    made = write_machine(
+        draw_machine(ground, secret, config.effects, config.strength), out
+    )
+    print(
+        f"{len(made.all)} recordings of {part} in {out / SWEEPS}: simulated, not real; by the twin's own equations"
+    )
     _print_next(out / SWEEPS, config.twin, out)
     return 0
 
 
-def _sweeps(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig | None") -> str:
+def _sweeps(
+    config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig | None"
+) -> str:
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.problems.joints import SIGNALS
     from taccorl.surrogate.cases import case_of, draw_case, draw_secret
@@ -159,23 +198,36 @@ def _sweeps(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig 
     with Bars(1, "drawing a robot") as bars:
         if robot is not None:
             signals = SIGNALS if config.signal is None else [config.signal]
-            cases = [case_of(robot, signal, secret, config.design) for signal in signals]
+            cases = [
+                case_of(robot, signal, secret, config.design) for signal in signals
+            ]
         else:
             drawn = draw_secret(secret) if config.effects is None else config.effects
-            asked = {name: getattr(config, name) for name in ("signal", "strength", "gains_known", "design")}
+            asked = {
+                name: getattr(config, name)
+                for name in ("signal", "strength", "gains_known", "design")
+            }
             cases = [draw_case(drawn, secret, **asked)]
         count = write_recordings(cases, out, bars.update)
     return f"{count} recordings of {', '.join(case.signal for case in cases)}"
 
 
-def _presses(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig | None") -> str:
+def _presses(
+    config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig | None"
+) -> str:
     from taccorl.cli.progress import Bars
     from taccorl.surrogate.touch import draw_touch_case, touch_case_of
     from taccorl.surrogate.writing import draw_touch_secret, write_touch_recordings
 
-    refuse(config, ("signal", "gains_known", "design"), f"applies to joints only; remove it with --pads={config.pads}")
+    refuse(
+        config,
+        ("signal", "gains_known", "design"),
+        f"applies to joints only; remove it with --pads={config.pads}",
+    )
     with Bars(1, "drawing pads") as bars:
-        effects = draw_touch_secret(secret) if config.effects is None else config.effects
+        effects = (
+            draw_touch_secret(secret) if config.effects is None else config.effects
+        )
         arm = None if config.pads == "drawn" else config.pads
         case = (
             draw_touch_case(effects, secret, arm=arm, strength=config.strength)
@@ -183,4 +235,6 @@ def _presses(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig
             else touch_case_of(robot, secret, arm)
         )
         made = write_touch_recordings(case, out, bars.update)
-    return f"{len(made.all)} recordings of the {case.arm} pads, which press known objects,"
+    return (
+        f"{len(made.all)} recordings of the {case.arm} pads, which press known objects,"
+    )

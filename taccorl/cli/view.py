@@ -82,13 +82,19 @@ def run(config: ViewConfig, given: Collection[str] = ()) -> int:
     with contextlib.ExitStack() as stack:
         from taccorl.views.part import part_of
 
-        whole = stack.enter_context(opened_episode(config.path, config.episode, config.spec, "--spec"))
+        whole = stack.enter_context(
+            opened_episode(config.path, config.episode, config.spec, "--spec")
+        )
         shown = episode = part_of(whole, config.start_s, config.end_s)
         if config.against is not None:
             from taccorl.views.pair import Pair
 
             other = stack.enter_context(_other(config, config.against, whole))
-            shown = Pair(episode, part_of(other, config.start_s, config.end_s), cast("Align", config.align))
+            shown = Pair(
+                episode,
+                part_of(other, config.start_s, config.end_s),
+                cast("Align", config.align),
+            )
             _note_other_touch(other, "against")
         for option in ("sheet", "against"):
             if getattr(config, option) is not None:
@@ -112,12 +118,22 @@ def _note_other_touch(episode: "Episode", option: str) -> None:
 
 def _check_against(config: ViewConfig, given: Collection[str]) -> None:
     if config.align not in ALIGNMENTS:
-        raise TaccorlError(f"--align={config.align}: {nearest(config.align, ALIGNMENTS)}")
-    useless = sorted({"against_episode", "against_spec", "align"}.intersection(given)) if config.against is None else []
+        raise TaccorlError(
+            f"--align={config.align}: {nearest(config.align, ALIGNMENTS)}"
+        )
+    useless = (
+        sorted({"against_episode", "against_spec", "align"}.intersection(given))
+        if config.against is None
+        else []
+    )
     if useless:
-        raise TaccorlError(f"--{useless[0]} has no effect without --against=: remove it, or name the other episode")
+        raise TaccorlError(
+            f"--{useless[0]} has no effect without --against=: remove it, or name the other episode"
+        )
     if config.against is not None and config.sheet is not None:
-        raise TaccorlError("--sheet shows one episode: with --against=, use --screenshot=, or remove --against=")
+        raise TaccorlError(
+            "--sheet shows one episode: with --against=, use --screenshot=, or remove --against="
+        )
 
 
 @contextlib.contextmanager
@@ -150,11 +166,25 @@ def _replayed(twin: Path, episode: "Episode") -> "Episode":
     sim.reset([0])
     done = replay_episode(sim, episode)
     if sim.diverged[0]:
-        raise TaccorlError(f"--against={twin}: the twin diverged; check its gains and effects")
-    arrays = {key: values for key, values in done.arrays.items() if key not in done.spec.sensors}
+        raise TaccorlError(
+            f"--against={twin}: the twin diverged; check its gains and effects"
+        )
+    arrays = {
+        key: values
+        for key, values in done.arrays.items()
+        if key not in done.spec.sensors
+    }
     facts = {"twin": str(twin), "scene": "empty bench: no parts, no pictures, no touch"}
     name = f"{episode.name}, replayed in {twin}"
-    return dataclasses.replace(done, name=name, arrays=arrays, success=None, stages=(), baselines={}, provenance=facts)
+    return dataclasses.replace(
+        done,
+        name=name,
+        arrays=arrays,
+        success=None,
+        stages=(),
+        baselines={},
+        provenance=facts,
+    )
 
 
 def _check_outputs(config: ViewConfig) -> None:
@@ -173,7 +203,9 @@ def _check_outputs(config: ViewConfig) -> None:
 
 
 @contextlib.contextmanager
-def opened_episode(path: Path, number: int, spec: str | None, option: str) -> Iterator["Episode"]:
+def opened_episode(
+    path: Path, number: int, spec: str | None, option: str
+) -> Iterator["Episode"]:
     """Context manager that opens one episode of a dataset, a recording or an attempt, and closes its files. ``option``: name
     of the option for the recording's spec, for messages. Raises TaccorlError: there is no such file or episode, or a
     recording's spec is missing."""
@@ -188,7 +220,10 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     if not path.exists():
         raise TaccorlError(no_such_path(path))
     if spec is None and (path / "entry.json").is_file():
-        from taccorl.episodes.sources.mimicgen.augment import attempt_episode, is_attempt
+        from taccorl.episodes.sources.mimicgen.augment import (
+            attempt_episode,
+            is_attempt,
+        )
 
         if is_attempt(path):
             yield attempt_episode(path)
@@ -196,7 +231,9 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     if spec is None:
         if path.suffix.lower() in (".csv", ".parquet", ".mat"):
             text = "a table, for taccorl compare; view opens recordings (.mcap, .db3, .bag, .hdf5), and LeRobot datasets as "
-            raise TaccorlError(f"{path}: {text}taccorl ingest, taccorl collect and lerobot-record make them")
+            raise TaccorlError(
+                f"{path}: {text}taccorl ingest, taccorl collect and lerobot-record make them"
+            )
         if what := no_recording(path):
             raise TaccorlError(f"{path}: {what}")
         try:
@@ -207,7 +244,9 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
 
     with open_episodes(path, spec) as episodes:
         if not 0 <= number < len(episodes):
-            raise TaccorlError(f"{path}: no episode {number}; it has {len(episodes)}, counted from 0")
+            raise TaccorlError(
+                f"{path}: no episode {number}; it has {len(episodes)}, counted from 0"
+            )
         yield episodes[number]
 
 
@@ -219,7 +258,9 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
 
         with Bars(1, "reading the episode") as bars:
             save_shown(shown, config.save, progress=bars.update)
-        command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(config.save)])
+        command = shlex.join(
+            [str(Path(sys.executable).with_name("rerun")), str(config.save)]
+        )
         print(f"wrote {config.save}: look at it with {command}")
     if config.sheet is not None:
         from taccorl.data.episode import Episode
@@ -231,9 +272,15 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
     if config.screenshot is not None:  # last: it alone needs what a machine may lack
         from taccorl.views.screenshot import screenshot
 
-        screenshot(shown, config.screenshot, progress=lambda text: print(text, file=sys.stderr, flush=True))
+        screenshot(
+            shown,
+            config.screenshot,
+            progress=lambda text: print(text, file=sys.stderr, flush=True),
+        )
         print(f"wrote {config.screenshot}")
-    return any(path is not None for path in (config.save, config.screenshot, config.sheet))
+    return any(
+        path is not None for path in (config.save, config.screenshot, config.sheet)
+    )
 
 
 @contextlib.contextmanager
@@ -253,11 +300,19 @@ def _serve(shown: "Shown") -> None:
 
     with _as_file(shown) as rrd:
         asked_to_end = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):  # by hand, so that the server never outlives us
+        for number in (
+            signal.SIGINT,
+            signal.SIGTERM,
+        ):  # by hand, so that the server never outlives us
             signal.signal(number, lambda *_: asked_to_end.set())
         with served(rrd) as address:
-            print(f"{address}\nopen this in a browser on this machine; Ctrl-C ends it", flush=True)
-            while not asked_to_end.wait(0.2):  # without a timeout, a signal that meets another thread wakes nobody
+            print(
+                f"{address}\nopen this in a browser on this machine; Ctrl-C ends it",
+                flush=True,
+            )
+            while not asked_to_end.wait(
+                0.2
+            ):  # without a timeout, a signal that meets another thread wakes nobody
                 pass
 
 

@@ -11,34 +11,65 @@ import numpy as np
 
 from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.finding import Finding, finding, listed, not_judged
-from taccorl.data.grip_checks import DRIFT_SHARE, Grippers, check_touch_and_grip, odd_lags, read_grippers, rest_level
+from taccorl.data.grip_checks import (
+    DRIFT_SHARE,
+    Grippers,
+    check_touch_and_grip,
+    odd_lags,
+    read_grippers,
+    rest_level,
+)
 from taccorl.data.grip_checks import touch_lags as lags_of_pad
 from taccorl.data.joint_checks import Motion, arm_lags, check_motion, check_values
 from taccorl.data.picture_checks import check_pictures
 from taccorl.data.spec import ACTION, STATE
-from taccorl.data.touch_checks import Pad, check_other_touch, check_pads, other_touch_keys, read_pads, tactile_keys
+from taccorl.data.touch_checks import (
+    Pad,
+    check_other_touch,
+    check_pads,
+    other_touch_keys,
+    read_pads,
+    tactile_keys,
+)
 
 
 def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     """All findings on one episode, worst first. ``pictures``: also decode the pictures, to find frozen ones."""
     if not episode.arrays or episode.num_rows < 2:
         return [not_judged("", "episode", "it has less than two rows of numbers")]
-    findings = [*episode.findings, *(f for timing in episode.timing for f in check_timing(timing, episode))]
+    findings = [
+        *episode.findings,
+        *(f for timing in episode.timing for f in check_timing(timing, episode)),
+    ]
     values = list(check_values(episode))
     wrong, keys = {f.feature for f in values}, tactile_keys(episode)
-    touch = [pad.mean(axis=(1, 2)) for key in keys for pad in episode.pads(key).values()]
+    touch = [
+        pad.mean(axis=(1, 2)) for key in keys for pad in episode.pads(key).values()
+    ]
     no_touch = np.empty((episode.num_rows, 0))
     findings += values
-    findings += check_motion(Motion(episode, wrong), np.stack(touch, axis=1) if touch else no_touch)
-    joints_wrong = wrong & {STATE, ACTION} or any(f.check == "swapped_arms" for f in findings)
+    findings += check_motion(
+        Motion(episode, wrong), np.stack(touch, axis=1) if touch else no_touch
+    )
+    joints_wrong = wrong & {STATE, ACTION} or any(
+        f.check == "swapped_arms" for f in findings
+    )
     for key in keys:
         if key not in wrong:
             findings += check_pads(episode, key, pads := read_pads(episode, key))
-            why = not_judged(key, "touch against grippers", "joints or command are wrong")
-            findings += [why] if joints_wrong else check_touch_and_grip(episode, key, pads)
-    findings += [f for key in other_touch_keys(episode) for f in check_other_touch(episode, key)]
+            why = not_judged(
+                key, "touch against grippers", "joints or command are wrong"
+            )
+            findings += (
+                [why] if joints_wrong else check_touch_and_grip(episode, key, pads)
+            )
+    findings += [
+        f for key in other_touch_keys(episode) for f in check_other_touch(episode, key)
+    ]
     findings += check_pictures(episode, decode=pictures)
-    return sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))
+    return sorted(
+        findings, key=lambda f: ("error", "warning", "note").index(f.severity)
+    )
 
 
 RATE_SHARE = 0.8
@@ -65,14 +96,36 @@ def check_timing(t: ChannelTiming, episode: Episode) -> Iterator[Finding]:
             text = f"rows show samples {t.age_median_s * 1000:.0f} ms old (median), {t.age_max_s * 1000:.0f} ms at "
             text += f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind"
             found.append(("old_samples", f"{text}, set `latency_s` or `clock`"))
-    for name, number, what in (  # counted over the whole recording, which may hold many episodes
-        ("duplicates", t.duplicates, "samples of the recording repeat a stamp; the first of each was kept"),
-        ("out_of_order", t.out_of_order, "samples of the recording were out of order; sorted by stamp"),
-        ("zero_stamps", t.zero_stamps, "samples of the recording are stamped 0; left out (`drop_zero_stamp`)"),
-        *(("skipped", n, f"messages of the recording give no sample: {why}") for why, n in t.skipped.items()),
+    for (
+        name,
+        number,
+        what,
+    ) in (  # counted over the whole recording, which may hold many episodes
+        (
+            "duplicates",
+            t.duplicates,
+            "samples of the recording repeat a stamp; the first of each was kept",
+        ),
+        (
+            "out_of_order",
+            t.out_of_order,
+            "samples of the recording were out of order; sorted by stamp",
+        ),
+        (
+            "zero_stamps",
+            t.zero_stamps,
+            "samples of the recording are stamped 0; left out (`drop_zero_stamp`)",
+        ),
+        *(
+            ("skipped", n, f"messages of the recording give no sample: {why}")
+            for why, n in t.skipped.items()
+        ),
     ):
         found += [(name, f"{number} {what}")] if number else []
-    yield from (finding(name, t.channel, f"{t.channel} ({t.feature}): {text}") for name, text in found)
+    yield from (
+        finding(name, t.channel, f"{t.channel} ({t.feature}): {text}")
+        for name, text in found
+    )
 
 
 # ---- across the episodes of a recording ----
@@ -85,12 +138,20 @@ def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
     """Compare the episodes of one recording; each finding names the episode that differs."""
     if len(episodes) < 2:
         return []
-    good = [e for e in episodes if e.arrays and e.num_rows >= 2 and not any(check_values(e))]
+    good = [
+        e for e in episodes if e.arrays and e.num_rows >= 2 and not any(check_values(e))
+    ]
     touch: list[tuple[Episode, str, list[Pad], Grippers]] = []
     for e in good:
         if (grippers := read_grippers(e)) is not None:
             touch += [
-                (e, k, [p for p in read_pads(e, k) if p.arm in grippers.opening], grippers) for k in tactile_keys(e)
+                (
+                    e,
+                    k,
+                    [p for p in read_pads(e, k) if p.arm in grippers.opening],
+                    grippers,
+                )
+                for k in tactile_keys(e)
             ]
     return [*_odd_arms(good), *_odd_touch(touch), *_resting_levels(touch)]
 
@@ -109,12 +170,16 @@ def _odd_arms(episodes: list[Episode]) -> Iterator[Finding]:
                 yield finding("action_lag", ACTION, text)
 
 
-def _odd_touch(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> Iterator[Finding]:
+def _odd_touch(
+    touch: list[tuple[Episode, str, list[Pad], Grippers]],
+) -> Iterator[Finding]:
     """Many holds average out the resolution of one row, so the accepted interval is not widened by it."""
     lags: dict[str, dict[str, list[float]]] = {}
     for episode, key, pads, grippers in touch:
         for pad in pads:
-            lags.setdefault(key, {}).setdefault(pad.name, []).extend(lags_of_pad(pad, grippers, episode.spec.fps))
+            lags.setdefault(key, {}).setdefault(pad.name, []).extend(
+                lags_of_pad(pad, grippers, episode.spec.fps)
+            )
     for key, of_pads in sorted(lags.items()):
         odd, text = odd_lags(of_pads, least=2)
         if odd:
@@ -122,17 +187,26 @@ def _odd_touch(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> Iterato
             yield finding("touch_lag", key, text)
 
 
-def _resting_levels(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> Iterator[Finding]:
+def _resting_levels(
+    touch: list[tuple[Episode, str, list[Pad], Grippers]],
+) -> Iterator[Finding]:
     """Pads that rest at another level in a later episode: one baseline for the whole recording no longer holds."""
     levels: dict[str, dict[str, dict[float, str]]] = {}
-    limits = {key: DRIFT_SHARE * episode.spec.sensors[key].noise_count for episode, key, _, _ in touch}
+    limits = {
+        key: DRIFT_SHARE * episode.spec.sensors[key].noise_count
+        for episode, key, _, _ in touch
+    }
     for episode, key, pads, grippers in touch:
         for pad in pads:
             level = rest_level(pad.counts, grippers.rest(pad.arm, pad.fps), pad.fps)
             if level is not None:
-                levels.setdefault(key, {}).setdefault(pad.name, {}).setdefault(level, episode.name)
+                levels.setdefault(key, {}).setdefault(pad.name, {}).setdefault(
+                    level, episode.name
+                )
     for key, of_pads in levels.items():
-        ends = {pad: (min(of_pad), max(of_pad), of_pad) for pad, of_pad in of_pads.items()}
+        ends = {
+            pad: (min(of_pad), max(of_pad), of_pad) for pad, of_pad in of_pads.items()
+        }
         drifting = [
             f"{pad} {low:+.1f} counts in {of_pad[low]}, {high:+.1f} in {of_pad[high]}"
             for pad, (low, high, of_pad) in ends.items()

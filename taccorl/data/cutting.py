@@ -19,7 +19,13 @@ from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import RATE_OF, Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened
 from taccorl.data.sensor_spec import SensorSpec
-from taccorl.data.spec import ACTION, STATE, FeatureSpec, RecordingSpec, load_recording_spec
+from taccorl.data.spec import (
+    ACTION,
+    STATE,
+    FeatureSpec,
+    RecordingSpec,
+    load_recording_spec,
+)
 from taccorl.data.spool import release
 from taccorl.data.timed_recording import TimedRecording, Unfit
 from taccorl.data.timing import NS_PER_S, Matched, SetBack
@@ -82,11 +88,20 @@ class Cutter(TimedRecording):
         another domain."""
         self.origin = recording.origin.agreed(domain, "--domain")
         super().__init__(recording)
-        self.fps, self._sizes = self.spec.target.fps, dict[str, Counter[tuple[int, ...]]]()
+        self.fps, self._sizes = (
+            self.spec.target.fps,
+            dict[str, Counter[tuple[int, ...]]](),
+        )
         self.broken_pictures_s: dict[str, list[float]] = {}
         """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
-        sensors = {key: sensor for key, sensor in self.spec.target.sensors.items() if key in self.spec.features}
-        self.baselines = {key: self._baseline(key, sensor) for key, sensor in sensors.items()}
+        sensors = {
+            key: sensor
+            for key, sensor in self.spec.target.sensors.items()
+            if key in self.spec.features
+        }
+        self.baselines = {
+            key: self._baseline(key, sensor) for key, sensor in sensors.items()
+        }
 
     def _baseline(self, key: str, sensor: SensorSpec) -> np.ndarray:
         """(pads · rows · columns,) median of the first frames of every pad."""
@@ -94,14 +109,20 @@ class Cutter(TimedRecording):
         for name in self.spec.features[key].channels:
             channel = self.recording.channels[name]
             assert channel.values is not None
-            first = np.asarray(channel.values[self.clocks[name].order[: rule.frames]], dtype=np.int64)
+            first = np.asarray(
+                channel.values[self.clocks[name].order[: rule.frames]], dtype=np.int64
+            )
             if len(first) < rule.frames:
-                raise Unfit(f"{channel.spec.topic}: {len(first)} frames, but the baseline needs {rule.frames}")
+                raise Unfit(
+                    f"{channel.spec.topic}: {len(first)} frames, but the baseline needs {rule.frames}"
+                )
             baseline = np.round(np.median(first, axis=0)).astype(np.int64)
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
                 text = f"{channel.spec.topic}: counts spread by {spread:.0f} about their median in the first "
-                raise Unfit(f"{text}{rule.frames} frames: touched while the baseline was recorded?")
+                raise Unfit(
+                    f"{text}{rule.frames} frames: touched while the baseline was recorded?"
+                )
             parts.append(baseline)
         return np.concatenate(parts)
 
@@ -110,21 +131,41 @@ class Cutter(TimedRecording):
     def cut(self) -> Cut:
         """All episodes of the recording, and the time ranges that became no rows."""
         result = Cut(self.origin_ns)
-        intervals = {"markers": self._marked, "metadata": self._from_metadata, "whole_file": self._whole}
+        intervals = {
+            "markers": self._marked,
+            "metadata": self._from_metadata,
+            "whole_file": self._whole,
+        }
         found = intervals[self.spec.episodes.by](result)
         for step in self.set_backs:
             found = [part for interval in found for part in _parted(interval, step)]
             end_s = self.seconds(step.end_ns)
-            result.losses.append(Loss(end_s, end_s, f"the clock was set back by {step.by_s:.3f} s: cut there"))
+            result.losses.append(
+                Loss(
+                    end_s,
+                    end_s,
+                    f"the clock was set back by {step.by_s:.3f} s: cut there",
+                )
+            )
         for number, interval in enumerate(found):
-            self._cut_interval(interval, f"episode {number}" if len(found) > 1 else "", result)
+            self._cut_interval(
+                interval, f"episode {number}" if len(found) > 1 else "", result
+            )
         return result
 
     def _whole(self, result: Cut) -> list[_Interval]:
         last = max(int(c.time_ns[-1]) for c in self.clocks.values())
-        told = {r["success"].lower() for r in self.recording.reader.metadata.values() if "success" in r}
+        told = {
+            r["success"].lower()
+            for r in self.recording.reader.metadata.values()
+            if "success" in r
+        }
         success = OUTCOMES.get(told.pop()) if len(told) == 1 else None
-        return [_Interval(result.origin_ns, last, self._instruction(), success, marked=False)]
+        return [
+            _Interval(
+                result.origin_ns, last, self._instruction(), success, marked=False
+            )
+        ]
 
     def _marked(self, result: Cut) -> list[_Interval]:
         topic = self.spec.episodes.topic
@@ -136,32 +177,56 @@ class Cutter(TimedRecording):
             found.append(_Interval(start, end_ns, instruction, success, marked=True))
             if why:
                 end_s = self.seconds(end_ns)
-                result.losses.append(Loss(end_s, end_s, f"no end marker on {topic}: {why}"))
+                result.losses.append(
+                    Loss(end_s, end_s, f"no end marker on {topic}: {why}")
+                )
 
-        texts, shifts_ns = self.recording.texts[topic], self._shift_ns(self.recording.text_places[topic])
-        for log_ns, text in sorted((at + int(more), text) for (at, text), more in zip(texts, shifts_ns, strict=True)):
+        texts, shifts_ns = (
+            self.recording.texts[topic],
+            self._shift_ns(self.recording.text_places[topic]),
+        )
+        for log_ns, text in sorted(
+            (at + int(more), text)
+            for (at, text), more in zip(texts, shifts_ns, strict=True)
+        ):
             time_ns = self._common_ns(log_ns)
             word, _, rest = text.partition(":")
             if word not in ("start", "success", "failure", "discard", "end"):
-                raise RecordingError(f"{topic}: unknown marker {text!r}; use start:…, success, failure, discard, end")
+                raise RecordingError(
+                    f"{topic}: unknown marker {text!r}; use start:…, success, failure, discard, end"
+                )
             if word == "start":
                 if start is not None:
                     end(time_ns, None, "the next episode starts")
                 start, from_markers = time_ns, self.spec.instruction.from_ == "markers"
-                instruction = _of_usual_length(rest.strip()) if from_markers else self._instruction()
+                instruction = (
+                    _of_usual_length(rest.strip())
+                    if from_markers
+                    else self._instruction()
+                )
                 if not instruction:
-                    raise RecordingError(f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)")
+                    raise RecordingError(
+                        f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)"
+                    )
                 continue
             if start is None:
-                raise RecordingError(f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start")
+                raise RecordingError(
+                    f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start"
+                )
             if word == "discard":
                 span_s = self.seconds(start), self.seconds(time_ns)
-                result.losses.append(Loss(*span_s, "discarded by the operator", wanted=False))
+                result.losses.append(
+                    Loss(*span_s, "discarded by the operator", wanted=False)
+                )
             else:
                 end(time_ns, {"success": True, "failure": False}.get(word))
             start = None
         if start is not None:
-            end(max(int(c.time_ns[-1]) for c in self.clocks.values()), None, "the recording ends within the episode")
+            end(
+                max(int(c.time_ns[-1]) for c in self.clocks.values()),
+                None,
+                "the recording ends within the episode",
+            )
         return found
 
     def _from_metadata(self, _: Cut) -> list[_Interval]:
@@ -169,21 +234,34 @@ class Cutter(TimedRecording):
         metadata, found = self.recording.reader.metadata, []
         if self.set_backs:
             text = f"the clock was set back by {self.set_backs[0].by_s:.3f} s in mid-recording: which times the metadata records"
-            raise RecordingError(f"{text} of its episodes state is unknown; use `episodes: {{by: whole_file}}`")
-        for name, record in sorted(metadata.items(), key=lambda item: item[1].get("start", "")):
+            raise RecordingError(
+                f"{text} of its episodes state is unknown; use `episodes: {{by: whole_file}}`"
+            )
+        for name, record in sorted(
+            metadata.items(), key=lambda item: item[1].get("start", "")
+        ):
             if not name.startswith("episode_"):
                 continue
             try:
                 start, end = (self._common_ns(int(record[k])) for k in ("start", "end"))
             except (KeyError, ValueError) as error:
-                raise RecordingError(f"metadata {name!r}: {record} does not state start and end in ns") from error
+                raise RecordingError(
+                    f"metadata {name!r}: {record} does not state start and end in ns"
+                ) from error
             if end < start:
-                raise RecordingError(f"metadata {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts")
+                raise RecordingError(
+                    f"metadata {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts"
+                )
             success = OUTCOMES.get(record.get("success", "").lower())
-            instruction = _of_usual_length(record.get("instruction", "").strip()) or self._instruction()
+            instruction = (
+                _of_usual_length(record.get("instruction", "").strip())
+                or self._instruction()
+            )
             found.append(_Interval(start, end, instruction, success, marked=True))
         if not found:
-            raise RecordingError(f"no metadata record episode_<id>; the recording has {', '.join(metadata) or 'none'}")
+            raise RecordingError(
+                f"no metadata record episode_<id>; the recording has {', '.join(metadata) or 'none'}"
+            )
         return sorted(found, key=lambda i: i.start_ns)
 
     def _instruction(self) -> str:
@@ -191,30 +269,61 @@ class Cutter(TimedRecording):
         if rule.from_ == "spec":
             return _of_usual_length(rule.text or "")
         if rule.from_ == "topic":
-            texts = sorted({text.strip() for _, text in self.recording.texts[rule.topic or ""]} - {""})
+            texts = sorted(
+                {text.strip() for _, text in self.recording.texts[rule.topic or ""]}
+                - {""}
+            )
             if (n := len(texts)) != 1:
-                raise RecordingError(f"{rule.topic} has {n} different instructions {texts[:3]}, but needs exactly one")
+                raise RecordingError(
+                    f"{rule.topic} has {n} different instructions {texts[:3]}, but needs exactly one"
+                )
             return _of_usual_length(texts.pop())
-        found = next((text for record in metadata if (text := record.get(rule.key or "", "").strip())), None)
+        found = next(
+            (
+                text
+                for record in metadata
+                if (text := record.get(rule.key or "", "").strip())
+            ),
+            None,
+        )
         if found is None:
             known = sorted({k for r in metadata for k in r})
-            raise RecordingError(f"no metadata key {rule.key!r} for the instruction; there are {known or 'none'}")
+            raise RecordingError(
+                f"no metadata key {rule.key!r} for the instruction; there are {known or 'none'}"
+            )
         return _of_usual_length(found)
 
     # ---- rows ----
 
     def _cut_interval(self, interval: _Interval, label: str, result: Cut) -> None:
         spec, fps = self.spec, self.fps
-        start_ns = max([interval.start_ns, *(self._first_usable_ns(key) for key in spec.mapped)])
+        start_ns = max(
+            [interval.start_ns, *(self._first_usable_ns(key) for key in spec.mapped)]
+        )
         end_ns = min([interval.end_ns, *self._last_ns().values()])
         self._report_ends(interval, start_ns, end_ns, result)
         grid_ns = timing.make_grid(start_ns, end_ns, fps)
         matches = {key: self._match(key, grid_ns) for key in spec.mapped}
-        stale = {c: ~m.fresh for by_channel in matches.values() for c, m in by_channel.items()}
-        fresh = ~np.any(list(stale.values()), axis=0) if len(grid_ns) else np.zeros(0, dtype=bool)
+        stale = {
+            c: ~m.fresh
+            for by_channel in matches.values()
+            for c, m in by_channel.items()
+        }
+        fresh = (
+            ~np.any(list(stale.values()), axis=0)
+            if len(grid_ns)
+            else np.zeros(0, dtype=bool)
+        )
 
         def lost(a: int, b: int, reason: str) -> None:
-            result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason, rows=b - a))
+            result.losses.append(
+                Loss(
+                    self.seconds(grid_ns[a]),
+                    self.seconds(grid_ns[b - 1]),
+                    reason,
+                    rows=b - a,
+                )
+            )
 
         for a, b in timing.runs(~fresh):
             silent = sorted({c for c, s in stale.items() if s[a:b].any()})
@@ -222,22 +331,32 @@ class Cutter(TimedRecording):
         pieces = timing.runs(fresh)
         for number, (a, b) in enumerate(pieces):
             if (b - a) / fps < spec.episodes.min_s:
-                lost(a, b, f"{b - a} rows are shorter than the spec's min_s {spec.episodes.min_s:g}")
+                lost(
+                    a,
+                    b,
+                    f"{b - a} rows are shorter than the spec's min_s {spec.episodes.min_s:g}",
+                )
                 continue
             part = f"part {number}" if len(pieces) > 1 else ""
             name = " ".join(w for w in (self.recording.source.name, label, part) if w)
             # The outcome is what was to be seen at the end: of a part without it, nobody said one.
             slack_ns = END_SLACK_S * NS_PER_S + NS_PER_S // fps
-            has_end = b == pieces[-1][1] and interval.end_ns - grid_ns[b - 1] <= slack_ns
+            has_end = (
+                b == pieces[-1][1] and interval.end_ns - grid_ns[b - 1] <= slack_ns
+            )
             shown = interval if has_end else replace(interval, success=None)
-            result.episodes.append(self._episode(name, shown, grid_ns[a:b], matches, slice(a, b)))
+            result.episodes.append(
+                self._episode(name, shown, grid_ns[a:b], matches, slice(a, b))
+            )
 
     def _last_ns(self) -> dict[str, int]:
         """Channel → time of the last row that it can fill [ns]; a held channel has no end."""
         found: dict[str, int] = {}
         for key, mapping in self.spec.features.items():
             if key in self.spec.mapped and mapping.align != "hold":
-                ahead_ns = NS_PER_S // self.fps if key == ACTION else 0  # rounded down: rows are 1 / fps apart to 1 ns
+                ahead_ns = (
+                    NS_PER_S // self.fps if key == ACTION else 0
+                )  # rounded down: rows are 1 / fps apart to 1 ns
                 for c in mapping.channels:
                     last_ns = int(self.clocks[c].time_ns[-1]) - ahead_ns
                     found[c] = min(last_ns, found.get(c, last_ns))
@@ -252,16 +371,24 @@ class Cutter(TimedRecording):
         for name in self.spec.features[key].channels:
             time_ns = self.clocks[name].time_ns
             if len(time_ns) < history:
-                raise Unfit(f"{self.spec.channels[name].topic}: {len(time_ns)} samples, but a window needs {history}")
+                raise Unfit(
+                    f"{self.spec.channels[name].topic}: {len(time_ns)} samples, but a window needs {history}"
+                )
             firsts.append(int(time_ns[history - 1]) - self._ahead_ns(key))
         return max(firsts)
 
-    def _report_ends(self, interval: _Interval, start_ns: int, end_ns: int, result: Cut) -> None:
+    def _report_ends(
+        self, interval: _Interval, start_ns: int, end_ns: int, result: Cut
+    ) -> None:
         late = max(self.clocks, key=lambda c: int(self.clocks[c].time_ns[0]))
         last_ns = self._last_ns()
         early = min(last_ns, key=last_ns.__getitem__, default=late)
         if end_ns < start_ns:  # not one row
-            reason = f"{early} ends early" if start_ns <= interval.end_ns else f"{late} begins late"
+            reason = (
+                f"{early} ends early"
+                if start_ns <= interval.end_ns
+                else f"{late} begins late"
+            )
             rows = (interval.end_ns - interval.start_ns) * self.fps // NS_PER_S + 1
             span_s = self.seconds(interval.start_ns), self.seconds(interval.end_ns)
             result.losses.append(Loss(*span_s, reason, rows=rows))
@@ -270,7 +397,12 @@ class Cutter(TimedRecording):
         spare_ns = self._ahead_ns(ACTION) if ACTION in self.spec.mapped else 0
         start_up_s = 0.0 if interval.marked else START_UP_S
         for from_ns, to_ns, slack_s, why in (
-            (interval.start_ns, start_ns, start_up_s + END_SLACK_S, f"{late} begins late"),
+            (
+                interval.start_ns,
+                start_ns,
+                start_up_s + END_SLACK_S,
+                f"{late} begins late",
+            ),
             (end_ns + spare_ns, interval.end_ns, END_SLACK_S, f"{early} ends early"),
         ):
             rows = (to_ns - from_ns + ROUNDING_NS) * self.fps // NS_PER_S
@@ -280,31 +412,60 @@ class Cutter(TimedRecording):
                 result.losses.append(Loss(*span_s, why, within_slack=within, rows=rows))
 
     def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, Matched]:
-        mapping, history = self.spec.features[key], self.spec.target.features[key].history
+        mapping, history = (
+            self.spec.features[key],
+            self.spec.target.features[key].history,
+        )
         # The action of row t is the last command before row t + 1: the target that is sent from row t on (action_time).
-        due_ns, found = timing.next_rows(grid_ns, self.fps) if key == ACTION else grid_ns, {}
+        due_ns, found = (
+            timing.next_rows(grid_ns, self.fps) if key == ACTION else grid_ns,
+            {},
+        )
         for name in mapping.channels:
             channel, time_ns = self.spec.channels[name], self.clocks[name].time_ns
-            rule = {"max_age_s": channel.max_age_s, "history": history, "rate_hz": channel.rate_hz}
+            rule = {
+                "max_age_s": channel.max_age_s,
+                "history": history,
+                "rate_hz": channel.rate_hz,
+            }
             found[name] = timing.match(due_ns, time_ns, mapping.align, **rule)
         return found
 
     def _episode(
-        self, name: str, interval: _Interval, grid_ns: np.ndarray, matches: dict[str, dict[str, Matched]], rows: slice
+        self,
+        name: str,
+        interval: _Interval,
+        grid_ns: np.ndarray,
+        matches: dict[str, dict[str, Matched]],
+        rows: slice,
     ) -> Episode:
         arrays, sources, timings = {}, {}, []
         for key, feature in self.spec.mapped.items():
-            timings += [self._timing(c, key, m.age_s[rows], grid_ns) for c, m in matches[key].items()]
+            timings += [
+                self._timing(c, key, m.age_s[rows], grid_ns)
+                for c, m in matches[key].items()
+            ]
             if feature.dtype == "video":
                 ((channel, m),) = matches[key].items()
                 sources[key] = (channel, self.clocks[channel].order[m.index[rows, 0]])
             else:
                 arrays[key] = self._array(key, feature, matches[key], rows)
-        shown, seen = self._pictures, {key: index for key, (_, index) in sources.items()}
-        what = (arrays, lambda: shown(sources, len(grid_ns)), tuple(sources), interval.instruction, interval.success)
+        shown, seen = (
+            self._pictures,
+            {key: index for key, (_, index) in sources.items()},
+        )
+        what = (
+            arrays,
+            lambda: shown(sources, len(grid_ns)),
+            tuple(sources),
+            interval.instruction,
+            interval.success,
+        )
         facts = (self.origin, tuple(timings), seen, dict(self.baselines))
         jumps = tuple(self._sample_jumps(grid_ns))
-        return Episode(name, self.spec.target, int(grid_ns[0]), *what, *facts, findings=jumps)
+        return Episode(
+            name, self.spec.target, int(grid_ns[0]), *what, *facts, findings=jumps
+        )
 
     def _sample_jumps(self, grid_ns: np.ndarray) -> Iterator[Finding]:
         """Findings of ``check_sample_jumps`` for the channels of state and action between the first and the last row. Channels
@@ -316,64 +477,114 @@ class Cutter(TimedRecording):
                 assert values is not None
                 part = slice(start, start := start + values.shape[1])
                 if self.spec.channels[name].rate_hz > self.fps:
-                    inside = (clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])
+                    inside = (clock.time_ns >= grid_ns[0]) & (
+                        clock.time_ns <= grid_ns[-1]
+                    )
                     time_s = (clock.time_ns[inside] - grid_ns[0]) / NS_PER_S
                     samples = np.asarray(values[clock.order[inside]], dtype=float)
                     release(values)
                     names, units = feature.element_names(key)[part], feature.units[part]
-                    yield from check_sample_jumps(name, samples, time_s, names, units, 1 / self.fps)
+                    yield from check_sample_jumps(
+                        name, samples, time_s, names, units, 1 / self.fps
+                    )
 
     def nominal_hz(self, channel: str) -> float:
         """Rate of ``channel`` [Hz] in the metadata (``rate_hz <topic>``), else of the spec. Raises RecordingError: malformed."""
-        spec, records = self.spec.channels[channel], self.recording.reader.metadata.values()
-        said = next((r[key] for r in records if (key := RATE_OF + spec.topic) in r), spec.rate_hz)
+        spec, records = (
+            self.spec.channels[channel],
+            self.recording.reader.metadata.values(),
+        )
+        said = next(
+            (r[key] for r in records if (key := RATE_OF + spec.topic) in r),
+            spec.rate_hz,
+        )
         with contextlib.suppress(ValueError):
             if 0.0 < (rate_hz := float(said)) < float("inf"):
                 return rate_hz
         text = f"{self.recording.source.name}: metadata {RATE_OF + spec.topic!r} is {said!r}, no rate in Hz above 0: "
-        raise RecordingError(f"{text}correct it, or leave it out, and the spec's {spec.rate_hz:g} Hz is used")
+        raise RecordingError(
+            f"{text}correct it, or leave it out, and the spec's {spec.rate_hz:g} Hz is used"
+        )
 
-    def _timing(self, channel: str, key: str, age_s: np.ndarray, grid_ns: np.ndarray) -> ChannelTiming:
+    def _timing(
+        self, channel: str, key: str, age_s: np.ndarray, grid_ns: np.ndarray
+    ) -> ChannelTiming:
         clock = self.clocks[channel]
-        inside = clock.time_ns[(clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])]
+        inside = clock.time_ns[
+            (clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])
+        ]
         steps = np.diff(inside) / NS_PER_S
         median = float(np.median(steps)) if len(steps) else float("inf")
-        rate_hz, longest_s = (round(1.0 / median, 3), round(float(steps.max()), 6)) if len(steps) else (0.0, 0.0)
+        rate_hz, longest_s = (
+            (round(1.0 / median, 3), round(float(steps.max()), 6))
+            if len(steps)
+            else (0.0, 0.0)
+        )
         ages = (round(float(np.median(age_s)), 6), round(float(age_s.max()), 6))
-        skipped, nominal_hz = dict(self.recording.channels[channel].skipped), self.nominal_hz(channel)
-        counts = (clock.duplicates, clock.out_of_order, clock.zero_stamps, skipped, nominal_hz)
+        skipped, nominal_hz = (
+            dict(self.recording.channels[channel].skipped),
+            self.nominal_hz(channel),
+        )
+        counts = (
+            clock.duplicates,
+            clock.out_of_order,
+            clock.zero_stamps,
+            skipped,
+            nominal_hz,
+        )
         align, gaps = self.spec.features[key].align, int((steps > 1.5 * median).sum())
-        return ChannelTiming(channel, key, align, rate_hz, gaps, longest_s, *ages, *counts)
+        return ChannelTiming(
+            channel, key, align, rate_hz, gaps, longest_s, *ages, *counts
+        )
 
-    def _array(self, key: str, feature: FeatureSpec, matches: dict[str, Matched], rows: slice) -> np.ndarray:
+    def _array(
+        self, key: str, feature: FeatureSpec, matches: dict[str, Matched], rows: slice
+    ) -> np.ndarray:
         """(T, size) of one feature, in its dtype."""
         parts = []
         for name, m in matches.items():
-            values, order, index = self.recording.channels[name].values, self.clocks[name].order, m.index[rows]
+            values, order, index = (
+                self.recording.channels[name].values,
+                self.clocks[name].order,
+                m.index[rows],
+            )
             assert values is not None
-            parts.append(np.asarray(values[order[index]]))  # (T, L, size of the channel)
+            parts.append(
+                np.asarray(values[order[index]])
+            )  # (T, L, size of the channel)
             release(values)
         joined = np.concatenate(parts, axis=2)
         if key in self.baselines:
-            joined = np.subtract(joined, self.baselines[key], dtype=np.int16, casting="unsafe")  # max_count fits int16
+            joined = np.subtract(
+                joined, self.baselines[key], dtype=np.int16, casting="unsafe"
+            )  # max_count fits int16
         out = joined.reshape(len(joined), -1)
         if out.shape[1] != feature.size:
-            raise RecordingError(f"{key}: {', '.join(matches)} have {out.shape[1]} values, the spec {feature.size}")
+            raise RecordingError(
+                f"{key}: {', '.join(matches)} have {out.shape[1]} values, the spec {feature.size}"
+            )
         return out.astype(feature.dtype, copy=False)
 
     # ---- pictures ----
 
-    def _pictures(self, sources: dict[str, tuple[str, np.ndarray]], num_rows: int) -> Iterator[Pictures]:
+    def _pictures(
+        self, sources: dict[str, tuple[str, np.ndarray]], num_rows: int
+    ) -> Iterator[Pictures]:
         """Rows' pictures, decoded once each, in one pass over the file."""
         if not sources:
             return
-        due = {key: [self._identities[c][int(i)] for i in index] for key, (c, index) in sources.items()}
+        due = {
+            key: [self._identities[c][int(i)] for i in index]
+            for key, (c, index) in sources.items()
+        }
         needed = {key: set(ids) for key, ids in due.items()}
         wanted: dict[str, list[Identity]] = {}
         for key, (channel, _) in sources.items():
             wanted.setdefault(channel, []).extend(due[key])
         waiting: dict[str, dict[Identity, Any]] = {key: {} for key in sources}
-        shown: dict[str, tuple[Identity | None, Any]] = dict.fromkeys(sources, (None, None))
+        shown: dict[str, tuple[Identity | None, Any]] = dict.fromkeys(
+            sources, (None, None)
+        )
         row = 0
         for channel, identity, payload in self.recording.pictures(wanted):
             for key in sources:
@@ -382,30 +593,49 @@ class Cutter(TimedRecording):
             if sum(map(len, waiting.values())) > MAX_WAITING_PICTURES:
                 text = f"{MAX_WAITING_PICTURES} pictures of one camera come before any of another: cameras are not "
                 raise RecordingError(f"{text}interleaved in the file")
-            while row < num_rows and all(due[k][row] in waiting[k] or shown[k][0] == due[k][row] for k in sources):
+            while row < num_rows and all(
+                due[k][row] in waiting[k] or shown[k][0] == due[k][row] for k in sources
+            ):
                 for key in sources:
                     if shown[key][0] != (ident := due[key][row]):
-                        shown[key] = ident, self._decode(key, sources[key][0], ident, waiting[key].pop(ident))
+                        shown[key] = (
+                            ident,
+                            self._decode(
+                                key, sources[key][0], ident, waiting[key].pop(ident)
+                            ),
+                        )
                 yield {key: picture for key, (_, picture) in shown.items()}
                 row += 1
         if row < num_rows:
             name = self.recording.source.name
-            raise RecordingError(f"{name}: its pictures ended at row {row} of {num_rows}: did the file change?")
+            raise RecordingError(
+                f"{name}: its pictures ended at row {row} of {num_rows}: did the file change?"
+            )
 
-    def _decode(self, key: str, channel: str, identity: Identity, payload: Any) -> np.ndarray:
+    def _decode(
+        self, key: str, channel: str, identity: Identity, payload: Any
+    ) -> np.ndarray:
         rows, columns, _ = self.spec.target.features[key].shape
         try:
             picture = pictures.picture(payload, self.spec.channels[channel])
             self._sizes.setdefault(key, Counter())[picture.shape[:2]] += 1
             return pictures.letterbox(picture, rows, columns)
         except RecordingError as error:
-            raise BrokenPicture(f"{channel}: the picture logged at {identity[0]} ns is broken: {error}") from error
+            raise BrokenPicture(
+                f"{channel}: the picture logged at {identity[0]} ns is broken: {error}"
+            ) from error
 
     def size_findings(self) -> list[Finding]:
         """Findings on cameras whose pictures, as far as they were decoded, changed their size."""
-        found, why = [], "the camera was set up anew in mid-recording; the same place is not the same pixel in all rows"
+        found, why = (
+            [],
+            "the camera was set up anew in mid-recording; the same place is not the same pixel in all rows",
+        )
         for key, sizes in self._sizes.items():
-            several = ", ".join(f"{rows}×{columns} {count} times" for (rows, columns), count in sizes.items())
+            several = ", ".join(
+                f"{rows}×{columns} {count} times"
+                for (rows, columns), count in sizes.items()
+            )
             text = f"{key}: its pictures have several sizes ({several}): {why}"
             found += [finding("picture_size", key, text)] if len(sizes) > 1 else []
         return found
@@ -419,7 +649,9 @@ class Cutter(TimedRecording):
                 pictures.picture(payload, self.spec.channels[channel])
             except RecordingError:
                 self.dropped.setdefault(channel, set()).add(identity)
-                self.broken_pictures_s.setdefault(channel, []).append(self.seconds(self._common_ns(identity[0])))
+                self.broken_pictures_s.setdefault(channel, []).append(
+                    self.seconds(self._common_ns(identity[0]))
+                )
                 broken += 1
         self.clocks = self._read_clocks()
         return broken
@@ -436,12 +668,18 @@ def _parted(interval: _Interval, step: SetBack) -> list[_Interval]:
     """The interval before and after a step of the clock; the operator's judgement is of the part in which it was given."""
     if not interval.start_ns <= step.end_ns < step.start_ns <= interval.end_ns:
         return [interval]
-    before = replace(interval, end_ns=step.end_ns, success=None if interval.marked else interval.success)
+    before = replace(
+        interval,
+        end_ns=step.end_ns,
+        success=None if interval.marked else interval.success,
+    )
     return [before, replace(interval, start_ns=step.start_ns)]
 
 
 @contextlib.contextmanager
-def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list[Episode]]:
+def open_episodes(
+    path: Path, spec: str | Path | RecordingSpec
+) -> Iterator[list[Episode]]:
     """Context manager that gives the episodes of one recording, for looking at; usable inside the ``with`` only (numbers live
     in a scratch folder). Raises RecordingError: not readable, more than one recording, or nothing in it fits the spec."""
     loaded = spec if isinstance(spec, RecordingSpec) else load_recording_spec(spec)

@@ -28,13 +28,30 @@ from taccorl.data.timing import MOST_S
 from taccorl.data.video_files import frame_problems, video_frames
 from taccorl.errors import DatasetError, TaccorlError, no_such_path
 
-PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
-DATASET_STAGES = {"collection": "collect", "corrections": "correct", "augmented": "augment"}
+PROVENANCE = Path(
+    "meta/taccorl"
+)  # Folder in a dataset with the files that taccorl adds to LeRobot's
+DATASET_STAGES = {
+    "collection": "collect",
+    "corrections": "correct",
+    "augmented": "augment",
+}
 """Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in their order."""
 ROWS_PER_PICTURE = "rows_per_picture"
 """Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
-BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # LeRobot's own columns, no features
-NUMBERS = ("float32", "float64", "int16", "int64")  # Kinds of numbers that are read from flat features
+BOOKKEEPING = (
+    "timestamp",
+    "frame_index",
+    "episode_index",
+    "index",
+    "task_index",
+)  # LeRobot's own columns, no features
+NUMBERS = (
+    "float32",
+    "float64",
+    "int16",
+    "int64",
+)  # Kinds of numbers that are read from flat features
 MOST_FPS = 100_000  # Highest accepted rate of rows [Hz]
 MOST_NUMBERS = 10_000_000  # Most numbers of a feature in a row: ten times a picture of 640 × 480 in three colours
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
@@ -66,32 +83,60 @@ class Dataset:
         self.instructions = tuple(self.task_names.values())
         self.spec, self.skipped = _read_spec(self.root, self.info)
         """``skipped``: feature key → why episodes do not have it."""
-        cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
-        known = {name.rpartition("/")[0] for name in self._table[0]} if self._table else set()
-        self.unstored = tuple(key for key in cameras if self._table and f"videos/{key}" not in known)
+        cameras = [
+            key for key, f in self.info["features"].items() if f["dtype"] == "video"
+        ]
+        known = (
+            {name.rpartition("/")[0] for name in self._table[0]}
+            if self._table
+            else set()
+        )
+        self.unstored = tuple(
+            key for key in cameras if self._table and f"videos/{key}" not in known
+        )
         """Cameras without videos: ``taccorl collect --pictures=cache`` stored their frames only in training's frame cache."""
         self.cameras = [key for key in cameras if key not in self.unstored]
         if self.unstored:
-            kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
+            kept = {
+                key: f
+                for key, f in self.spec.features.items()
+                if key not in self.unstored
+            }
             self.spec = dataclasses.replace(self.spec, features=kept)
             why = "not stored as video; frames are in training's cache (lerobot-train --dataset.cache=gpu|host|disk)"
             self.skipped |= dict.fromkeys(self.unstored, why)
         self._records = _read_records(self.root, self._table, self.info["features"])
         manifest = self.root / PROVENANCE / "manifest.json"
-        self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
-        absent = sorted({str(p) for i in range(self.num_episodes) if not (p := self.data_file(i)).is_file()})
+        self.provenance: dict[str, Any] | None = (
+            _read_json(manifest) if manifest.is_file() else None
+        )
+        absent = sorted(
+            {
+                str(p)
+                for i in range(self.num_episodes)
+                if not (p := self.data_file(i)).is_file()
+            }
+        )
         if absent:
-            raise DatasetError(f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy it whole")
+            raise DatasetError(
+                f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy it whole"
+            )
 
     @property
     def rows_per_picture(self) -> int:
         """k: of each episode the rows 0, k, 2k … have pictures; 1 for a dataset with videos. Raises DatasetError:
         ``info.json`` states several values, or none that is possible."""
-        cameras = {key: f for key, f in self.info["features"].items() if f["dtype"] == "video"}
+        cameras = {
+            key: f for key, f in self.info["features"].items() if f["dtype"] == "video"
+        }
         stated = {key: f.get(ROWS_PER_PICTURE, 1) for key, f in cameras.items()}
-        if len(set(stated.values())) > 1 or not all(isinstance(k, int) and k >= 1 for k in stated.values()):
+        if len(set(stated.values())) > 1 or not all(
+            isinstance(k, int) and k >= 1 for k in stated.values()
+        ):
             text = f"{self.root / 'meta/info.json'}: {ROWS_PER_PICTURE} is {stated}; the same whole number of at least "
-            raise DatasetError(f"{text}1 is needed for all cameras. Make the dataset again")
+            raise DatasetError(
+                f"{text}1 is needed for all cameras. Make the dataset again"
+            )
         return next(iter(stated.values()), 1)
 
     @property
@@ -102,7 +147,9 @@ class Dataset:
     def entry(self, index: int) -> dict[str, Any]:
         """One episode's entry in ``meta/episodes``, without its statistics."""
         if not 0 <= index < len(self._table):
-            raise DatasetError(f"{self.root}: no episode {index}; it has {len(self._table)}, counted from 0")
+            raise DatasetError(
+                f"{self.root}: no episode {index}; it has {len(self._table)}, counted from 0"
+            )
         return self._table[index]
 
     def num_rows(self, index: int) -> int:
@@ -132,27 +179,51 @@ class Dataset:
         """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of
         one episode. Reads only these rows and columns. Raises DatasetError: rows are missing, or a value does not fit its
         feature's shape."""
-        path, num_rows, features = self.data_file(index), self.num_rows(index), self.info["features"]
-        where, columns = f"{path}, episode {index}", list(dict.fromkeys(["frame_index", *keys]))
+        path, num_rows, features = (
+            self.data_file(index),
+            self.num_rows(index),
+            self.info["features"],
+        )
+        where, columns = (
+            f"{path}, episode {index}",
+            list(dict.fromkeys(["frame_index", *keys])),
+        )
         with plainly(path, PARQUET):
-            table = pq.read_table(path, columns=columns, filters=[("episode_index", "==", index)])
-        if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(range(num_rows)):
-            raise DatasetError(f"{where}: has {table.num_rows} rows, which are not rows 0 to {num_rows - 1} in order")
-        return {key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}") for key in keys}
+            table = pq.read_table(
+                path, columns=columns, filters=[("episode_index", "==", index)]
+            )
+        if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(
+            range(num_rows)
+        ):
+            raise DatasetError(
+                f"{where}: has {table.num_rows} rows, which are not rows 0 to {num_rows - 1} in order"
+            )
+        return {
+            key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}")
+            for key in keys
+        }
 
-    def frames(self, index: int, key: str, first: int = 0, end: int | None = None) -> Generator[np.ndarray, None, None]:
+    def frames(
+        self, index: int, key: str, first: int = 0, end: int | None = None
+    ) -> Generator[np.ndarray, None, None]:
         """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded), one at a time. Raises DatasetError:
         a row has no frame at its time."""
         video = self.video(index, key)
         end = video.num_frames if end is None else end
-        yield from video_frames(video, self.spec.fps, first, end, f"{video.path}, episode {index}")
+        yield from video_frames(
+            video, self.spec.fps, first, end, f"{video.path}, episode {index}"
+        )
 
     def tasks(self, index: int) -> list[tuple[int, str]]:
         """The instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
         numbers = self.values(index, ["task_index"])["task_index"].ravel()
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
-        if unknown := sorted({int(numbers[row]) for row in starts} - set(self.task_names)):
-            raise DatasetError(f"{self.root}/meta/tasks.parquet has no task {unknown[0]} of episode {index}")
+        if unknown := sorted(
+            {int(numbers[row]) for row in starts} - set(self.task_names)
+        ):
+            raise DatasetError(
+                f"{self.root}/meta/tasks.parquet has no task {unknown[0]} of episode {index}"
+            )
         return [(int(row), self.task_names[int(numbers[row])]) for row in starts]
 
     def episode_facts(self, index: int) -> dict[str, Any]:
@@ -163,26 +234,54 @@ class Dataset:
 
     def episode(self, index: int) -> Episode:
         """Read one episode: its numbers at once, its pictures on demand."""
-        present = {key: f for key, f in self.spec.features.items() if key in self.info["features"]}
+        present = {
+            key: f
+            for key, f in self.spec.features.items()
+            if key in self.info["features"]
+        }
         cameras = tuple(key for key, f in present.items() if f.dtype == "video")
         stored = self.values(index, [key for key in present if key not in cameras])
-        arrays = {key: rows.reshape(len(rows), -1).astype(present[key].dtype) for key, rows in stored.items()}
+        arrays = {
+            key: rows.reshape(len(rows), -1).astype(present[key].dtype)
+            for key, rows in stored.items()
+        }
         tasks, told = self.tasks(index), self.episode_facts(index)
         if "stages" not in told and len(tasks) > 1:
             told["stages"] = tuple(tasks)
-        name, start_ns, shown = f"{self.root.name} episode {index}", told.pop("start_ns", 0), self._pictures
-        instruction, videos = tasks[0][1] if tasks else "", {key: self.video(index, key) for key in cameras}
+        name, start_ns, shown = (
+            f"{self.root.name} episode {index}",
+            told.pop("start_ns", 0),
+            self._pictures,
+        )
+        instruction, videos = (
+            tasks[0][1] if tasks else "",
+            {key: self.video(index, key) for key in cameras},
+        )
         pictures = (lambda: shown(index, cameras), cameras)
-        return Episode(name, self.spec, start_ns, arrays, *pictures, instruction, videos=videos, **told)
+        return Episode(
+            name,
+            self.spec,
+            start_ns,
+            arrays,
+            *pictures,
+            instruction,
+            videos=videos,
+            **told,
+        )
 
     def _pictures(self, index: int, cameras: tuple[str, ...]) -> Iterator[Pictures]:
         with contextlib.ExitStack() as stack:
-            streams = [stack.enter_context(contextlib.closing(self.frames(index, key))) for key in cameras]
+            streams = [
+                stack.enter_context(contextlib.closing(self.frames(index, key)))
+                for key in cameras
+            ]
             for shown in zip(*streams, strict=True):
                 for key, picture in zip(cameras, shown, strict=True):
                     if picture.shape != (shape := self.spec.features[key].shape):
                         path = self.video(index, key).path
-                        raise DatasetError(f"{path}: pictures have shape {picture.shape}, but the spec states {shape}")
+                        raise DatasetError(
+                            f"{path}: pictures have shape {picture.shape}, but the spec states {shape}"
+                        )
                 yield dict(zip(cameras, shown, strict=True))
 
     def video_problems(self) -> list[str]:
@@ -196,22 +295,33 @@ class Dataset:
                 due_s = video.from_s + np.arange(video.num_frames) / self.spec.fps
                 files.setdefault(video.path, {})[index] = due_s
             for path, due in files.items():
-                problems += [f"{path.relative_to(self.root)}: {p}" for p in frame_problems(path, due)]
+                problems += [
+                    f"{path.relative_to(self.root)}: {p}"
+                    for p in frame_problems(path, due)
+                ]
         return problems
 
     def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
         entry = self.entry(index)
         try:
-            chunk, file = int(entry[f"{prefix}chunk_index"]), int(entry[f"{prefix}file_index"])
+            chunk, file = (
+                int(entry[f"{prefix}chunk_index"]),
+                int(entry[f"{prefix}file_index"]),
+            )
             text = str(self.info[template])
             if not _TEMPLATE.fullmatch(text):
-                raise ValueError(f"{template} {text[:200]!r} is not a path with fields such as {{chunk_index:03d}}")
+                raise ValueError(
+                    f"{template} {text[:200]!r} is not a path with fields such as {{chunk_index:03d}}"
+                )
             name = text.format(chunk_index=chunk, file_index=file, **names)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             text = f"{self.root}/meta: no entry states which file holds {prefix} of episode {index} ({error})"
             raise DatasetError(text) from error
         # By its text: in the cache of Hugging Face's Hub files are links to a folder beside.
-        if Path(os.path.normpath(name)).parts[:1] == ("..",) or Path(name).is_absolute():
+        if (
+            Path(os.path.normpath(name)).parts[:1] == ("..",)
+            or Path(name).is_absolute()
+        ):
             text = f"{self.root}/meta/info.json: {template} {self.info[template]!r} points outside of the dataset"
             text = f"{text}, to {self.root / name}, which is not opened: "
             raise DatasetError(f"{text}a dataset's files must lie in its folder")
@@ -224,9 +334,13 @@ class Dataset:
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
     """A dataset spec with its sensors as plain JSON values. Raises DatasetError: a feature without a range, as other people's
     datasets have: such a spec is derived, never written."""
-    endless = [key for key, f in spec.features.items() if not np.isfinite(f.limits).all()]
+    endless = [
+        key for key, f in spec.features.items() if not np.isfinite(f.limits).all()
+    ]
     if endless:
-        raise DatasetError(f"{spec.name}: {endless[0]} has no valid range; state one in a spec in data_specs/")
+        raise DatasetError(
+            f"{spec.name}: {endless[0]} has no valid range; state one in a spec in data_specs/"
+        )
     return dataclasses.asdict(spec)
 
 
@@ -240,24 +354,48 @@ def dataset_spec_from_json(path: Path) -> DatasetSpec:
 def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
     """The entry of ``meta/taccorl/episodes.json`` for an episode, as JSON values: what LeRobot's files cannot state
     (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files."""
-    recording, part, simulation = (episode.provenance.get(key) for key in ("recording", "part", "simulation"))
-    where = {"recording": str(recording or episode.name), "part": part, "source_digest": source_digest}
-    what = {"start_ns": int(episode.start_ns), "rows": episode.num_rows, "instruction": episode.instruction}
-    baselines = {key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()}
+    recording, part, simulation = (
+        episode.provenance.get(key) for key in ("recording", "part", "simulation")
+    )
+    where = {
+        "recording": str(recording or episode.name),
+        "part": part,
+        "source_digest": source_digest,
+    }
+    what = {
+        "start_ns": int(episode.start_ns),
+        "rows": episode.num_rows,
+        "instruction": episode.instruction,
+    }
+    baselines = {
+        key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()
+    }
     timing = [dataclasses.asdict(t) for t in episode.timing]
     stages = [[int(row), name] for row, name in episode.stages]
-    found = {"baselines": baselines, "timing": timing, "stages": stages, "simulation": simulation}
+    found = {
+        "baselines": baselines,
+        "timing": timing,
+        "stages": stages,
+        "simulation": simulation,
+    }
     return where | what | {"success": episode.success} | episode.origin.record() | found
 
 
 def _from_record(record: dict[str, Any], features: Iterable[str]) -> dict[str, Any]:
     """Fields of ``Episode`` from its record; ``stages`` only where there are any."""
     stages = tuple((int(row), str(name)) for row, name in record["stages"])
-    fields: dict[str, Any] = {"start_ns": int(record["start_ns"]), "success": record["success"]}
+    fields: dict[str, Any] = {
+        "start_ns": int(record["start_ns"]),
+        "success": record["success"],
+    }
     fields["origin"] = Origin.read(record, features)
-    fields["baselines"] = {key: np.array(counts) for key, counts in record["baselines"].items()}
+    fields["baselines"] = {
+        key: np.array(counts) for key, counts in record["baselines"].items()
+    }
     fields["timing"] = tuple(ChannelTiming(**t) for t in record["timing"])
-    fields["provenance"] = {k: record.get(k) for k in ("recording", "part", "source_digest", "simulation")}
+    fields["provenance"] = {
+        k: record.get(k) for k in ("recording", "part", "source_digest", "simulation")
+    }
     return fields | ({"stages": stages} if stages else {})
 
 
@@ -288,15 +426,27 @@ def read_info(root: Path) -> dict[str, Any]:
 
 def write_info(root: Path, info: Mapping[str, Any]) -> None:
     """Write ``meta/info.json`` as LeRobot formats it."""
-    (root / "meta" / "info.json").write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    (root / "meta" / "info.json").write_text(
+        json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8"
+    )
 
 
 def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:
     """Origin of every episode of a dataset without records."""
-    stated = next((feature[DOMAINS] for feature in features.values() if DOMAINS in feature), None)
+    stated = next(
+        (feature[DOMAINS] for feature in features.values() if DOMAINS in feature), None
+    )
     if stated is not None and len(stated) > 1:
-        return Origin(None, f"episodes of several domains ({', '.join(map(str, stated))}), edited by another tool")
-    return Origin.read({} if stated is None else {"domain": stated[0], "origin": "edited by another tool"}, features)
+        return Origin(
+            None,
+            f"episodes of several domains ({', '.join(map(str, stated))}), edited by another tool",
+        )
+    return Origin.read(
+        {}
+        if stated is None
+        else {"domain": stated[0], "origin": "edited by another tool"},
+        features,
+    )
 
 
 # ---- meta/ ----
@@ -305,7 +455,9 @@ def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:
 def _checked_info(root: Path) -> dict[str, Any]:
     if not root.is_dir():
         if root.exists():
-            raise DatasetError(f"{root}: is a file; a dataset is the folder that holds meta/info.json")
+            raise DatasetError(
+                f"{root}: is a file; a dataset is the folder that holds meta/info.json"
+            )
         raise DatasetError(no_such_path(root, "folder"))
     path = root / "meta" / "info.json"
     if not path.is_file():
@@ -317,14 +469,33 @@ def _checked_info(root: Path) -> dict[str, Any]:
         text += "lerobot.scripts.convert_dataset_v21_to_v30 --push-to-hub=false "
         raise DatasetError(f"{text}--repo-id=local/{root.name} --root={root}")
     if not version.startswith("v3."):
-        raise DatasetError(f"{root}: is a LeRobot dataset {version}, only v3 is supported; LeRobot converts v2.1 to it")
-    needed = {"fps": int | float, "features": dict, "total_episodes": int, "data_path": str}
-    if wrong := [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]:
-        raise DatasetError(f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}")
-    if vague := [key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)]:
+        raise DatasetError(
+            f"{root}: is a LeRobot dataset {version}, only v3 is supported; LeRobot converts v2.1 to it"
+        )
+    needed = {
+        "fps": int | float,
+        "features": dict,
+        "total_episodes": int,
+        "data_path": str,
+    }
+    if wrong := [
+        key for key, kind in needed.items() if not isinstance(info.get(key), kind)
+    ]:
+        raise DatasetError(
+            f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}"
+        )
+    if vague := [
+        key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)
+    ]:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
-    if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or not 0 < info["fps"] <= MOST_FPS:
-        raise DatasetError(f"{path}: fps {info['fps']}; only whole numbers up to {MOST_FPS} are supported")
+    if (
+        not math.isfinite(info["fps"])
+        or int(info["fps"]) != info["fps"]
+        or not 0 < info["fps"] <= MOST_FPS
+    ):
+        raise DatasetError(
+            f"{path}: fps {info['fps']}; only whole numbers up to {MOST_FPS} are supported"
+        )
     return info
 
 
@@ -333,29 +504,47 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         with plainly(path, PARQUET):
-            names = [n for n in pq.read_schema(path).names if not n.startswith("stats/")]
+            names = [
+                n for n in pq.read_schema(path).names if not n.startswith("stats/")
+            ]
             rows += pq.read_table(path, columns=names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
     listed, told = [r["episode_index"] for r in rows], info["total_episodes"]
     if len(listed) != told or listed != list(range(told)):
-        missing = next((i for i in range(told) if i not in listed), None)  # `told` may be any number
-        described = "one stands twice or is too many" if missing is None else f"episode {missing} is missing"
+        missing = next(
+            (i for i in range(told) if i not in listed), None
+        )  # `told` may be any number
+        described = (
+            "one stands twice or is too many"
+            if missing is None
+            else f"episode {missing} is missing"
+        )
         text = f"{root}: info.json states {told} episodes, but meta/episodes lists {len(listed)}, {described}: the "
-        raise DatasetError(f"{text}writer died before finalize(), or the copy is incomplete")
+        raise DatasetError(
+            f"{text}writer died before finalize(), or the copy is incomplete"
+        )
     return rows
 
 
 def _read_tasks(root: Path) -> dict[int, str]:
     path = root / "meta" / "tasks.parquet"
     if not path.is_file():
-        raise DatasetError(f"{root}: there is no meta/tasks.parquet: copy it whole, or remove a failed recording")
+        raise DatasetError(
+            f"{root}: there is no meta/tasks.parquet: copy it whole, or remove a failed recording"
+        )
     with plainly(path, PARQUET):
         table = pq.read_table(path)
     # LeRobot up to 0.4 kept the text as pandas' index.
-    text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
+    text = next(
+        (n for n in ("task", "__index_level_0__") if n in table.column_names), None
+    )
     if text is None or "task_index" not in table.column_names:
-        raise DatasetError(f"{path}: has the columns {', '.join(table.column_names)} instead of task_index and task")
-    return dict(zip(table["task_index"].to_pylist(), table[text].to_pylist(), strict=True))
+        raise DatasetError(
+            f"{path}: has the columns {', '.join(table.column_names)} instead of task_index and task"
+        )
+    return dict(
+        zip(table["task_index"].to_pylist(), table[text].to_pylist(), strict=True)
+    )
 
 
 def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str, str]]:
@@ -366,46 +555,86 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         return derived, skipped
     spec = dataset_spec_from_json(path)
     if spec.fps != info["fps"]:
-        raise DatasetError(f"{path} states {spec.fps} fps, but info.json {info['fps']}: a spec of another dataset")
+        raise DatasetError(
+            f"{path} states {spec.fps} fps, but info.json {info['fps']}: a spec of another dataset"
+        )
     for key, feature in spec.features.items():
         found = derived.features.get(key)
         if found is None and not feature.optional:
-            raise DatasetError(f"{path} has {key}, but info.json does not: {skipped.get(key, 'was it removed?')}")
-        if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
+            raise DatasetError(
+                f"{path} has {key}, but info.json does not: {skipped.get(key, 'was it removed?')}"
+            )
+        if found is not None and (found.dtype, found.shape) != (
+            feature.dtype,
+            feature.shape,
+        ):
             text = f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
-            raise DatasetError(f"{text}{list(found.shape)}: one of the two was changed; write the dataset again")
+            raise DatasetError(
+                f"{text}{list(found.shape)}: one of the two was changed; write the dataset again"
+            )
     others = [key for key in derived.features if key not in spec.features]
     return spec, skipped | dict.fromkeys(others, "not in the dataset's own spec")
 
 
-def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str, str]]:
+def _derive_spec(
+    root: Path, info: dict[str, Any]
+) -> tuple[DatasetSpec, dict[str, str]]:
     features, skipped, codec, rate_hz = {}, {}, "libsvtav1", float(info["fps"])
     for key, f in info["features"].items():
         if key in BOOKKEEPING:
             continue
-        shape, names, dtype, size = tuple(f["shape"]), f.get("names"), f["dtype"], math.prod(f["shape"])
+        shape, names, dtype, size = (
+            tuple(f["shape"]),
+            f.get("names"),
+            f["dtype"],
+            math.prod(f["shape"]),
+        )
         what, info_of = f"{dtype} {list(f['shape'])}", f.get("info") or {}
         if dtype == "video":
             if isinstance(names, list) and names[:1] in (["channel"], ["channels"]):
                 shape = (*shape[1:], shape[0])
             if len(shape) != 3 or shape[2] != 3 or info_of.get("is_depth_map"):
-                skipped[key] = f"a video of shape {list(f['shape'])}: colour pictures are read"
+                skipped[key] = (
+                    f"a video of shape {list(f['shape'])}: colour pictures are read"
+                )
                 continue
             codec = "h264" if info_of.get("video.codec") == "h264" else codec
-            told = {"dtype": "video", "shape": shape, "unit": "rgb8", "range": (0.0, 255.0)}
+            told = {
+                "dtype": "video",
+                "shape": shape,
+                "unit": "rgb8",
+                "range": (0.0, 255.0),
+            }
         elif dtype == "image":
-            skipped[key] = "pictures inside the parquet files; lerobot-edit-dataset's convert_image_to_video helps"
+            skipped[key] = (
+                "pictures inside the parquet files; lerobot-edit-dataset's convert_image_to_video helps"
+            )
             continue
         elif size > MOST_NUMBERS or dtype not in READ_AS or not shape:
             limit = f"at most {MOST_NUMBERS:,} numbers a row are read"
-            skipped[key] = f"{what}: {limit if size > MOST_NUMBERS else f'numbers are read ({", ".join(READ_AS)})'}"
+            skipped[key] = (
+                f"{what}: {limit if size > MOST_NUMBERS else f'numbers are read ({", ".join(READ_AS)})'}"
+            )
             continue
         else:
-            told = {"dtype": READ_AS[dtype], "shape": (size,), "unit": "unknown", "range": (-math.inf, math.inf)}
-            told |= {"layout": shape if len(shape) > 1 else (), "names": _names(names, shape)}
+            told = {
+                "dtype": READ_AS[dtype],
+                "shape": (size,),
+                "unit": "unknown",
+                "range": (-math.inf, math.inf),
+            }
+            told |= {
+                "layout": shape if len(shape) > 1 else (),
+                "names": _names(names, shape),
+            }
         features[key] = FeatureSpec(**told, frame="unknown", rate_hz=rate_hz)
     robot = str(info.get("robot_type") or "unknown")
-    what = {"name": root.name, "robot_type": robot, "fps": int(info["fps"]), "features": features}
+    what = {
+        "name": root.name,
+        "robot_type": robot,
+        "fps": int(info["fps"]),
+        "features": features,
+    }
     return DatasetSpec(spec_version=SPEC_VERSION, video_codec=codec, **what), skipped
 
 
@@ -413,12 +642,18 @@ def _names(names: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
     """One name per element, or none: datasets write lists, and dicts of one list ({"motors": […]})."""
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
-    if not isinstance(names, list) or len(names) != math.prod(shape) or len(set(map(str, names))) != len(names):
+    if (
+        not isinstance(names, list)
+        or len(names) != math.prod(shape)
+        or len(set(map(str, names))) != len(names)
+    ):
         return ()
     return tuple(map(str, names))
 
 
-def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[str]) -> list[dict[str, Any]] | None:
+def _read_records(
+    root: Path, table: list[dict[str, Any]], features: Iterable[str]
+) -> list[dict[str, Any]] | None:
     path = root / PROVENANCE / "episodes.json"
     if not path.is_file():
         return None
@@ -426,7 +661,9 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
     rows = [r.get("rows") if isinstance(r, dict) else None for r in records]
     if rows != [r["length"] for r in table]:
         text = f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, but the dataset has "
-        raise DatasetError(f"{text}{len(table)} episodes, {sum(r['length'] for r in table)} rows: {EDITED}")
+        raise DatasetError(
+            f"{text}{len(table)} episodes, {sum(r['length'] for r in table)} rows: {EDITED}"
+        )
     try:
         return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
@@ -440,7 +677,9 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     with plainly(path, "JSON"):
         value = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(value, kind):
-        raise DatasetError(f"{path}: contains a {type(value).__name__} instead of a {kind.__name__}")
+        raise DatasetError(
+            f"{path}: contains a {type(value).__name__} instead of a {kind.__name__}"
+        )
     return value
 
 
@@ -449,10 +688,16 @@ def _read_json(path: Path, kind: type = dict) -> Any:
 
 def flattened(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """All numbers or texts of a column, one after the other, whatever lists they stand in."""
-    if isinstance(column.type, pa.BaseExtensionType):  # Hugging Face's Array2D, where `datasets` is imported
-        column = pa.chunked_array([c.storage for c in column.chunks], column.type.storage_type)
+    if isinstance(
+        column.type, pa.BaseExtensionType
+    ):  # Hugging Face's Array2D, where `datasets` is imported
+        column = pa.chunked_array(
+            [c.storage for c in column.chunks], column.type.storage_type
+        )
     while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-        column = pa.chunked_array([c.flatten() for c in column.chunks], column.type.value_type)
+        column = pa.chunked_array(
+            [c.flatten() for c in column.chunks], column.type.value_type
+        )
     return column
 
 
@@ -467,7 +712,11 @@ def feature_rows(root: Path, key: str) -> np.ndarray:
     for path in data_files(root):
         with plainly(path, PARQUET):
             column = pq.read_table(path, columns=[key])[key]
-        parts += [flattened(column).to_numpy().reshape(len(column), -1)] if len(column) else []
+        parts += (
+            [flattened(column).to_numpy().reshape(len(column), -1)]
+            if len(column)
+            else []
+        )
     return np.concatenate(parts)
 
 

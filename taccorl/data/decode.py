@@ -20,13 +20,18 @@ class NoSample(RecordingError):
 
 
 MISSING = object()  # Value that stands for a field which a message does not have
-NAMES_FIELDS = ("name", "joint_names")  # Fields that may list the names of the values (JointState, JointTrajectory)
+NAMES_FIELDS = (
+    "name",
+    "joint_names",
+)  # Fields that may list the names of the values (JointState, JointTrajectory)
 JOINED = "a part of a sample that several messages make"
 
 
 def natural_key(name: str) -> tuple[Any, ...]:
     """Sort key that puts episode_2 before episode_10."""
-    return tuple(int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name)))
+    return tuple(
+        int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name))
+    )
 
 
 def type_key(name: str) -> str:
@@ -37,7 +42,11 @@ def type_key(name: str) -> str:
 def _part(value: Any, part: str) -> Any:
     if isinstance(value, dict):
         return value.get(part, MISSING)
-    if part.isdecimal() and not isinstance(value, str | bytes) and hasattr(value, "__getitem__"):
+    if (
+        part.isdecimal()
+        and not isinstance(value, str | bytes)
+        and hasattr(value, "__getitem__")
+    ):
         return value[int(part)] if int(part) < len(value) else MISSING
     return getattr(value, part, MISSING)
 
@@ -57,7 +66,11 @@ def get(value: Any, field: str) -> Any:
     for part in field.split("."):
         inner = _part(value, part)
         if inner is MISSING:
-            if part.isdecimal() and not isinstance(value, dict | str | bytes) and hasattr(value, "__len__"):
+            if (
+                part.isdecimal()
+                and not isinstance(value, dict | str | bytes)
+                and hasattr(value, "__len__")
+            ):
                 raise NoSample(f"no element {part} in {field!r}: {len(value)} elements")
             raise RecordingError(f"no field {part!r}; {nearest(part, _fields(value))}")
         value = inner
@@ -68,7 +81,11 @@ def _fields(value: Any) -> list[str]:
     if (descriptor := getattr(value, "DESCRIPTOR", None)) is not None:
         return [f.name for f in descriptor.fields]
     slots = getattr(type(value), "__slots__", None) or getattr(value, "__dict__", {})
-    return [str(s).lstrip("_") for s in (value if isinstance(value, dict) else slots) if not str(s).startswith("__")]
+    return [
+        str(s).lstrip("_")
+        for s in (value if isinstance(value, dict) else slots)
+        if not str(s).startswith("__")
+    ]
 
 
 def stamp_ns(value: Any) -> int | None:
@@ -78,7 +95,12 @@ def stamp_ns(value: Any) -> int | None:
         stamp = maybe(value, field)
         if isinstance(stamp, str) and (from_text := _iso_ns(stamp)) is not None:
             return from_text
-        for sec, nsec in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
+        for sec, nsec in (
+            ("sec", "nanosec"),
+            ("sec", "nsec"),
+            ("seconds", "nanos"),
+            ("secs", "nsecs"),
+        ):
             try:
                 found = int(maybe(stamp, sec)) * 1_000_000_000 + int(maybe(stamp, nsec))
             except (TypeError, ValueError, OverflowError):
@@ -89,19 +111,28 @@ def stamp_ns(value: Any) -> int | None:
 
 def _iso_ns(text: str) -> int | None:
     """Nanoseconds since 1970 of a time in ISO 8601 (without a zone: UTC), with up to nine decimals; None for another text."""
-    found = re.fullmatch(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?", text.strip())
+    found = re.fullmatch(
+        r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?",
+        text.strip(),
+    )
     try:
         moment = datetime.fromisoformat(found[1] + (found[3] or "Z")) if found else None
     except ValueError:
         return None
-    return int(moment.timestamp()) * 10**9 + int((found[2] or "0").ljust(9, "0")) if found and moment else None
+    return (
+        int(moment.timestamp()) * 10**9 + int((found[2] or "0").ljust(9, "0"))
+        if found and moment
+        else None
+    )
 
 
 def text(value: Any, topic: str) -> str:
     """The text of a std_msgs/String, a JSON string or ``{"data": …}``. Raises RecordingError: it is none of these."""
     found = value if isinstance(value, str) else maybe(value, "data")
     if not isinstance(found, str):
-        raise RecordingError(f"{topic}: expected a text (std_msgs/String), found {type(found or value).__name__}")
+        raise RecordingError(
+            f"{topic}: expected a text (std_msgs/String), found {type(found or value).__name__}"
+        )
     return found
 
 
@@ -109,12 +140,17 @@ def vector_paths(value: Any) -> dict[str, str]:
     """Names of the numbers in a ROS vector, pose, twist, wrench, IMU or odometry message → their dotted paths; empty for other
     messages."""
     found: dict[str, str] = {}
-    for field in next((s for s in STRUCTURES if all(_part(value, f) is not MISSING for f in s)), ()):
+    for field in next(
+        (s for s in STRUCTURES if all(_part(value, f) is not MISSING for f in s)), ()
+    ):
         inner = {"": ""} if len(field) == 1 else vector_paths(_part(value, field))
         if not inner:
             return {}
         prefix = "" if field in WRAPPERS else field
-        found |= {".".join(filter(None, (prefix, n))): ".".join(filter(None, (field, p))) for n, p in inner.items()}
+        found |= {
+            ".".join(filter(None, (prefix, n))): ".".join(filter(None, (field, p)))
+            for n, p in inner.items()
+        }
     return found
 
 
@@ -123,7 +159,9 @@ def names_of(value: Any) -> tuple[str, ...] | None:
     for field in NAMES_FIELDS:
         if (found := maybe(value, field)) is not None:
             if isinstance(found, str | bytes) or not hasattr(found, "__len__"):
-                raise RecordingError(f"`{field}` is {found!r} instead of a list of names")
+                raise RecordingError(
+                    f"`{field}` is {found!r} instead of a list of names"
+                )
             return tuple(map(str, found))
     return None
 
@@ -151,51 +189,75 @@ class VectorExtractor:
         names = tuple(self.paths) or None
         if self.paths:
             found = [get(found, path) for path in self.paths.values()]
-        elif isinstance(found, dict) and found and all(type(x) in (int, float) for x in found.values()):
+        elif (
+            isinstance(found, dict)
+            and found
+            and all(type(x) in (int, float) for x in found.values())
+        ):
             names, found = tuple(found), list(found.values())
             if not self.channel.pick:
                 listed = ", ".join(names[:4])
-                raise RecordingError(f"an object with the names {listed}: name them in `pick`, in the order to take")
+                raise RecordingError(
+                    f"an object with the names {listed}: name them in `pick`, in the order to take"
+                )
         try:
             plain = np.asarray(found)
-            if plain.dtype.kind not in "biuf":  # NumPy would read the text "1.5" as 1.5, and None as not-a-number
+            if (
+                plain.dtype.kind not in "biuf"
+            ):  # NumPy would read the text "1.5" as 1.5, and None as not-a-number
                 raise TypeError(f"it is {type(found).__name__} of {plain.dtype}")
             numbers = plain.astype(np.float64).reshape(-1)
         except (TypeError, ValueError, OverflowError) as error:
-            raise RecordingError(f"{self.what} is not a list of numbers: {error}") from error
+            raise RecordingError(
+                f"{self.what} is not a list of numbers: {error}"
+            ) from error
         if numbers.size == 0:
             raise NoSample(f"{self.what} is empty")
         if self.channel.pick:
             names = names or names_of(value)
             if names is None:
                 has = ", ".join(_fields(value))
-                raise RecordingError(f"no field {NAMES_FIELDS[0]!r} with a list of names, for `pick`; it has {has}")
+                raise RecordingError(
+                    f"no field {NAMES_FIELDS[0]!r} with a list of names, for `pick`; it has {has}"
+                )
             numbers = self._picked(names, numbers)
         if self.scale is not None:
             if self.scale.size not in (1, numbers.size):
-                raise RecordingError(f"{numbers.size} values, but the spec has factors (`scale`) for {self.scale.size}")
+                raise RecordingError(
+                    f"{numbers.size} values, but the spec has factors (`scale`) for {self.scale.size}"
+                )
             numbers = numbers * self.scale
         return numbers
 
     def _picked(self, names: tuple[str, ...], numbers: np.ndarray) -> np.ndarray:
         pick = self.channel.pick
         if numbers.size != len(names):
-            raise RecordingError(f"{numbers.size} values for {len(names)} names in {self.channel.field!r}")
+            raise RecordingError(
+                f"{numbers.size} values for {len(names)} names in {self.channel.field!r}"
+            )
         if names not in self.indices:
             if twice := [name for name in pick if names.count(name) > 1]:
                 raise RecordingError(f"{twice[0]!r} stands twice among its names")
-            self.indices[names] = [names.index(n) for n in pick] if set(names) >= set(pick) else None
+            self.indices[names] = (
+                [names.index(n) for n in pick] if set(names) >= set(pick) else None
+            )
         if (at := self.indices[names]) is not None:
             return numbers[at]
         if self.paths:  # the same in every message
             wrong = next(name for name in pick if name not in self.paths)
-            raise RecordingError(f"{wrong!r} is not among its names; {nearest(wrong, self.paths)}")
-        self.parts |= {name: x for name, x in zip(names, numbers, strict=True) if name in pick}
+            raise RecordingError(
+                f"{wrong!r} is not among its names; {nearest(wrong, self.paths)}"
+            )
+        self.parts |= {
+            name: x for name, x in zip(names, numbers, strict=True) if name in pick
+        }
         self.ever |= set(self.parts)
         unseen = [name for name in pick if name not in self.ever]
         if unseen or not set(names) & set(pick):
             lacking = next(iter(unseen), pick[0])
-            raise NoSample(f"{lacking!r} is not among its names; {nearest(lacking, names)}")
+            raise NoSample(
+                f"{lacking!r} is not among its names; {nearest(lacking, names)}"
+            )
         if len(self.parts) < len(pick):
             raise NoSample(JOINED)
         joined = np.array([self.parts[name] for name in pick])
@@ -203,7 +265,9 @@ class VectorExtractor:
         return joined
 
 
-def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
+def pad_extractor(
+    channel: ChannelSpec, sensor: SensorSpec
+) -> Callable[[Any], np.ndarray]:
     """Function from a decoded message to the counts of one pad frame, (K,), K = rows × columns of taxels, row after row in the
     pad's own order and in the wire's dtype."""
     wire = sensor.wire
@@ -211,15 +275,22 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
 
     def extract(value: Any) -> np.ndarray:
         found = get(value, channel.field) if channel.field else value
-        if isinstance(found, np.ndarray) and (found.dtype, found.shape) == (np.uint8, (wire_bytes,)):  # of ROS: uint8[]
+        if isinstance(found, np.ndarray) and (found.dtype, found.shape) == (
+            np.uint8,
+            (wire_bytes,),
+        ):  # of ROS: uint8[]
             found = found.tobytes()
         counts = pad_counts(found, wire.dtype)
         if counts.size != wire.rows * wire.columns:
             text = f"{counts.size} taxels, but sensor {sensor.name} has {wire.rows}×{wire.columns}"
-            raise RecordingError(f"{text}; other layouts: a file in data_specs/sensors/")
+            raise RecordingError(
+                f"{text}; other layouts: a file in data_specs/sensors/"
+            )
         if counts.ndim == 2 and counts.shape != (wire.rows, wire.columns):
             text = f"a frame of {counts.shape[0]}×{counts.shape[1]} taxels, but the wire format of {sensor.name} is "
-            raise RecordingError(f"{text}{wire.rows}×{wire.columns}: is the frame transposed already?")
+            raise RecordingError(
+                f"{text}{wire.rows}×{wire.columns}: is the frame transposed already?"
+            )
         if counts.max() > sensor.max_count:
             text = f"a count of {counts.max()}, but {sensor.name} sends at most {sensor.max_count}: another byte order"
             raise RecordingError(f"{text}, or another sensor?")
@@ -237,17 +308,29 @@ def pad_counts(found: Any, dtype: str) -> np.ndarray:
         found = from_base64(found)
     if isinstance(found, bytes | bytearray | memoryview):
         if len(found) % wire.itemsize:
-            raise RecordingError(f"{len(found)} bytes are not a whole number of {dtype} counts")
+            raise RecordingError(
+                f"{len(found)} bytes are not a whole number of {dtype} counts"
+            )
         return np.frombuffer(found, wire)
     try:
         exact, bounds = np.asarray(found), np.iinfo(wire)
         if exact.dtype.kind not in "biuf":
-            raise TypeError(f"{type(found).__name__} of {exact.dtype}; name the field that holds the raw counts")
-        whole = bool(((exact >= bounds.min) & (exact <= bounds.max) & (exact == np.floor(exact))).all())
+            raise TypeError(
+                f"{type(found).__name__} of {exact.dtype}; name the field that holds the raw counts"
+            )
+        whole = bool(
+            (
+                (exact >= bounds.min)
+                & (exact <= bounds.max)
+                & (exact == np.floor(exact))
+            ).all()
+        )
     except (TypeError, ValueError) as error:
         raise RecordingError(f"not a list of counts: {error}") from error
     if not whole:
-        raise RecordingError(f"counts that are not {wire.name} (normalised by the driver?): record raw counts")
+        raise RecordingError(
+            f"counts that are not {wire.name} (normalised by the driver?): record raw counts"
+        )
     return exact.astype(wire)
 
 

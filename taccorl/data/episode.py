@@ -45,9 +45,13 @@ class ChannelTiming:
     time of the next row − sample time."""
     age_max_s: float
     duplicates: int = 0  # Number of samples that repeat the time of an earlier one
-    out_of_order: int = 0  # Number of samples that are older than the one before them in the file
+    out_of_order: int = (
+        0  # Number of samples that are older than the one before them in the file
+    )
     zero_stamps: int = 0  # Number of samples that were dropped because their stamp is 0
-    skipped: dict[str, int] = field(default_factory=dict)  # Reason → number of messages that give the channel no sample
+    skipped: dict[str, int] = field(
+        default_factory=dict
+    )  # Reason → number of messages that give the channel no sample
     nominal_hz: float = 0.0  # Rate that the recording spec states for the channel [Hz]; 0 if it states none
 
 
@@ -70,12 +74,16 @@ class Episode:
     name: str  # Name for messages and titles: recording and episode
     spec: DatasetSpec
     start_ns: int  # Time of row 0 on the recording's clock [ns]
-    arrays: dict[str, np.ndarray]  # Feature key → (T, size): every feature of the episode that is not a video
+    arrays: dict[
+        str, np.ndarray
+    ]  # Feature key → (T, size): every feature of the episode that is not a video
     pictures: Callable[[], Iterator[Pictures]]
     """Calling it streams the T rows' pictures from the start, for the video features of ``picture_keys``."""
     picture_keys: tuple[str, ...]
     instruction: str  # Sentence that the policy reads
-    success: bool | None = None  # True or False as the operator's marker states; None without a marker
+    success: bool | None = (
+        None  # True or False as the operator's marker states; None without a marker
+    )
     origin: Origin = UNSTATED
     timing: tuple[ChannelTiming, ...] = ()
     picture_rows: dict[str, np.ndarray] = field(default_factory=dict)
@@ -83,8 +91,12 @@ class Episode:
     dataset."""
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
     """Tactile key → (K,) counts of the untouched pad that were subtracted from the readings."""
-    videos: dict[str, Video] = field(default_factory=dict)  # Video key → file, where the episode comes from a dataset
-    stages: tuple[tuple[int, str], ...] = ()  # (first row, name) of the task's stages, where known
+    videos: dict[str, Video] = field(
+        default_factory=dict
+    )  # Video key → file, where the episode comes from a dataset
+    stages: tuple[
+        tuple[int, str], ...
+    ] = ()  # (first row, name) of the task's stages, where known
     provenance: dict[str, object] = field(default_factory=dict)
     """Facts about how the episode was made, as JSON values: recording, simulation …"""
     findings: tuple[Finding, ...] = ()
@@ -104,12 +116,18 @@ class Episode:
         """(T, A) targets that were sent: the actions, or where ``action`` is what was intended (of a disturbed arm, or of an
         expert that aims with an error) the targets that were sent. Raises DatasetError: those are not stored."""
         told = self.provenance.get("simulation")
-        made = told.get("mimicgen", told.get("correction")) if isinstance(told, dict) else None
+        made = (
+            told.get("mimicgen", told.get("correction"))
+            if isinstance(told, dict)
+            else None
+        )
         if EXECUTED in self.arrays:
             return self.arrays[EXECUTED]
         if isinstance(made, dict) and ("disturbance" in made or INTENDED in made):
             text = f"{self.name}: its actions are what was intended, those sent ({EXECUTED}) are not stored: merge "
-            raise DatasetError(f"{text}omits them. Give the dataset as it was before the merge")
+            raise DatasetError(
+                f"{text}omits them. Give the dataset as it was before the merge"
+            )
         return self.arrays["action"]
 
     def joints(self, key: str, unit: str) -> np.ndarray:
@@ -124,11 +142,16 @@ class Episode:
         """Arms by the prefixes ``left_`` and ``right_`` of the names in ``observation.state``, never by position; elements
         without a prefix belong to the arm without a name."""
         names, units = self.element_names(STATE), self.spec.features[STATE].units
-        prefixes = [next((p for p in ("left", "right") if n.startswith(f"{p}_")), "") for n in names]
+        prefixes = [
+            next((p for p in ("left", "right") if n.startswith(f"{p}_")), "")
+            for n in names
+        ]
         arms = []
         for prefix in sorted(set(prefixes)):
             own = [i for i, p in enumerate(prefixes) if p == prefix]
-            grippers = [i for i in own if units[i] == "m" and names[i].endswith("gripper.pos")]
+            grippers = [
+                i for i in own if units[i] == "m" and names[i].endswith("gripper.pos")
+            ]
             joints = np.array([i for i in own if units[i] == "rad"], dtype=int)
             arms.append(Arm(prefix, joints, next(iter(grippers), None)))
         return arms
@@ -137,10 +160,16 @@ class Episode:
         """Arms of an episode whose state and command have the same names; none if they differ or one is missing."""
         if STATE not in self.arrays or ACTION not in self.arrays:
             return []
-        return self.state_arms() if self.element_names(STATE) == self.spec.features[ACTION].names else []
+        return (
+            self.state_arms()
+            if self.element_names(STATE) == self.spec.features[ACTION].names
+            else []
+        )
 
     def pads(self, key: str) -> dict[str, np.ndarray]:
         """Pad name → (T, rows, columns) counts above baseline, the newest reading in each row of tactile feature ``key``."""
         feature, sensor = self.spec.features[key], self.spec.sensors[key]
-        counts = self.arrays[key].reshape(-1, feature.history, len(feature.pads), sensor.rows, sensor.columns)
+        counts = self.arrays[key].reshape(
+            -1, feature.history, len(feature.pads), sensor.rows, sensor.columns
+        )
         return {pad: counts[:, -1, p] for p, pad in enumerate(feature.pads)}

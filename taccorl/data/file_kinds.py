@@ -30,11 +30,17 @@ FILE_KINDS = (
     FileKind("a ROS 1 bag", b"#ROSBAG V", "rosbag1"),
     FileKind("a JPEG picture", b"\xff\xd8\xff"),
     FileKind("a PNG picture", b"\x89PNG\r\n"),
-    FileKind("a Git LFS pointer", b"version https://git-lfs.github.com/spec/", command="git -C {folder} lfs pull"),
+    FileKind(
+        "a Git LFS pointer",
+        b"version https://git-lfs.github.com/spec/",
+        command="git -C {folder} lfs pull",
+    ),
     FileKind("a ZIP archive", b"PK\x03\x04", command="unzip {path} -d {folder}"),
     FileKind("a gzip archive", b"\x1f\x8b", command="gunzip --keep {path}"),
     FileKind("a zstd archive", b"\x28\xb5\x2f\xfd", command="unzstd {path}"),
-    FileKind("a tar archive", b"ustar", command="tar -xf {path} -C {folder}", offset=257),
+    FileKind(
+        "a tar archive", b"ustar", command="tar -xf {path} -C {folder}", offset=257
+    ),
 )
 
 
@@ -44,7 +50,9 @@ def sniff(path: Path) -> FileKind | None:
     if path.is_file():  # a pipe would wait for ever
         with contextlib.suppress(OSError), path.open("rb") as file:
             head = file.read(512)
-    return next((kind for kind in FILE_KINDS if head.startswith(kind.magic, kind.offset)), None)
+    return next(
+        (kind for kind in FILE_KINDS if head.startswith(kind.magic, kind.offset)), None
+    )
 
 
 def no_recording(path: Path) -> str | None:
@@ -52,8 +60,12 @@ def no_recording(path: Path) -> str | None:
     kind = sniff(path)
     if kind is None or kind.reader is not None:
         return None
-    command = kind.command.format(path=shlex.quote(str(path)), folder=shlex.quote(str(path.parent)))
-    return f"{kind.name}, no recording" + (f"; this gives the file: {command}" if command else "")
+    command = kind.command.format(
+        path=shlex.quote(str(path)), folder=shlex.quote(str(path.parent))
+    )
+    return f"{kind.name}, no recording" + (
+        f"; this gives the file: {command}" if command else ""
+    )
 
 
 @contextlib.contextmanager
@@ -63,6 +75,13 @@ def plainly(path: Path, what: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
-    except (*_UNREADABLE, *raised("av.error.FFmpegError"), *raised("pyarrow.lib.ArrowException")) as error:
-        known = no_recording(path) or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
+    except (
+        *_UNREADABLE,
+        *raised("av.error.FFmpegError"),
+        *raised("pyarrow.lib.ArrowException"),
+    ) as error:
+        known = (
+            no_recording(path)
+            or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
+        )
         raise DatasetError(f"{path}: {known}") from error

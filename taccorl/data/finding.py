@@ -28,22 +28,86 @@ class Finding:
 
 
 CHECKS: dict[str, Severity] = {
-    **dict.fromkeys(("not_finite", "joint_limit", "out_of_range", "swapped_arms", "swapped_pads"), "error"),
-    **dict.fromkeys(("noise_only", "totals", "episode_rows", "row_index", "row_time", "dataset_index"), "error"),
+    **dict.fromkeys(
+        ("not_finite", "joint_limit", "out_of_range", "swapped_arms", "swapped_pads"),
+        "error",
+    ),
+    **dict.fromkeys(
+        (
+            "noise_only",
+            "totals",
+            "episode_rows",
+            "row_index",
+            "row_time",
+            "dataset_index",
+        ),
+        "error",
+    ),
     **dict.fromkeys(("tasks", "statistics"), "error"),
-    **dict.fromkeys(("jump", "sample_jump", "idle", "frozen_state", "dead_command", "copied_command"), "warning"),
-    **dict.fromkeys(("frozen_command", "command_scale", "action_lag", "unexplained_motion", "silent_pad"), "warning"),
-    **dict.fromkeys(("stuck_taxel", "dead_taxel", "saturated", "noisy_pad", "frozen_touch", "touch_lag"), "warning"),
-    **dict.fromkeys(("pad_lag", "baseline_drift", "baseline_offset", "frozen_picture", "picture_size"), "warning"),
+    **dict.fromkeys(
+        (
+            "jump",
+            "sample_jump",
+            "idle",
+            "frozen_state",
+            "dead_command",
+            "copied_command",
+        ),
+        "warning",
+    ),
+    **dict.fromkeys(
+        (
+            "frozen_command",
+            "command_scale",
+            "action_lag",
+            "unexplained_motion",
+            "silent_pad",
+        ),
+        "warning",
+    ),
+    **dict.fromkeys(
+        (
+            "stuck_taxel",
+            "dead_taxel",
+            "saturated",
+            "noisy_pad",
+            "frozen_touch",
+            "touch_lag",
+        ),
+        "warning",
+    ),
+    **dict.fromkeys(
+        (
+            "pad_lag",
+            "baseline_drift",
+            "baseline_offset",
+            "frozen_picture",
+            "picture_size",
+        ),
+        "warning",
+    ),
     **dict.fromkeys(("low_rate", "gaps", "old_samples"), "warning"),
-    **dict.fromkeys(("touch_range", "contact_coverage", "duplicates", "out_of_order", "zero_stamps"), "note"),
+    **dict.fromkeys(
+        (
+            "touch_range",
+            "contact_coverage",
+            "duplicates",
+            "out_of_order",
+            "zero_stamps",
+        ),
+        "note",
+    ),
     "skipped": "note",
 }
 """Name of every check → its severity, unless the finding itself states another. Thresholds stand beside the functions."""
 
 
 def finding(
-    name: str, feature: str, text: str, rows: tuple[int, int] | None = None, severity: Severity | None = None
+    name: str,
+    feature: str,
+    text: str,
+    rows: tuple[int, int] | None = None,
+    severity: Severity | None = None,
 ) -> Finding:
     """Finding of a check in ``CHECKS``, with the severity that stands there if none is given."""
     return Finding(name, severity or CHECKS[name], feature, text, rows)
@@ -53,7 +117,13 @@ def leave_out(root: Path, number: int) -> str:
     """The two commands that write a copy of the dataset at ``root`` (absolute) without episode ``number``."""
     new = root.with_name(f"{root.name}_without_{number}")
     old_root, new_root, spec, beside = (
-        shlex.quote(str(path)) for path in (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")
+        shlex.quote(str(path))
+        for path in (
+            root,
+            new,
+            root / "meta/taccorl/dataset_spec.json",
+            new / "meta/taccorl",
+        )
     )
     own = f"; `install -D {spec} -t {beside}` keeps its units and pads, which LeRobot leaves behind"
     return (
@@ -73,7 +143,9 @@ def recompute_statistics(root: Path, *words: str) -> str:
 
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
     """Note that a check could not examine ``what``. ``topic``: as in ``Finding``; ``what`` if empty."""
-    return Finding("not_judged", "note", feature, f"{what} not judged: {why}", topic=topic or what)
+    return Finding(
+        "not_judged", "note", feature, f"{what} not judged: {why}", topic=topic or what
+    )
 
 
 def place(rows: tuple[int, int], fps: int) -> str:

@@ -12,7 +12,15 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 
 from taccorl.data import decode, pictures
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, find_sources, readers
+from taccorl.data.recording import (
+    Damage,
+    Message,
+    Reader,
+    Source,
+    TopicType,
+    find_sources,
+    readers,
+)
 from taccorl.data.ros import unit_of, vector_type
 from taccorl.data.sensor_spec import SensorSpec, WireSpec, load_sensor_spec
 from taccorl.data.spec import ChannelSpec, data_specs_folder
@@ -21,11 +29,21 @@ from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError
 
 PICTURES = ("CompressedImage", "Image", "CompressedVideo")
-PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")  # In the names of topics of pictures
+PICTURE_WORDS = (
+    "image",
+    "camera",
+    "cam",
+    "picture",
+    "rgb",
+    "color",
+    "colour",
+)  # In the names of topics of pictures
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
-WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])  # Data types that a pad's counts may have
+WIRE_DTYPES = get_args(
+    get_type_hints(WireSpec)["dtype"]
+)  # Data types that a pad's counts may have
 IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 
@@ -83,7 +101,10 @@ class TopicSummary:
         """Whether its messages are pictures: by their type, or stored as arrays of three axes, or of two under a fitting name."""
         if self.type.shape is None:
             return self.holds(PICTURES)
-        named = any(word.startswith(PICTURE_WORDS) for word in re.split(r"[^a-z]+", self.topic.lower()))
+        named = any(
+            word.startswith(PICTURE_WORDS)
+            for word in re.split(r"[^a-z]+", self.topic.lower())
+        )
         return len(self.type.shape) == 3 or (len(self.type.shape) == 2 and named)
 
     @property
@@ -93,7 +114,9 @@ class TopicSummary:
 
     def holds(self, kinds: tuple[str, ...]) -> bool:
         """Whether the name of its message type ends in one of ``kinds``, in any package."""
-        return any(kind in decode.type_key(self.type.name).rsplit("/", 1)[-1] for kind in kinds)
+        return any(
+            kind in decode.type_key(self.type.name).rsplit("/", 1)[-1] for kind in kinds
+        )
 
 
 @dataclass(frozen=True)
@@ -116,8 +139,17 @@ class Inventory:
     @property
     def faults(self) -> tuple[str, ...]:
         """Reasons why the recording cannot be read as a whole even with a spec that fits."""
-        simulated, lost = [t.topic for t in self.topics if t.sim_time], [d for d in self.damage if d.lost]
-        found = [f"{len(simulated)} topics are stamped in simulation time, first {simulated[0]}"] if simulated else []
+        simulated, lost = (
+            [t.topic for t in self.topics if t.sim_time],
+            [d for d in self.damage if d.lost],
+        )
+        found = (
+            [
+                f"{len(simulated)} topics are stamped in simulation time, first {simulated[0]}"
+            ]
+            if simulated
+            else []
+        )
         more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
         return (*found, *([f"it is damaged: {lost[0]}{more}"] if lost else []))
 
@@ -125,7 +157,11 @@ class Inventory:
     def duration_s(self) -> float:
         """Time from the first to the last message of all topics [s]."""
         spans = [(t.first_ns, t.last_ns) for t in self.topics if t.num_messages]
-        return (max(b for _, b in spans) - min(a for a, _ in spans)) / NS_PER_S if spans else 0.0
+        return (
+            (max(b for _, b in spans) - min(a for a, _ in spans)) / NS_PER_S
+            if spans
+            else 0.0
+        )
 
 
 def inspect_source(reader_name: str, source: Source) -> Inventory:
@@ -138,12 +174,29 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         log.append(m.log_ns)
         stamp.append(m.stamp_ns)
     types = reader.topics()
-    summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
+    summaries = [
+        _summary(topic, types[topic], *times.get(topic, ([], [])))
+        for topic in sorted(types)
+    ]
     summaries = [part for t in summaries for part in _by_names(reader, t)]
-    sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
-    summaries = tuple(replace(t, first=None, **_first_message(reader, t, sensors)) for t in summaries)
-    fits = _fitting(reader_name, {t.topic: t.type.name for t in summaries if t.num_messages})
-    return Inventory(source, reader_name, summaries, dict(reader.metadata), tuple(reader.damage), fits)
+    sensors = {
+        p.stem: load_sensor_spec(p)
+        for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))
+    }
+    summaries = tuple(
+        replace(t, first=None, **_first_message(reader, t, sensors)) for t in summaries
+    )
+    fits = _fitting(
+        reader_name, {t.topic: t.type.name for t in summaries if t.num_messages}
+    )
+    return Inventory(
+        source,
+        reader_name,
+        summaries,
+        dict(reader.metadata),
+        tuple(reader.damage),
+        fits,
+    )
 
 
 def choose_spec(paths: Sequence[Path]) -> str:
@@ -152,24 +205,40 @@ def choose_spec(paths: Sequence[Path]) -> str:
     fits: list[str] | None = None
     for path in paths:
         for reader_name, source in find_sources(path, skipped=[]):
-            topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
+            topics = {
+                topic: kind.name
+                for topic, kind in readers.get(reader_name)(source).topics().items()
+            }
             own = _fitting(reader_name, topics)
             if not own:
                 it = shlex.quote(str(path))
                 text = f"no shipped spec fits. `taccorl compare {it}` checks joints or pads without cameras; "
-                raise RecordingError(f"{source.name}: {text}`taccorl ingest inspect {it} --draft=FILE` drafts a --spec")
+                raise RecordingError(
+                    f"{source.name}: {text}`taccorl ingest inspect {it} --draft=FILE` drafts a --spec"
+                )
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
-                raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")
-            if source.part is not None:  # the other episodes of one file or dataset are like it
+                raise RecordingError(
+                    f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…"
+                )
+            if (
+                source.part is not None
+            ):  # the other episodes of one file or dataset are like it
                 break
     if fits is None or len(fits) != 1:
-        raise RecordingError(f"{paths[0]}: fits the specs {', '.join(fits or ())}: choose one with --spec=…")
+        raise RecordingError(
+            f"{paths[0]}: fits the specs {', '.join(fits or ())}: choose one with --spec=…"
+        )
     return fits[0]
 
 
-def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | None]) -> TopicSummary:
-    log_ns, stamp_ns = np.array(log, dtype=np.int64), np.array([s or 0 for s in stamps], dtype=np.int64)
+def _summary(
+    topic: str, kind: TopicType, log: list[int], stamps: list[int | None]
+) -> TopicSummary:
+    log_ns, stamp_ns = (
+        np.array(log, dtype=np.int64),
+        np.array([s or 0 for s in stamps], dtype=np.int64),
+    )
     stamped = bool(stamps) and all(stamps[len(stamps) // 2 :])
     good = stamp_ns != 0
     own = np.sort(stamp_ns[good]) if stamped else np.sort(log_ns)
@@ -177,21 +246,45 @@ def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | Non
     median = float(np.median(steps)) if len(steps) else 0.0
     skew = (log_ns[good] - stamp_ns[good]) / NS_PER_S if stamped else np.zeros(1)
     ends = (int(log_ns[0]), int(log_ns[-1])) if len(log) else (0, 0)
-    gaps = (float(steps.max()) if len(steps) else 0.0, int((steps > 1.5 * median).sum()))
-    skews = (float(np.median(skew)), float(np.quantile(np.abs(skew - np.median(skew)), 0.99)))
+    gaps = (
+        float(steps.max()) if len(steps) else 0.0,
+        int((steps > 1.5 * median).sum()),
+    )
+    skews = (
+        float(np.median(skew)),
+        float(np.quantile(np.abs(skew - np.median(skew)), 0.99)),
+    )
     odd = (int((np.diff(own) == 0).sum()), int((~good).sum()) if stamped else 0)
-    return TopicSummary(topic, kind, len(log), *ends, 1.0 / median if median else 0.0, *gaps, stamped, *skews, *odd)
+    return TopicSummary(
+        topic,
+        kind,
+        len(log),
+        *ends,
+        1.0 / median if median else 0.0,
+        *gaps,
+        stamped,
+        *skews,
+        *odd,
+    )
 
 
 def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
     """One summary for each set of names that occurs in a topic of joint states: several drivers may publish on one topic."""
-    if t.type.undecodable or t.type.shape is not None or not t.num_messages or not t.holds(JOINTS):
+    if (
+        t.type.undecodable
+        or t.type.shape is not None
+        or not t.num_messages
+        or not t.holds(JOINTS)
+    ):
         return [t]
     times: dict[tuple[str, ...], tuple[list[int], list[int | None], Any]] = {}
     unusable = 0
     try:
         for m in reader.messages({t.topic}):
-            names, positions = decode.names_of(m.value) or (), decode.maybe(m.value, "position")
+            names, positions = (
+                decode.names_of(m.value) or (),
+                decode.maybe(m.value, "position"),
+            )
             if not names or positions is None or len(positions) == 0:
                 unusable += 1
                 continue
@@ -200,64 +293,125 @@ def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
             stamp.append(m.stamp_ns)
     except (RecordingError, TypeError):
         return [t]
-    parts = [(_summary(t.topic, t.type, log, stamp), n, first) for n, (log, stamp, first) in times.items()]
-    return [replace(part, names=names, unusable=unusable, first=first) for part, names, first in parts] or [t]
+    parts = [
+        (_summary(t.topic, t.type, log, stamp), n, first)
+        for n, (log, stamp, first) in times.items()
+    ]
+    return [
+        replace(part, names=names, unusable=unusable, first=first)
+        for part, names, first in parts
+    ] or [t]
 
 
-def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
+def _first_message(
+    reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]
+) -> dict[str, Any]:
     """Facts that only a decoded message gives: names, number of values, whether it is a pad frame, why it cannot be used."""
     if t.type.undecodable or not t.num_messages:
         return {}
 
-    def first() -> Message | None:  # read by its time where the reader can; the file is let go after it
-        return next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+    def first() -> (
+        Message | None
+    ):  # read by its time where the reader can; the file is let go after it
+        return next(
+            iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)),
+            None,
+        )
 
     try:
         if (shape := t.type.shape) is not None:
             if t.is_picture:
                 if t.type.encoding == "hdf5" and (found := first()) is not None:
-                    pictures.picture(found.value, ChannelSpec(topic=t.topic, rate_hz=1.0))
+                    pictures.picture(
+                        found.value, ChannelSpec(topic=t.topic, rate_hz=1.0)
+                    )
                 return {}
-            frames = {n: ((s.wire.rows * s.wire.columns,), (s.wire.rows, s.wire.columns)) for n, s in sensors.items()}
-            fitting = [n for n, s in sensors.items() if t.type.name == s.wire.dtype and shape in frames[n]]
-            size = math.prod(shape) if len(shape) <= 1 or t.type.encoding == "lerobot" else None
-            is_wire = not fitting and t.type.name in WIRE_DTYPES and len(shape) in (1, 2)
+            frames = {
+                n: ((s.wire.rows * s.wire.columns,), (s.wire.rows, s.wire.columns))
+                for n, s in sensors.items()
+            }
+            fitting = [
+                n
+                for n, s in sensors.items()
+                if t.type.name == s.wire.dtype and shape in frames[n]
+            ]
+            size = (
+                math.prod(shape)
+                if len(shape) <= 1 or t.type.encoding == "lerobot"
+                else None
+            )
+            is_wire = (
+                not fitting and t.type.name in WIRE_DTYPES and len(shape) in (1, 2)
+            )
             counts = (t.type.name, shape) if is_wire else None
-            return {"names": t.type.names, "num_values": size, "sensor": next(iter(fitting), None), "counts": counts}
-        if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
+            return {
+                "names": t.type.names,
+                "num_values": size,
+                "sensor": next(iter(fitting), None),
+                "counts": counts,
+            }
+        if (
+            not t.holds((*JOINTS, *ARRAYS, *PICTURES))
+            and vector_type(t.type.name) is None
+        ):
             return {}
         if t.first is not None:
             return _content(t, t.first, sensors)
-        return _content(t, found.value, sensors) if (found := first()) is not None else {}
+        return (
+            _content(t, found.value, sensors) if (found := first()) is not None else {}
+        )
     except RecordingError as error:
         return {"misfit": str(error)}
 
 
-def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
+def _content(
+    t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]
+) -> dict[str, Any]:
     """Raises RecordingError: a spec could not use it either."""
     if vector_type(t.type.name) is not None:
         return _vector_content(t, value)
-    channel, dtype_of = ChannelSpec(topic=t.topic, rate_hz=1.0, field="data"), t.type.name.lower()
+    channel, dtype_of = (
+        ChannelSpec(topic=t.topic, rate_hz=1.0, field="data"),
+        t.type.name.lower(),
+    )
     if t.holds(PICTURES):
         if pictures.is_stream(value):
             stream = pictures.VideoStream(str(decode.get(value, "format")))
-            frames = [*stream.decode(0, decode.get(value, "data")), *stream.decode(None, None)]
+            frames = [
+                *stream.decode(0, decode.get(value, "data")),
+                *stream.decode(None, None),
+            ]
             missing = all(frame is None for _, frame in frames)
-            return {"misfit": "its first message is no key frame: earlier ones are missing"} if missing else {}
+            return (
+                {
+                    "misfit": "its first message is no key frame: earlier ones are missing"
+                }
+                if missing
+                else {}
+            )
         pictures.picture(value, replace(channel, field=None))
         return {}
     if t.holds(JOINTS):
         names = tuple(str(n) for n in decode.get(value, "name"))
-        size = decode.VectorExtractor(replace(channel, field="position", pick=names))(value).size
+        size = decode.VectorExtractor(replace(channel, field="position", pick=names))(
+            value
+        ).size
         return {"names": names, "num_values": size}
     for name, sensor in sensors.items():
         if sensor.wire.dtype in dtype_of:
             with contextlib.suppress(RecordingError):
-                return {"sensor": name, "num_values": decode.pad_extractor(channel, sensor)(value).size}
+                return {
+                    "sensor": name,
+                    "num_values": decode.pad_extractor(channel, sensor)(value).size,
+                }
     for dtype in WIRE_DTYPES:
         if dtype in dtype_of:
             size = decode.pad_counts(decode.get(value, "data"), dtype).size
-            return {"num_values": size, "counts": (dtype, (size,))} if size else {"misfit": "data is empty"}
+            return (
+                {"num_values": size, "counts": (dtype, (size,))}
+                if size
+                else {"misfit": "data is empty"}
+            )
     return {"num_values": decode.VectorExtractor(channel)(value).size}
 
 
@@ -265,14 +419,32 @@ def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
     """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1). Raises
     RecordingError: a field that holds no number."""
     decode.VectorExtractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
-    covariances = {part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS}
-    absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]
-    names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)
+    covariances = {
+        part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS
+    }
+    absent = [
+        part
+        for part, covariance in covariances.items()
+        if covariance[:1].tolist() == [-1.0]
+    ]
+    names = tuple(
+        name
+        for name in decode.vector_paths(value)
+        if name.partition(".")[0] not in absent
+    )
     units = tuple(unit_of(name, t.type.name) for name in names)
     # An odometry's pose is in header.frame_id, its twist in child_frame_id (nav_msgs/Odometry): no frame is that of all.
-    is_odometry = all(decode.maybe(value, f) is not None for f in ("child_frame_id", "pose.pose", "twist.twist"))
+    is_odometry = all(
+        decode.maybe(value, f) is not None
+        for f in ("child_frame_id", "pose.pose", "twist.twist")
+    )
     frame = "" if is_odometry else decode.maybe(value, "header.frame_id")
-    return {"names": names, "num_values": len(names), "units": units, "frame": str(frame or "")}
+    return {
+        "names": names,
+        "num_values": len(names),
+        "units": units,
+        "frame": str(frame or ""),
+    }
 
 
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:
@@ -280,8 +452,17 @@ def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:
 
     def fits(c: ChannelSpec) -> bool:
         found = topics.get(c.topic)
-        return found is not None and decode.type_key(c.type or found) == decode.type_key(found)
+        return found is not None and decode.type_key(
+            c.type or found
+        ) == decode.type_key(found)
 
-    texts = {n: {t for t in (s.episodes.topic, s.instruction.topic) if t} for n, s in shipped().items()}
-    own = [(n, s) for n, s in shipped().items() if s.reader == reader_name and texts[n] <= set(topics)]
+    texts = {
+        n: {t for t in (s.episodes.topic, s.instruction.topic) if t}
+        for n, s in shipped().items()
+    }
+    own = [
+        (n, s)
+        for n, s in shipped().items()
+        if s.reader == reader_name and texts[n] <= set(topics)
+    ]
     return tuple(name for name, spec in own if all(map(fits, spec.channels.values())))

@@ -41,10 +41,14 @@ def in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
 
 def require_videos(root: Path) -> None:
     """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
-    pictures = any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
+    pictures = any(
+        f["dtype"] in ("video", "image") for f in read_info(root)["features"].values()
+    )
     if pictures and (unstored := Dataset(root).unstored):
         text = f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
-        raise DatasetError(f"{text}--pictures=cache, or make it with taccorl collect --pictures=video")
+        raise DatasetError(
+            f"{text}--pictures=cache, or make it with taccorl collect --pictures=video"
+        )
 
 
 @dataclass(eq=False)
@@ -62,40 +66,74 @@ class _Part:
 _Source = tuple[Path, _Part]
 
 
-def join(roots: Sequence[Path], destination: Path, features: dict[str, Any], run: Run = in_threads) -> None:
+def join(
+    roots: Sequence[Path],
+    destination: Path,
+    features: dict[str, Any],
+    run: Run = in_threads,
+) -> None:
     """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``destination``:
     does not exist, or is empty. ``features``: of all ``roots``, as in ``info.json``. ``run`` writes the files."""
     infos = [read_info(root) for root in roots]
     names, numbers_of = _tasks(roots)
     rows = np.cumsum([0, *(info["total_frames"] for info in infos)])
     episodes = np.cumsum([0, *(info["total_episodes"] for info in infos)])
-    parts = [_Part(int(rows[k]), int(episodes[k]), numbers_of[k]) for k in range(len(roots))]
+    parts = [
+        _Part(int(rows[k]), int(episodes[k]), numbers_of[k]) for k in range(len(roots))
+    ]
     videos = [f"videos/{key}" for key, f in features.items() if f["dtype"] == "video"]
-    most = {_DATA: JOINED_TOGETHER, _EPISODES: JOINED_TOGETHER} | dict.fromkeys(videos, 1)
-    placed = {kind: _placed_files(kind, most[kind], roots, parts, infos[0]) for kind in most}
+    most = {_DATA: JOINED_TOGETHER, _EPISODES: JOINED_TOGETHER} | dict.fromkeys(
+        videos, 1
+    )
+    placed = {
+        kind: _placed_files(kind, most[kind], roots, parts, infos[0]) for kind in most
+    }
     numbers = {name: k for k, name in enumerate(names)}
-    write = functools.partial(_write_episodes, destination, frozenset(features), numbers)
+    write = functools.partial(
+        _write_episodes, destination, frozenset(features), numbers
+    )
     meta = [functools.partial(write, *file) for file in placed[_EPISODES].items()]
     jobs = [
         *meta,
-        *(functools.partial(_write_rows, _path(destination, _DATA, p), own) for p, own in placed[_DATA].items()),
+        *(
+            functools.partial(_write_rows, _path(destination, _DATA, p), own)
+            for p, own in placed[_DATA].items()
+        ),
     ]
     for kind in videos:
         for place, [(source, _)] in placed[kind].items():
-            jobs.append(functools.partial(shutil.copyfile, source, _path(destination, kind, place)))
+            jobs.append(
+                functools.partial(
+                    shutil.copyfile, source, _path(destination, kind, place)
+                )
+            )
     written = run(_called, jobs)[: len(meta)]
-    common = frozenset.intersection(*map(frozenset, written))  # some lack statistics of an added feature
+    common = frozenset.intersection(
+        *map(frozenset, written)
+    )  # some lack statistics of an added feature
     run(
         _called,
-        [functools.partial(job, only=common) for job, own in zip(meta, written, strict=True) if common != set(own)],
+        [
+            functools.partial(job, only=common)
+            for job, own in zip(meta, written, strict=True)
+            if common != set(own)
+        ],
     )
     import pandas as pd
 
-    frame = pd.DataFrame({"task_index": range(len(names))}, index=pd.Index(names, name="task"))
+    frame = pd.DataFrame(
+        {"task_index": range(len(names))}, index=pd.Index(names, name="task")
+    )
     frame.to_parquet(destination / "meta/tasks.parquet")
-    totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(names)}
+    totals = {
+        "total_episodes": int(episodes[-1]),
+        "total_frames": int(rows[-1]),
+        "total_tasks": len(names),
+    }
     splits = {"train": f"0:{episodes[-1]}"}
-    write_info(destination, infos[0] | totals | {"splits": splits, "features": features})
+    write_info(
+        destination, infos[0] | totals | {"splits": splits, "features": features}
+    )
 
 
 def _called(job: Callable[[], Any]) -> Any:
@@ -107,19 +145,32 @@ def _tasks(roots: Sequence[Path]) -> tuple[list[str], list[np.ndarray]]:
     in the result."""
     import pandas as pd
 
-    contents = [(root / "meta/tasks.parquet").read_bytes() for root in roots]  # of demonstrations, all the same
-    frames = {content: pd.read_parquet(io.BytesIO(content)) for content in dict.fromkeys(contents)}
-    names: list[str] = list(dict.fromkeys(name for frame in frames.values() for name in frame.index))
+    contents = [
+        (root / "meta/tasks.parquet").read_bytes() for root in roots
+    ]  # of demonstrations, all the same
+    frames = {
+        content: pd.read_parquet(io.BytesIO(content))
+        for content in dict.fromkeys(contents)
+    }
+    names: list[str] = list(
+        dict.fromkeys(name for frame in frames.values() for name in frame.index)
+    )
     number = {name: k for k, name in enumerate(names)}
     new: dict[bytes, np.ndarray] = {}
     for content, frame in frames.items():
         new[content] = np.zeros(int(frame["task_index"].max()) + 1, dtype=np.int64)
-        new[content][frame["task_index"].to_numpy()] = [number[name] for name in frame.index]
+        new[content][frame["task_index"].to_numpy()] = [
+            number[name] for name in frame.index
+        ]
     return names, [new[content] for content in contents]
 
 
 def _placed_files(
-    kind: str, most: int, roots: Sequence[Path], parts: Sequence[_Part], info: dict[str, Any]
+    kind: str,
+    most: int,
+    roots: Sequence[Path],
+    parts: Sequence[_Part],
+    info: dict[str, Any],
 ) -> dict[_Place, list[_Source]]:
     """Files of one kind in the result and their sources: at most ``most`` for each, about the size that ``info`` allows."""
     files: dict[_Place, list[_Source]] = {}
@@ -127,9 +178,16 @@ def _placed_files(
     for part, root in zip(parts, roots, strict=True):
         part.places[kind] = {}
         for path in sorted((root / kind).glob("chunk-*/file-*.*")):
-            own = int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
+            own = (
+                int(path.parent.name.removeprefix("chunk-")),
+                int(path.stem.removeprefix("file-")),
+            )
             more = path.stat().st_size
-            if not files or size + more > info["data_files_size_in_mb"] * _MB or len(files[place]) == most:
+            if (
+                not files
+                or size + more > info["data_files_size_in_mb"] * _MB
+                or len(files[place]) == most
+            ):
                 place, size = divmod(len(files), info["chunks_size"]), 0
                 files[place] = []
             size += more
@@ -154,7 +212,11 @@ def _write_rows(path: Path, sources: list[_Source]) -> None:
             for k in range(file.num_row_groups):
                 table = _plus(file.read_row_group(k), "index", part.first_row)
                 table = _plus(table, "episode_index", part.first_episode)
-                table = set_column(table, "task_index", pa.array(part.task_numbers[table["task_index"].to_numpy()]))
+                table = set_column(
+                    table,
+                    "task_index",
+                    pa.array(part.task_numbers[table["task_index"].to_numpy()]),
+                )
                 writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
                 writer.write_table(table.select(writer.schema.names))
     if writer is not None:
@@ -174,16 +236,26 @@ def _write_episodes(
     the time of a merge."""
     read = []
     for path, _ in sources:
-        with pq.ParquetFile(path) as file:  # for small files of many columns in half the time of ``pq.read_table``
+        with (
+            pq.ParquetFile(path) as file
+        ):  # for small files of many columns in half the time of ``pq.read_table``
             read.append(file.read())
     known = set.intersection(*(set(table.column_names) for table in read))
     known &= known if only is None else only
     # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
     stated = {name for name in known if name.startswith("stats/")}
-    gone = {name for name in stated if name.removeprefix("stats/").rpartition("/")[0] not in features}
+    gone = {
+        name
+        for name in stated
+        if name.removeprefix("stats/").rpartition("/")[0] not in features
+    }
     names = [name for name in read[0].column_names if name in known - gone]
     table = pa.concat_tables(table.select(names) for table in read)
-    part_of = [part for table, (_, part) in zip(read, sources, strict=True) for _ in range(len(table))]
+    part_of = [
+        part
+        for table, (_, part) in zip(read, sources, strict=True)
+        for _ in range(len(table))
+    ]
     first_rows = np.array([part.first_row for part in part_of])
     first_episodes = np.array([part.first_episode for part in part_of])
     table = _plus(table, "episode_index", first_episodes)
@@ -191,32 +263,69 @@ def _write_episodes(
         table = _plus(table, key, first_rows)
     table = _with_own_statistics(table, first_rows, first_episodes, tasks)
     for kind in part_of[0].places.keys() - {_EPISODES}:
-        was = zip(*(table[f"{kind}/{level}_index"].to_pylist() for level in ("chunk", "file")), strict=True)
-        table = _placed(table, kind, [part.places[kind][own] for part, own in zip(part_of, was, strict=True)])
+        was = zip(
+            *(
+                table[f"{kind}/{level}_index"].to_pylist()
+                for level in ("chunk", "file")
+            ),
+            strict=True,
+        )
+        table = _placed(
+            table,
+            kind,
+            [part.places[kind][own] for part, own in zip(part_of, was, strict=True)],
+        )
     table = _placed(table, _EPISODES, [place] * len(table))
-    with pq.ParquetWriter(_path(destination, _EPISODES, place), table.schema, **_FORMAT) as writer:
+    with pq.ParquetWriter(
+        _path(destination, _EPISODES, place), table.schema, **_FORMAT
+    ) as writer:
         writer.write_table(table)
     return names
 
 
 _STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
-    **dict(zip(("min", "max", "mean", "std"), (np.min, np.max, np.mean, np.std), strict=True)),
-    **{f"q{q:02d}": functools.partial(np.quantile, q=q / 100) for q in (1, 10, 50, 90, 99)},
+    **dict(
+        zip(
+            ("min", "max", "mean", "std"),
+            (np.min, np.max, np.mean, np.std),
+            strict=True,
+        )
+    ),
+    **{
+        f"q{q:02d}": functools.partial(np.quantile, q=q / 100)
+        for q in (1, 10, 50, 90, 99)
+    },
 }
 
 
 def _with_own_statistics(
-    table: pa.Table, first_rows: np.ndarray, first_episodes: np.ndarray, tasks: dict[str, int]
+    table: pa.Table,
+    first_rows: np.ndarray,
+    first_episodes: np.ndarray,
+    tasks: dict[str, int],
 ) -> pa.Table:
     """Table of episodes with new statistics of the row, episode and task indices, which differ after the merge."""
-    ids = [np.array([tasks[name] for name in names], dtype=float) for names in table["tasks"].to_pylist()]
+    ids = [
+        np.array([tasks[name] for name in names], dtype=float)
+        for names in table["tasks"].to_pylist()
+    ]
     for name, statistic in _STATISTICS.items():
-        new: dict[str, list[Any]] = {"task_index": [float(statistic(own)) for own in ids]}
-        more = {"index": first_rows, "episode_index": first_episodes} if name != "std" else {}
+        new: dict[str, list[Any]] = {
+            "task_index": [float(statistic(own)) for own in ids]
+        }
+        more = (
+            {"index": first_rows, "episode_index": first_episodes}
+            if name != "std"
+            else {}
+        )
         for key, values in (more | new).items():
             if (column := f"stats/{key}/{name}") in table.column_names:
-                cells = zip(table[column].to_pylist(), np.asarray(values).tolist(), strict=True)
-                moved = [[x + y if key in more else y for x in cell] for cell, y in cells]
+                cells = zip(
+                    table[column].to_pylist(), np.asarray(values).tolist(), strict=True
+                )
+                moved = [
+                    [x + y if key in more else y for x in cell] for cell, y in cells
+                ]
                 table = set_column(table, column, like(moved, table, column))
     return table
 
@@ -237,7 +346,11 @@ def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
 
 def _placed(table: pa.Table, prefix: str, places: Sequence[_Place]) -> pa.Table:
     for k, kind in enumerate(("chunk", "file")):
-        table = set_column(table, f"{prefix}/{kind}_index", pa.array([place[k] for place in places], pa.int64()))
+        table = set_column(
+            table,
+            f"{prefix}/{kind}_index",
+            pa.array([place[k] for place in places], pa.int64()),
+        )
     return table
 
 

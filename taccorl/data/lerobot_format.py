@@ -24,9 +24,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset, feature_rows, read_info, write_info
+from taccorl.data.dataset import (
+    BOOKKEEPING,
+    PROVENANCE,
+    ROWS_PER_PICTURE,
+    Dataset,
+    feature_rows,
+    read_info,
+    write_info,
+)
 from taccorl.data.episode import Episode
-from taccorl.data.exact_statistics import exact_stats, known_rows, statistics_of_rows, stats_of_counts
+from taccorl.data.exact_statistics import (
+    exact_stats,
+    known_rows,
+    statistics_of_rows,
+    stats_of_counts,
+)
 from taccorl.data.joining import JOINED_TOGETHER, Run, in_threads, join, require_videos
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
@@ -37,7 +50,12 @@ QUEUE_FRAMES = 4  # Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at
 LARGE_FEATURE = 256  # Fewest elements with exact quantiles in blocks; LeRobot's histograms take 80 kB an element
 PRIORITY_ROWS = 16
 UNSAFE_IN_PATHS = "'*?[]"  # What LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos)
-STATED = (*(f"{sign}int{bits}" for sign in ("u", "") for bits in (8, 16, 32, 64)), "float16", "float32", "float64")
+STATED = (
+    *(f"{sign}int{bits}" for sign in ("u", "") for bits in (8, 16, 32, 64)),
+    "float16",
+    "float32",
+    "float64",
+)
 """Types of features that have statistics: numbers, LeRobot's own columns among them."""
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
@@ -54,24 +72,46 @@ ENCODERS: dict[str, dict[str, Any]] = {
 """Codec of a data spec → options of LeRobot's video encoder."""
 
 
-def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
+def lerobot_features(
+    spec: DatasetSpec, keys: Sequence[str]
+) -> dict[str, dict[str, Any]]:
     """LeRobot's features of ``keys``, in their order. Unit, frame, range and a sensor's layout are stored in the feature."""
     features: dict[str, dict[str, Any]] = {}
     for key in keys:
         f = spec.features[key]
         entry: dict[str, Any] = {"dtype": f.dtype, "shape": f.shape}
-        entry["names"] = ["height", "width", "channels"] if f.dtype == "video" else list(f.names) or None
+        entry["names"] = (
+            ["height", "width", "channels"]
+            if f.dtype == "video"
+            else list(f.names) or None
+        )
         if f.dtype != "video":
-            entry |= {"unit": list(f.unit) if isinstance(f.unit, tuple) else f.unit, "frame": f.frame}
+            entry |= {
+                "unit": list(f.unit) if isinstance(f.unit, tuple) else f.unit,
+                "frame": f.frame,
+            }
             if not isinstance(f.range, dict) and np.isfinite(f.range).all():
                 entry["range"] = list(f.range)
             if f.layout:
                 entry["layout"] = list(f.layout)
         if key in spec.sensors:
             sensor = spec.sensors[key]
-            layout = {"history": f.history, "pad": len(f.pads), "row": sensor.rows, "column": sensor.columns}
-            touch = {"sensor": sensor.name, "layout": list(layout.values()), "layout_names": list(layout)}
-            touch |= {"pads": list(f.pads), "signal": "counts above baseline", "scheme": sensor.scheme}
+            layout = {
+                "history": f.history,
+                "pad": len(f.pads),
+                "row": sensor.rows,
+                "column": sensor.columns,
+            }
+            touch = {
+                "sensor": sensor.name,
+                "layout": list(layout.values()),
+                "layout_names": list(layout),
+            }
+            touch |= {
+                "pads": list(f.pads),
+                "signal": "counts above baseline",
+                "scheme": sensor.scheme,
+            }
             entry["tactile"] = touch | {"gain_per_count": sensor.gain_per_count}
         features[key] = entry
     return features
@@ -92,7 +132,10 @@ def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -
 
 
 def change_features(
-    root: Path, copy: Path, keep: Collection[str], added: Mapping[str, tuple[float, Mapping[str, Any]]]
+    root: Path,
+    copy: Path,
+    keep: Collection[str],
+    added: Mapping[str, tuple[float, Mapping[str, Any]]],
 ) -> None:
     """Write the dataset at ``root`` with other features to ``copy``, which must not exist, without its provenance. Videos are
     linked. ``keep``: features that remain, besides LeRobot's own columns. ``added``: new feature → its value in all rows, and its
@@ -101,46 +144,78 @@ def change_features(
     with quiet_lerobot():
         from lerobot.datasets.feature_utils import get_hf_features_from_features
 
-    shutil.copytree(root / "meta", copy / "meta", ignore=shutil.ignore_patterns(PROVENANCE.name))
+    shutil.copytree(
+        root / "meta", copy / "meta", ignore=shutil.ignore_patterns(PROVENANCE.name)
+    )
     info = read_info(copy)
-    kept = {key: f for key, f in info["features"].items() if key in keep or key in BOOKKEEPING}
+    kept = {
+        key: f
+        for key, f in info["features"].items()
+        if key in keep or key in BOOKKEEPING
+    }
     lost = [key for key in info["features"] if key not in kept]
-    info["features"] = kept | {key: {**told, "shape": list(told["shape"])} for key, (_, told) in added.items()}
+    info["features"] = kept | {
+        key: {**told, "shape": list(told["shape"])} for key, (_, told) in added.items()
+    }
     is_shown = any(f["dtype"] == "video" for f in kept.values())
     info["video_path"] = info.get("video_path") if is_shown else None
     write_info(copy, info)
     if is_shown:
-        (copy / "videos").symlink_to((root / "videos").resolve(), target_is_directory=True)
+        (copy / "videos").symlink_to(
+            (root / "videos").resolve(), target_is_directory=True
+        )
 
-    shaped = {key: {**f, "shape": tuple(f["shape"])} for key, f in info["features"].items()}
+    shaped = {
+        key: {**f, "shape": tuple(f["shape"])} for key, f in info["features"].items()
+    }
     schema = get_hf_features_from_features(shaped).arrow_schema
     for source in sorted((root / "data").glob("*/*.parquet")):
-        table = pq.read_table(source, columns=[name for name in schema.names if name not in added])
+        table = pq.read_table(
+            source, columns=[name for name in schema.names if name not in added]
+        )
         for key, (value, _) in added.items():
             kind = schema.field(key).type
             size = kind.list_size if pa.types.is_fixed_size_list(kind) else 1
             flat = pa.array(np.full(len(table) * size, value, dtype=np.float32))
-            column = pa.FixedSizeListArray.from_arrays(flat, size) if pa.types.is_fixed_size_list(kind) else flat
+            column = (
+                pa.FixedSizeListArray.from_arrays(flat, size)
+                if pa.types.is_fixed_size_list(kind)
+                else flat
+            )
             table = table.append_column(key, column)
         place = copy / source.relative_to(root)
         place.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table.select(schema.names).cast(schema), place, compression="snappy")
+        pq.write_table(
+            table.select(schema.names).cast(schema), place, compression="snappy"
+        )
 
     gone = tuple(f"{kind}/{key}/" for kind in ("videos", "stats") for key in lost)
     for file in (copy / "meta/episodes").rglob("*.parquet"):
         table = pq.read_table(file)
-        pq.write_table(table.select([name for name in table.column_names if not name.startswith(gone)]), file)
+        pq.write_table(
+            table.select(
+                [name for name in table.column_names if not name.startswith(gone)]
+            ),
+            file,
+        )
     stats = copy / "meta" / "stats.json"
     if stats.is_file():
         known = json.loads(stats.read_text(encoding="utf-8"))
-        stats.write_text(json.dumps({key: s for key, s in known.items() if key not in lost}), encoding="utf-8")
+        stats.write_text(
+            json.dumps({key: s for key, s in known.items() if key not in lost}),
+            encoding="utf-8",
+        )
 
 
 def copy_pictures(source: Path, root: Path) -> None:
     """Add the picture features of the dataset at ``source`` to ``info.json`` of the one at ``root``, whose frames are only in the
     frame cache of training."""
     features, info = read_info(source)["features"], read_info(root)
-    cameras = {key: {k: v for k, v in f.items() if k != "info"} for key, f in features.items() if f["dtype"] == "video"}
+    cameras = {
+        key: {k: v for k, v in f.items() if k != "info"}
+        for key, f in features.items()
+        if f["dtype"] == "video"
+    }
     write_info(root, info | {"features": cameras | info["features"]})
 
 
@@ -153,19 +228,27 @@ def check_path(path: Path) -> None:
 
 
 def write_episodes(
-    episodes: Sequence[Episode], root: Path, *, progress: Callable[[int], None] | None = None, streaming: bool = True
+    episodes: Sequence[Episode],
+    root: Path,
+    *,
+    progress: Callable[[int], None] | None = None,
+    streaming: bool = True,
 ) -> None:
     """Write these episodes as a new dataset at ``root``, and verify it; if that fails, or without ``streaming``, write it through
     PNG files. ``progress``: called with the number of rows written so far. Raises DatasetError: also the videos made from PNG
     files do not hold exactly one frame per row; RecordingError: a picture is broken; nothing is left at ``root``."""
     check_path(root)
     if root.exists():
-        raise DatasetError(f"{root} exists already; nothing was changed: give another folder")
+        raise DatasetError(
+            f"{root} exists already; nothing was changed: give another folder"
+        )
     try:
         _write(episodes, root, progress, streaming)
         problems = Dataset(root).video_problems()
         if problems and streaming:
-            logging.getLogger(__name__).warning("%s: %s; writing again without streaming", root, problems[0])
+            logging.getLogger(__name__).warning(
+                "%s: %s; writing again without streaming", root, problems[0]
+            )
             shutil.rmtree(root)
             _write(episodes, root, progress, streaming=False)
             problems = Dataset(root).video_problems()
@@ -176,14 +259,23 @@ def write_episodes(
         raise DatasetError(f"{root}: {len(problems)} problems, first: {problems[0]}")
 
 
-def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], None] | None, streaming: bool) -> None:
+def _write(
+    episodes: Sequence[Episode],
+    root: Path,
+    progress: Callable[[int], None] | None,
+    streaming: bool,
+) -> None:
     with quiet_lerobot():
         from lerobot.configs import RGBEncoderConfig
         from lerobot.datasets import dataset_metadata
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         first = episodes[0]
-        keys = [k for k in first.spec.features if k in first.arrays or k in first.picture_keys]
+        keys = [
+            k
+            for k in first.spec.features
+            if k in first.arrays or k in first.picture_keys
+        ]
         dataset = LeRobotDataset.create(
             repo_id=f"local/{root.name}",
             fps=first.spec.fps,
@@ -208,18 +300,25 @@ def _write(episodes: Sequence[Episode], root: Path, progress: Callable[[int], No
                             _normal_priority()
                         if progress is not None:
                             progress(done)
-                    with _large_features_in_blocks(dataset.writer), _statistics_in_order(dataset_metadata):
+                    with (
+                        _large_features_in_blocks(dataset.writer),
+                        _statistics_in_order(dataset_metadata),
+                    ):
                         dataset.save_episode()
             dataset.finalize()
         except BaseException:
-            with contextlib.suppress(Exception):  # stop encoder threads; the error that brought us here matters
+            with contextlib.suppress(
+                Exception
+            ):  # stop encoder threads; the error that brought us here matters
                 dataset.clear_episode_buffer()
                 dataset.finalize()
             raise
 
 
 def _rows(episode: Episode) -> Iterator[dict[str, Any]]:
-    pictures = episode.pictures() if episode.picture_keys else iter([{}] * episode.num_rows)
+    pictures = (
+        episode.pictures() if episode.picture_keys else iter([{}] * episode.num_rows)
+    )
     for k, shown in enumerate(pictures):
         numbers = {key: values[k] for key, values in episode.arrays.items()}
         yield {**numbers, **shown, "task": episode.instruction}
@@ -259,20 +358,37 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     from lerobot.datasets import dataset_writer
 
     def is_large(value: Any) -> bool:
-        return isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] >= LARGE_FEATURE
+        return (
+            isinstance(value, np.ndarray)
+            and value.ndim == 2
+            and value.shape[1] >= LARGE_FEATURE
+        )
 
     compute, save = dataset_writer.compute_episode_stats, writer._save_episode_data
 
-    def compute_in_blocks(data: dict[str, Any], features: dict[str, Any], *args: Any) -> dict[str, Any]:
+    def compute_in_blocks(
+        data: dict[str, Any], features: dict[str, Any], *args: Any
+    ) -> dict[str, Any]:
         large = {k: exact_stats(v) for k, v in data.items() if is_large(v)}
-        stats = compute({k: v for k, v in data.items() if k not in large}, features, *args) | large
-        return {k: stats[k] for k in data if k in stats}  # they become the episodes' columns, in this order
+        stats = (
+            compute({k: v for k, v in data.items() if k not in large}, features, *args)
+            | large
+        )
+        return {
+            k: stats[k] for k in data if k in stats
+        }  # they become the episodes' columns, in this order
 
     def save_as_arrow(episode_buffer: dict[str, Any]) -> dict[str, Any]:
-        return save({k: as_arrow(v) if is_large(v) else v for k, v in episode_buffer.items()})
+        return save(
+            {k: as_arrow(v) if is_large(v) else v for k, v in episode_buffer.items()}
+        )
 
     with (
-        _replaced(dataset_writer, compute_episode_stats=compute_in_blocks, embed_images=lambda dataset: dataset),
+        _replaced(
+            dataset_writer,
+            compute_episode_stats=compute_in_blocks,
+            embed_images=lambda dataset: dataset,
+        ),
         _replaced(writer, _save_episode_data=save_as_arrow),
         _replaced(arrow_dataset, generate_fingerprint=lambda dataset: "0" * 16),
     ):
@@ -297,11 +413,20 @@ def _pixels_counted() -> Iterator[None]:
                 super().update(batch)
                 return
             pixels = np.ascontiguousarray(batch.reshape(-1, 1, batch.shape[-1]))
-            new = [cv2.calcHist([pixels], [c], None, [256], [0, 256])[:, 0] for c in range(batch.shape[-1])]
-            self.counts = np.array(new, np.int64) + (0 if self.counts is None else self.counts)
+            new = [
+                cv2.calcHist([pixels], [c], None, [256], [0, 256])[:, 0]
+                for c in range(batch.shape[-1])
+            ]
+            self.counts = np.array(new, np.int64) + (
+                0 if self.counts is None else self.counts
+            )
 
         def get_statistics(self) -> dict[str, np.ndarray]:
-            return super().get_statistics() if self.counts is None else stats_of_counts(self.counts)
+            return (
+                super().get_statistics()
+                if self.counts is None
+                else stats_of_counts(self.counts)
+            )
 
     with _replaced(compute_stats, RunningQuantileStats=PixelStatistics):
         yield
@@ -315,7 +440,10 @@ def _statistics_in_order(module: Any) -> Iterator[None]:
 
     def in_order(stats: list[dict[str, Any]]) -> dict[str, Any]:
         total = aggregate(stats)
-        return {key: total[key] for key in dict.fromkeys(key for each in stats for key in each)}
+        return {
+            key: total[key]
+            for key in dict.fromkeys(key for each in stats for key in each)
+        }
 
     with _replaced(module, aggregate_stats=in_order):
         yield
@@ -325,7 +453,12 @@ def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
     """``values`` (T, size) as an Arrow array of T fixed-size lists, in pieces of ``rows``, so that no later step holds all of
     them twice."""
     pieces = [values[k : k + rows] for k in range(0, len(values), rows)]
-    return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
+    return pa.chunked_array(
+        [
+            pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1])
+            for p in pieces
+        ]
+    )
 
 
 def _wait_for_room(dataset: Any) -> None:
@@ -353,23 +486,39 @@ def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> No
     write_exact_statistics(destination, smaller_than=LARGE_FEATURE, run=run)
     problems = Dataset(destination).video_problems()
     if problems:
-        raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")
+        raise DatasetError(
+            f"{destination}: {len(problems)} problems after merging, first: {problems[0]}"
+        )
 
 
-def write_exact_statistics(root: Path, *, smaller_than: float = math.inf, run: Run = in_threads) -> None:
+def write_exact_statistics(
+    root: Path, *, smaller_than: float = math.inf, run: Run = in_threads
+) -> None:
     """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included. Rows
     that are NaN as a whole, in which the feature is unknown, are not counted. ``smaller_than``: leave features with as many
     elements as they are."""
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
-        stated = {key: f["shape"] for key, f in read_info(root)["features"].items() if f["dtype"] in STATED}
-        stated = {key: shape for key, shape in stated.items() if math.prod(shape) < smaller_than}
+        stated = {
+            key: f["shape"]
+            for key, f in read_info(root)["features"].items()
+            if f["dtype"] in STATED
+        }
+        stated = {
+            key: shape
+            for key, shape in stated.items()
+            if math.prod(shape) < smaller_than
+        }
         found = run(functools.partial(_exact_statistics, root), list(stated.items()))
-        write_stats(dict(load_stats(root) or {}) | dict(zip(stated, found, strict=True)), root)
+        write_stats(
+            dict(load_stats(root) or {}) | dict(zip(stated, found, strict=True)), root
+        )
 
 
-def _exact_statistics(root: Path, feature: tuple[str, Sequence[int]]) -> dict[str, np.ndarray]:
+def _exact_statistics(
+    root: Path, feature: tuple[str, Sequence[int]]
+) -> dict[str, np.ndarray]:
     key, shape = feature
     values = feature_rows(root, key)
     known = known_rows(values)
@@ -381,23 +530,38 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
-        stats = dict((load_stats(root) if (root / "meta/stats.json").is_file() else None) or {})
+        stats = dict(
+            (load_stats(root) if (root / "meta/stats.json").is_file() else None) or {}
+        )
         write_stats(stats | picture_statistics(root, keys), root)
 
 
-def picture_statistics(root: Path, keys: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+def picture_statistics(
+    root: Path, keys: Sequence[str]
+) -> dict[str, dict[str, np.ndarray]]:
     """Key → statistic → (3, 1, 1) of the pictures ``keys``, added up from those of the episodes in ``meta/episodes``."""
     stats: dict[str, dict[str, np.ndarray]] = {}
     with quiet_lerobot():
         from lerobot.datasets.compute_stats import aggregate_stats
 
-        tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
+        tables = [
+            pq.read_table(path)
+            for path in sorted((root / "meta/episodes").glob("*/*.parquet"))
+        ]
         for key in keys:
             prefix, episodes = f"stats/{key}/", []
-            columns = [t.select([n for n in t.column_names if n.startswith(prefix)]) for t in tables]
+            columns = [
+                t.select([n for n in t.column_names if n.startswith(prefix)])
+                for t in tables
+            ]
             for row in (row for table in columns for row in table.to_pylist()):
                 shapes = {n: (-1,) if n.endswith("/count") else (-1, 1, 1) for n in row}
-                episodes.append({n.removeprefix(prefix): np.array(v).reshape(shapes[n]) for n, v in row.items()})
+                episodes.append(
+                    {
+                        n.removeprefix(prefix): np.array(v).reshape(shapes[n])
+                        for n, v in row.items()
+                    }
+                )
             if episodes and episodes[0]:
                 stats |= aggregate_stats([{key: episode} for episode in episodes])
     return stats
@@ -410,7 +574,9 @@ def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:
         from datasets import config as datasets_config
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        with _replaced(datasets_config, HF_DATASETS_CACHE=Path(cache)):  # it would keep a copy of the rows there
+        with _replaced(
+            datasets_config, HF_DATASETS_CACHE=Path(cache)
+        ):  # it would keep a copy of the rows there
             try:
                 dataset = LeRobotDataset(f"local/{root.name}", root=root)
             except Exception as error:  # whatever it is, training would end in it
@@ -418,9 +584,15 @@ def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:
             for row in rows:
                 try:
                     found = int(dataset[row]["index"])  # pyright: ignore[reportCallIssue, reportArgumentType]
-                    problems += [] if found == row else [f"LeRobot gives row {found} for row {row}"]
+                    problems += (
+                        []
+                        if found == row
+                        else [f"LeRobot gives row {found} for row {row}"]
+                    )
                 except Exception as error:
-                    problems.append(f"LeRobot cannot read row {row}: {_in_one_line(error)}")
+                    problems.append(
+                        f"LeRobot cannot read row {row}: {_in_one_line(error)}"
+                    )
     return problems
 
 
@@ -432,7 +604,9 @@ def _in_one_line(error: Exception, most: int = 300) -> str:
 def _join(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
     with quiet_lerobot():
         join(roots, destination, _common_features(roots), run)
-    groups = [roots[k : k + JOINED_TOGETHER] for k in range(0, len(roots), JOINED_TOGETHER)]
+    groups = [
+        roots[k : k + JOINED_TOGETHER] for k in range(0, len(roots), JOINED_TOGETHER)
+    ]
     found = [stats for stats in run(_mean_statistics, groups) if stats]
     with quiet_lerobot():
         from lerobot.datasets.io_utils import write_stats
@@ -465,14 +639,29 @@ def _common_features(roots: Sequence[Path]) -> dict[str, Any]:
     infos = [read_info(root) for root in roots]
     for info, root in zip(infos, roots, strict=True):
         one, other = infos[0]["features"], info["features"]
-        compared = [(key, infos[0][key], info[key]) for key in ("fps", "robot_type") if infos[0][key] != info[key]]
+        compared = [
+            (key, infos[0][key], info[key])
+            for key in ("fps", "robot_type")
+            if infos[0][key] != info[key]
+        ]
         for key in {**one, **other}:
-            a, b = ({key: features[key]} if key in features else {} for features in (one, other))
-            compared += [] if features_equal_for_merge(a, b) else [(key, a.get(key, "absent"), b.get(key, "absent"))]
+            a, b = (
+                {key: features[key]} if key in features else {}
+                for features in (one, other)
+            )
+            compared += (
+                []
+                if features_equal_for_merge(a, b)
+                else [(key, a.get(key, "absent"), b.get(key, "absent"))]
+            )
         if compared:
             key, a, b = compared[0]
-            raise DatasetError(f"these datasets do not merge: {key} is {b} in {root.name}, but {a} in {roots[0].name}")
-    return merge_video_feature_info_for_aggregate([SimpleNamespace(features=info["features"]) for info in infos])  # pyright: ignore[reportArgumentType]
+            raise DatasetError(
+                f"these datasets do not merge: {key} is {b} in {root.name}, but {a} in {roots[0].name}"
+            )
+    return merge_video_feature_info_for_aggregate(
+        [SimpleNamespace(features=info["features"]) for info in infos]  # pyright: ignore[reportArgumentType]
+    )
 
 
 @contextlib.contextmanager
@@ -482,7 +671,10 @@ def quiet_lerobot() -> Iterator[None]:
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     os.environ.setdefault("SVT_LOG", "1")
     os.environ.setdefault("TQDM_DISABLE", "1")
-    if os.environ.get("TACCORL_PROGRAM") == "1" and "lerobot.processor" not in sys.modules:
+    if (
+        os.environ.get("TACCORL_PROGRAM") == "1"
+        and "lerobot.processor" not in sys.modules
+    ):
         # Writing a dataset needs no tokenizer: without transformers LeRobot imports 2 CPU-s faster and 55 MB smaller.
         from lerobot.utils import import_utils
 

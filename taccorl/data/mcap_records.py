@@ -18,28 +18,62 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode as Op
-from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Message, Metadata, MetadataIndex, Schema
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER_BYTES = 9  # Bytes of a record before its body: opcode (1), length (8)
-MAX_CHUNK_BYTES = 1 << 28  # A larger chunk is not opened: a few damaged bytes must not take all the memory
+MAX_CHUNK_BYTES = (
+    1 << 28
+)  # A larger chunk is not opened: a few damaged bytes must not take all the memory
 BLOCK_BYTES = 1 << 20  # Number of bytes that are read at once
 MESSAGE_BYTES = 22  # channel (2), sequence (4), log time (8), publish time (8); the rest is the payload
 DATA_END_BYTES = HEADER_BYTES + 4  # the whole record
 # Bodies: a number of fixed bytes; "short", "long": a part behind its own length in 4 or 8 bytes.
 _LAYOUTS: Mapping[Any, tuple[int | str, ...]] = (
-    {Op.HEADER: ("short", "short"), Op.FOOTER: (20,), Op.DATA_END: (4,), Op.SUMMARY_OFFSET: (17,)}
-    | {Op.SCHEMA: (2, "short", "short", "short"), Op.CHANNEL: (4, "short", "short", "short")}
-    | {Op.CHUNK: (28, "short", "long"), Op.MESSAGE_INDEX: (2, "short"), Op.CHUNK_INDEX: (32, "short", 8, "short", 16)}
-    | {Op.ATTACHMENT: (16, "short", "short", "long", 4), Op.ATTACHMENT_INDEX: (40, "short", "short")}
-    | {Op.METADATA: ("short", "short"), Op.METADATA_INDEX: (16, "short"), Op.STATISTICS: (42, "short")}
+    {
+        Op.HEADER: ("short", "short"),
+        Op.FOOTER: (20,),
+        Op.DATA_END: (4,),
+        Op.SUMMARY_OFFSET: (17,),
+    }
+    | {
+        Op.SCHEMA: (2, "short", "short", "short"),
+        Op.CHANNEL: (4, "short", "short", "short"),
+    }
+    | {
+        Op.CHUNK: (28, "short", "long"),
+        Op.MESSAGE_INDEX: (2, "short"),
+        Op.CHUNK_INDEX: (32, "short", 8, "short", 16),
+    }
+    | {
+        Op.ATTACHMENT: (16, "short", "short", "long", 4),
+        Op.ATTACHMENT_INDEX: (40, "short", "short"),
+    }
+    | {
+        Op.METADATA: ("short", "short"),
+        Op.METADATA_INDEX: (16, "short"),
+        Op.STATISTICS: (42, "short"),
+    }
 )
 _PARSERS: Mapping[Any, Callable[[ReadDataStream], Any]] = {
     Op.SCHEMA: Schema.read,
     Op.CHANNEL: Channel.read,
     Op.CHUNK: Chunk.read,
     Op.CHUNK_INDEX: ChunkIndex.read,
-} | {Op.ATTACHMENT_INDEX: AttachmentIndex.read, Op.METADATA: Metadata.read, Op.METADATA_INDEX: MetadataIndex.read}
+} | {
+    Op.ATTACHMENT_INDEX: AttachmentIndex.read,
+    Op.METADATA: Metadata.read,
+    Op.METADATA_INDEX: MetadataIndex.read,
+}
 BEGINNINGS = {Op.CHUNK, Op.ATTACHMENT, Op.METADATA, Op.DATA_END}
 """Kinds of records at which reading goes on behind a damaged one in data of chunks."""
 _END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
@@ -113,22 +147,35 @@ class McapFile:
             # Nothing inside a message says how long it is; and a damaged opcode must not make another record a message.
             others = {Op.HEADER, Op.SCHEMA, Op.CHANNEL, Op.CHUNK, Op.METADATA}
             others |= {Op.MESSAGE_INDEX} if self.chunked else set()
-            sound = record.length >= MESSAGE_BYTES and not any(self._fills(record._replace(opcode=o)) for o in others)
+            sound = record.length >= MESSAGE_BYTES and not any(
+                self._fills(record._replace(opcode=o)) for o in others
+            )
         else:
             sound = self._is_private(record)
         return record if sound and self._may_begin(record.end) else None
 
-    def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
+    def find(
+        self,
+        start: int,
+        stop: int,
+        opcodes: Collection[int],
+        channels: Collection[int] = (),
+    ) -> int | None:
         """Offset of the first whole record of one of ``opcodes`` in [start, stop), None without one; messages only of these
         channel ids."""
         wanted = np.isin(np.arange(256), list(opcodes))
         for offset in range(start, stop, BLOCK_BYTES):
             self.file.seek(offset)
-            block = np.frombuffer(self.file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1), np.uint8)
+            block = np.frombuffer(
+                self.file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1),
+                np.uint8,
+            )
             if len(block) < HEADER_BYTES:
                 return None
             heads = block[: len(block) - HEADER_BYTES + 1]
-            small = (block[6:-2] == 0) & (block[7:-1] == 0) & (block[8:] == 0)  # lengths below 2⁴⁰ bytes
+            small = (
+                (block[6:-2] == 0) & (block[7:-1] == 0) & (block[8:] == 0)
+            )  # lengths below 2⁴⁰ bytes
             for at in np.flatnonzero(wanted[heads] & small):
                 record = self.record(offset + int(at))
                 if record is not None and self._is_sure(record, channels):
@@ -180,18 +227,27 @@ class McapFile:
             return self.summary.end is None and known and record.length < 1 << 40
         if record.opcode in _LAYOUTS:
             return self._fills(record)
-        return record.length >= MESSAGE_BYTES if record.opcode == Op.MESSAGE else self._is_private(record)
+        return (
+            record.length >= MESSAGE_BYTES
+            if record.opcode == Op.MESSAGE
+            else self._is_private(record)
+        )
 
     def _is_private(self, record: Record) -> bool:
         """An application's own kind (0x80 and above), rather than a chunk or the end-of-data record with a damaged opcode."""
         indexed = self.summary.proven and self.summary.has_chunks
-        place = len(MAGIC) < record.offset != self.summary.next_start(record.offset) and record.end != self.end
+        place = (
+            len(MAGIC) < record.offset != self.summary.next_start(record.offset)
+            and record.end != self.end
+        )
         return record.opcode >= 0x80 and indexed and place
 
     def _is_sure(self, record: Record, channels: Collection[int]) -> bool:
         if record.opcode == Op.MESSAGE:
             channel = int.from_bytes(self.body(record)[:2], "little")
-            return channel in channels and (record.end == self.end or self.record(record.end) is not None)
+            return channel in channels and (
+                record.end == self.end or self.record(record.end) is not None
+            )
         return record.opcode != Op.DATA_END or self._may_begin(record.end)
 
     def _crc(self, start: int, end: int) -> int:
@@ -217,17 +273,31 @@ class McapFile:
         summary, offset = Summary(proven=crc != 0, end=start), start
         while offset < footer.offset:
             record = self.record(offset)
-            if record is None or record.opcode in (Op.MESSAGE, Op.CHUNK, Op.ATTACHMENT, Op.METADATA, Op.DATA_END):
+            if record is None or record.opcode in (
+                Op.MESSAGE,
+                Op.CHUNK,
+                Op.ATTACHMENT,
+                Op.METADATA,
+                Op.DATA_END,
+            ):
                 return Summary(f"no index record at byte {offset:,}")
             try:
-                found = parse(record.opcode, self.body(record)) if record.opcode in _PARSERS else None
+                found = (
+                    parse(record.opcode, self.body(record))
+                    if record.opcode in _PARSERS
+                    else None
+                )
             except (ValueError, struct.error, McapError) as error:
                 return Summary(f"unreadable at byte {offset:,}: {error}")
             if isinstance(found, Schema | Channel):
                 summary.definitions.append(found)
             elif found is not None:
                 summary.has_chunks |= record.opcode == Op.CHUNK_INDEX
-                summary.starts.append(found.chunk_start_offset if record.opcode == Op.CHUNK_INDEX else found.offset)
+                summary.starts.append(
+                    found.chunk_start_offset
+                    if record.opcode == Op.CHUNK_INDEX
+                    else found.offset
+                )
             offset = record.end
         summary.definitions.sort(key=lambda d: isinstance(d, Channel))
         summary.starts.sort()
@@ -243,17 +313,23 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
         data = chunk.data
     elif chunk.compression == "zstd":
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
-            data = reader.read(claims + BLOCK_BYTES)  # a damaged block may overrun: room to say so
+            data = reader.read(
+                claims + BLOCK_BYTES
+            )  # a damaged block may overrun: room to say so
     elif chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, claims + 1)
     else:
         raise ValueError(f"compression {chunk.compression!r} is not supported")
     if chunk.compression and len(data) > claims:
-        raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
+        raise ValueError(
+            f"it contains more than the {claims:,} bytes that its header states"
+        )
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("its CRC does not match")
     if not chunk.uncompressed_crc and len(data) != claims:
-        raise ValueError(f"{len(data):,} bytes uncompressed, but its header states {claims:,}")
+        raise ValueError(
+            f"{len(data):,} bytes uncompressed, but its header states {claims:,}"
+        )
     view, offset = memoryview(data), 0
     while offset < len(data):
         opcode, length = struct.unpack_from("<BQ", view, offset)
@@ -267,4 +343,6 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
 def check_size(num_bytes: int) -> None:
     """Raises ValueError: a chunk has more than ``MAX_CHUNK_BYTES``."""
     if num_bytes > MAX_CHUNK_BYTES:
-        raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
+        raise ValueError(
+            f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted"
+        )

@@ -16,7 +16,9 @@ Domain = Literal["real", "surrogate", "twin"]
 """``real``: a robot. ``surrogate``: a simulated robot in place of a real one. ``twin``: the twin, or another simulation."""
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
 NOT_STATED = "origin not stated"  # Label of data that do not state their origin
-NO_ROBOT = "not a robot"  # Words of every text that this project writes about simulated data
+NO_ROBOT = (
+    "not a robot"  # Words of every text that this project writes about simulated data
+)
 RATE_OF = "rate_hz "  # Key of the rate of a topic [Hz] in a recording's metadata, followed by the topic
 
 
@@ -32,9 +34,13 @@ class Origin:
     def __post_init__(self) -> None:
         if self.domain is not None and self.domain not in DOMAINS:
             described = f" of data described as {self.text!r}" if self.text else ""
-            raise TaccorlError(f"unknown domain {self.domain!r}{described}: {nearest(self.domain, DOMAINS)}")
+            raise TaccorlError(
+                f"unknown domain {self.domain!r}{described}: {nearest(self.domain, DOMAINS)}"
+            )
         if self.domain == "real" and NO_ROBOT in self.text:
-            raise TaccorlError(f"domain 'real' of {self.text!r} contradicts the data: they come from a simulation")
+            raise TaccorlError(
+                f"domain 'real' of {self.text!r} contradicts the data: they come from a simulation"
+            )
 
     def __bool__(self) -> bool:
         return self.domain is not None or bool(self.text)
@@ -57,8 +63,13 @@ class Origin:
         text = str(record.get("origin") or "")
         simulated = any(key.startswith("sim.") for key in features)
         if simulated and record.get("domain") == "real":
-            raise TaccorlError(f"domain 'real' of {text!r} contradicts the data: they hold a simulator's state (sim.*)")
-        return cls(cast("Domain | None", record.get("domain", "twin" if simulated else None)), text)
+            raise TaccorlError(
+                f"domain 'real' of {text!r} contradicts the data: they hold a simulator's state (sim.*)"
+            )
+        return cls(
+            cast("Domain | None", record.get("domain", "twin" if simulated else None)),
+            text,
+        )
 
     def agreed(self, domain: Domain | None, who: str) -> "Origin":
         """With the ``domain`` that a user states, if the data state none. ``who``: where the user states it. Raises
@@ -66,13 +77,17 @@ class Origin:
         if domain is None or domain == self.domain:
             return self
         if self.domain is not None:
-            raise TaccorlError(f"{who} states domain {domain!r}, but the data state {self}: remove the statement")
+            raise TaccorlError(
+                f"{who} states domain {domain!r}, but the data state {self}: remove the statement"
+            )
         return Origin(domain, self.text)
 
 
 def labelled(origin: Origin) -> dict[str, str]:
     """The keys of ``Origin.record`` with their values as texts, for a recording's metadata; without those that are None."""
-    return {key: str(value) for key, value in origin.record().items() if value is not None}
+    return {
+        key: str(value) for key, value in origin.record().items() if value is not None
+    }
 
 
 UNSTATED = Origin()

@@ -27,7 +27,10 @@ def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
     ``thumbs``: (T, h, w) block means."""
     found, first = [], 0
     for row in range(1, len(thumbs) + 1):
-        if row == len(thumbs) or np.abs(thumbs[row] - thumbs[first]).max() >= SAME_LEVELS:
+        if (
+            row == len(thumbs)
+            or np.abs(thumbs[row] - thumbs[first]).max() >= SAME_LEVELS
+        ):
             found.append((first, row))
             first = row
     return found
@@ -42,7 +45,9 @@ class PictureWatch:
 
     def restart(self) -> None:
         """Start again from the episode's first row."""
-        self._thumbs: dict[str, list[np.ndarray]] = {key: [] for key in self.episode.picture_keys}
+        self._thumbs: dict[str, list[np.ndarray]] = {
+            key: [] for key in self.episode.picture_keys
+        }
 
     def see(self, pictures: Pictures) -> None:
         """Add the pictures of the next row."""
@@ -53,38 +58,82 @@ class PictureWatch:
 
     def findings(self) -> list[Finding]:
         """Findings about frozen cameras, after all rows were added."""
-        return [f for key, thumbs in self._thumbs.items() for f in _check_thumbs(self.episode, key, np.array(thumbs))]
+        return [
+            f
+            for key, thumbs in self._thumbs.items()
+            for f in _check_thumbs(self.episode, key, np.array(thumbs))
+        ]
 
 
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     """Find frozen cameras. ``decode``: also compare the decoded pictures; without it only rows that repeat one source picture
     are found, so nothing in an episode of a dataset."""
-    same = {key: stretches(repeated(n), episode.spec.fps, FROZEN_S) for key, n in episode.picture_rows.items()}
-    findings = [f for key, found in same.items() for f in _frozen(episode, key, found, "the same source picture")]
+    same = {
+        key: stretches(repeated(n), episode.spec.fps, FROZEN_S)
+        for key, n in episode.picture_rows.items()
+    }
+    findings = [
+        f
+        for key, found in same.items()
+        for f in _frozen(episode, key, found, "the same source picture")
+    ]
     if not decode or not episode.picture_keys:
         return findings
     watch = PictureWatch(episode)
     for pictures in episode.pictures():
         watch.see(pictures)
-    return findings + [f for f in watch.findings() if f.feature not in {g.feature for g in findings}]
+    return findings + [
+        f for f in watch.findings() if f.feature not in {g.feature for g in findings}
+    ]
 
 
-def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str) -> Iterator[Finding]:
+def _frozen(
+    episode: Episode, key: str, found: list[tuple[int, int]], what: str
+) -> Iterator[Finding]:
     if found:
-        fps, rows, share = episode.spec.fps, longest(found), sum(b - a for a, b in found) / episode.num_rows
+        fps, rows, share = (
+            episode.spec.fps,
+            longest(found),
+            sum(b - a for a, b in found) / episode.num_rows,
+        )
         text = f"{what} for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}; {share:.0%} of the episode is "
         text += f"frozen: the camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
-        yield finding("frozen_picture", key, text, rows, "error" if share >= FROZEN_SHARE else None)
+        yield finding(
+            "frozen_picture",
+            key,
+            text,
+            rows,
+            "error" if share >= FROZEN_SHARE else None,
+        )
 
 
 def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> Iterator[Finding]:
     joints = joints_in_sight(episode, key.rsplit(".", 1)[-1])
     if len(thumbs) != episode.num_rows:
-        yield not_judged(key, "pictures", f"{len(thumbs)} pictures for {episode.num_rows} rows")
+        yield not_judged(
+            key, "pictures", f"{len(thumbs)} pictures for {episode.num_rows} rows"
+        )
     elif joints is None:
         yield not_judged(key, "frozen pictures", "no joints in rad to compare with")
     else:
-        same = [r for r in same_picture_runs(thumbs) if (r[1] - r[0]) / episode.spec.fps >= FROZEN_S]
-        found = [r for r in same if np.ptp(joints[slice(*r)], axis=0).max(initial=0.0) >= SIGHT_RAD]
-        kind = "black" if found and thumbs[longest(found)[0]].mean() < DARK_LEVEL else "unchanged"
-        yield from _frozen(episode, key, found, f"{kind} pictures while joints move by more than {SIGHT_RAD:g} rad")
+        same = [
+            r
+            for r in same_picture_runs(thumbs)
+            if (r[1] - r[0]) / episode.spec.fps >= FROZEN_S
+        ]
+        found = [
+            r
+            for r in same
+            if np.ptp(joints[slice(*r)], axis=0).max(initial=0.0) >= SIGHT_RAD
+        ]
+        kind = (
+            "black"
+            if found and thumbs[longest(found)[0]].mean() < DARK_LEVEL
+            else "unchanged"
+        )
+        yield from _frozen(
+            episode,
+            key,
+            found,
+            f"{kind} pictures while joints move by more than {SIGHT_RAD:g} rad",
+        )

@@ -103,10 +103,16 @@ class Query(NamedTuple):
 
     def reads(self, topic: str) -> bool:
         """Whether values of the topic are wanted."""
-        return self.topics is not None and topic in self.topics and topic not in self.stamps_only
+        return (
+            self.topics is not None
+            and topic in self.topics
+            and topic not in self.stamps_only
+        )
 
     def covers(self, log_ns: int) -> bool:
-        return (self.start_ns is None or log_ns >= self.start_ns) and (self.end_ns is None or log_ns <= self.end_ns)
+        return (self.start_ns is None or log_ns >= self.start_ns) and (
+            self.end_ns is None or log_ns <= self.end_ns
+        )
 
 
 class Reader(ABC):
@@ -135,14 +141,23 @@ class Reader(ABC):
         """The recordings that ``path`` (a file or folder) holds, in order; None if this reader does not know such a path.
         ``split_bag``: the numbered files of a folder may be one."""
         del split_bag
-        return [Source(path, (path,))] if path.is_file() and path.suffix in cls.suffixes else None
+        return (
+            [Source(path, (path,))]
+            if path.is_file() and path.suffix in cls.suffixes
+            else None
+        )
 
     @abstractmethod
     def topics(self) -> dict[str, TopicType]:
         """Topic → its type. May be incomplete until ``messages`` has run over a damaged file."""
 
     def messages(
-        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
+        self,
+        topics: Topics | None,
+        *,
+        stamps_only: Topics = (),
+        start_ns: int | None = None,
+        end_ns: int | None = None,
     ) -> Iterator[Message]:
         """Messages of ``topics`` (None: all topics, stamps only) in file order; those of ``stamps_only`` without values. May
         skip those logged before ``start_ns`` or after ``end_ns``. Raises RecordingError: the file is not of this format, or a
@@ -158,12 +173,16 @@ class Reader(ABC):
         raise NotImplementedError
         yield
 
-    def check_decodable(self, types: Mapping[str, TopicType], query: Query, place: str) -> None:
+    def check_decodable(
+        self, types: Mapping[str, TopicType], query: Query, place: str
+    ) -> None:
         """Raises RecordingError: values are wanted of a topic that cannot be decoded."""
         for topic, kind in types.items():
             if kind.undecodable and query.reads(topic):
                 named = kind.undecodable.startswith(topic)
-                raise RecordingError(f"{place}: {kind.undecodable if named else f'{topic}: {kind.undecodable}'}")
+                raise RecordingError(
+                    f"{place}: {kind.undecodable if named else f'{topic}: {kind.undecodable}'}"
+                )
 
 
 readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
@@ -176,7 +195,11 @@ DEEPEST = 4  # Levels of folders that are searched for a hint, below the level a
 
 
 def find_sources(
-    path: Path, *, reader: str | None = None, split_bag: bool = False, skipped: list[str] | None = None
+    path: Path,
+    *,
+    reader: str | None = None,
+    split_bag: bool = False,
+    skipped: list[str] | None = None,
 ) -> list[tuple[str, Source]]:
     """All recordings at ``path`` (a file, bag folder, dataset, or folder of those) as (reader name, source). ``skipped``: if
     given, other entries of a folder and the reasons why they are not read are added to it, and an unreadable entry raises no
@@ -200,7 +223,9 @@ def find_sources(
                     raise
                 why = without_place(str(error), child)
             if sources is None and not child.name.startswith("."):
-                left.append(f"{child.name} ({why or _why_not(child, names, split_bag)})")
+                left.append(
+                    f"{child.name} ({why or _why_not(child, names, split_bag)})"
+                )
             found += sources or []
         if found:
             if skipped is not None:
@@ -208,15 +233,28 @@ def find_sources(
             return found
         raise RecordingError(f"{path}: {_why_nothing(path, names, split_bag, left)}")
     opens = kind.reader if (kind := sniff(path)) else None
-    if opens in names or (reader is not None and _other_kind(path, names, split_bag) is None):
+    if opens in names or (
+        reader is not None and _other_kind(path, names, split_bag) is None
+    ):
         # the reader will say what is wrong with it
         return [(opens if opens in names else names[0], Source(path, (path,)))]
     raise RecordingError(f"{path}: {_why_nothing(path, names, split_bag, [])}")
 
 
-def _sources_at(path: Path, names: list[str], split_bag: bool) -> list[tuple[str, Source]] | None:
-    found = ((name, readers.get(name).sources(path, split_bag=split_bag)) for name in names)
-    return next(([(name, source) for source in sources] for name, sources in found if sources is not None), None)
+def _sources_at(
+    path: Path, names: list[str], split_bag: bool
+) -> list[tuple[str, Source]] | None:
+    found = (
+        (name, readers.get(name).sources(path, split_bag=split_bag)) for name in names
+    )
+    return next(
+        (
+            [(name, source) for source in sources]
+            for name, sources in found
+            if sources is not None
+        ),
+        None,
+    )
 
 
 def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
@@ -224,12 +262,16 @@ def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
     others = [name for name in readers if name not in names]
     reads = f"; this spec reads {', '.join(names)}" if others else ""
     if (kind := sniff(path)) is not None:
-        return no_recording(path) or (None if kind.reader in names else kind.name + reads)
+        return no_recording(path) or (
+            None if kind.reader in names else kind.name + reads
+        )
     try:
         found = _sources_at(path, others, split_bag) or []
     except RecordingError as error:
         return without_place(str(error), path) + reads
-    name = next(("a LeRobot dataset" if name == "lerobot" else name for name, _ in found), "")
+    name = next(
+        ("a LeRobot dataset" if name == "lerobot" else name for name, _ in found), ""
+    )
     return name + reads if found else None
 
 
@@ -239,23 +281,48 @@ def _why_not(path: Path, names: list[str], split_bag: bool) -> str:
         return other
     if path.is_dir():
         deeper = _nearest_folder(path, names, split_bag)
-        return f"there are recordings in {deeper}: give that folder" if deeper else "a folder without recordings"
-    return f"{kind.name} with another ending: give the file itself" if (kind := sniff(path)) else "no recording"
+        return (
+            f"there are recordings in {deeper}: give that folder"
+            if deeper
+            else "a folder without recordings"
+        )
+    return (
+        f"{kind.name} with another ending: give the file itself"
+        if (kind := sniff(path))
+        else "no recording"
+    )
 
 
 def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str]) -> str:
     """Why no recording was found at ``path``, and the way to one."""
     if (other := _other_kind(path, names, split_bag)) is not None:
         opens = kind.reader if (kind := sniff(path)) else None
-        fitting = [name for name, spec in shipped_recording_specs().items() if spec.reader == opens]
-        return other + (f" ({', '.join(fitting)} reads {opens})" if fitting and len(names) == 1 else "")
+        fitting = [
+            name
+            for name, spec in shipped_recording_specs().items()
+            if spec.reader == opens
+        ]
+        return other + (
+            f" ({', '.join(fitting)} reads {opens})"
+            if fitting and len(names) == 1
+            else ""
+        )
     if (path / "data").is_dir() and (path / "meta").is_dir() and "lerobot" in names:
         return "a LeRobot dataset without meta/info.json: copy it again"
-    if path.is_dir() and (deeper := _nearest_folder(path, names, split_bag)) is not None:
+    if (
+        path.is_dir()
+        and (deeper := _nearest_folder(path, names, split_bag)) is not None
+    ):
         return f"no recording here, but there are some in {deeper}: give that folder"
-    opened = [", ".join(sorted({s for name in names for s in readers.get(name).suffixes}))]
+    opened = [
+        ", ".join(sorted({s for name in names for s in readers.get(name).suffixes}))
+    ]
     opened += ["LeRobot datasets"] * ("lerobot" in names)
-    who = f"the reader {names[0]} opens" if len(names) == 1 else f"readers {', '.join(names)} open"
+    who = (
+        f"the reader {names[0]} opens"
+        if len(names) == 1
+        else f"readers {', '.join(names)} open"
+    )
     more = f" and {len(left) - MOST_NAMED} more" if len(left) > MOST_NAMED else ""
     listed = f"; not read: {', '.join(left[:MOST_NAMED])}{more}" if left else ""
     return f"no recording here; {who} {' and '.join(filter(None, opened))}{', taccorl compare tables' * (len(names) > 1)}{listed}"
@@ -282,7 +349,11 @@ def _nearest_folder(path: Path, names: list[str], split_bag: bool) -> Path | Non
     level = [path]
     for _ in range(DEEPEST):
         level = [p for folder in level for p in entries(folder) if p.is_dir()]
-        if (found := next((folder for folder in level if any(map(is_read, entries(folder)))), None)) is not None:
+        if (
+            found := next(
+                (folder for folder in level if any(map(is_read, entries(folder)))), None
+            )
+        ) is not None:
             return found
     return None
 
@@ -301,7 +372,9 @@ class Channel:
     name: str
     spec: ChannelSpec
     log_ns: np.ndarray  # (N,) int64 log times [ns]
-    stamp_ns: np.ndarray | None  # (N,) int64 header stamps [ns]; None if the messages have no header
+    stamp_ns: (
+        np.ndarray | None
+    )  # (N,) int64 header stamps [ns]; None if the messages have no header
     values: np.ndarray | None  # (N, size) numbers; None for pictures
     place: np.ndarray  # (N,) int64 number of each message among all that were read, in the order of the file
     skipped: dict[str, int] = field(default_factory=dict)
@@ -342,10 +415,14 @@ class Recording:
         named = [Origin(text=r["origin"]) for r in records if "origin" in r]
         domains = {str(origin.domain) for origin in stated}
         if len(domains) > 1:
-            raise RecordingError(f"{self.source.name}: its metadata state the domains {', '.join(sorted(domains))}")
+            raise RecordingError(
+                f"{self.source.name}: its metadata state the domains {', '.join(sorted(domains))}"
+            )
         return next(iter(stated or named), Origin())
 
-    def pictures(self, wanted: dict[str, list[Identity]]) -> Iterator[tuple[str, Identity, Any]]:
+    def pictures(
+        self, wanted: dict[str, list[Identity]]
+    ) -> Iterator[tuple[str, Identity, Any]]:
         """Yield encoded pictures in the order of the file: (channel, identity, payload as the reader decodes it). ``wanted``:
         name of the channel → identities of the pictures."""
         logs = [ident[0] for ids in wanted.values() for ident in ids]
@@ -356,10 +433,16 @@ class Recording:
         seen: Counter[tuple[str, int, int | None]] = Counter()
         streams: dict[str, VideoStream] = {}
 
-        def given(topic: str, decoded: list[tuple[Any, np.ndarray | None]]) -> Iterator[tuple[str, Identity, Any]]:
+        def given(
+            topic: str, decoded: list[tuple[Any, np.ndarray | None]]
+        ) -> Iterator[tuple[str, Identity, Any]]:
             names = [name for name in wanted if self.spec.channels[name].topic == topic]
             for (ident, value), frame in decoded:
-                yield from ((n, ident, value if frame is None else frame) for n in names if ident in sets[n])
+                yield from (
+                    (n, ident, value if frame is None else frame)
+                    for n in names
+                    if ident in sets[n]
+                )
 
         # The frames of a video need those before them.
         start_ns = None if self._streams & topics else min(logs)
@@ -370,8 +453,13 @@ class Recording:
             if m.topic not in self._streams:
                 yield from given(m.topic, [((ident, m.value), None)])
             elif m.topic in streams or is_stream(m.value):
-                stream = streams.setdefault(m.topic, VideoStream(str(decode.maybe(m.value, "format"))))
-                yield from given(m.topic, stream.decode((ident, m.value), decode.maybe(m.value, "data")))
+                stream = streams.setdefault(
+                    m.topic, VideoStream(str(decode.maybe(m.value, "format")))
+                )
+                yield from given(
+                    m.topic,
+                    stream.decode((ident, m.value), decode.maybe(m.value, "data")),
+                )
         for topic, stream in streams.items():
             yield from given(topic, stream.decode(None, None))
 
@@ -379,7 +467,9 @@ class Recording:
         """Check that pictures of a channel decode, before any work is done for them: its first one, else another one. Raises
         RecordingError: none of those does, with the reason of the first."""
         topic, number, reason = self.spec.channels[name].topic, len(identities), ""
-        tried = {identities[k] for k in (0, number // 2, number - 1)} if number else set()
+        tried = (
+            {identities[k] for k in (0, number // 2, number - 1)} if number else set()
+        )
         for _, ident, value in self.pictures({name: sorted(tried, key=lambda i: i[0])}):
             if ident == identities[0] and is_stream(value):
                 self._streams.add(topic)
@@ -415,17 +505,37 @@ def load_recording(source: Source, spec: RecordingSpec, scratch: Path) -> Record
     the recording is used. Raises RecordingError: not readable, a topic is missing or of another type, or a message does not fit
     the spec."""
     reader = readers.get(spec.reader)(source, spec)
-    number_channels = {n: c for n, c in spec.channels.items() if n not in spec.picture_channels}
+    number_channels = {
+        n: c for n, c in spec.channels.items() if n not in spec.picture_channels
+    }
     if both := spec.picture_topics & {c.topic for c in number_channels.values()}:
-        raise RecordingError(f"{', '.join(sorted(both))}: the spec reads it both as pictures and as numbers")
-    pads = {key: sensor for key, sensor in spec.target.sensors.items() if key in spec.features}
-    of_pads = {channel: sensor for key, sensor in pads.items() for channel in spec.features[key].channels}
+        raise RecordingError(
+            f"{', '.join(sorted(both))}: the spec reads it both as pictures and as numbers"
+        )
+    pads = {
+        key: sensor
+        for key, sensor in spec.target.sensors.items()
+        if key in spec.features
+    }
+    of_pads = {
+        channel: sensor
+        for key, sensor in pads.items()
+        for channel in spec.features[key].channels
+    }
     numbers: dict[str, dict[str, _Numbers]] = {}
     for k, (name, channel) in enumerate(number_channels.items()):
-        extract = decode.pad_extractor(channel, of_pads[name]) if name in of_pads else decode.VectorExtractor(channel)
-        numbers.setdefault(channel.topic, {})[name] = _Numbers(Spool(scratch, f"channel_{k}"), extract)
+        extract = (
+            decode.pad_extractor(channel, of_pads[name])
+            if name in of_pads
+            else decode.VectorExtractor(channel)
+        )
+        numbers.setdefault(channel.topic, {})[name] = _Numbers(
+            Spool(scratch, f"channel_{k}"), extract
+        )
     text_topics = {t for t in (spec.episodes.topic, spec.instruction.topic) if t}
-    topics = {t: _Topic() for t in {*(c.topic for c in spec.channels.values()), *text_topics}}
+    topics = {
+        t: _Topic() for t in {*(c.topic for c in spec.channels.values()), *text_topics}
+    }
     for k, m in enumerate(reader.messages(topics, stamps_only=spec.picture_topics)):
         topic = topics[m.topic]
         if m.stamp_ns is None:
@@ -442,50 +552,98 @@ def load_recording(source: Source, spec: RecordingSpec, scratch: Path) -> Record
             except decode.NoSample as reason:
                 found.skipped[str(reason)] += 1
             except RecordingError as error:
-                _check_type(spec, name, reader.topics())  # another type explains more than what is odd in it
-                raise RecordingError(f"{m.topic}, message {len(topic.log) - 1}: {error}") from error
+                _check_type(
+                    spec, name, reader.topics()
+                )  # another type explains more than what is odd in it
+                raise RecordingError(
+                    f"{m.topic}, message {len(topic.log) - 1}: {error}"
+                ) from error
     present = reader.topics()
     marked = [spec.episodes.topic] if spec.episodes.topic else []
     wanted = [*sorted({c.topic for c in spec.channels.values()}), *marked]
     if missing := [t for t in wanted if not topics[t].log]:
-        hints: dict[str, list[str]] = {}  # topics that no name resembles share one list of the known ones
+        hints: dict[
+            str, list[str]
+        ] = {}  # topics that no name resembles share one list of the known ones
         for t in missing:
-            hints.setdefault(nearest(t, present) if t not in present else "", []).append(t)
+            hints.setdefault(
+                nearest(t, present) if t not in present else "", []
+            ).append(t)
         unknown = [f"{', '.join(of)}: {text}" for text, of in hints.items() if text]
-        hint = "; ".join(unknown[:3]) or "the file names them, but holds no message of them"
+        hint = (
+            "; ".join(unknown[:3])
+            or "the file names them, but holds no message of them"
+        )
         hint = hint if present else "the file names no topics"
-        hint = f"the file is damaged or cut off: {reader.damage[0]}" if reader.damage else hint
-        raise RecordingError(f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})")
+        hint = (
+            f"the file is damaged or cut off: {reader.damage[0]}"
+            if reader.damage
+            else hint
+        )
+        raise RecordingError(
+            f"topics in the spec but without messages in the recording: {', '.join(missing)} ({hint})"
+        )
     for name in spec.channels:
         _check_type(spec, name, present)
     channels = {
-        n: _channel(spec, n, topics[c.topic], numbers.get(c.topic, {}).get(n)) for n, c in spec.channels.items()
+        n: _channel(spec, n, topics[c.topic], numbers.get(c.topic, {}).get(n))
+        for n, c in spec.channels.items()
     }
     counts = {t: len(topic.log) for t, topic in topics.items()}
     places = {t: np.array(topics[t].place, dtype=np.int64) for t in text_topics}
-    return Recording(source, spec, reader, channels, {t: topics[t].texts for t in text_topics}, places, counts)
+    return Recording(
+        source,
+        spec,
+        reader,
+        channels,
+        {t: topics[t].texts for t in text_topics},
+        places,
+        counts,
+    )
 
 
 def _check_type(spec: RecordingSpec, name: str, present: dict[str, TopicType]) -> None:
     channel = spec.channels[name]
     found = present[channel.topic].name
-    if channel.type is not None and decode.type_key(found) != decode.type_key(channel.type):
-        raise RecordingError(f"{channel.topic} is {found}, but the spec's channel {name!r} requires {channel.type}")
+    if channel.type is not None and decode.type_key(found) != decode.type_key(
+        channel.type
+    ):
+        raise RecordingError(
+            f"{channel.topic} is {found}, but the spec's channel {name!r} requires {channel.type}"
+        )
 
 
-def _channel(spec: RecordingSpec, name: str, topic: _Topic, numbers: _Numbers | None) -> Channel:
+def _channel(
+    spec: RecordingSpec, name: str, topic: _Topic, numbers: _Numbers | None
+) -> Channel:
     channel, total, without = spec.channels[name], len(topic.log), topic.headless
     if numbers is not None and not numbers.kept:
-        reasons = "; ".join(f"{count}: {reason}" for reason, count in numbers.skipped.most_common(3))
+        reasons = "; ".join(
+            f"{count}: {reason}" for reason, count in numbers.skipped.most_common(3)
+        )
         text = f"{channel.topic}: none of its {total} messages gives a sample of channel {name!r}: {reasons}"
         raise RecordingError(text)
     if without and spec.clock_of(name) == "header":
-        many = f" in {len(without)} of {total} messages, first in message {without[0]}" if len(without) < total else ""
-        raise RecordingError(f"{channel.topic} has no header stamp{many}: write `clock: log` on channel {name!r}")
+        many = (
+            f" in {len(without)} of {total} messages, first in message {without[0]}"
+            if len(without) < total
+            else ""
+        )
+        raise RecordingError(
+            f"{channel.topic} has no header stamp{many}: write `clock: log` on channel {name!r}"
+        )
     kept = np.arange(total) if numbers is None else np.array(numbers.kept)
-    log_ns, stamp_ns, place = (np.array(x, dtype=np.int64)[kept] for x in (topic.log, topic.stamp, topic.place))
-    values, skipped = (None, {}) if numbers is None else (numbers.spool.finish(), dict(numbers.skipped))
-    return Channel(name, channel, log_ns, None if without else stamp_ns, values, place, skipped)
+    log_ns, stamp_ns, place = (
+        np.array(x, dtype=np.int64)[kept] for x in (topic.log, topic.stamp, topic.place)
+    )
+    values, skipped = (
+        (None, {})
+        if numbers is None
+        else (numbers.spool.finish(), dict(numbers.skipped))
+    )
+    return Channel(
+        name, channel, log_ns, None if without else stamp_ns, values, place, skipped
+    )
 
 
 @contextlib.contextmanager

@@ -15,15 +15,44 @@ import zstandard
 
 from taccorl.errors import RecordingError
 
-WRAPPERS = ("vector", "point", "quaternion", "pose", "twist", "wrench", "accel", "transform")
+WRAPPERS = (
+    "vector",
+    "point",
+    "quaternion",
+    "pose",
+    "twist",
+    "wrench",
+    "accel",
+    "transform",
+)
 """Fields of Stamped and WithCovariance types that contain the message itself."""
 STRUCTURES = (
-    *(("w", "x", "y", "z"), ("x", "y", "z"), ("position", "orientation"), ("translation", "rotation")),
-    *(("linear", "angular"), ("force", "torque"), ("orientation", "angular_velocity", "linear_acceleration")),
+    *(
+        ("w", "x", "y", "z"),
+        ("x", "y", "z"),
+        ("position", "orientation"),
+        ("translation", "rotation"),
+    ),
+    *(
+        ("linear", "angular"),
+        ("force", "torque"),
+        ("orientation", "angular_velocity", "linear_acceleration"),
+    ),
     *(("pose", "twist"), *((wrapper,) for wrapper in WRAPPERS)),
 )
 """Fields that hold numbers, in the order in which they are read. The first group that a message has applies."""
-TYPES = ("Vector3", "Point", "Quaternion", "Pose", "Transform", "Twist", "Accel", "Wrench", "Imu", "Odometry")
+TYPES = (
+    "Vector3",
+    "Point",
+    "Quaternion",
+    "Pose",
+    "Transform",
+    "Twist",
+    "Accel",
+    "Wrench",
+    "Imu",
+    "Odometry",
+)
 UNITS = {
     "position": "m",
     "translation": "m",
@@ -31,10 +60,18 @@ UNITS = {
     "rotation": "wxyz",
     "linear": "m/s",
     "force": "N",
-} | {"angular": "rad/s", "angular_velocity": "rad/s", "linear_acceleration": "m/s2", "torque": "Nm"}
+} | {
+    "angular": "rad/s",
+    "angular_velocity": "rad/s",
+    "linear_acceleration": "m/s2",
+    "torque": "Nm",
+}
 """Name of the field that holds x, y and z → their unit."""
 UNITS_OF_ACCEL = {"linear": "m/s2", "angular": "rad/s2"}
-UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}  # Of messages of x, y, z (and w) only; Vector3 states no quantity
+UNITS_OF_TYPE = {
+    "Point": "m",
+    "Quaternion": "wxyz",
+}  # Of messages of x, y, z (and w) only; Vector3 states no quantity
 Decoder = Callable[[bytes], Any]
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MOST_BYTES = 1 << 28
@@ -43,14 +80,23 @@ MOST_BYTES = 1 << 28
 
 def vector_type(kind: str) -> str | None:
     """Name in ``TYPES`` of a message type of any package: ``geometry_msgs/msg/PoseStamped`` is a Pose; None for others."""
-    name = kind.replace(".", "/").rpartition("/")[2].removesuffix("Stamped").removesuffix("WithCovariance")
+    name = (
+        kind.replace(".", "/")
+        .rpartition("/")[2]
+        .removesuffix("Stamped")
+        .removesuffix("WithCovariance")
+    )
     return name if name in TYPES else None
 
 
 def unit_of(name: str, kind: str) -> str:
     """Unit of the value ``name`` of a message of type ``kind``; empty if the type does not determine it."""
     field, own = name.rpartition(".")[0], vector_type(kind) or ""
-    return (UNITS_OF_ACCEL if own == "Accel" else UNITS).get(field, "") if field else UNITS_OF_TYPE.get(own, "")
+    return (
+        (UNITS_OF_ACCEL if own == "Accel" else UNITS).get(field, "")
+        if field
+        else UNITS_OF_TYPE.get(own, "")
+    )
 
 
 def unpacked(data: bytes) -> bytes:
@@ -76,25 +122,41 @@ def full_name(kind: str) -> str:
 @functools.lru_cache(maxsize=256)
 def type_store(kind: str, encoding: str, definition: str, what: str = "") -> Any:
     """rosbags' type store that knows ``kind`` by a definition, named ``what``. Raises RecordingError: it does not parse."""
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys import (
+        Stores,
+        get_types_from_idl,
+        get_types_from_msg,
+        get_typestore,
+    )
 
     try:
         if encoding not in ("ros1msg", "ros2msg", "ros2idl"):
-            raise RecordingError(f"definitions in {encoding!r} are not supported (supported: ros2msg, ros2idl)")
+            raise RecordingError(
+                f"definitions in {encoding!r} are not supported (supported: ros2msg, ros2idl)"
+            )
         types = {}
-        for name in ("Time", "Duration"):  # of which definitions may speak without defining them
-            types |= get_types_from_msg("int32 sec\nuint32 nanosec", f"builtin_interfaces/msg/{name}")
+        for name in (
+            "Time",
+            "Duration",
+        ):  # of which definitions may speak without defining them
+            types |= get_types_from_msg(
+                "int32 sec\nuint32 nanosec", f"builtin_interfaces/msg/{name}"
+            )
         if encoding == "ros2idl":
             for part in re.split(r"^=+\nIDL: .*\n", definition, flags=re.MULTILINE):
                 types |= get_types_from_idl(part) if part.strip() else {}
         else:
-            types |= get_types_from_msg(re.sub(r"(?m)^=+\s*$", "=" * 80, definition), kind)
+            types |= get_types_from_msg(
+                re.sub(r"(?m)^=+\s*$", "=" * 80, definition), kind
+            )
         store = get_typestore(Stores.EMPTY)
         store.register(types)
         store.get_msgdef(kind)
     except Exception as error:  # this topic only
         what = what or f"the bag's definition of {kind}"
-        raise RecordingError(f"{what} does not parse ({type(error).__name__}: {str(error)[:200]})") from error
+        raise RecordingError(
+            f"{what} does not parse ({type(error).__name__}: {str(error)[:200]})"
+        ) from error
     return store
 
 

@@ -10,7 +10,26 @@ from taccorl.data.strict_yaml import Document, Rules, check_version
 from taccorl.errors import nearest
 
 UNITS = (
-    *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz", "N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
+    *(
+        "rad",
+        "rad/s",
+        "rad/s2",
+        "m",
+        "m/s",
+        "m/s2",
+        "wxyz",
+        "N",
+        "Nm",
+        "Pa",
+        "kg",
+        "A",
+        "V",
+        "W",
+        "K",
+        "s",
+        "Hz",
+        "1",
+    ),
     *("T", "adc_count", "rgb8", "unknown"),
 )
 """Units of features and sensors: SI; wxyz: a unit quaternion; 1: a number without unit; unknown: of others' datasets."""
@@ -19,7 +38,10 @@ OTHER_UNITS = {
     **dict.fromkeys(("deg/s", "degrees/s", "°/s", "dps"), ("rad/s", "0.0174533")),
     **dict.fromkeys(("mm", "millimetre", "millimeter"), ("m", "0.001")),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), ("m", "0.01")),
-    **{u: (si, "0.001") for u, si in {"mm/s": "m/s", "mA": "A", "mV": "V", "mT": "T", "ms": "s"}.items()},
+    **{
+        u: (si, "0.001")
+        for u, si in {"mm/s": "m/s", "mA": "A", "mV": "V", "mT": "T", "ms": "s"}.items()
+    },
     "rpm": ("rad/s", "0.104720"),
     "Ncm": ("Nm", "0.01"),
     "kPa": ("Pa", "1000"),
@@ -87,7 +109,15 @@ def load_sensor_spec(path: Path) -> SensorSpec:
 
 
 def _sensor_rules(spec: SensorSpec) -> Rules:
-    for key in ("rows", "columns", "adc_bits", "rate_hz", "scan_time_s", "gain_per_count", "baseline/frames"):
+    for key in (
+        "rows",
+        "columns",
+        "adc_bits",
+        "rate_hz",
+        "scan_time_s",
+        "gain_per_count",
+        "baseline/frames",
+    ):
         value = spec.baseline.frames if "/" in key else getattr(spec, key)
         yield value <= 0, key, f"{value:g} is not above 0"
     bits = f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
@@ -98,7 +128,11 @@ def _sensor_rules(spec: SensorSpec) -> Rules:
     yield unit_rule("unit", spec.unit)
     counts, dtype = f"{spec.max_count} counts do not fit the", spec.wire.dtype
     yield spec.max_count > np.iinfo(dtype).max, "wire/dtype", f"{counts} wire's {dtype}"
-    yield spec.max_count > np.iinfo(np.int16).max, "adc_bits", f"{counts} dataset's int16"
+    yield (
+        spec.max_count > np.iinfo(np.int16).max,
+        "adc_bits",
+        f"{counts} dataset's int16",
+    )
 
 
 def unit_rule(where: str, unit: str) -> tuple[bool, str, str]:

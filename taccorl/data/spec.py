@@ -35,7 +35,13 @@ _ROWS = {
     "field": "the topic itself is the value",
     "pick": "the elements of a row have no names in the file: the order is that of the file",
 }
-WITHOUT_EFFECT = {"mcap": _TIMED, "db3": _TIMED, "rosbag1": _TIMED, "hdf5": _ROWS, "lerobot": _ROWS}
+WITHOUT_EFFECT = {
+    "mcap": _TIMED,
+    "db3": _TIMED,
+    "rosbag1": _TIMED,
+    "hdf5": _ROWS,
+    "lerobot": _ROWS,
+}
 """Reader → key of a recording spec or a channel that does nothing with it → reason."""
 
 
@@ -116,7 +122,9 @@ class DatasetSpec:
                 "DATASET --spec=…, with reader: lerobot and lead_frames on the channel of action"
             )
 
-    def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
+    def keys(
+        self, kind: Literal["video", "tactile", "vector", "simulator"]
+    ) -> list[str]:
         """Feature keys of one kind, in the spec's order; ``sim.*`` are a simulator's own: its state, seeds and labels."""
 
         def kind_of(key: str) -> str:
@@ -214,13 +222,17 @@ class RecordingSpec:
     @property
     def target(self) -> DatasetSpec:
         """The dataset spec ``contract``, which must have been loaded."""
-        assert self.contract is not None, "load a RecordingSpec with load_recording_spec"
+        assert self.contract is not None, (
+            "load a RecordingSpec with load_recording_spec"
+        )
         return self.contract
 
     @property
     def mapped(self) -> dict[str, FeatureSpec]:
         """The dataset's features that this spec fills, in the dataset's order."""
-        return {key: f for key, f in self.target.features.items() if key in self.features}
+        return {
+            key: f for key, f in self.target.features.items() if key in self.features
+        }
 
     @property
     def picture_channels(self) -> dict[str, str]:
@@ -240,7 +252,9 @@ class RecordingSpec:
     @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of everything in the spec that affects the output; comments and layout of the files do not."""
-        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps(dataclasses.asdict(self), sort_keys=True).encode()
+        ).hexdigest()
 
 
 # ---- files ----
@@ -255,10 +269,15 @@ def data_specs_folder() -> Path:
 
 def find_spec(name: str | Path) -> Path:
     """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name. Raises SpecError: neither exists."""
-    path, shipped = Path(name), {p.stem: p for p in sorted(data_specs_folder().rglob("*.yaml"))}
+    path, shipped = (
+        Path(name),
+        {p.stem: p for p in sorted(data_specs_folder().rglob("*.yaml"))},
+    )
     if path.is_file() or str(name) in shipped:
         return path if path.is_file() else shipped[str(name)]
-    raise SpecError(f"no spec {str(name)!r}: neither a file nor a shipped spec; {nearest(path.stem, shipped)}")
+    raise SpecError(
+        f"no spec {str(name)!r}: neither a file nor a shipped spec; {nearest(path.stem, shipped)}"
+    )
 
 
 def shipped_recording_specs() -> dict[str, RecordingSpec]:
@@ -278,8 +297,18 @@ def _recording_specs(folder: Path) -> dict[str, RecordingSpec]:
 def _beside(document: Document[Any], key: str, name: str) -> Path:
     """The file that ``key`` names, relative to the document's own folder."""
     path = document.path.parent / name
-    siblings = [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-    document.refuse([(not path.is_file(), key, f"no file {name!r} beside it; {nearest(path.name, siblings)}")])
+    siblings = (
+        [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+    )
+    document.refuse(
+        [
+            (
+                not path.is_file(),
+                key,
+                f"no file {name!r} beside it; {nearest(path.name, siblings)}",
+            )
+        ]
+    )
     return path
 
 
@@ -293,53 +322,128 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
     return dataclasses.replace(spec, sensors=sensors)
 
 
-def _dataset_rules(document: Document[Any], spec: DatasetSpec, sensors: dict[str, SensorSpec]) -> Rules:
+def _dataset_rules(
+    document: Document[Any], spec: DatasetSpec, sensors: dict[str, SensorSpec]
+) -> Rules:
     """Adds to ``sensors`` what the features name."""
     text = "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t "
-    text += "+ 1 (`this_row` where the robot receives one target a row, right after row t)"
-    text = text if ACTION in spec.features else f"has no effect without a feature {ACTION!r}; remove it"
-    yield spec.sensors, "sensors", "is not a key of this file; give `sensor:` on the tactile feature"
+    text += (
+        "+ 1 (`this_row` where the robot receives one target a row, right after row t)"
+    )
+    text = (
+        text
+        if ACTION in spec.features
+        else f"has no effect without a feature {ACTION!r}; remove it"
+    )
+    yield (
+        spec.sensors,
+        "sensors",
+        "is not a key of this file; give `sensor:` on the tactile feature",
+    )
     yield spec.fps <= 0, "fps", f"{spec.fps} is not a valid rate; give a number above 0"
     yield not spec.features, "features", "holds nothing"
-    yield (ACTION in spec.features) != (spec.action_time is not None), "action_time", text
+    yield (
+        (ACTION in spec.features) != (spec.action_time is not None),
+        "action_time",
+        text,
+    )
     for key, feature in spec.features.items():
-        where, known = f"features/{key}", key == ACTION or key.startswith("observation.")
-        yield not known, where, "LeRobot's policies read `action` and `observation.*` only"
+        where, known = (
+            f"features/{key}",
+            key == ACTION or key.startswith("observation."),
+        )
+        yield (
+            not known,
+            where,
+            "LeRobot's policies read `action` and `observation.*` only",
+        )
         text = f"{key!r}: a feature's name has letters, digits, `_`, `.` and `-`: it becomes the name of a folder"
         yield not re.fullmatch(r"[\w.-]+", key), where, text
         if feature.sensor is not None:
-            sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))
+            sensors[key] = load_sensor_spec(
+                _beside(document, f"{where}/sensor", feature.sensor)
+            )
         yield from _feature_rules(where, feature, sensors.get(key))
 
 
 def _feature_rules(where: str, f: FeatureSpec, sensor: SensorSpec | None) -> Rules:
-    shape, names, units = list(f.shape), f.names, (f.unit,) if isinstance(f.unit, str) else f.unit
-    by_name, is_video = f.range if isinstance(f.range, dict) else None, f.dtype == "video"
+    shape, names, units = (
+        list(f.shape),
+        f.names,
+        (f.unit,) if isinstance(f.unit, str) else f.unit,
+    )
+    by_name, is_video = (
+        f.range if isinstance(f.range, dict) else None,
+        f.dtype == "video",
+    )
     yield not shape or min(shape) <= 0, f"{where}/shape", f"{shape} holds nothing"
-    yield f.rate_hz <= 0, f"{where}/rate_hz", f"{f.rate_hz:g} is not a valid rate; give a number above 0"
+    yield (
+        f.rate_hz <= 0,
+        f"{where}/rate_hz",
+        f"{f.rate_hz:g} is not a valid rate; give a number above 0",
+    )
     yield from (unit_rule(f"{where}/unit", unit) for unit in units)
     if is_video:
-        sized = len(shape) == 3 and shape[2] == 3 and not shape[0] % 2 and not shape[1] % 2
-        yield not sized, f"{where}/shape", f"{shape} is not [rows, columns, 3] with even rows and columns"
+        sized = (
+            len(shape) == 3 and shape[2] == 3 and not shape[0] % 2 and not shape[1] % 2
+        )
+        yield (
+            not sized,
+            f"{where}/shape",
+            f"{shape} is not [rows, columns, 3] with even rows and columns",
+        )
         for option in ("names", "pads", "sensor", "layout"):
-            yield getattr(f, option), f"{where}/{option}", "has no effect on pictures; remove it"
+            yield (
+                getattr(f, option),
+                f"{where}/{option}",
+                "has no effect on pictures; remove it",
+            )
         several = isinstance(f.unit, tuple) or by_name is not None or f.history != 1
         yield several, where, "pictures have one unit, one range and no history"
     else:
-        flat = f"{shape}: LeRobot can merge and edit only flat features; write [{f.size}]"
+        flat = (
+            f"{shape}: LeRobot can merge and edit only flat features; write [{f.size}]"
+        )
         yield len(shape) != 1, f"{where}/shape", flat
-        layout = "has no effect: the sensor states it" if sensor else f"{list(f.layout)} are not {f.size} values"
-        yield f.layout and (math.prod(f.layout) != f.size or sensor), f"{where}/layout", layout
-        yield names and len(names) != f.size, f"{where}/names", f"{len(names)} names for {f.size} values"
+        layout = (
+            "has no effect: the sensor states it"
+            if sensor
+            else f"{list(f.layout)} are not {f.size} values"
+        )
+        yield (
+            f.layout and (math.prod(f.layout) != f.size or sensor),
+            f"{where}/layout",
+            layout,
+        )
+        yield (
+            names and len(names) != f.size,
+            f"{where}/names",
+            f"{len(names)} names for {f.size} values",
+        )
         yield len(set(names)) != len(names), f"{where}/names", "a name stands twice"
         wrong_units = not isinstance(f.unit, str) and len(units) != f.size
         yield wrong_units, f"{where}/unit", f"{len(units)} units for {f.size} values"
     if by_name is not None:
-        yield from ((n not in names, f"{where}/range/{n}", f"no such name; {nearest(n, names)}") for n in by_name)
+        yield from (
+            (n not in names, f"{where}/range/{n}", f"no such name; {nearest(n, names)}")
+            for n in by_name
+        )
         missing = ", ".join(n for n in names if n not in by_name)
-        yield missing or not names, f"{where}/range", f"no range for {missing or 'unnamed values'}"
-    yield (f.limits[:, 0] >= f.limits[:, 1]).any(), f"{where}/range", "a lower bound is not below its upper bound"
-    yield sensor is None and (f.pads or f.history != 1), where, "`pads` and `history` need `sensor`"
+        yield (
+            missing or not names,
+            f"{where}/range",
+            f"no range for {missing or 'unnamed values'}",
+        )
+    yield (
+        (f.limits[:, 0] >= f.limits[:, 1]).any(),
+        f"{where}/range",
+        "a lower bound is not below its upper bound",
+    )
+    yield (
+        sensor is None and (f.pads or f.history != 1),
+        where,
+        "`pads` and `history` need `sensor`",
+    )
     yield len(set(f.pads)) != len(f.pads), f"{where}/pads", "a pad stands twice"
     if sensor is not None:
         expected = f.history * len(f.pads) * sensor.rows * sensor.columns
@@ -353,7 +457,15 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
     file, line, key, value and the way out."""
     document = Document(RecordingSpec, find_spec(name))
     check_version(document, document.value.spec_version)
-    document.refuse([(document.value.contract, "contract", "is not a key of this file; give `dataset:`")])
+    document.refuse(
+        [
+            (
+                document.value.contract,
+                "contract",
+                "is not a key of this file; give `dataset:`",
+            )
+        ]
+    )
     contract = load_dataset_spec(_beside(document, "dataset", document.value.dataset))
     spec = dataclasses.replace(document.value, contract=contract)
     document.refuse(_recording_rules(document, spec))
@@ -363,17 +475,29 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
 def _recording_rules(document: Document[Any], spec: RecordingSpec) -> Rules:
     known = spec.target.features
     for key in spec.features:
-        yield key not in known, f"features/{key}", f"not in {spec.dataset}; {nearest(key, known)}"
+        yield (
+            key not in known,
+            f"features/{key}",
+            f"not in {spec.dataset}; {nearest(key, known)}",
+        )
     missing = [k for k, f in known.items() if k not in spec.features and not f.optional]
     yield missing, "features", f"nothing fills {', '.join(missing)} of {spec.dataset}"
     for key, why in WITHOUT_EFFECT.get(spec.reader, {}).items():
         for at in (key, *(f"channels/{c}/{key}" for c in spec.channels)):
-            yield document.has(at), at, f"has no effect with reader: {spec.reader}: {why}; remove it"
+            yield (
+                document.has(at),
+                at,
+                f"has no effect with reader: {spec.reader}: {why}; remove it",
+            )
     for c in spec.channels:
         clock, order = f"channels/{c}/clock", f"channels/{c}/channel_order"
         by_header = spec.reader == "lerobot" and spec.clock_of(c) == "header"
         at = clock if document.has(clock) else "clock"
-        yield by_header, at, "header: rows of a LeRobot dataset have one time, write log"
+        yield (
+            by_header,
+            at,
+            "header: rows of a LeRobot dataset have one time, write log",
+        )
         no_picture = document.has(order) and c not in spec.picture_channels
         yield no_picture, order, "has no effect: it fills no video feature; remove it"
     for key, mapping in spec.features.items():
@@ -382,41 +506,95 @@ def _recording_rules(document: Document[Any], spec: RecordingSpec) -> Rules:
     pick = "names elements of a `field` (position, velocity …); none is given (needed unless `type` is a pose, a "
     pick += "wrench …)"
     for c, channel in spec.channels.items():
-        where, age_s, factors, picks = f"channels/{c}", channel.max_age_s, len(channel.scale), len(channel.pick)
+        where, age_s, factors, picks = (
+            f"channels/{c}",
+            channel.max_age_s,
+            len(channel.scale),
+            len(channel.pick),
+        )
         yield c not in used, where, "no feature uses it; remove it or map it"
-        yield age_s is not None and age_s <= 0, f"{where}/max_age_s", f"{age_s} s: every row would be stale"
-        yield channel.rate_hz <= 0, f"{where}/rate_hz", f"{channel.rate_hz} is not a valid rate; give a number above 0"
-        yield factors and picks and factors != picks, f"{where}/scale", f"{factors} factors for {picks} picked values"
-        yield picks and channel.field is None and vector_type(channel.type or "") is None, f"{where}/pick", pick
+        yield (
+            age_s is not None and age_s <= 0,
+            f"{where}/max_age_s",
+            f"{age_s} s: every row would be stale",
+        )
+        yield (
+            channel.rate_hz <= 0,
+            f"{where}/rate_hz",
+            f"{channel.rate_hz} is not a valid rate; give a number above 0",
+        )
+        yield (
+            factors and picks and factors != picks,
+            f"{where}/scale",
+            f"{factors} factors for {picks} picked values",
+        )
+        yield (
+            picks and channel.field is None and vector_type(channel.type or "") is None,
+            f"{where}/pick",
+            pick,
+        )
     spread = f"{spec.max_clock_spread_s:g} s: no two clocks agree so closely"
     yield spec.max_clock_spread_s <= 0, "max_clock_spread_s", spread
     episodes, instruction = spec.episodes, spec.instruction
     with_topic = (episodes.by == "markers") != (episodes.topic is not None)
     yield with_topic, "episodes", "`topic` goes with `by: markers`, and only with it"
-    needs = {"spec": "text", "metadata": "key", "topic": "topic", "markers": None}[instruction.from_]
+    needs = {"spec": "text", "metadata": "key", "topic": "topic", "markers": None}[
+        instruction.from_
+    ]
     for field in ("text", "key", "topic"):
         given = getattr(instruction, field) is not None
         text = f"`{field}` {'has no effect' if given else 'is missing'} with `from: {instruction.from_}`"
         yield given != (field == needs), "instruction", text
     empty = instruction.text is not None and instruction.text.strip() in ("", "TODO")
-    yield empty, "instruction/text", "is empty or `TODO`; write the instruction: the policy reads it"
+    yield (
+        empty,
+        "instruction/text",
+        "is empty or `TODO`; write the instruction: the policy reads it",
+    )
     unmarked = instruction.from_ == "markers" and episodes.by != "markers"
-    yield unmarked, "instruction/from", "`from: markers` requires `episodes: by: markers`"
+    yield (
+        unmarked,
+        "instruction/from",
+        "`from: markers` requires `episodes: by: markers`",
+    )
 
 
 def _mapping_rules(spec: RecordingSpec, key: str, mapping: MappingSpec) -> Rules:
-    where, feature, names, align = f"features/{key}", spec.target.features[key], mapping.channels, mapping.align
+    where, feature, names, align = (
+        f"features/{key}",
+        spec.target.features[key],
+        mapping.channels,
+        mapping.align,
+    )
     twice = not names or len(set(names)) != len(names)
     yield twice, f"{where}/channels", "names no channel, or the same channel twice"
     for c in names:
-        yield c not in spec.channels, f"{where}/channels", f"no channel {c!r}; {nearest(c, spec.channels)}"
-        has_age, hold, at = spec.channels[c].max_age_s is not None, align == "hold", f"channels/{c}"
-        yield has_age and hold, f"{at}/max_age_s", f"has no effect: {key} has the last value; use align: asof"
-        yield not has_age and not hold, at, f"key 'max_age_s' is missing: {key} is aligned by {align}"
+        yield (
+            c not in spec.channels,
+            f"{where}/channels",
+            f"no channel {c!r}; {nearest(c, spec.channels)}",
+        )
+        has_age, hold, at = (
+            spec.channels[c].max_age_s is not None,
+            align == "hold",
+            f"channels/{c}",
+        )
+        yield (
+            has_age and hold,
+            f"{at}/max_age_s",
+            f"has no effect: {key} has the last value; use align: asof",
+        )
+        yield (
+            not has_age and not hold,
+            at,
+            f"key 'max_age_s' is missing: {key} is aligned by {align}",
+        )
     is_video, is_touch = feature.dtype == "video", key in spec.target.sensors
     odd = is_video and (len(names) != 1 or align not in ("hold", "asof"))
     yield odd, where, "a picture comes from one channel, aligned by hold or asof"
-    for c, option in itertools.product(names if is_video or is_touch else (), ("pick", "scale")):
+    for c, option in itertools.product(
+        names if is_video or is_touch else (), ("pick", "scale")
+    ):
         text = f"has no effect: {key} has no named numbers"
         yield getattr(spec.channels[c], option), f"channels/{c}/{option}", text
     window = f"{align} with history: {feature.history}; a window needs history > 1"
@@ -425,4 +603,8 @@ def _mapping_rules(spec: RecordingSpec, key: str, mapping: MappingSpec) -> Rules
     yield is_touch and len(names) != len(feature.pads), f"{where}/channels", pads
     picked = [len(spec.channels[c].pick) for c in names]
     wrong = feature.dtype == "float32" and all(picked) and sum(picked) != feature.size
-    yield wrong, f"{where}/channels", f"pick {sum(picked)} values together; {key} has {feature.size}"
+    yield (
+        wrong,
+        f"{where}/channels",
+        f"pick {sum(picked)} values together; {key} has {feature.size}",
+    )

@@ -22,7 +22,9 @@ class Spool:
         if self._first is None:
             self._first = row
         elif row.size != self._first.size:
-            raise RecordingError(f"{row.size} values after messages with {self._first.size}")
+            raise RecordingError(
+                f"{row.size} values after messages with {self._first.size}"
+            )
         self._file.write(row.astype(self._first.dtype, copy=False).tobytes())
         self._rows += 1
 
@@ -31,7 +33,12 @@ class Spool:
         self._file.close()
         if self._first is None:
             return np.empty((0, 0))
-        return np.memmap(self._path, dtype=self._first.dtype, mode="r", shape=(self._rows, self._first.size))
+        return np.memmap(
+            self._path,
+            dtype=self._first.dtype,
+            mode="r",
+            shape=(self._rows, self._first.size),
+        )
 
 
 def release(values: np.ndarray) -> None:

@@ -21,14 +21,20 @@ import yaml
 from taccorl.errors import SpecError, nearest
 
 SPEC_VERSION = 1  # Version of the files' format that this code reads
-MOST_BYTES = 1 << 18  # Largest YAML file that is read [bytes]; the largest shipped one has 9 kB
+MOST_BYTES = (
+    1 << 18
+)  # Largest YAML file that is read [bytes]; the largest shipped one has 9 kB
 MOST_DIGITS = 100  # Most digits of a whole number. Python refuses more than 4300, without naming the file
 MOST_SHOWN = 60  # Most characters of a value that an error message repeats
 _hints = functools.cache(typing.get_type_hints)
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
-PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
+PLAIN_FLOAT = re.compile(
+    r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?"
+)
 
-Rules = Iterator[tuple[Any, str, str]]  # What is wrong if true, key, text: later rules rely on earlier ones
+Rules = Iterator[
+    tuple[Any, str, str]
+]  # What is wrong if true, key, text: later rules rely on earlier ones
 
 
 def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
@@ -38,7 +44,9 @@ def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:
-        raise SpecError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
+        raise SpecError(
+            f"{path}: is not YAML: {' '.join(str(error).split())}"
+        ) from error
     except RecursionError as error:
         raise SpecError(f"{path}: is nested too deeply") from error
 
@@ -59,15 +67,22 @@ def read_bounded(path: Path, most_bytes: int, what: str) -> str:
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
         if len(content) > most_bytes:
-            raise SpecError(f"{path}: is larger than {most_bytes:,} bytes, the limit here: is it the right file?")
+            raise SpecError(
+                f"{path}: is larger than {most_bytes:,} bytes, the limit here: is it the right file?"
+            )
         return content.decode("utf-8")
     except FileNotFoundError as error:
         siblings = [p.name for p in path.parent.glob("*.y*ml")]
-        raise SpecError(f"{path}: no such file" + (f"; {nearest(path.name, siblings)}" if siblings else "")) from error
+        raise SpecError(
+            f"{path}: no such file"
+            + (f"; {nearest(path.name, siblings)}" if siblings else "")
+        ) from error
     except IsADirectoryError as error:
         raise SpecError(f"{path}: is a folder; give a file of it") from error
     except UnicodeDecodeError as error:
-        raise SpecError(f"{path}: cannot be read as {what}: it is not a text file in UTF-8 ({error})") from error
+        raise SpecError(
+            f"{path}: cannot be read as {what}: it is not a text file in UTF-8 ({error})"
+        ) from error
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror or error}") from error
 
@@ -80,20 +95,34 @@ class Document[T]:
         self.path = Path(path)
         self._lines: dict[str, int] = {}
         text = read_bounded(self.path, MOST_BYTES, "a spec")
-        self._todo = [n for n, line in enumerate(text.splitlines(), 1) if re.match(r"[^#]*\bTODO\b", line)]
+        self._todo = [
+            n
+            for n, line in enumerate(text.splitlines(), 1)
+            if re.match(r"[^#]*\bTODO\b", line)
+        ]
         try:
             root = composed(text)
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
             hint = "; indent with spaces" if "'\\t'" in str(error.problem) else ""
-            hint = "; put a text with { and } in quotes" if "got '{'" in str(error.problem) else hint
-            raise SpecError(f"{self.path}:{line}: is not YAML: {error.problem}{hint}") from error
+            hint = (
+                "; put a text with { and } in quotes"
+                if "got '{'" in str(error.problem)
+                else hint
+            )
+            raise SpecError(
+                f"{self.path}:{line}: is not YAML: {error.problem}{hint}"
+            ) from error
         except yaml.YAMLError as error:
-            raise SpecError(f"{self.path}: is not YAML: {' '.join(str(error).split())}") from error
+            raise SpecError(
+                f"{self.path}: is not YAML: {' '.join(str(error).split())}"
+            ) from error
         except RecursionError as error:
             raise SpecError(f"{self.path}: is nested too deeply for a spec") from error
         if root is None:
-            keys = ", ".join(f.name for f in dataclasses.fields(typing.cast("Any", cls)))
+            keys = ", ".join(
+                f.name for f in dataclasses.fields(typing.cast("Any", cls))
+            )
             raise SpecError(f"{self.path}: is empty; its keys are {keys}")
         self.value: T = self._build(cls, root, "")
 
@@ -110,7 +139,9 @@ class Document[T]:
         line = self._lines.get("/".join(parts), 1)
         place = f"{_short(key.replace('/', ' → '))}: " if key else ""
         others = [str(n) for n in self._todo if n != line] if line in self._todo else []
-        text += f"; TODO also in lines {', '.join(others[:MOST_SHOWN])}" if others else ""
+        text += (
+            f"; TODO also in lines {', '.join(others[:MOST_SHOWN])}" if others else ""
+        )
         return SpecError(f"{self.path}:{line}: {place}{text}")
 
     def refuse(self, rules: Iterable[tuple[Any, str, str]]) -> None:
@@ -130,11 +161,16 @@ class Document[T]:
             text = self._scalar(str, node, key)
             if text not in args:
                 known = ", ".join(map(repr, args))
-                raise self.error(key, f"{_quoted(text)} is not one of {known}; {nearest(text, args)}")
+                raise self.error(
+                    key, f"{_quoted(text)} is not one of {known}; {nearest(text, args)}"
+                )
             return text
         if origin is dict:
             items = self._items(node, key)
-            return {name: self._build(args[1], child, f"{key}/{name}" if key else name) for name, child in items}
+            return {
+                name: self._build(args[1], child, f"{key}/{name}" if key else name)
+                for name, child in items
+            }
         if origin is tuple:
             return self._tuple(args, node, key)
         return self._scalar(kind, node, key)
@@ -145,16 +181,23 @@ class Document[T]:
         items: dict[str, yaml.Node] = {}
         for name_node, child in node.value:
             if not isinstance(name_node, yaml.ScalarNode):
-                raise self.error(key, f"a key must be a word, found {_describe(name_node)}")
+                raise self.error(
+                    key, f"a key must be a word, found {_describe(name_node)}"
+                )
             name = str(name_node.value)
             path = f"{key}/{name}" if key else name
             self._lines[path] = name_node.start_mark.line + 1
             if name in items:
                 raise self.error(path, "stands here twice; keep one")
             if name == "<<":
-                raise self.error(path, "merge keys are not read; write the keys out, or share one value by an anchor")
+                raise self.error(
+                    path,
+                    "merge keys are not read; write the keys out, or share one value by an anchor",
+                )
             items[name] = child
-        return [(name, child) for name, child in items.items() if not name.startswith("x-")]
+        return [
+            (name, child) for name, child in items.items() if not name.startswith("x-")
+        ]
 
     def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
         hints, fields = _hints(cls), {f.name: f for f in dataclasses.fields(cls)}
@@ -164,25 +207,50 @@ class Document[T]:
         for name, child in self._items(node, key):
             path = f"{key}/{name}" if key else name
             if name not in known:
-                entries = [(f, getattr(k, "__dataclass_fields__", ())) for f in hints for k in get_args(hints[f])[1:]]
-                inside = [f"write `{f}: {{NAME: {{{name}: …}}}}`, in each entry" for f, own in entries if name in own]
-                raise self.error(path, f"unknown key {_quoted(name)}; {(inside or [nearest(name, known)])[0]}")
+                entries = [
+                    (f, getattr(k, "__dataclass_fields__", ()))
+                    for f in hints
+                    for k in get_args(hints[f])[1:]
+                ]
+                inside = [
+                    f"write `{f}: {{NAME: {{{name}: …}}}}`, in each entry"
+                    for f, own in entries
+                    if name in own
+                ]
+                raise self.error(
+                    path,
+                    f"unknown key {_quoted(name)}; {(inside or [nearest(name, known)])[0]}",
+                )
             values[known[name]] = self._build(hints[known[name]], child, path)
         for name, field in fields.items():
-            if field.default is dataclasses.MISSING is field.default_factory and name not in values:
+            if (
+                field.default is dataclasses.MISSING is field.default_factory
+                and name not in values
+            ):
                 raise self.error(key, f"key {name.rstrip('_')!r} is missing")
         return cls(**values)
 
-    def _tuple(self, args: tuple[Any, ...], node: yaml.Node, key: str) -> tuple[Any, ...]:
+    def _tuple(
+        self, args: tuple[Any, ...], node: yaml.Node, key: str
+    ) -> tuple[Any, ...]:
         if not isinstance(node, yaml.SequenceNode):
             raise self.error(key, f"expected a list, found {_describe(node)}")
         kinds = args[:1] * len(node.value) if args[1:] == (Ellipsis,) else args
         if len(kinds) != len(node.value):
-            raise self.error(key, f"expected {len(kinds)} values, found {len(node.value)}")
-        return tuple(self._build(a, c, f"{key}/{i}") for i, (a, c) in enumerate(zip(kinds, node.value, strict=True)))
+            raise self.error(
+                key, f"expected {len(kinds)} values, found {len(node.value)}"
+            )
+        return tuple(
+            self._build(a, c, f"{key}/{i}")
+            for i, (a, c) in enumerate(zip(kinds, node.value, strict=True))
+        )
 
     def _union(self, kinds: tuple[Any, ...], node: yaml.Node, key: str) -> Any:
-        if type(None) in kinds and isinstance(node, yaml.ScalarNode) and node.tag.endswith(":null"):
+        if (
+            type(None) in kinds
+            and isinstance(node, yaml.ScalarNode)
+            and node.tag.endswith(":null")
+        ):
             return None
         plain = {
             yaml.MappingNode: (dict,),
@@ -191,7 +259,10 @@ class Document[T]:
         }
         mapping = isinstance(node, yaml.MappingNode)
         fitting = [
-            k for k in kinds if (get_origin(k) or k) in plain[type(node)] or (mapping and dataclasses.is_dataclass(k))
+            k
+            for k in kinds
+            if (get_origin(k) or k) in plain[type(node)]
+            or (mapping and dataclasses.is_dataclass(k))
         ]
         error = self.error(key, f"does not fit: found {_describe(node)}")
         for kind in fitting:
@@ -203,22 +274,44 @@ class Document[T]:
 
     def _scalar(self, kind: Any, node: yaml.Node, key: str) -> Any:
         if not isinstance(node, yaml.ScalarNode):
-            raise self.error(key, f"expected one {kind.__name__}, found {_describe(node)}")
+            raise self.error(
+                key, f"expected one {kind.__name__}, found {_describe(node)}"
+            )
         tag, text = node.tag.rsplit(":", 1)[-1], str(node.value)
         plain = node.style is None  # quoted digits are a text
         if kind is bool and tag == "bool":
             return text.lower() in ("true", "yes", "on")
-        if kind is int and plain and len(text) <= MOST_DIGITS and PLAIN_INT.fullmatch(text):
+        if (
+            kind is int
+            and plain
+            and len(text) <= MOST_DIGITS
+            and PLAIN_INT.fullmatch(text)
+        ):
             return int(text)
         # By its own rule, not by YAML 1.1's, which reads 1e-3 as a text
-        if kind is float and plain and PLAIN_FLOAT.fullmatch(text) and math.isfinite(float(text)):
+        if (
+            kind is float
+            and plain
+            and PLAIN_FLOAT.fullmatch(text)
+            and math.isfinite(float(text))
+        ):
             return float(text)
         if kind is str and tag == "str":
             return text
-        digits = f"at most {MOST_DIGITS} digits" if len(text) > MOST_DIGITS else "plain digits only"
-        hint = {str: "; put it in quotes", int: f"; {digits}", float: "; plain decimal digits only"}.get(kind, "")
+        digits = (
+            f"at most {MOST_DIGITS} digits"
+            if len(text) > MOST_DIGITS
+            else "plain digits only"
+        )
+        hint = {
+            str: "; put it in quotes",
+            int: f"; {digits}",
+            float: "; plain decimal digits only",
+        }.get(kind, "")
         hint += ", without quotes" * (not plain and kind in (int, float))
-        raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
+        raise self.error(
+            key, f"expected {kind.__name__}, found {_describe(node)}{hint}"
+        )
 
 
 def check_version(document: Document[Any], version: int) -> None:
@@ -238,4 +331,8 @@ def _short(text: str) -> str:
 
 
 def _quoted(value: str) -> str:
-    return repr(value) if len(value) <= MOST_SHOWN else f"{value[:MOST_SHOWN]!r}… ({len(value):,} characters)"
+    return (
+        repr(value)
+        if len(value) <= MOST_SHOWN
+        else f"{value[:MOST_SHOWN]!r}… ({len(value):,} characters)"
+    )

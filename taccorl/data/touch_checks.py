@@ -66,7 +66,12 @@ class Pad:
     @functools.cached_property
     def smooth(self) -> np.ndarray:
         """(T, R, C) means of ``living`` over 3 × 3 taxels."""
-        return uniform_filter1d(uniform_filter1d(self.living, 3, axis=1, mode="nearest"), 3, axis=2, mode="nearest")
+        return uniform_filter1d(
+            uniform_filter1d(self.living, 3, axis=1, mode="nearest"),
+            3,
+            axis=2,
+            mode="nearest",
+        )
 
     @functools.cached_property
     def structured(self) -> bool:
@@ -76,16 +81,29 @@ class Pad:
     @functools.cached_property
     def contact(self) -> np.ndarray:
         """(T,) bool: the pad reads contact."""
-        return ((self.smooth >= self.noise_count).sum(axis=(1, 2)) >= CONTACT_MIN_TAXELS) & self.structured
+        return (
+            (self.smooth >= self.noise_count).sum(axis=(1, 2)) >= CONTACT_MIN_TAXELS
+        ) & self.structured
 
 
 def read_pads(episode: Episode, key: str) -> list[Pad]:
     """The pads of one tactile feature, in the spec's order."""
-    sensor, counts, stored = episode.spec.sensors[key], episode.pads(key), episode.baselines.get(key)
+    sensor, counts, stored = (
+        episode.spec.sensors[key],
+        episode.pads(key),
+        episode.baselines.get(key),
+    )
     shape = (len(counts), sensor.rows, sensor.columns)
-    baselines = stored.reshape(shape) if stored is not None and stored.size == np.prod(shape) else [None] * len(counts)
+    baselines = (
+        stored.reshape(shape)
+        if stored is not None and stored.size == np.prod(shape)
+        else [None] * len(counts)
+    )
     rest = (sensor.noise_count, sensor.max_count, episode.spec.fps)
-    return [Pad(n, counts[n].astype(np.float32), b, *rest) for n, b in zip(counts, baselines, strict=True)]
+    return [
+        Pad(n, counts[n].astype(np.float32), b, *rest)
+        for n, b in zip(counts, baselines, strict=True)
+    ]
 
 
 def tactile_keys(episode: Episode) -> list[str]:
@@ -96,19 +114,33 @@ def tactile_keys(episode: Episode) -> list[str]:
 
 def other_touch_keys(episode: Episode) -> list[str]:
     """Keys of touch whose layout and units no sensor spec states, as other people's datasets have."""
-    return [k for k in episode.arrays if k.startswith("observation.tactile") and k not in episode.spec.sensors]
+    return [
+        k
+        for k in episode.arrays
+        if k.startswith("observation.tactile") and k not in episode.spec.sensors
+    ]
 
 
 def check_other_touch(episode: Episode, key: str) -> Iterator[Finding]:
     """Touch of any kind: it never changes, a part of it never does, or it stands still for a time."""
     values, fps = episode.arrays[key], episode.spec.fps
-    layout = " × ".join(map(str, episode.spec.features[key].layout)) or str(values.shape[1])
-    known = values[np.isfinite(values).all(axis=1)] if values.dtype.kind == "f" else values
+    layout = " × ".join(map(str, episode.spec.features[key].layout)) or str(
+        values.shape[1]
+    )
+    known = (
+        values[np.isfinite(values).all(axis=1)] if values.dtype.kind == "f" else values
+    )
     if len(known) < JUDGE_S * fps:
-        yield not_judged(key, "touch", f"{len(known) / fps:.1f} s of values, it takes {JUDGE_S:g} s")
+        yield not_judged(
+            key, "touch", f"{len(known) / fps:.1f} s of values, it takes {JUDGE_S:g} s"
+        )
         return
     span = f"{known.min():.4g} … {known.max():.4g}"
-    stated = [u for u in dict.fromkeys(episode.spec.features[key].units) if u not in ("", "unknown")]
+    stated = [
+        u
+        for u in dict.fromkeys(episode.spec.features[key].units)
+        if u not in ("", "unknown")
+    ]
     unit = f"the unit {listed(stated)}" if stated else "a unit that nobody stated"
     yield finding("touch_range", key, f"{key}: {layout} values of {span}, in {unit}")
     constant = np.ptp(known, axis=0) == 0
@@ -122,7 +154,9 @@ def check_other_touch(episode: Episode, key: str) -> Iterator[Finding]:
         yield finding("dead_taxel", key, text)
     same = repeated(known.astype(float))
     held = stretches(same, fps, SATURATED_S)
-    if held and same.mean() < 0.5:  # else a binary or very slow sensor, which holds its values
+    if (
+        held and same.mean() < 0.5
+    ):  # else a binary or very slow sensor, which holds its values
         rows = longest(held)
         text = f"{key}: bit-identical for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}: its driver repeats "
         yield finding("frozen_touch", key, f"{text}old values", rows)
@@ -167,10 +201,14 @@ def find_stuck(pad: Pad, counts: np.ndarray) -> np.ndarray:
             # At the wire's maximum while others vary: saturated by a touch, unless it never comes down.
             stuck &= (pad.baseline + value < pad.max_count) | (length == len(counts))
             low, high = np.quantile(pad.baseline, (0.25, 0.75))
-            stuck |= (length == len(counts)) & (pad.baseline > high + STUCK_BASELINE_FENCE * (high - low))
+            stuck |= (length == len(counts)) & (
+                pad.baseline > high + STUCK_BASELINE_FENCE * (high - low)
+            )
     always = ((np.abs(counts) > pad.noise_count).mean(axis=0) >= STUCK_ALWAYS) & ~stuck
     for r, c in np.argwhere(always):
-        around = np.abs(counts[:, max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]).reshape(len(counts), -1)
+        around = np.abs(
+            counts[:, max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
+        ).reshape(len(counts), -1)
         alone = (around >= np.abs(counts[:, r, c])[:, None] / 2).sum(axis=1) == 1
         stuck[r, c] = alone.mean() >= STUCK_ALWAYS / 2
     return stuck
@@ -181,7 +219,9 @@ def inside_contact(counts: np.ndarray) -> np.ndarray:
     row or a column (not a diagonal: the inner corner of an L is free), with at most ``DEAD_GAP`` taxels between the two."""
     expected = np.zeros_like(counts)
     for axis in (1, 2):
-        padded = np.pad(counts, [(DEAD_GAP, DEAD_GAP) if a == axis else (0, 0) for a in range(3)])
+        padded = np.pad(
+            counts, [(DEAD_GAP, DEAD_GAP) if a == axis else (0, 0) for a in range(3)]
+        )
         at = {
             by: np.take(padded, np.arange(counts.shape[axis]) + DEAD_GAP + by, axis)
             for by in range(-DEAD_GAP, DEAD_GAP + 1)
@@ -199,10 +239,17 @@ def find_dead(pad: Pad) -> np.ndarray:
     inside = expected > 2 * pad.noise_count
     shown, due = (living * inside).sum(axis=0), (expected * inside).sum(axis=0)
     highest = living.max(axis=0, initial=0.0)
-    dead = (inside.sum(axis=0) >= DEAD_MIN_S * pad.fps) & (shown < DEAD_SHARE * due) & (highest <= pad.noise_count)
+    dead = (
+        (inside.sum(axis=0) >= DEAD_MIN_S * pad.fps)
+        & (shown < DEAD_SHARE * due)
+        & (highest <= pad.noise_count)
+    )
     if _noise_visible(pad.counts):
         constant = np.ptp(pad.counts, axis=0) == 0
-        if pad.baseline is not None and np.quantile(pad.baseline, 0.05) < 2 * RESTING_COUNT:
+        if (
+            pad.baseline is not None
+            and np.quantile(pad.baseline, 0.05) < 2 * RESTING_COUNT
+        ):
             constant &= pad.baseline >= RESTING_COUNT
         dead |= constant
     return dead & ~pad.stuck
@@ -214,7 +261,9 @@ def spatial_structure(counts: np.ndarray) -> float:
     strongest = counts[np.argsort(power)[-max(len(counts) // 10, 1) :]]
     x = strongest - strongest.mean(axis=(1, 2), keepdims=True)
     neighbours = np.mean(x[:, 1:] * x[:, :-1]) + np.mean(x[:, :, 1:] * x[:, :, :-1])
-    return float(neighbours) / (2 * energy) if (energy := float(np.mean(x * x))) else 0.0
+    return (
+        float(neighbours) / (2 * energy) if (energy := float(np.mean(x * x))) else 0.0
+    )
 
 
 # ---- findings ----
@@ -242,28 +291,49 @@ def taxel_list(mask: np.ndarray) -> str:
 def check_pads(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Finding]:
     """The pads of the feature ``key``, by all checks."""
     if episode.num_rows < JUDGE_S * episode.spec.fps:
-        yield not_judged(key, "taxels", f"{episode.num_rows / episode.spec.fps:.1f} s, it takes {JUDGE_S:g} s")
+        yield not_judged(
+            key,
+            "taxels",
+            f"{episode.num_rows / episode.spec.fps:.1f} s, it takes {JUDGE_S:g} s",
+        )
         return
     for pad in pads:
         for single in (_stuck, _dead, _saturated, _noisy, _frozen):
             yield from single(key, pad)
     if any(pad.baseline is None for pad in pads):
-        yield not_judged(key, "saturation", "no baselines, so that counts on the wire are unknown")
+        yield not_judged(
+            key, "saturation", "no baselines, so that counts on the wire are unknown"
+        )
     parts = []
     for p in pads:
-        active = ((p.counts >= p.noise_count).any(axis=0) & ~p.stuck).mean() * p.structured
-        parts.append(f"{p.name} in {p.contact.mean():.0%} of the rows, {active:.0%} of its taxels ever active")
-    yield finding("contact_coverage", key, f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}")
+        active = (
+            (p.counts >= p.noise_count).any(axis=0) & ~p.stuck
+        ).mean() * p.structured
+        parts.append(
+            f"{p.name} in {p.contact.mean():.0%} of the rows, {active:.0%} of its taxels ever active"
+        )
+    yield finding(
+        "contact_coverage",
+        key,
+        f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}",
+    )
 
 
 def _stuck(key: str, pad: Pad) -> Iterator[Finding]:
     stuck = pad.stuck & ~pad.shorted
     if stuck.any():
         baseline = 0 * pad.counts[0] if pad.baseline is None else pad.baseline
-        level = [f"{v:.0f}" for v in np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)]
+        level = [
+            f"{v:.0f}"
+            for v in np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)
+        ]
         where = "above baseline" if pad.baseline is None else "on the wire"
         text = f"{pad.name}: stuck at {listed(level, 3)} counts {where}, {taxel_list(stuck)}: pinched by the mounting, "
-        yield finding("stuck_taxel", key, f"{text}or a trace shorted to its neighbour; mask them for training")
+        yield finding(
+            "stuck_taxel",
+            key,
+            f"{text}or a trace shorted to its neighbour; mask them for training",
+        )
 
 
 def _dead(key: str, pad: Pad) -> Iterator[Finding]:
@@ -278,10 +348,15 @@ def _saturated(key: str, pad: Pad) -> Iterator[Finding]:
     if pad.shorted.any():
         text = f"{pad.name}: always at {most}, {taxel_list(pad.shorted)}: a short to the supply; mask them for training"
         yield finding("saturated", key, text)
-    full = (pad.counts + (np.nan if pad.baseline is None else pad.baseline) >= pad.max_count) & ~pad.stuck
+    full = (
+        pad.counts + (np.nan if pad.baseline is None else pad.baseline) >= pad.max_count
+    ) & ~pad.stuck
     rows = np.flatnonzero(full.any(axis=(1, 2)))
     if len(rows):
-        share, where = len(rows) / max(int(pad.contact.sum()), len(rows)), (int(rows[0]), int(rows[-1]) + 1)
+        share, where = (
+            len(rows) / max(int(pad.contact.sum()), len(rows)),
+            (int(rows[0]), int(rows[-1]) + 1),
+        )
         bad = len(rows) / pad.fps >= SATURATED_S and share >= SATURATED_SHARE
         text = f"{pad.name}: up to {full.sum(axis=(1, 2)).max()} taxels at {most} in {len(rows)} rows, {share:.0%} of "
         text += f"those in contact, {place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
@@ -301,7 +376,10 @@ def _noisy(key: str, pad: Pad) -> Iterator[Finding]:
 
 
 def _frozen(key: str, pad: Pad) -> Iterator[Finding]:
-    found, at_rest = stretches(pad.repeated, pad.fps, FROZEN_S), np.flatnonzero(~pad.repeated[1:] & ~pad.contact[1:])
+    found, at_rest = (
+        stretches(pad.repeated, pad.fps, FROZEN_S),
+        np.flatnonzero(~pad.repeated[1:] & ~pad.contact[1:]),
+    )
     if not found or len(at_rest) < FROZEN_S * pad.fps:
         return
     if np.mean(pad.counts[at_rest + 1] != pad.counts[at_rest]) >= LIVELY_SHARE:

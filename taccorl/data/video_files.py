@@ -12,7 +12,9 @@ from taccorl.errors import DatasetError
 from taccorl.extras import OnUse
 
 av = OnUse("av")
-TOLERANCE_S = 1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
+TOLERANCE_S = (
+    1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
+)
 
 
 def _nearest(times_s: np.ndarray, due_s: np.ndarray) -> np.ndarray:
@@ -20,7 +22,9 @@ def _nearest(times_s: np.ndarray, due_s: np.ndarray) -> np.ndarray:
     if len(times_s) < 2:
         return np.zeros(len(due_s), dtype=int)
     after = np.clip(np.searchsorted(times_s, due_s), 1, len(times_s) - 1)
-    return np.where(due_s - times_s[after - 1] <= times_s[after] - due_s, after - 1, after)
+    return np.where(
+        due_s - times_s[after - 1] <= times_s[after] - due_s, after - 1, after
+    )
 
 
 def _packet_times(path: Path) -> tuple[np.ndarray, int]:
@@ -34,11 +38,15 @@ def _packet_times(path: Path) -> tuple[np.ndarray, int]:
     return np.sort(np.array(times, dtype=float)), corrupt
 
 
-def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Generator[np.ndarray, None, None]:
+def video_frames(
+    video: Video, fps: int, first: int, end: int, name: str
+) -> Generator[np.ndarray, None, None]:
     """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time. ``name``:
     of the video, for the message. Raises DatasetError: a row has no frame at its time."""
     row = first
-    for time_s, frame in _decode_from(video.path, video.from_s + first / fps) if row < end else ():
+    for time_s, frame in (
+        _decode_from(video.path, video.from_s + first / fps) if row < end else ()
+    ):
         due_s = video.from_s + row / fps
         if time_s > due_s + TOLERANCE_S:
             break
@@ -48,7 +56,9 @@ def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Gen
             if row == end:
                 return
     if row < end:
-        raise DatasetError(f"{name}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}")
+        raise DatasetError(
+            f"{name}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}"
+        )
 
 
 def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, Any]]:
@@ -61,12 +71,20 @@ def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, Any]]:
         container.seek(max(0, round(time_s / base) - 1), stream=stream)
         frames = container.decode(stream)
         first = next(frames, None)
-        if first is None or first.pts is None or first.pts * base > time_s + TOLERANCE_S:
-            container.seek(0, stream=stream)  # an index that points behind the wanted frame: from the start, then
+        if (
+            first is None
+            or first.pts is None
+            or first.pts * base > time_s + TOLERANCE_S
+        ):
+            container.seek(
+                0, stream=stream
+            )  # an index that points behind the wanted frame: from the start, then
             frames = container.decode(stream)
         else:
             yield first.pts * base, first
-        yield from ((frame.pts * base, frame) for frame in frames if frame.pts is not None)
+        yield from (
+            (frame.pts * base, frame) for frame in frames if frame.pts is not None
+        )
 
 
 def frame_problems(path: Path, due: Mapping[int, np.ndarray]) -> list[str]:
@@ -76,21 +94,33 @@ def frame_problems(path: Path, due: Mapping[int, np.ndarray]) -> list[str]:
         times_s, corrupt = _packet_times(path)
     except DatasetError as error:
         return [str(error).removeprefix(f"{path}: ")]
-    problems = [f"{corrupt} of {len(times_s)} frames are cut off or corrupt"] if corrupt else []
+    problems = (
+        [f"{corrupt} of {len(times_s)} frames are cut off or corrupt"]
+        if corrupt
+        else []
+    )
     owner: dict[int, int] = {}
     for index, due_s in due.items():
         nearby = _nearest(times_s, due_s)
-        found = np.abs(times_s[nearby] - due_s) < TOLERANCE_S if len(times_s) else np.zeros(len(due_s), dtype=bool)
+        found = (
+            np.abs(times_s[nearby] - due_s) < TOLERANCE_S
+            if len(times_s)
+            else np.zeros(len(due_s), dtype=bool)
+        )
         if not found.all():
             row = int(np.argmin(found))
             text = f"episode {index}: {int(found.sum())} frames for {len(due_s)} rows; row {row} has none at "
             problems.append(f"{text}{due_s[row]:.4f} s")
         claimed = [int(f) for f in nearby[found]]
         if shared := [owner[f] for f in claimed if f in owner]:
-            problems.append(f"episode {index}: {len(shared)} of its frames are also those of episode {min(shared)}")
+            problems.append(
+                f"episode {index}: {len(shared)} of its frames are also those of episode {min(shared)}"
+            )
         owner.update(dict.fromkeys(claimed, index))
     if spare := [f for f in range(len(times_s)) if f not in owner]:
         rows, episodes = sum(map(len, due.values())), list(due)
         text = f"{len(times_s)} frames for {rows} rows of episodes {episodes[0]} to {episodes[-1]}: {len(spare)} "
-        problems.append(f"{text}frames belong to no row, first at {times_s[spare[0]]:.4f} s")
+        problems.append(
+            f"{text}frames belong to no row, first at {times_s[spare[0]]:.4f} s"
+        )
     return problems

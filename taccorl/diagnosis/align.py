@@ -14,11 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera, without_effects
+from taccorl.alignment.camera.calibration import (
+    CameraFrames,
+    calibrate_camera,
+    without_effects,
+)
 from taccorl.alignment.camera.episode import all_pictures, camera_frames, joint_rows
 from taccorl.alignment.camera.light import camera_light
 from taccorl.alignment.camera.timing import camera_latency
-from taccorl.alignment.controller.identification import ControllerFit, identify_controller
+from taccorl.alignment.controller.identification import (
+    ControllerFit,
+    identify_controller,
+)
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -87,16 +94,24 @@ class Alignment:
 
     def record(self) -> dict[str, Any]:
         """The result as JSON values, for a report; NaN becomes None. Pictures and the twin are left out."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_STORED}
+        values = {
+            f.name: getattr(self, f.name)
+            for f in dataclasses.fields(self)
+            if f.name not in _NOT_STORED
+        }
         values["numbers"] = [dataclasses.asdict(n) for n in self.numbers]
-        values["effects"] = [effect.name for effect in self.effects if not effect.is_absent]
+        values["effects"] = [
+            effect.name for effect in self.effects if not effect.is_absent
+        ]
         return _plain(values)
 
 
 _NOT_STORED = ("numbers", "effects", "twin", "overlays")
 
 
-def align_part(part: str, config: TwinConfig, measurements: Measurements, *, fit_kp: bool = False) -> Alignment:
+def align_part(
+    part: str, config: TwinConfig, measurements: Measurements, *, fit_kp: bool = False
+) -> Alignment:
     """Align one joint (``left_joint5``) or the pads of one arm (``left pads``); why it cannot be done is its ``trouble``.
     ``fit_kp``: fit K_p, too. Positions determine K_d / K_p and T_ref / K_p, and K_p only through small terms that other errors of
     the model change; without, K_p is what the recordings state, or the twin's."""
@@ -124,7 +139,9 @@ def align_parts(
     return joints.each(one, {part: part for part in parts}, workers, done)
 
 
-def _align_joint(signal: str, config: TwinConfig, measurements: Measurements, fit_kp: bool) -> Alignment:
+def _align_joint(
+    signal: str, config: TwinConfig, measurements: Measurements, fit_kp: bool
+) -> Alignment:
     own = joints.of_joints(measurements, [signal])
     model = JointModel(config, signal)
     motions = [joint_motion(m, config, signal) for m in own.fit]
@@ -132,15 +149,27 @@ def _align_joint(signal: str, config: TwinConfig, measurements: Measurements, fi
     free += ["kd"] * (not all(m.kd_known for m in motions))
     free += ["kp"] * (fit_kp and not all(m.kp_known for m in motions))
     fit = identify_controller(
-        motions, model, free=free, validation=[joint_motion(m, config, signal) for m in own.validation]
+        motions,
+        model,
+        free=free,
+        validation=[joint_motion(m, config, signal) for m in own.validation],
     )
     judged = [e for e in fit.errors if e.use == "validation"] or list(fit.errors)
     before, after = (
-        float(np.sqrt(np.mean([getattr(e, name) ** 2 for e in judged]))) for name in ("rmse_before", "rmse_after")
+        float(np.sqrt(np.mean([getattr(e, name) ** 2 for e in judged])))
+        for name in ("rmse_before", "rmse_after")
     )
     numbers = _gains(fit, model)
-    trouble = "" if fit.converged else "; ".join(r for r in fit.remarks if r.startswith("not converged"))
-    unchanged = not trouble and after > before and all(n.fixed or n.low <= n.before <= n.high for n in numbers)
+    trouble = (
+        ""
+        if fit.converged
+        else "; ".join(r for r in fit.remarks if r.startswith("not converged"))
+    )
+    unchanged = (
+        not trouble
+        and after > before
+        and all(n.fixed or n.low <= n.before <= n.high for n in numbers)
+    )
     if not trouble and not unchanged and after > before:
         trouble = f"the error on {', '.join(e.name for e in judged)} is larger with the fitted gains"
     remarks = _limits_of_gains("kp" in free, all(m.kp_known for m in motions))
@@ -156,7 +185,10 @@ def _align_joint(signal: str, config: TwinConfig, measurements: Measurements, fi
         after=after,
         judged_by=tuple(e.name for e in judged),
         fitted_to=tuple(e.name for e in fit.errors if e.use == "fit"),
-        remarks=(*remarks, *(r for r in fit.remarks if not r.startswith("not converged"))),
+        remarks=(
+            *remarks,
+            *(r for r in fit.remarks if not r.startswith("not converged")),
+        ),
         trouble=trouble,
         unchanged=unchanged,
     )
@@ -182,7 +214,15 @@ def _gains(fit: ControllerFit, model: JointModel) -> tuple[FittedNumber, ...]:
     before = had._asdict() | {"lag": had.kd / had.kp, "offset": had.torque_ff / had.kp}
     words = {"lag": "kd/kp", "offset": "torque_ff/kp"}
     return tuple(
-        FittedNumber(words.get(name, name), found.unit, before[name], found.value, found.low, found.high, found.fixed)
+        FittedNumber(
+            words.get(name, name),
+            found.unit,
+            before[name],
+            found.value,
+            found.low,
+            found.high,
+            found.fixed,
+        )
         for name, found in fit.estimates.items()
         if name in before
     )
@@ -191,7 +231,11 @@ def _gains(fit: ControllerFit, model: JointModel) -> tuple[FittedNumber, ...]:
 def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Alignment:
     arm = part.removesuffix(" pads")
     fit, validation = (
-        [touch_motion(m, config, m.pressed) for m in side if m.pressed is not None and pads.presses(m, arm)]
+        [
+            touch_motion(m, config, m.pressed)
+            for m in side
+            if m.pressed is not None and pads.presses(m, arm)
+        ]
         for side in (measurements.fit, measurements.validation)
     )
     found = calibrate_touch(fit, validation, config)
@@ -202,7 +246,14 @@ def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Al
     return Alignment(
         part=part,
         numbers=tuple(
-            FittedNumber(name, n.unit, float(getattr(sensor, pads.FIELDS[name])), n.value, n.low, n.high)
+            FittedNumber(
+                name,
+                n.unit,
+                float(getattr(sensor, pads.FIELDS[name])),
+                n.value,
+                n.low,
+                n.high,
+            )
             for name, n in (("k_n", found.stiffness), ("k_d", found.damping))
         ),
         error_name="RMS error of the counts of active taxels",
@@ -238,15 +289,34 @@ def align_camera(camera: str, config: TwinConfig, episode: Episode) -> Alignment
         return Alignment(part=part, trouble=str(error))
 
 
-def _align_camera(part: str, camera: str, config: TwinConfig, episode: Episode) -> Alignment:
-    had = [e for e in config.effects if e.name.startswith("camera_") and camera in e.acts_on()]
-    late = camera_latency(all_pictures(episode, camera), episode.time_s, joint_rows(episode), config, camera)
+def _align_camera(
+    part: str, camera: str, config: TwinConfig, episode: Episode
+) -> Alignment:
+    had = [
+        e
+        for e in config.effects
+        if e.name.startswith("camera_") and camera in e.acts_on()
+    ]
+    late = camera_latency(
+        all_pictures(episode, camera),
+        episode.time_s,
+        joint_rows(episode),
+        config,
+        camera,
+    )
     known_s = sum(float(getattr(e, "delay_s", 0.0)) for e in had)
     latency_s = known_s if late.problems else late.latency_s
     frames = camera_frames(episode, camera, latency_s=latency_s)
     fit = calibrate_camera(frames, config, camera)
     numbers = [
-        FittedNumber(name=name, unit=unit, before=float(a), value=float(b), low=float(b - h), high=float(b + h))
+        FittedNumber(
+            name=name,
+            unit=unit,
+            before=float(a),
+            value=float(b),
+            low=float(b - h),
+            high=float(b + h),
+        )
         for name, unit, a, b, h in zip(
             [*(f"turn_{x}" for x in _AXES), *(f"shift_{x}" for x in _AXES)],
             ["rad"] * 3 + ["m"] * 3,
@@ -256,15 +326,33 @@ def _align_camera(part: str, camera: str, config: TwinConfig, episode: Episode) 
             strict=True,
         )
     ]
-    remarks, effects, twin = [f"latency not fitted: {why}" for why in late.problems], [], None
+    remarks, effects, twin = (
+        [f"latency not fitted: {why}" for why in late.problems],
+        [],
+        None,
+    )
     if not late.problems:
         low, high = late.interval_s
-        numbers.append(FittedNumber(name="latency", unit="s", before=known_s, value=late.latency_s, low=low, high=high))
+        numbers.append(
+            FittedNumber(
+                name="latency",
+                unit="s",
+                before=known_s,
+                value=late.latency_s,
+                low=low,
+                high=high,
+            )
+        )
         is_late = low > 0.0
         if not is_late:
             remarks.append("the latency's interval contains 0: the new twin has none")
         effects.append(
-            make_effect("camera_latency", cameras=[camera], delay_s=late.latency_s, interval={"delay_s": (low, high)})
+            make_effect(
+                "camera_latency",
+                cameras=[camera],
+                delay_s=late.latency_s,
+                interval={"delay_s": (low, high)},
+            )
             if is_late
             else make_effect("camera_latency", cameras=[camera], delay_s=0.0)
         )
@@ -298,14 +386,34 @@ def _exposure(
     camera: str, config: TwinConfig, frames: CameraFrames, had: Sequence[Effect]
 ) -> tuple[Effect, list[FittedNumber], str]:
     """Effect, its numbers, and how well the grey values match, for a camera whose pose in ``config`` is fitted."""
-    light = camera_light(frames, without_effects(config, camera, ("camera_exposure",)), camera)
-    ends = {"gain": light.gain_interval, "gamma": light.gamma_interval, "blur_px": light.blur_interval_px}
-    made = make_effect(
-        "camera_exposure", cameras=[camera], gain=light.gain, gamma=light.gamma, blur_px=light.blur_px, interval=ends
+    light = camera_light(
+        frames, without_effects(config, camera, ("camera_exposure",)), camera
     )
-    before = next((e for e in had if e.name == made.name), make_effect(made.name, cameras=[camera]))
+    ends = {
+        "gain": light.gain_interval,
+        "gamma": light.gamma_interval,
+        "blur_px": light.blur_interval_px,
+    }
+    made = make_effect(
+        "camera_exposure",
+        cameras=[camera],
+        gain=light.gain,
+        gamma=light.gamma,
+        blur_px=light.blur_px,
+        interval=ends,
+    )
+    before = next(
+        (e for e in had if e.name == made.name),
+        make_effect(made.name, cameras=[camera]),
+    )
     numbers = [
-        FittedNumber(p.name, p.unit, float(getattr(before, p.name)), float(getattr(made, p.name)), *ends[p.name])
+        FittedNumber(
+            p.name,
+            p.unit,
+            float(getattr(before, p.name)),
+            float(getattr(made, p.name)),
+            *ends[p.name],
+        )
         for p in made.parameters()
     ]
     said = f"grey values away from edges: mean difference {light.grey_before:.1f} → {light.grey_after:.1f} of 255"
@@ -322,7 +430,11 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
     good = [a for a in found if not a.trouble and not a.unchanged]
     why = ""
     for a in good:
-        values = {n.name: n.value for n in a.numbers if n.name in Gains._fields and not n.fixed}
+        values = {
+            n.name: n.value
+            for n in a.numbers
+            if n.name in Gains._fields and not n.fixed
+        }
         if a.part in joints.SIGNALS:
             joints.set_numbers(config, a.part, values, {})
         elif a.twin is not None:
@@ -331,9 +443,15 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
             config.cameras = [new if c.name == camera else c for c in config.cameras]
             gone = ("camera_pose", *(e.name for e in a.effects))
             config = without_effects(config, camera, gone)
-            config.effects = [*config.effects, *(e for e in a.effects if not e.is_absent)]
+            config.effects = [
+                *config.effects,
+                *(e for e in a.effects if not e.is_absent),
+            ]
     of_pads = {
-        a.part: ({n.name: n.value for n in a.numbers}, {n.name: (n.low, n.high) for n in a.numbers})
+        a.part: (
+            {n.name: n.value for n in a.numbers},
+            {n.name: (n.low, n.high) for n in a.numbers},
+        )
         for a in good
         if a.part.endswith(" pads")
     }

@@ -58,7 +58,12 @@ class Source(draccus.ChoiceRegistry, abc.ABC):
 class Recorder(Protocol):
     """Interface of what executes targets: ``EpisodeRecorder``, or one that keeps less."""
 
-    def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
+    def step(
+        self,
+        action: np.ndarray,
+        watch: Watch | None = None,
+        intended: np.ndarray | None = None,
+    ) -> None:
         """Make one control step with ``action`` (14,)."""
         ...
 
@@ -72,8 +77,12 @@ class Attempt:
     of ``CAUSES``; ``error``; ``crashed`` or ``hung`` of its process; or what its kind of attempt adds."""
     reason: str = ""  # Explanation of the outcome; empty if there is none
     name: str = ""
-    recorder: EpisodeRecorder | None = None  # Recorder with the rows, if the attempt has rows
-    provenance: dict[str, Any] = field(default_factory=dict)  # How the episode was simulated, for its provenance
+    recorder: EpisodeRecorder | None = (
+        None  # Recorder with the rows, if the attempt has rows
+    )
+    provenance: dict[str, Any] = field(
+        default_factory=dict
+    )  # How the episode was simulated, for its provenance
     source_digest: str = ""  # Digest of the dataset from which the episode was made
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     """Name → further array of the attempt, stored as NAME.npy beside entry.json."""
@@ -85,7 +94,10 @@ class Attempt:
 
 
 def act(
-    sim: Simulation, targets: Actions, recorder: Recorder, watch: Callable[[], Watch] | None = None
+    sim: Simulation,
+    targets: Actions,
+    recorder: Recorder,
+    watch: Callable[[], Watch] | None = None,
 ) -> tuple[str, str]:
     """Execute ``targets`` up to success, failure, the time limit, or their end. Returns outcome and reason. ``watch``: function
     that returns the callback for the physics steps of the next control step."""
@@ -124,7 +136,9 @@ def write_attempt(
             raise
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}:{place.lineno}"
-        done = Attempt(outcome="error", reason=f"{type(error).__name__}: {error} ({where})")
+        done = Attempt(
+            outcome="error", reason=f"{type(error).__name__}: {error} ({where})"
+        )
     told, began_s = entry(done), time.perf_counter()
     if done.recorder is not None:
         if keeps(told):
@@ -132,7 +146,9 @@ def write_attempt(
 
             episode = done.recorder.episode(done.name, done.provenance)
             write_episodes([episode], folder / "dataset")
-            write_json(folder / "episodes.json", [episode_record(episode, done.source_digest)])
+            write_json(
+                folder / "episodes.json", [episode_record(episode, done.source_digest)]
+            )
         seconds |= {"physics": done.recorder.physics_s, "touch": done.recorder.touch_s}
         seconds["writing"] = time.perf_counter() - began_s
     for name, array in done.arrays.items():
@@ -145,4 +161,6 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )

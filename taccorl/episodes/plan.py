@@ -85,7 +85,12 @@ class Needed:
     run succeed: the attempts follow from the plan alone, whatever their order of ending and number at the same time.
     """
 
-    def __init__(self, plan: "Plan", at_once: int = 1, advice: "Callable[[Made], str] | None" = None) -> None:
+    def __init__(
+        self,
+        plan: "Plan",
+        at_once: int = 1,
+        advice: "Callable[[Made], str] | None" = None,
+    ) -> None:
         """``at_once``: number of attempts that may run at the same time. ``advice``: as ``Plan.advice``, in place of it."""
         self._plan, self._advice = plan, advice or plan.advice
         self._unjudged = plan.many + at_once - 1
@@ -115,9 +120,17 @@ class Needed:
         while (num := self._in_order.total()) in self._made:
             self._in_order[self._made[num].entry["outcome"]] += 1
             tried, successes = num + 1, self._in_order["success"]
-            if plan.repeatable and tried >= plan.many and successes < plan.least * tried:
-                kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(self._in_order.items()))
-                first = next(made for _, made in sorted(self._made.items()) if not made.success)
+            if (
+                plan.repeatable
+                and tried >= plan.many
+                and successes < plan.least * tried
+            ):
+                kinds = ", ".join(
+                    f"{n} {kind}" for kind, n in sorted(self._in_order.items())
+                )
+                first = next(
+                    made for _, made in sorted(self._made.items()) if not made.success
+                )
                 raise TaccorlError(
                     f"{plan.task}: {tried - successes} of {tried} failed ({kinds}); {self._advice(first)}"
                 )
@@ -154,7 +167,10 @@ class Drawing:
         """Draw them. Raises EngineError: the process that drew them died or was stopped."""
         if end:
             raise EngineError(f"{self}: {end.reason}")
-        self.draw(self.plan.opened().sim, Dataset(self.folder / "dataset").values(0, ["sim.state"])["sim.state"])
+        self.draw(
+            self.plan.opened().sim,
+            Dataset(self.folder / "dataset").values(0, ["sim.state"])["sim.state"],
+        )
 
     def __str__(self) -> str:
         return f"pictures of {self.plan.word} {self.item}"
@@ -204,13 +220,21 @@ class Plan(abc.ABC):
             if getattr(self, name) < least:
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
         if not 0 <= self.randomization <= 1:
-            raise TaccorlError(f"--randomization={self.randomization:g}: give a share of the reset ranges, 0 to 1")
+            raise TaccorlError(
+                f"--randomization={self.randomization:g}: give a share of the reset ranges, 0 to 1"
+            )
         if self.pictures == "cache" and not self.images:
-            raise TaccorlError("--pictures=cache and --images=false contradict one another: remove one")
+            raise TaccorlError(
+                "--pictures=cache and --images=false contradict one another: remove one"
+            )
         if (how := self.stored_as) not in get_args(PicturesAs):
-            raise TaccorlError(f"--pictures={how}: {nearest(how, get_args(PicturesAs))}")
+            raise TaccorlError(
+                f"--pictures={how}: {nearest(how, get_args(PicturesAs))}"
+            )
         if self.rows_per_picture > 1 and how != "cache":
-            raise TaccorlError(f"--rows_per_picture={self.rows_per_picture} needs --pictures=cache, not {how}")
+            raise TaccorlError(
+                f"--rows_per_picture={self.rows_per_picture} needs --pictures=cache, not {how}"
+            )
 
     # scene and rows ---------------------------------------------------------------------------------------------------
 
@@ -220,7 +244,11 @@ class Plan(abc.ABC):
     def make(self) -> Simulation:
         """Make the simulation of this plan. Raises TaccorlError: the task or difficulty is unknown; the message names the
         nearest."""
-        return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
+        return Simulation(
+            tasks.get(self.task)(self.difficulty),
+            self.twin_config(),
+            scale=self.randomization,
+        )
 
     def scene_config(self) -> dict[str, Any]:
         """Settings on which scenes and physics depend, besides seeds, as JSON values: name → value; part of the store's keys."""
@@ -260,11 +288,21 @@ class Plan(abc.ABC):
 
     def contract(self, sim: Simulation) -> DatasetSpec:
         """Data spec of an attempt's rows."""
-        return row_spec(sim, pictures=self.stored_as == "video", executed=self.executes, parts=self.part_poses)
+        return row_spec(
+            sim,
+            pictures=self.stored_as == "video",
+            executed=self.executes,
+            parts=self.part_poses,
+        )
 
     def published(self, sim: Simulation) -> DatasetSpec:
         """Data spec of the published dataset, with the cameras whose pictures are in the frame cache."""
-        return row_spec(sim, pictures=self.stored_as != "none", executed=self.executes, parts=self.part_poses)
+        return row_spec(
+            sim,
+            pictures=self.stored_as != "none",
+            executed=self.executes,
+            parts=self.part_poses,
+        )
 
     def actor(self, sim: Simulation) -> Any:
         """What acts in the attempts, if it is made once for all of them."""
@@ -276,12 +314,16 @@ class Plan(abc.ABC):
 
         def make() -> Opened:
             if self.scene_config() != self.scene:
-                raise TaccorlError(f"{self.twin} was changed while attempts ran; run the command again")
+                raise TaccorlError(
+                    f"{self.twin} was changed while attempts ran; run the command again"
+                )
             sim = self.make()
             return Opened(sim, self.contract(sim), self.actor(sim))
 
         own = [self.stored_as == "video", self.part_poses, self.executes]
-        return made_once([type(self).__name__, self.scene, own, self.actor_config()], make)
+        return made_once(
+            [type(self).__name__, self.scene, own, self.actor_config()], make
+        )
 
     def actor_config(self) -> Any:
         """Settings on which ``actor`` depends, as JSON values."""
@@ -343,11 +385,19 @@ class Plan(abc.ABC):
                 break
 
             def attempt(config: Any, inputs: list[Path], step: Step = step) -> Attempt:
-                return self.lost(item, end) if end else step.attempt(item, config, inputs + before)
+                return (
+                    self.lost(item, end)
+                    if end
+                    else step.attempt(item, config, inputs + before)
+                )
 
             entry = functools.partial(self.entry, item)
-            write = functools.partial(write_attempt, attempt, entry, self.keeps, self.counts_errors, seconds)
-            artefact = store.run(step.stage.bound(write), self.config(item), self.inputs(item))
+            write = functools.partial(
+                write_attempt, attempt, entry, self.keeps, self.counts_errors, seconds
+            )
+            artefact = store.run(
+                step.stage.bound(write), self.config(item), self.inputs(item)
+            )
             before.append(artefact.path)
             made = Made(artefact, read_json(artefact.path / "entry.json"), seconds)
         return made
@@ -361,12 +411,20 @@ class Plan(abc.ABC):
 
     def items_of(self, report: dict[str, Any]) -> Iterable[Any] | None:
         """Attempts of which a dataset with that report may be made; None if it cannot be one of this plan's."""
-        return [entry["attempt"] for entry in report["entries"]] if report["episodes"] == self.episodes else None
+        return (
+            [entry["attempt"] for entry in report["entries"]]
+            if report["episodes"] == self.episodes
+            else None
+        )
 
-    def may_be_made_of(self, report: dict[str, Any], keys: set[str], store: Store) -> bool:
+    def may_be_made_of(
+        self, report: dict[str, Any], keys: set[str], store: Store
+    ) -> bool:
         """True if a dataset with that report, of artefacts with those ``keys``, may be the one of this plan."""
         items, stage = self.items_of(report), self.steps[-1].stage
-        return items is not None and keys <= {store.key(stage, self.config(i), self.inputs(i)) for i in items}
+        return items is not None and keys <= {
+            store.key(stage, self.config(i), self.inputs(i)) for i in items
+        }
 
     def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
         """Counts of a run by outcome, and each attempt, as JSON values."""
@@ -383,7 +441,9 @@ class Plan(abc.ABC):
 
     def nothing(self, report: dict[str, Any], out: Path) -> TaccorlError:
         """The error if no attempt is kept."""
-        return TaccorlError(f"{self.task}: no attempt succeeded, nothing was written to {out}: {report['outcomes']}")
+        return TaccorlError(
+            f"{self.task}: no attempt succeeded, nothing was written to {out}: {report['outcomes']}"
+        )
 
 
 _kept: dict[str, Any] = {}

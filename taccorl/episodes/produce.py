@@ -28,7 +28,9 @@ from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
-_CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
+_CARE = Care(
+    limit_s=600.0, tries=2
+)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Progress = Callable[[str], None]
 """Function that is called with a text about what has been done."""
@@ -37,7 +39,9 @@ Progress = Callable[[str], None]
 class Pictures(Protocol):
     """Pictures of a dataset that is being produced: they are drawn while other attempts run."""
 
-    def add(self, demonstration: Artefact, rows: int) -> Callable[[Simulation, np.ndarray], None]:
+    def add(
+        self, demonstration: Artefact, rows: int
+    ) -> Callable[[Simulation, np.ndarray], None]:
         """Add the next episode of the dataset, which has ``rows`` rows. Returns a function that renders its pictures; a worker
         process calls it with a simulation and the episode's states (T, row_size)."""
         ...
@@ -73,13 +77,26 @@ def produce(
     spec = plan.published(sim)
     if plan.repeatable:
         sim.reset([0])
-        sim.touch(np.random.default_rng(0))  # compiled once, and not in each worker at the same time
+        sim.touch(
+            np.random.default_rng(0)
+        )  # compiled once, and not in each worker at the same time
     run = functools.partial(plan.run, store)
     engine = engine or LocalEngine()
     at_work = _Run(plan, engine.at_once, progress, pictures)
     if plan.repeatable:
-        names = {"name": lambda item: str(item) if isinstance(item, Drawing) else f"{plan.word} {item}"}
-        engine.map(run, [*at_work.first()], on_done=at_work.on_done, care=_CARE, instead=run, **names)
+        names = {
+            "name": lambda item: (
+                str(item) if isinstance(item, Drawing) else f"{plan.word} {item}"
+            )
+        }
+        engine.map(
+            run,
+            [*at_work.first()],
+            on_done=at_work.on_done,
+            care=_CARE,
+            instead=run,
+            **names,
+        )
     else:
         in_order(run, at_work.first(), at_work.on_done)
     made = at_work.counted()
@@ -99,7 +116,9 @@ def produce(
 class _Run:
     """Attempts of a run that have ended, and what follows from them."""
 
-    def __init__(self, plan: Plan, at_once: int, progress: Progress, pictures: Pictures | None) -> None:
+    def __init__(
+        self, plan: Plan, at_once: int, progress: Progress, pictures: Pictures | None
+    ) -> None:
         self._plan, self._progress, self._pictures = plan, progress, pictures
         self._schedule = plan.schedule(at_once)
         self._items: list[Any] = []
@@ -122,11 +141,19 @@ class _Run:
 
     def _count(self) -> str:
         wanted = self._plan.wanted
-        return f" ({sum(made.success for made in self._made.values())} of {wanted})" if wanted else ""
+        return (
+            f" ({sum(made.success for made in self._made.values())} of {wanted})"
+            if wanted
+            else ""
+        )
 
     def _drawings(self) -> list[Drawing]:
         found = []
-        while self._pictures and self._drawn < len(self._items) and (item := self._items[self._drawn]) in self._made:
+        while (
+            self._pictures
+            and self._drawn < len(self._items)
+            and (item := self._items[self._drawn]) in self._made
+        ):
             made = self._made[item]
             if self._plan.keeps(made.entry):
                 draw = self._pictures.add(made.artefact, made.entry["rows"])
@@ -138,13 +165,20 @@ class _Run:
         """In the order of the attempts, up to the last success that is wanted."""
         found = list[Made]()
         for item in self._items:
-            if self._plan.wanted is not None and sum(made.success for made in found) == self._plan.wanted:
+            if (
+                self._plan.wanted is not None
+                and sum(made.success for made in found) == self._plan.wanted
+            ):
                 break
             found.append(self._made[item])
         return found
 
 
-def in_order[T](run: Callable[[Any], T], first: Iterable[Any], on_done: Callable[[Any, T], Iterable[Any]]) -> None:
+def in_order[T](
+    run: Callable[[Any], T],
+    first: Iterable[Any],
+    on_done: Callable[[Any, T], Iterable[Any]],
+) -> None:
     """Run attempts one after another in this process; errors end them."""
     todo = deque(first)
     while todo:
@@ -155,7 +189,9 @@ def in_order[T](run: Callable[[Any], T], first: Iterable[Any], on_done: Callable
 def said(entry: dict[str, Any]) -> str:
     """What a line of progress says of an attempt."""
     after = f" after {entry['seconds']:.1f} s" if "seconds" in entry else ""
-    return f"{entry['outcome']}{after}" + (f", {entry['reason']}" if entry.get("reason") else "")
+    return f"{entry['outcome']}{after}" + (
+        f", {entry['reason']}" if entry.get("reason") else ""
+    )
 
 
 def mean_seconds(seconds: Sequence[dict[str, float]]) -> dict[str, float]:
@@ -163,7 +199,11 @@ def mean_seconds(seconds: Sequence[dict[str, float]]) -> dict[str, float]:
     episode.
     """
     known = [each for each in seconds if each]
-    return {key: sum(each[key] for each in known) / len(known) for key in known[0]} if known else {}
+    return (
+        {key: sum(each[key] for each in known) / len(known) for key in known[0]}
+        if known
+        else {}
+    )
 
 
 def check_out(plan: Plan, out: Path, store: Store) -> None:
@@ -178,16 +218,22 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
             manifest["stage"] == plan.dataset.name
             and manifest["config"].items() >= config.items()
             and (report := out / PROVENANCE / REPORT).is_file()
-            and plan.may_be_made_of(read_json(report), {entry["key"] for entry in manifest["inputs"]}, store)
+            and plan.may_be_made_of(
+                read_json(report), {entry["key"] for entry in manifest["inputs"]}, store
+            )
         ):
             return  # made of attempts of this very plan, and of as many successes
-        other = [key for key in config if manifest["config"].get(key) != config[key]] or [
-            "attempts (source, seed, number, what is kept of each)"
-        ]
+        other = [
+            key for key in config if manifest["config"].get(key) != config[key]
+        ] or ["attempts (source, seed, number, what is kept of each)"]
         made = f"{manifest['stage']} v{manifest['stage_version']}, made {manifest['created']}"
         held = f"holds {made}, which differs in {', '.join(other)}"
     else:
-        kind = f"a folder of {sum(1 for _ in out.rglob('*'))} entries" if out.is_dir() else "a file"
+        kind = (
+            f"a folder of {sum(1 for _ in out.rglob('*'))} entries"
+            if out.is_dir()
+            else "a file"
+        )
         held = f"is {kind} without a taccorl manifest"
     raise InTheWayError(
         f"{out} is occupied: it {held}; this run makes {plan.dataset.name} v{plan.dataset.version} of {plan.task}. Nothing "
@@ -208,9 +254,16 @@ def _assemble(
     shards; the dataset states it. ``engine``: where datasets without videos are merged."""
     from taccorl.data.lerobot_format import declare_pictures, merge
 
-    merge([shard / "dataset" for shard in shards], folder, in_threads if engine == LocalEngine() else engine.map)
+    merge(
+        [shard / "dataset" for shard in shards],
+        folder,
+        in_threads if engine == LocalEngine() else engine.map,
+    )
     meta = folder / PROVENANCE
-    write_records(folder, [record for shard in shards for record in read_json(shard / "episodes.json")])
+    write_records(
+        folder,
+        [record for shard in shards for record in read_json(shard / "episodes.json")],
+    )
     write_json(meta / REPORT, report)
     write_json(meta / "dataset_spec.json", dataset_spec_to_json(spec))
     if rows_per_picture is not None:

@@ -17,7 +17,13 @@ from taccorl.data.episode import EXECUTED, Episode, Pictures
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec, find_spec, load_dataset_spec
 from taccorl.robots import ROBOT
-from taccorl.sim.part_poses import PARTS_KEY, POSE_UNITS, part_pose_names, part_poses, posed_bodies
+from taccorl.sim.part_poses import (
+    PARTS_KEY,
+    POSE_UNITS,
+    part_pose_names,
+    part_poses,
+    posed_bodies,
+)
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
@@ -27,12 +33,17 @@ def told_origin(origin: Origin) -> dict[str, Any]:
 
     The domain of the twin is left out: the store's keys of attempts that were made before there was a domain stay valid.
     """
-    return {"origin": origin.text} | ({} if origin.domain == TWIN_ORIGIN.domain else {"domain": origin.domain})
+    return {"origin": origin.text} | (
+        {} if origin.domain == TWIN_ORIGIN.domain else {"domain": origin.domain}
+    )
 
 
 def origin_told(simulation: Mapping[str, Any]) -> Origin:
     """Origin stated by a simulation's description."""
-    return Origin(simulation.get("domain", TWIN_ORIGIN.domain), simulation.get("origin", TWIN_ORIGIN.text))
+    return Origin(
+        simulation.get("domain", TWIN_ORIGIN.domain),
+        simulation.get("origin", TWIN_ORIGIN.text),
+    )
 
 
 _ANY = (-1e12, 1e12)
@@ -41,7 +52,9 @@ PICTURE = "observation.images."
 """Beginning of the keys of picture features."""
 
 
-def row_spec(sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False) -> DatasetSpec:
+def row_spec(
+    sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False
+) -> DatasetSpec:
     """Data spec of the twin's rows: the robot's features and the simulator's own: state, seed, subtask of each arm, success.
 
     ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it. ``executed``: rows also
@@ -55,11 +68,25 @@ def row_spec(sim: Simulation, *, pictures: bool, executed: bool = False, parts: 
         if not feature.optional and (pictures or feature.dtype != "video")
     }
     if pictures:
-        sim.require_cameras([key.removeprefix(PICTURE) for key, f in features.items() if f.dtype == "video"])
+        sim.require_cameras(
+            [
+                key.removeprefix(PICTURE)
+                for key, f in features.items()
+                if f.dtype == "video"
+            ]
+        )
     features |= {
-        "sim.state": FeatureSpec(dtype="float64", shape=(sim.row_size,), range=_ANY, **own),
+        "sim.state": FeatureSpec(
+            dtype="float64", shape=(sim.row_size,), range=_ANY, **own
+        ),
         "sim.seed": FeatureSpec(dtype="int64", shape=(1,), range=(0, 2**62), **own),
-        "sim.subtask": FeatureSpec(dtype="int16", shape=(len(ROBOT.arms),), range=(0, 99), names=ROBOT.arms, **own),
+        "sim.subtask": FeatureSpec(
+            dtype="int16",
+            shape=(len(ROBOT.arms),),
+            range=(0, 99),
+            names=ROBOT.arms,
+            **own,
+        ),
         "sim.success": FeatureSpec(dtype="int16", shape=(1,), range=(0, 1), **own),
     }
     if parts:
@@ -85,17 +112,26 @@ class EpisodeRecorder:
 
     sim: Simulation
     spec: DatasetSpec  # Data spec of the rows, from ``row_spec``
-    sensor_rng: np.random.Generator | None = None  # Random generator of the pads' noise; None: a noiseless sensor
+    sensor_rng: np.random.Generator | None = (
+        None  # Random generator of the pads' noise; None: a noiseless sensor
+    )
     dense: bool = False
     """True: also keep a trajectory at 200 Hz, from which a recording in the format of the drivers is made."""
-    rows: list[dict[str, np.ndarray]] = field(default_factory=list)  # Recorded rows: feature → value
+    rows: list[dict[str, np.ndarray]] = field(
+        default_factory=list
+    )  # Recorded rows: feature → value
     physics_s: float = 0.0  # Wall time of the physics in all steps so far [s]
     touch_s: float = 0.0  # Wall time of touch in all steps so far [s]
 
     def __post_init__(self) -> None:
         self._dense = DenseRecorder(self.sim) if self.dense else None
 
-    def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
+    def step(
+        self,
+        action: np.ndarray,
+        watch: Watch | None = None,
+        intended: np.ndarray | None = None,
+    ) -> None:
         """Record one row and make one control step with ``action`` (14,) [rad, m]. The action is rounded to float32 before it is
         executed, so that the executed action is the stored one. ``watch``: callback for physics steps in between; only without
         ``dense``. ``intended``: (14,) the row's ``action``, if it differs from the executed one, which is then stored as
@@ -115,11 +151,17 @@ class EpisodeRecorder:
         if PARTS_KEY in self.spec.features:
             row[PARTS_KEY] = part_poses(sim)[0]
         began_s = time.perf_counter()
-        sim.step(action[None].astype(np.float64), watch=self._dense.watch() if self._dense else watch)
+        sim.step(
+            action[None].astype(np.float64),
+            watch=self._dense.watch() if self._dense else watch,
+        )
         self.physics_s += time.perf_counter() - began_s
         row["action"] = sim.executed[0].astype(np.float32)
         if intended is not None:
-            row[EXECUTED], row["action"] = row["action"], np.asarray(intended, np.float32)
+            row[EXECUTED], row["action"] = (
+                row["action"],
+                np.asarray(intended, np.float32),
+            )
         row["sim.success"] = sim.judge.success[:1].astype(np.int16)
         self.rows.append(row)
 
@@ -130,7 +172,9 @@ class EpisodeRecorder:
 
     def episode(self, name: str, simulation: dict[str, Any]) -> Episode:
         """All recorded rows as an episode of the origin that ``simulation`` states. It is stored in the episode's provenance."""
-        arrays = {key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]}
+        arrays = {
+            key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]
+        }
         outcome = self.sim.judge.outcome
         keys = tuple(key for key in self.spec.keys("video"))
         return Episode(
@@ -148,7 +192,9 @@ class EpisodeRecorder:
             provenance={"recording": name, "simulation": simulation},
         )
 
-    def _pictures(self, states: np.ndarray, keys: tuple[str, ...]) -> Iterator[Pictures]:
+    def _pictures(
+        self, states: np.ndarray, keys: tuple[str, ...]
+    ) -> Iterator[Pictures]:
         cameras = [key.removeprefix(PICTURE) for key in keys]
         for images in self.sim.render_states(states, cameras):
             yield {PICTURE + camera: image for camera, image in images.items()}
@@ -156,7 +202,9 @@ class EpisodeRecorder:
     def _stages(self, subtask: np.ndarray) -> Iterator[tuple[int, str]]:
         """(first row, "right: insert plug") wherever an arm begins another subtask."""
         subtasks = self.sim.task.subtasks()
-        for row in np.flatnonzero(np.any(np.diff(subtask, axis=0, prepend=-1) != 0, axis=1)):
+        for row in np.flatnonzero(
+            np.any(np.diff(subtask, axis=0, prepend=-1) != 0, axis=1)
+        ):
             now = [
                 f"{arm}: {subtasks[arm][k].name if k < len(subtasks[arm]) else 'done'}"
                 for arm, k in zip(ROBOT.arms, subtask[row], strict=True)

@@ -32,7 +32,15 @@ from taccorl.tasks.experts.mating import Mating
 from taccorl.tasks.experts.scripted import ScriptedExpert
 from taccorl.tasks.experts.se3 import inverse
 
-ACROSS_M = ((0.0, 0.0), (-0.004, 0.0), (-0.002, 0.0), (0.002, 0.0), (0.004, 0.0), (0.0, -0.003), (0.0, 0.003))
+ACROSS_M = (
+    (0.0, 0.0),
+    (-0.004, 0.0),
+    (-0.002, 0.0),
+    (0.002, 0.0),
+    (0.004, 0.0),
+    (0.0, -0.003),
+    (0.0, 0.003),
+)
 """Displacements across the hole's axis, x and y in its frame [m]."""
 MANY_GRIPS = ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06)
 """Grips as wide apart as those of ``pipelines.learn``."""
@@ -43,7 +51,10 @@ BEFORE_M = 0.018
 _WITHIN_M = 0.004  # of the axis, when the expert has brought the part
 _BEFORE_RANGE_M = (0.014, 0.024)
 _SERVO_STEPS, _STILL_STEPS = 32, 13
-_SERVO_GAIN, _LARGEST_M = 0.25, 0.004  # share of the remaining displacement that a step corrects, and its limit
+_SERVO_GAIN, _LARGEST_M = (
+    0.25,
+    0.004,
+)  # share of the remaining displacement that a step corrects, and its limit
 
 
 @dataclass(frozen=True)
@@ -96,20 +107,30 @@ def aims(
     """
     found: list[Aim] = []
     rows = executed * max(1, math.ceil((window - 1) / executed)) + 1
-    env = scenes.environments(task, 1, images=actor.needs_images, part_poses=actor.needs_part_poses)
+    env = scenes.environments(
+        task, 1, images=actor.needs_images, part_poses=actor.needs_part_poses
+    )
     try:
         for seed in scenes.seeds:
             held = _Held.bring(env, seed, hands)
-            answers = [] if held is None else [held.ask(actor, rows, scenes.pictures, seed, m) for m in across_m]
+            answers = (
+                []
+                if held is None
+                else [held.ask(actor, rows, scenes.pictures, seed, m) for m in across_m]
+            )
             asked = [answer for answer in answers if answer is not None]
             if held is not None and len(asked) == len(answers):
                 found += asked
             ended = "asked" if asked else "not brought before its mate"
-            progress(f"{task}, grip {seed}: {ended if len(asked) == len(answers) else 'lost when it was displaced'}")
+            progress(
+                f"{task}, grip {seed}: {ended if len(asked) == len(answers) else 'lost when it was displaced'}"
+            )
     finally:
         env.close()
     if not found:
-        raise TaccorlError(f"{task}: in none of {scenes.episodes} scenes the expert brought a part before its mate")
+        raise TaccorlError(
+            f"{task}: in none of {scenes.episodes} scenes the expert brought a part before its mate"
+        )
     return found
 
 
@@ -122,23 +143,40 @@ def aims_of(
     progress: Callable[[str], None],
 ) -> dict[str, dict[str, Any]]:
     """Path of a checkpoint → task → its aims of ``grips`` further scenes, which are also printed."""
-    held = dataclasses.replace(scenes, episodes=grips, seed=scenes.seeds.stop, episode_length=None)
+    held = dataclasses.replace(
+        scenes, episodes=grips, seed=scenes.seeds.stop, episode_length=None
+    )
     found: dict[str, dict[str, Any]] = {}
     for one in checkpoints:
         predicted = getattr(one.config, "chunk_size", None)
         steps = None if predicted is None else min(EXECUTED, predicted)
-        checkpoint, name = open_checkpoint(one.path, device, n_action_steps=steps), str(one.path)
+        checkpoint, name = (
+            open_checkpoint(one.path, device, n_action_steps=steps),
+            str(one.path),
+        )
         found[name] = {}
         for task in scenes.tasks:
-            rows = {"executed": steps or 1, "window": getattr(one.config, "window_rows", 1)}
+            rows = {
+                "executed": steps or 1,
+                "window": getattr(one.config, "window_rows", 1),
+            }
             try:
-                answers = aimed(aims(held, task, checkpoint.load(seed), **rows, progress=progress))
+                answers = aimed(
+                    aims(held, task, checkpoint.load(seed), **rows, progress=progress)
+                )
             except TaccorlError as error:  # the scores are still written
                 print(f"note: --before_mate: {error}")
                 continue
             print(f"{name}, {task}, before the mate: {answers}")
-            numbers = {"kept": answers.kept.tolist(), "error_m": answers.error_m.tolist()}
-            found[name][task] = {**numbers, "grips": answers.grips, "text": str(answers)}
+            numbers = {
+                "kept": answers.kept.tolist(),
+                "error_m": answers.error_m.tolist(),
+            }
+            found[name][task] = {
+                **numbers,
+                "grips": answers.grips,
+                "text": str(answers),
+            }
     return found
 
 
@@ -151,8 +189,14 @@ def aimed(answers: Sequence[Aim]) -> Aimed:
     for axis in range(2):
         x, y = displaced_m[:, axis], aim_m[:, axis]
         means = [np.bincount(grip, v) / np.bincount(grip) for v in (x, y)]
-        kept[axis] = (x - means[0][grip]) @ (y - means[1][grip]) / ((x - means[0][grip]) @ (x - means[0][grip]))
-        error_m[axis] = (means[1] - kept[axis] * means[0]).std(ddof=1) if len(seeds) > 1 else np.nan
+        kept[axis] = (
+            (x - means[0][grip])
+            @ (y - means[1][grip])
+            / ((x - means[0][grip]) @ (x - means[0][grip]))
+        )
+        error_m[axis] = (
+            (means[1] - kept[axis] * means[0]).std(ddof=1) if len(seeds) > 1 else np.nan
+        )
     return Aimed(kept, error_m, len(seeds))
 
 
@@ -169,10 +213,14 @@ class _Held:
     state: Snapshot
 
     @classmethod
-    def bring(cls, env: TaccorlVectorEnv, seed: int, hands: ScriptedExpertConfig) -> "_Held | None":
+    def bring(
+        cls, env: TaccorlVectorEnv, seed: int, hands: ScriptedExpertConfig
+    ) -> "_Held | None":
         """Let the expert act until a part is before its mate; None if that does not happen."""
         env.reset(seed=[seed])
-        expert = expert_of(env.sim.task)(env.sim, np.random.default_rng([seed, 1]), hands)
+        expert = expert_of(env.sim.task)(
+            env.sim, np.random.default_rng([seed, 1]), hands
+        )
         expert.start()
         while not expert.done:
             action = expert.act()
@@ -184,10 +232,24 @@ class _Held:
                     continue
                 fit, (least_m, most_m) = hand.mating.fit(expert), _BEFORE_RANGE_M
                 if fit.lateral_m < _WITHIN_M and least_m < -fit.depth_m < most_m:
-                    return cls(env, expert, arm, hand.mating, action.astype(float), env.sim.snapshot())
+                    return cls(
+                        env,
+                        expert,
+                        arm,
+                        hand.mating,
+                        action.astype(float),
+                        env.sim.snapshot(),
+                    )
         return None
 
-    def ask(self, actor: Actor, rows: int, pictures: str, seed: int, across_m: tuple[float, float]) -> Aim | None:
+    def ask(
+        self,
+        actor: Actor,
+        rows: int,
+        pictures: str,
+        seed: int,
+        across_m: tuple[float, float],
+    ) -> Aim | None:
         """Displace the hand, hold it still, and ask the policy after ``rows`` rows; None if the episode ends."""
         own, kinematics = ROBOT.joint_slice(self.arm), self.expert.kinematics[self.arm]
         self.env.reset(options={"state": self.state})
@@ -197,9 +259,13 @@ class _Held:
                 hole, tip = self._hole(), self._tip()
                 off_m = np.array((*across_m, -BEFORE_M)) - (inverse(hole) @ tip)[:3, 3]
                 goal = kinematics.pose(action[own])
-                goal[:3, 3] += hole[:3, :3] @ (_SERVO_GAIN * np.clip(off_m, -_LARGEST_M, _LARGEST_M))
+                goal[:3, 3] += hole[:3, :3] @ (
+                    _SERVO_GAIN * np.clip(off_m, -_LARGEST_M, _LARGEST_M)
+                )
                 action[own] = kinematics.solve(goal, action[own])[0]
-            observation, _, terminated, truncated, _ = self.env.step(action[None].astype(np.float32))
+            observation, _, terminated, truncated, _ = self.env.step(
+                action[None].astype(np.float32)
+            )
             if terminated.any() or truncated.any():
                 return None
             seen.append(observation)
@@ -208,7 +274,11 @@ class _Held:
         actor.begin(self.env, pictures)
         for observation in seen:
             target = actor.act({**shown, **observation}).actions[0].astype(float)
-        return Aim(seed, self._relative_m(self._hole(), self._tip()), self._aim_m(target, seen[-1][STATE_KEY][0]))
+        return Aim(
+            seed,
+            self._relative_m(self._hole(), self._tip()),
+            self._aim_m(target, seen[-1][STATE_KEY][0]),
+        )
 
     def _aim_m(self, target: np.ndarray, state: np.ndarray) -> np.ndarray:
         hole, tip, sim = self._hole(), self._tip(), self.expert.sim
@@ -216,10 +286,15 @@ class _Held:
         pads = {arm: slice(num * k, num * (k + 1)) for k, arm in enumerate(ROBOT.arms)}
         for arm in ROBOT.arms:
             own, kinematics = ROBOT.joint_slice(arm), self.expert.kinematics[arm]
-            moved = kinematics.pose(target[own]) @ inverse(kinematics.pose(state[own].astype(float)))
+            moved = kinematics.pose(target[own]) @ inverse(
+                kinematics.pose(state[own].astype(float))
+            )
             if arm == self.arm:
                 tip = moved @ tip
-            elif self.mating.holder in sim.task.parts and sim.pads_touching(self.mating.holder)[0, pads[arm]].all():
+            elif (
+                self.mating.holder in sim.task.parts
+                and sim.pads_touching(self.mating.holder)[0, pads[arm]].all()
+            ):
                 hole = moved @ hole
         return self._relative_m(hole, tip)
 

@@ -58,8 +58,13 @@ class EpisodeRow:
     @property
     def failed_in(self) -> dict[str, str]:
         """Arm → first of its subtasks that the episode did not complete; empty for a successful episode."""
-        began = {arm: [name for name, end in own.items() if end is None] for arm, own in self.subtask_end_s.items()}
-        return {arm: names[0] for arm, names in began.items() if names and not self.success}
+        began = {
+            arm: [name for name, end in own.items() if end is None]
+            for arm, own in self.subtask_end_s.items()
+        }
+        return {
+            arm: names[0] for arm, names in began.items() if names and not self.success
+        }
 
     @property
     def success(self) -> bool:
@@ -73,7 +78,10 @@ class EpisodeRow:
 
     def to_json(self) -> dict[str, Any]:
         """The row as JSON values: field name → value, and ``success`` (bool) and ``partial_credit`` (0 … 1)."""
-        return asdict(self) | {"success": self.success, "partial_credit": self.partial_credit}
+        return asdict(self) | {
+            "success": self.success,
+            "partial_credit": self.partial_credit,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +109,9 @@ class Summary:
     @classmethod
     def of(cls, rows: Sequence[EpisodeRow]) -> "Summary":
         """Summarise rows (≥ 1) of the same policy and task, from which the same was hidden and who saw the same pictures."""
-        (policy, task, pictures, hidden), *others = {(row.policy, row.task, row.pictures, row.hidden) for row in rows}
+        (policy, task, pictures, hidden), *others = {
+            (row.policy, row.task, row.pictures, row.hidden) for row in rows
+        }
         assert not others, "rows of one policy, one task and one kind of pictures"
         good = [row.time_s for row in rows if row.success]
         return cls(
@@ -113,7 +123,9 @@ class Summary:
             successes=len(good),
             interval_95=wilson_interval(len(good), len(rows)),
             partial_credit=fmean(row.partial_credit for row in rows),
-            failures=dict(Counter(row.outcome for row in rows if not row.success).most_common()),
+            failures=dict(
+                Counter(row.outcome for row in rows if not row.success).most_common()
+            ),
             median_success_s=median(good) if good else None,
         )
 
@@ -124,8 +136,17 @@ class Summary:
 
     def __str__(self) -> str:
         low, high = (100 * end for end in self.interval_95)
-        time = "" if self.median_success_s is None else f", median time to success {self.median_success_s:.1f} s"
-        failures = ", ".join(f"{category} {count}" for category, count in self.failures.items()) or "none"
+        time = (
+            ""
+            if self.median_success_s is None
+            else f", median time to success {self.median_success_s:.1f} s"
+        )
+        failures = (
+            ", ".join(
+                f"{category} {count}" for category, count in self.failures.items()
+            )
+            or "none"
+        )
         return (
             f"{self.successes} of {self.n} episodes succeeded: {100 * self.rate:.1f} % (95 %: {low:.1f} … {high:.1f}), "
             f"partial credit {self.partial_credit:.2f}{time}; failures: {failures}"
@@ -145,11 +166,19 @@ def grouped(rows: Iterable[EpisodeRow]) -> dict[tuple[str, str], list[EpisodeRow
     return groups
 
 
-def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[str, PairedComparison]:
+def compare(
+    first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]
+) -> dict[str, PairedComparison]:
     """Task → comparison of two policies, paired by scene seed. ``first`` and ``second`` are the episodes of one policy each.
     Raises TaccorlError: the policies were not evaluated on the same tasks and seeds."""
-    one, other = ({(row.task, row.seed): row.success for row in rows} for rows in (first, second))
-    if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
+    one, other = (
+        {(row.task, row.seed): row.success for row in rows} for rows in (first, second)
+    )
+    if (
+        one.keys() != other.keys()
+        or len(one) != len(first)
+        or len(other) != len(second)
+    ):
         missing = sorted(one.keys() ^ other.keys())[:3]
         raise TaccorlError(
             f"paired comparison: {len(first)} and {len(second)} episodes were not run in the same scenes"
@@ -162,7 +191,9 @@ def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[s
     found = {}
     for task in dict.fromkeys(row.task for row in first):
         keys = [key for key in one if key[0] == task]
-        found[task] = PairedComparison.of([one[key] for key in keys], [other[key] for key in keys])
+        found[task] = PairedComparison.of(
+            [one[key] for key in keys], [other[key] for key in keys]
+        )
     return found
 
 
@@ -175,10 +206,20 @@ def write_rows(rows: Iterable[EpisodeRow], path: Path) -> None:
 def read_rows(path: Path) -> list[EpisodeRow]:
     """Return the rows that ``write_rows`` wrote, in the order of the file. Raises TaccorlError: a line is not a row."""
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(
+        path.read_text(encoding="utf-8").splitlines(), start=1
+    ):
         try:
             values = json.loads(line)
-            rows.append(EpisodeRow(**{k: v for k, v in values.items() if k not in ("success", "partial_credit")}))
+            rows.append(
+                EpisodeRow(
+                    **{
+                        k: v
+                        for k, v in values.items()
+                        if k not in ("success", "partial_credit")
+                    }
+                )
+            )
         except (ValueError, TypeError, AttributeError) as error:
             raise TaccorlError(
                 f"{path}, line {number}: is not an episode written by taccorl evaluate: {error}"

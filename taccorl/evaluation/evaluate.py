@@ -12,7 +12,14 @@ from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, EpisodeRow, read_rows
-from taccorl.evaluation.rollouts import Actor, Progress, Rollout, checked_hidden, checked_pictures, roll_out
+from taccorl.evaluation.rollouts import (
+    Actor,
+    Progress,
+    Rollout,
+    checked_hidden,
+    checked_pictures,
+    roll_out,
+)
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -56,17 +63,26 @@ class Scenes:
         """Raises TaccorlError: there is no task, a task is unknown (the message names the nearest), or a number is below its
         range."""
         if not self.tasks:
-            raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
+            raise TaccorlError(
+                f"missing --task=, one of {', '.join(tasks)}; --help says more"
+            )
         for task in self.tasks:
             tasks.get(task)(self.difficulty)
         if len(set(self.tasks)) < len(self.tasks):
             raise TaccorlError(f"--task: {', '.join(self.tasks)}: give each task once")
-        for name, least in (("episodes", 1), ("seed", 0), ("episode_length", 1), ("batch_size", 1)):
+        for name, least in (
+            ("episodes", 1),
+            ("seed", 0),
+            ("episode_length", 1),
+            ("batch_size", 1),
+        ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise TaccorlError(f"--{name}={value}: at least {least}")
         if not 0 <= self.randomization <= 1:
-            raise TaccorlError(f"--randomization={self.randomization:g}: a share of the task's reset ranges, 0 … 1")
+            raise TaccorlError(
+                f"--randomization={self.randomization:g}: a share of the task's reset ranges, 0 … 1"
+            )
         checked_pictures(self.pictures)
         checked_hidden(self.hidden)
         WarpSettings.parse(self.physics)
@@ -80,14 +96,23 @@ class Scenes:
         """Scenes of each of ``workers`` processes, at least one of each task: parts of ``seeds``, of equal size but for one."""
         n = min(workers, self.episodes)
         ends = [self.episodes * k // n for k in range(n + 1)]
-        return [dataclasses.replace(self, seed=self.seed + a, episodes=b - a) for a, b in itertools.pairwise(ends)]
+        return [
+            dataclasses.replace(self, seed=self.seed + a, episodes=b - a)
+            for a, b in itertools.pairwise(ends)
+        ]
 
     def twin_config(self) -> TwinConfig:
         """Load the twin of these scenes. Raises TaccorlError: the twin's file cannot be read."""
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def environments(
-        self, task: str, num_envs: int, *, images: bool, part_poses: bool = False, num_threads: int | None = None
+        self,
+        task: str,
+        num_envs: int,
+        *,
+        images: bool,
+        part_poses: bool = False,
+        num_threads: int | None = None,
     ) -> TaccorlVectorEnv:
         """Make ``num_envs`` environments of ``task``, whose simulations are frozen after the end of their episode.
 
@@ -114,7 +139,12 @@ class Scenes:
 
 
 def score(
-    scenes: Scenes, actor: Actor, progress: Progress | None = None, *, stream: int = 0, num_threads: int | None = None
+    scenes: Scenes,
+    actor: Actor,
+    progress: Progress | None = None,
+    *,
+    stream: int = 0,
+    num_threads: int | None = None,
 ) -> list[Rollout]:
     """Run all episodes of one policy; returns one ``Rollout`` per episode, task by task, in the order of their seeds.
 
@@ -126,8 +156,15 @@ def score(
     found: list[Rollout] = []
     for task in scenes.tasks:
         actor.restart(stream)
-        size = min(scenes.batch_size or scenes.episodes, actor.max_batch or scenes.episodes, scenes.episodes)
-        seen: dict[str, Any] = {"images": actor.needs_images, "part_poses": actor.needs_part_poses}
+        size = min(
+            scenes.batch_size or scenes.episodes,
+            actor.max_batch or scenes.episodes,
+            scenes.episodes,
+        )
+        seen: dict[str, Any] = {
+            "images": actor.needs_images,
+            "part_poses": actor.needs_part_poses,
+        }
         seen["num_threads"] = num_threads
         envs = scenes.environments(task, size, **seen)
         try:
@@ -136,8 +173,17 @@ def score(
                 if len(seeds) < size:
                     envs.close()
                     envs = scenes.environments(task, len(seeds), **seen)
-                shown = _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
-                found += roll_out(envs, actor, seeds, shown, pictures=scenes.pictures, hidden=scenes.hidden)
+                shown = _with_prefix(
+                    progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: "
+                )
+                found += roll_out(
+                    envs,
+                    actor,
+                    seeds,
+                    shown,
+                    pictures=scenes.pictures,
+                    hidden=scenes.hidden,
+                )
         finally:
             envs.close()
     return found
@@ -172,14 +218,27 @@ def read_stored(folder: Path, scenes: Scenes) -> Stored:
     ours = scenes_to_json(scenes)
     differing = [
         f"{name} {its[name]} there, {ours[name]} here"
-        for name in ("tasks", "episodes", "seed", "difficulty", "randomization", "episode_length")
+        for name in (
+            "tasks",
+            "episodes",
+            "seed",
+            "difficulty",
+            "randomization",
+            "episode_length",
+        )
         if its[name] != ours[name]
     ]
     if differing:
-        raise TaccorlError(f"--against={folder}: was evaluated on other scenes: {'; '.join(differing)}")
+        raise TaccorlError(
+            f"--against={folder}: was evaluated on other scenes: {'; '.join(differing)}"
+        )
     other = its.get("physics", "c")
     name = f"{policy} ({folder}{f', physics {other}' * (other != scenes.physics)})"
-    rows = [dataclasses.replace(row, policy=name) for row in read_rows(folder / ROWS_FILE) if row.policy == policy]
+    rows = [
+        dataclasses.replace(row, policy=name)
+        for row in read_rows(folder / ROWS_FILE)
+        if row.policy == policy
+    ]
     return Stored(name, rows)
 
 

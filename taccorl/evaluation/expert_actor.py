@@ -37,7 +37,9 @@ class ExpertActor:
     def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
         """Start the expert's script in the new episode. Raises TaccorlError: more than one environment, or a task without an
         expert."""
-        self._actions = self._source.actions(envs.sim, np.random.default_rng([int(envs.sim.seeds[0]), 1]))
+        self._actions = self._source.actions(
+            envs.sim, np.random.default_rng([int(envs.sim.seeds[0]), 1])
+        )
 
     def act(self, observation: Observation) -> Acted:
         """Next actions. At a pose that no joint angles reach the expert gives up as ``unreachable``, at the end of its script as
@@ -48,4 +50,6 @@ class ExpertActor:
         except UnreachableError as error:
             return Acted(nothing, {0: ("unreachable", str(error))})
         except StopIteration:
-            return Acted(nothing, {0: ("unfinished", "the script ended without success")})
+            return Acted(
+                nothing, {0: ("unfinished", "the script ended without success")}
+            )

@@ -48,7 +48,9 @@ def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
     by_category: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
         if not rollout.row.success and rollout.row.steps:
-            by_category.setdefault((rollout.row.task, rollout.row.outcome), []).append(rollout)
+            by_category.setdefault((rollout.row.task, rollout.row.outcome), []).append(
+                rollout
+            )
     chosen: list[Rollout] = []
     for turn in range(max((len(those) for those in by_category.values()), default=0)):
         chosen += [those[turn] for those in by_category.values() if turn < len(those)]
@@ -59,13 +61,19 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
     """Run a failed episode again: the same scene, actions and touch, bit for bit. Raises TaccorlError: the outcome differs from
     that of the row, so that the scenes are not those of the rollout."""
     row = rollout.row
-    sim = Simulation(tasks.get(row.task)(scenes.difficulty), scenes.twin_config(), scale=scenes.randomization)
+    sim = Simulation(
+        tasks.get(row.task)(scenes.difficulty),
+        scenes.twin_config(),
+        scale=scenes.randomization,
+    )
     if scenes.episode_length is not None:
         sim.judge.limit_steps = scenes.episode_length
     sim.reset([row.seed])
     recorder = EpisodeRecorder(sim, row_spec(sim, pictures=images))
     for action in rollout.actions:
-        recorder.sensor_rng = np.random.default_rng((row.seed, len(recorder.rows)))  # as the environment's pads
+        recorder.sensor_rng = np.random.default_rng(
+            (row.seed, len(recorder.rows))
+        )  # as the environment's pads
         recorder.step(action)
     outcome = sim.judge.outcome
     end = "success" if outcome.success[0] else str(outcome.failure[0])
@@ -74,21 +82,32 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
             f"{row.task} seed {row.seed}: executed again, the episode ends as {end or 'running'} instead of {row.outcome}"
         )
     name = f"{row.task} seed {row.seed}, {row.outcome}{': ' + row.reason if row.reason else ''}"
-    simulation = {"policy": row.policy, "task": row.task, "seed": row.seed, "twin": str(scenes.twin or "nominal")}
+    simulation = {
+        "policy": row.policy,
+        "task": row.task,
+        "seed": row.seed,
+        "twin": str(scenes.twin or "nominal"),
+    }
     origin = Origin(TWIN_ORIGIN.domain, f"{TWIN_ORIGIN.text}; actions of {row.policy}")
     episode = dataclasses.replace(recorder.episode(name, simulation), origin=origin)
-    instants = np.unique(np.linspace(0, len(recorder.rows) - 1, NUM_INSTANTS).round().astype(int))
+    instants = np.unique(
+        np.linspace(0, len(recorder.rows) - 1, NUM_INSTANTS).round().astype(int)
+    )
     pictures = None
     if images:
         columns = [
             np.concatenate([views[camera] for camera in ROBOT.cameras])
-            for views in sim.render_states(episode.arrays["sim.state"][instants], ROBOT.cameras)
+            for views in sim.render_states(
+                episode.arrays["sim.state"][instants], ROBOT.cameras
+            )
         ]
         pictures = np.concatenate(columns, axis=1)
     return FailedEpisode(rollout, episode, pictures, tuple(instants / episode.spec.fps))
 
 
-def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> list[tuple[FailedEpisode, Path]]:
+def recorded_failures(
+    rollouts: Sequence[Rollout], folder: Path
+) -> list[tuple[FailedEpisode, Path]]:
     """Failed trials on a robot that have a recording in ``folder``, be it complete or not: pictures from the recording, and the
     path of that file. Trials without a recording are left out."""
     found = []
@@ -100,16 +119,34 @@ def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> list[tuple[F
         if not path.is_file():
             continue
         with path.open("rb") as file, contextlib.suppress(McapError):
-            for _, channel, message in NonSeekingReader(file).iter_messages(list(frames), log_time_order=False):
+            for _, channel, message in NonSeekingReader(file).iter_messages(
+                list(frames), log_time_order=False
+            ):
                 frames[channel.topic].append((message.log_time, message.data))
         rows = []
         for stamped in filter(None, frames.values()):
-            chosen = [stamped[k] for k in np.linspace(0, len(stamped) - 1, NUM_INSTANTS).round().astype(int)]
-            jpegs = (np.frombuffer(data[data.find(JPEG_BEGIN) :], np.uint8) for _, data in chosen)
+            chosen = [
+                stamped[k]
+                for k in np.linspace(0, len(stamped) - 1, NUM_INSTANTS)
+                .round()
+                .astype(int)
+            ]
+            jpegs = (
+                np.frombuffer(data[data.find(JPEG_BEGIN) :], np.uint8)
+                for _, data in chosen
+            )
             rows.append(
-                np.concatenate([np.asarray(cv2.imdecode(x, cv2.IMREAD_COLOR))[..., ::-1] for x in jpegs], axis=1)
+                np.concatenate(
+                    [
+                        np.asarray(cv2.imdecode(x, cv2.IMREAD_COLOR))[..., ::-1]
+                        for x in jpegs
+                    ],
+                    axis=1,
+                )
             )
             times = tuple(1e-9 * (stamp - chosen[0][0]) for stamp, _ in chosen)
         if rows:
-            found.append((FailedEpisode(rollout, None, np.concatenate(rows), times), path))
+            found.append(
+                (FailedEpisode(rollout, None, np.concatenate(rows), times), path)
+            )
     return found

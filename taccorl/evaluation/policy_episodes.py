@@ -11,7 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from taccorl.episodes.plan import made_once
-from taccorl.episodes.sources.correct import CorrectionPlan, PolicyEpisode, write_policy_episodes
+from taccorl.episodes.sources.correct import (
+    CorrectionPlan,
+    PolicyEpisode,
+    write_policy_episodes,
+)
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Actor, Progress, roll_out
 from taccorl.lineage.engines import LocalEngine
@@ -40,13 +44,23 @@ def policy_episodes(
     """
     num = -(-plan.episodes // num_envs)
     workers = min(workers, num)
-    run = functools.partial(_run_batch, plan, load, num_envs, store, workers, progress if workers == 1 else None)
+    run = functools.partial(
+        _run_batch,
+        plan,
+        load,
+        num_envs,
+        store,
+        workers,
+        progress if workers == 1 else None,
+    )
 
     def said(batch: int, _: Artefact) -> None:
         if progress is not None and num > 1:
             progress(f"policy: batch {batch + 1} of {num} has acted")
 
-    return LocalEngine(workers=workers).map(run, range(num), on_done=said, name=lambda batch: f"policy's batch {batch}")
+    return LocalEngine(workers=workers).map(
+        run, range(num), on_done=said, name=lambda batch: f"policy's batch {batch}"
+    )
 
 
 def _run_batch(
@@ -70,7 +84,9 @@ def _run_batch(
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
         actor = made_once(["policy", plan.policy_digest, plan.seed], load)
         num_threads = max(len(os.sched_getaffinity(0)) // workers, 1)
-        write_policy_episodes(_act(plan, actor, batch, seeds, num_threads, progress), folder)
+        write_policy_episodes(
+            _act(plan, actor, batch, seeds, num_threads, progress), folder
+        )
 
     return store.run(_STAGE.bound(build), config, [])
 
@@ -79,7 +95,12 @@ _STAGE = Stage("policy_episodes", version=VERSION)
 
 
 def _act(
-    plan: CorrectionPlan, actor: Actor, batch: int, seeds: list[int], num_threads: int, progress: Progress | None
+    plan: CorrectionPlan,
+    actor: Actor,
+    batch: int,
+    seeds: list[int],
+    num_threads: int,
+    progress: Progress | None,
 ) -> list[PolicyEpisode]:
     """In the order of the scenes."""
     scenes = Scenes(
@@ -97,4 +118,7 @@ def _act(
         rollouts = roll_out(envs, actor, seeds, progress, pictures=plan.policy_pictures)
     finally:
         envs.close()
-    return [PolicyEpisode(r.row.seed, r.row.outcome, r.actions, r.states, r.subtasks) for r in rollouts]
+    return [
+        PolicyEpisode(r.row.seed, r.row.outcome, r.actions, r.states, r.subtasks)
+        for r in rollouts
+    ]

@@ -73,7 +73,11 @@ class Check:
 
 
 def preflight(
-    policy: PolicyFacts, twin: TwinConfig, *, tasks: Sequence[str] = (), pictures: str = "clear"
+    policy: PolicyFacts,
+    twin: TwinConfig,
+    *,
+    tasks: Sequence[str] = (),
+    pictures: str = "clear",
 ) -> list[Check]:
     """Compare checkpoint and environment; returns one ``Check`` per property: task, cameras, pictures, state, touch, part
     poses, other inputs, action, names, rate, normalisation and statistics. ``tasks``: names of the environment's tasks;
@@ -82,14 +86,27 @@ def preflight(
         *_task(policy, tasks),
         _cameras(policy, twin),
         *_pictures(policy, pictures),
-        _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ROBOT.action_low.shape), optional=True),
+        _same(
+            "state",
+            _shape(policy.inputs.get(STATE_KEY)),
+            _shape(ROBOT.action_low.shape),
+            optional=True,
+        ),
         *_touch(policy),
         *_parts(policy),
         *_other_inputs(policy),
         _same("action", _shape(policy.action_shape), _shape(ROBOT.action_low.shape)),
         *_names(policy),
-        _same("rate", NOT_STATED if policy.fps is None else f"{policy.fps:g} Hz", f"{CONTROL_HZ} Hz"),
-        *(_normalisation(policy, key) for key in ("action", STATE_KEY) if key in policy.ranges),
+        _same(
+            "rate",
+            NOT_STATED if policy.fps is None else f"{policy.fps:g} Hz",
+            f"{CONTROL_HZ} Hz",
+        ),
+        *(
+            _normalisation(policy, key)
+            for key in ("action", STATE_KEY)
+            if key in policy.ranges
+        ),
         *_statistics(policy),
     ]
 
@@ -99,15 +116,27 @@ def refuse_differences(checks: Sequence[Check], policy: str) -> None:
     values of both sides."""
     wrong = [c for c in checks if c.verdict == "differs"]
     if wrong:
-        lines = "; ".join(f"{c.what}: {c.policy} in the checkpoint, {c.environment} in the environment" for c in wrong)
-        raise TaccorlError(f"{policy} does not fit the environment: {lines}. Nothing was run")
+        lines = "; ".join(
+            f"{c.what}: {c.policy} in the checkpoint, {c.environment} in the environment"
+            for c in wrong
+        )
+        raise TaccorlError(
+            f"{policy} does not fit the environment: {lines}. Nothing was run"
+        )
 
 
 def _same(what: str, policy: str, environment: str, *, optional: bool = False) -> Check:
     """``optional``: the policy may do without."""
     if policy == NOT_STATED:
-        return Check(what, "not used" if optional else policy, environment, "within" if optional else NOT_STATED)
-    return Check(what, policy, environment, "same" if policy == environment else "differs")
+        return Check(
+            what,
+            "not used" if optional else policy,
+            environment,
+            "within" if optional else NOT_STATED,
+        )
+    return Check(
+        what, policy, environment, "same" if policy == environment else "differs"
+    )
 
 
 def _shape(shape: tuple[int, ...] | None) -> str:
@@ -122,36 +151,54 @@ def _task(policy: PolicyFacts, names: Sequence[str]) -> list[Check]:
     here = ", ".join(names)
     if policy.instructions is None:
         return [Check("task", f"task {NOT_STATED}", here, NOT_STATED)]
-    known, trained = {known_tasks.get(name).instruction: name for name in known_tasks}, set(policy.instructions)
+    known, trained = (
+        {known_tasks.get(name).instruction: name for name in known_tasks},
+        set(policy.instructions),
+    )
     there = ", ".join(known.get(text, f"“{text}”") for text in policy.instructions)
     wanted = {known_tasks.get(name).instruction for name in names}
     if wanted <= trained:
         return [Check("task", there, here, "same" if wanted == trained else "within")]
-    return [Check("task", there, here, "differs" if trained <= known.keys() else NOT_STATED)]
+    return [
+        Check("task", there, here, "differs" if trained <= known.keys() else NOT_STATED)
+    ]
 
 
 def _pictures(policy: PolicyFacts, pictures: str) -> list[Check]:
     if not any(key.startswith(_IMAGES) for key in policy.inputs):
         return []
-    there, here = policy.pictures_in_training, policy.pictures_in_use.get(pictures, pictures)
+    there, here = (
+        policy.pictures_in_training,
+        policy.pictures_in_use.get(pictures, pictures),
+    )
     if there is None:
         return [Check("pictures", NOT_STATED, here, NOT_STATED)]
-    verdict: Verdict = "same" if there == here else "within" if pictures == "clear" else "chosen"
+    verdict: Verdict = (
+        "same" if there == here else "within" if pictures == "clear" else "chosen"
+    )
     return [Check("pictures", there, here, verdict)]
 
 
 def _cameras(policy: PolicyFacts, twin: TwinConfig) -> Check:
     """A camera that the policy does not use is no difference."""
-    shapes = {k.removeprefix(_IMAGES): s for k, s in policy.inputs.items() if k.startswith(_IMAGES)}
+    shapes = {
+        k.removeprefix(_IMAGES): s
+        for k, s in policy.inputs.items()
+        if k.startswith(_IMAGES)
+    }
     there = [camera.name for camera in twin.cameras if camera.name in ROBOT.cameras]
     rows, columns, _ = IMAGE_SHAPE
     wanted = dict.fromkeys(there, (3, rows, columns))
     fits = all(wanted.get(name) == shape for name, shape in shapes.items())
 
     def listed(sizes: Mapping[str, tuple[int, ...]]) -> str:
-        return ", ".join(f"{name} {s[-2]}×{s[-1]}" for name, s in sizes.items()) or "none"
+        return (
+            ", ".join(f"{name} {s[-2]}×{s[-1]}" for name, s in sizes.items()) or "none"
+        )
 
-    verdict: Verdict = "differs" if not fits else "same" if shapes == wanted else "within"
+    verdict: Verdict = (
+        "differs" if not fits else "same" if shapes == wanted else "within"
+    )
     return Check("cameras", listed(shapes), listed(wanted), verdict)
 
 
@@ -159,16 +206,34 @@ def _touch(policy: PolicyFacts) -> list[Check]:
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     feature, sensor = spec.features[TACTILE_KEY], spec.sensors[TACTILE_KEY]
     layout = (len(feature.pads), sensor.rows, sensor.columns)
-    checks = [_same("touch", _shape(policy.inputs.get(TACTILE_KEY)), _shape(feature.shape), optional=True)]
+    checks = [
+        _same(
+            "touch",
+            _shape(policy.inputs.get(TACTILE_KEY)),
+            _shape(feature.shape),
+            optional=True,
+        )
+    ]
     if TACTILE_KEY in policy.inputs and not policy.touch_has_unit:
-        checks.append(Check("unit of touch", "statistics of its dataset", "counts above baseline", "differs"))
+        checks.append(
+            Check(
+                "unit of touch",
+                "statistics of its dataset",
+                "counts above baseline",
+                "differs",
+            )
+        )
     if TACTILE_KEY in policy.inputs and policy.touch_layout is not None:
-        checks.append(_same("touch layout", _shape(policy.touch_layout), _shape(layout)))
+        checks.append(
+            _same("touch layout", _shape(policy.touch_layout), _shape(layout))
+        )
     if TACTILE_KEY in policy.inputs and policy.touch_gain_per_count is not None:
         gains = (policy.touch_gain_per_count, sensor.gain_per_count)
         same = bool(np.isclose(*gains, rtol=1e-6))
         words = [f"counts × {gain:.6g}" for gain in gains]
-        checks.append(Check("touch gain", words[0], words[1], "same" if same else "differs"))
+        checks.append(
+            Check("touch gain", words[0], words[1], "same" if same else "differs")
+        )
     return checks
 
 
@@ -176,13 +241,22 @@ def _parts(policy: PolicyFacts) -> list[Check]:
     """Which parts there are, each task says; the policy compares names when its episodes begin."""
     if PARTS_KEY not in policy.inputs:
         return []
-    return [Check("poses of the parts", _shape(policy.inputs[PARTS_KEY]), "those of each task", "same")]
+    return [
+        Check(
+            "poses of the parts",
+            _shape(policy.inputs[PARTS_KEY]),
+            "those of each task",
+            "same",
+        )
+    ]
 
 
 def _other_inputs(policy: PolicyFacts) -> list[Check]:
     known = {STATE_KEY, TACTILE_KEY, PARTS_KEY, *IMAGE_KEYS.values()}
     others = [k for k in policy.inputs if k not in known and not k.startswith(_IMAGES)]
-    return [Check("other inputs", ", ".join(others), "none", "differs")] if others else []
+    return (
+        [Check("other inputs", ", ".join(others), "none", "differs")] if others else []
+    )
 
 
 def _names(policy: PolicyFacts) -> list[Check]:
@@ -193,7 +267,9 @@ def _names(policy: PolicyFacts) -> list[Check]:
         same = policy.action_names == names
         words = [", ".join(those) for those in (policy.action_names, names)]
         words = ["as the environment", f"{names[0]} … {names[-1]}"] if same else words
-        checks.append(Check("action names", words[0], words[1], "same" if same else "differs"))
+        checks.append(
+            Check("action names", words[0], words[1], "same" if same else "differs")
+        )
     return checks
 
 

@@ -87,11 +87,17 @@ class Rollout:
     """Result of one episode: its row, actions and states. Of a robot's trial, the row only: there is a recording of the rest."""
 
     row: EpisodeRow
-    actions: np.ndarray = field(default_factory=lambda: np.empty((0, len(ROBOT.action_names)), np.float32))
+    actions: np.ndarray = field(
+        default_factory=lambda: np.empty((0, len(ROBOT.action_names)), np.float32)
+    )
     """(T, 14) float32 actions as the actor returned them."""
-    states: np.ndarray = field(default_factory=lambda: np.empty((0, len(ROBOT.action_names)), np.float32))
+    states: np.ndarray = field(
+        default_factory=lambda: np.empty((0, len(ROBOT.action_names)), np.float32)
+    )
     """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
-    subtasks: np.ndarray = field(default_factory=lambda: np.empty((0, len(ROBOT.arms)), np.int16))
+    subtasks: np.ndarray = field(
+        default_factory=lambda: np.empty((0, len(ROBOT.arms)), np.int16)
+    )
     """(T + 1, 2) int16 index of each arm's subtask before each action, and after the last."""
 
 
@@ -121,7 +127,9 @@ class _Running:
         self._states[0], self._subtasks[0], self.facts = state, facts["subtask"], facts
         self.steps = 0
         self.clipped_steps = 0
-        self.subtask_end_s: dict[str, dict[str, float | None]] = {arm: dict.fromkeys(own) for arm, own in names.items()}
+        self.subtask_end_s: dict[str, dict[str, float | None]] = {
+            arm: dict.fromkeys(own) for arm, own in names.items()
+        }
         self.end: tuple[str, str] | None = None
         """Outcome and reason."""
         self.touch, self.place = touch, place
@@ -143,7 +151,9 @@ class _Running:
         """(T + 1, 2) int16 so far."""
         return self._subtasks[: self.steps + 1]
 
-    def stepped(self, action: np.ndarray, facts: dict[str, Any], state: np.ndarray) -> None:
+    def stepped(
+        self, action: np.ndarray, facts: dict[str, Any], state: np.ndarray
+    ) -> None:
         self.facts = facts
         if facts["failure"] == BAD_ACTION:  # not carried out
             self.end = (BAD_ACTION, str(facts["reason"]))
@@ -177,7 +187,9 @@ def checked_hidden(hidden: Sequence[str], option: str = "--hide") -> None:
             raise TaccorlError(f"{option}={what}: give it once")
 
 
-def _without(observation: Observation, hidden: Sequence[str], is_last_N: np.ndarray) -> Observation:
+def _without(
+    observation: Observation, hidden: Sequence[str], is_last_N: np.ndarray
+) -> Observation:
     """The observation with zeros in what is hidden from the policy. ``is_last_N``: whether all arms of the environment are in
     their last subtask."""
     left = dict(observation)
@@ -212,11 +224,25 @@ def roll_out(
         TaccorlError: the number of seeds differs from that of environments, or the actions are not (N, 14).
     """
     observation, _ = envs.reset(seed=[int(seed) for seed in seeds])
-    names = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}
-    num, limit, size = envs.num_envs, envs.sim.judge.limit_steps, len(ROBOT.action_names)
-    memory = np.empty((num, limit, size), np.float32), np.empty((num, limit + 1, size), np.float32)
+    names = {
+        arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()
+    }
+    num, limit, size = (
+        envs.num_envs,
+        envs.sim.judge.limit_steps,
+        len(ROBOT.action_names),
+    )
+    memory = (
+        np.empty((num, limit, size), np.float32),
+        np.empty((num, limit + 1, size), np.float32),
+    )
     memory += (np.empty((num, limit + 1, len(ROBOT.arms)), np.int16),)
-    began = observation[STATE_KEY], observation[TACTILE_KEY], _places(envs), _each(envs.facts(), num)
+    began = (
+        observation[STATE_KEY],
+        observation[TACTILE_KEY],
+        _places(envs),
+        _each(envs.facts(), num),
+    )
     running = [_Running(names, *own) for own in zip(*memory, *began, strict=True)]
     actor.begin(envs, checked_pictures(pictures))
     views: Observation = {}
@@ -224,7 +250,11 @@ def roll_out(
         if actor.needs_images and actor.looks_now():
             views = envs.observe(images=True)
         shown = {**views, **observation}
-        acted = actor.act(_without(shown, hidden, _in_last_subtask(running, names)) if hidden else shown)
+        acted = actor.act(
+            _without(shown, hidden, _in_last_subtask(running, names))
+            if hidden
+            else shown
+        )
         actions = shaped(acted.actions, envs.num_envs).astype(np.float32)
         for i, end in acted.given_up.items():
             running[i].end = running[i].end or end
@@ -235,14 +265,21 @@ def roll_out(
         actions[over] = observation[STATE_KEY][over]
         observation, *_ = envs.step(actions)
         facts = _each(envs.facts(), envs.num_envs)
-        forces = {f"{one}_on_{other}_n": envs.sim.contact(one, other).force_n for one, other in envs.sim.task.mating}
+        forces = {
+            f"{one}_on_{other}_n": envs.sim.contact(one, other).force_n
+            for one, other in envs.sim.task.mating
+        }
         for i in np.flatnonzero(~over):
             running[i].stepped(actions[i], facts[i], observation[STATE_KEY][i])
             running[i].touch = observation[TACTILE_KEY][i].copy()
-            running[i].forces = {name: float(force[i]) for name, force in forces.items()}
+            running[i].forces = {
+                name: float(force[i]) for name, force in forces.items()
+            }
         over = np.array([one.end is not None for one in running])
         if progress is not None:
-            successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
+            successes = sum(
+                one.end is not None and one.end[0] == SUCCESS for one in running
+            )
             steps = max(one.steps for one in running)
             progress(
                 f"step {steps} of {envs.sim.judge.limit_steps}: {over.sum()} of {len(over)} over, {successes} succeeded"
@@ -250,7 +287,10 @@ def roll_out(
         if over.all():
             break
     seen = pictures if actor.needs_images else NO_PICTURES
-    return [_rollout(envs, actor, int(seed), seen, hidden, one) for seed, one in zip(seeds, running, strict=True)]
+    return [
+        _rollout(envs, actor, int(seed), seen, hidden, one)
+        for seed, one in zip(seeds, running, strict=True)
+    ]
 
 
 def _places(envs: TaccorlVectorEnv) -> list[dict[str, float]]:
@@ -259,22 +299,36 @@ def _places(envs: TaccorlVectorEnv) -> list[dict[str, float]]:
     for body in posed_bodies(envs.sim.task):
         for place, pose in zip(places, envs.sim.poses(body), strict=True):
             yaw = math.atan2(pose[1, 0], pose[0, 0])
-            place |= {f"{body}_x_m": float(pose[0, 3]), f"{body}_y_m": float(pose[1, 3]), f"{body}_yaw_rad": yaw}
+            place |= {
+                f"{body}_x_m": float(pose[0, 3]),
+                f"{body}_y_m": float(pose[1, 3]),
+                f"{body}_yaw_rad": yaw,
+            }
     return places
 
 
-def _in_last_subtask(running: Sequence[_Running], names: Mapping[str, Sequence[str]]) -> np.ndarray:
+def _in_last_subtask(
+    running: Sequence[_Running], names: Mapping[str, Sequence[str]]
+) -> np.ndarray:
     last = np.array([len(names[arm]) - 1 for arm in ROBOT.arms])
     return np.array([(one.subtasks[-1] >= last).all() for one in running])
 
 
 def _rollout(
-    envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, hidden: Sequence[str], one: _Running
+    envs: TaccorlVectorEnv,
+    actor: Actor,
+    seed: int,
+    pictures: str,
+    hidden: Sequence[str],
+    one: _Running,
 ) -> Rollout:
     assert one.end is not None
     outcome, reason = one.end
     largest = one.touch.reshape(len(ROBOT.arms), -1).max(axis=1)
-    touched = {f"{arm}_touch_counts": counts for arm, counts in zip(ROBOT.arms, largest, strict=True)}
+    touched = {
+        f"{arm}_touch_counts": counts
+        for arm, counts in zip(ROBOT.arms, largest, strict=True)
+    }
     row = EpisodeRow(
         policy=actor.name,
         task=envs.task,
@@ -287,7 +341,11 @@ def _rollout(
         subtask_end_s=one.subtask_end_s,
         clipped_steps=one.clipped_steps,
         # A diverged simulation has no measures: JSON knows no NaN.
-        measures={k: float(v) for k, v in (one.facts["measures"] | touched | one.forces).items() if np.isfinite(v)},
+        measures={
+            k: float(v)
+            for k, v in (one.facts["measures"] | touched | one.forces).items()
+            if np.isfinite(v)
+        },
         reset=one.place,
         reason=reason,
         pictures=pictures,
@@ -300,7 +358,9 @@ def _each(facts: dict[str, Any], n: int) -> list[dict[str, Any]]:
     """The facts of each environment."""
     return [
         {
-            k: {name: v[i] for name, v in values.items()} if isinstance(values, dict) else values[i]
+            k: {name: v[i] for name, v in values.items()}
+            if isinstance(values, dict)
+            else values[i]
             for k, values in facts.items()
         }
         for i in range(n)

@@ -26,7 +26,9 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 def told_rate(successes: int, n: int) -> str:
     """Success rate with Wilson's interval as text: ``8 of 10: 80 % (95 %: 49 … 94)``, without percentages if n is 0."""
     low, high = (100 * end for end in wilson_interval(successes, n))
-    return f"{successes} of {n}: " + (f"{100 * successes / n:.0f} % (95 %: {low:.0f} … {high:.0f})" if n else "–")
+    return f"{successes} of {n}: " + (
+        f"{100 * successes / n:.0f} % (95 %: {low:.0f} … {high:.0f})" if n else "–"
+    )
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
@@ -35,12 +37,16 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
     ``only_first`` b and ``only_second`` c are the numbers of scenes on which only one of the policies succeeds. Raises
     TaccorlError: a count is negative."""
     if min(only_first, only_second) < 0:
-        raise TaccorlError(f"McNemar's test: counts {only_first} and {only_second}; give numbers ≥ 0")
+        raise TaccorlError(
+            f"McNemar's test: counts {only_first} and {only_second}; give numbers ≥ 0"
+        )
     disagree = only_first + only_second
     return float(binomtest(only_first, disagree, 0.5).pvalue) if disagree else 1.0
 
 
-def paired_difference_interval(both: int, only_first: int, only_second: int, neither: int) -> tuple[float, float]:
+def paired_difference_interval(
+    both: int, only_first: int, only_second: int, neither: int
+) -> tuple[float, float]:
     """95 % interval (low, high) of p₁ − p₂ from paired outcomes: Newcombe's method 10 (Statist. Med. 17, 2635–2650, 1998).
 
     Args:
@@ -57,7 +63,9 @@ def paired_difference_interval(both: int, only_first: int, only_second: int, nei
     a, b, c, d = both, only_first, only_second, neither
     n = a + b + c + d
     if min(a, b, c, d) < 0 or n == 0:
-        raise TaccorlError(f"paired difference: counts {a}, {b}, {c}, {d}; give numbers ≥ 0, one of them > 0")
+        raise TaccorlError(
+            f"paired difference: counts {a}, {b}, {c}, {d}; give numbers ≥ 0, one of them > 0"
+        )
     p1, p2 = (a + b) / n, (a + c) / n
     (l1, u1), (l2, u2) = wilson_interval(a + b, n), wilson_interval(a + c, n)
     margins = (a + b) * (c + d) * (a + c) * (b + d)
@@ -110,7 +118,9 @@ class PairedComparison:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of ``difference``, from ``paired_difference_interval``."""
-        return paired_difference_interval(self.both, self.only_first, self.only_second, self.neither)
+        return paired_difference_interval(
+            self.both, self.only_first, self.only_second, self.neither
+        )
 
     @property
     def p_value(self) -> float:
@@ -119,7 +129,10 @@ class PairedComparison:
 
     def to_json(self) -> dict[str, int | float | list[float]]:
         """JSON values: ``n``, the four counts, ``difference``, ``difference_interval_95`` ([low, high]), ``mcnemar_exact_p``."""
-        counts = {name: getattr(self, name) for name in ("both", "only_first", "only_second", "neither")}
+        counts = {
+            name: getattr(self, name)
+            for name in ("both", "only_first", "only_second", "neither")
+        }
         return {
             "n": self.n,
             **counts,

@@ -16,7 +16,10 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 
 # The simulation is imported when an environment is made: lerobot-train loads this plug-in even where it needs none.
-_IMAGES = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (224, 224, 3)) for name in ROBOT.cameras}
+_IMAGES = {
+    f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (224, 224, 3))
+    for name in ROBOT.cameras
+}
 _FEATURES = {
     "action": PolicyFeature(FeatureType.ACTION, (ROBOT.num_actions,)),
     "agent_pos": PolicyFeature(FeatureType.STATE, (ROBOT.num_actions,)),
@@ -62,7 +65,9 @@ class TaccorlEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         if self.fps != _FPS:
-            raise TaccorlError(f"--env.fps={self.fps}: the twin makes {_FPS} control steps per second; remove it")
+            raise TaccorlError(
+                f"--env.fps={self.fps}: the twin makes {_FPS} control steps per second; remove it"
+            )
         if self.part_poses:
             from taccorl.sim.part_poses import part_pose_names
             from taccorl.sim.task import tasks
@@ -100,7 +105,9 @@ class TaccorlEnvConfig(EnvConfig):
         if use_async_envs and n_envs > 1:
             make = partial(LeRobotEnv, task, **settings)
             envs = gymnasium.vector.AsyncVectorEnv(
-                [make] * n_envs, context="forkserver", autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP
+                [make] * n_envs,
+                context="forkserver",
+                autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,
             )
         else:
             num_threads = min(n_envs, len(os.sched_getaffinity(0)))

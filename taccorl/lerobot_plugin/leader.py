@@ -16,7 +16,11 @@ import draccus
 import lerobot.teleoperators
 import numpy as np
 import yaml
-from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, make_teleoperator_from_config
+from lerobot.teleoperators import (
+    Teleoperator,
+    TeleoperatorConfig,
+    make_teleoperator_from_config,
+)
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from taccorl.data.spec import find_spec, load_dataset_spec
@@ -28,7 +32,10 @@ JOINT_UNITS = ("rad", "deg", "range_m100_100")
 """Units that a teleoperator's joints may have, see ``to_twin``."""
 GRIPPER_UNITS = ("m", "range_0_100")
 """Units that a teleoperator's grippers may have, see ``to_twin``."""
-_FAR_RAD, _FAR_M = 0.35, 0.02  # a first reading this far beyond a limit is another unit, not another arm's range
+_FAR_RAD, _FAR_M = (
+    0.35,
+    0.02,
+)  # a first reading this far beyond a limit is another unit, not another arm's range
 _GRIPPERS = np.array(ROBOT.gripper_indices)
 
 
@@ -92,7 +99,11 @@ class LeRobotLeader:
         off = (values < ROBOT.action_low - far) | (values > ROBOT.action_high + far)
         if off.any():
             k = int(np.flatnonzero(off)[0])
-            what, unit, known = ("gripper", "m", GRIPPER_UNITS) if k in _GRIPPERS else ("joint", "rad", JOINT_UNITS)
+            what, unit, known = (
+                ("gripper", "m", GRIPPER_UNITS)
+                if k in _GRIPPERS
+                else ("joint", "rad", JOINT_UNITS)
+            )
             said = getattr(self._source, f"{what}_unit")
             raise TaccorlError(
                 f"{self._source.teleop}: {self.names[k]} reads {given[k]:g} {said}, far beyond {ROBOT.action_low[k]:.3g} … "
@@ -110,7 +121,9 @@ def open_leader(source: LeaderSource) -> LeRobotLeader:
     try:
         device = make_teleoperator_from_config(config)
     except (ImportError, ValueError, OSError) as error:
-        raise TaccorlError(f"{source.teleop}: LeRobot cannot make it: {error}") from error
+        raise TaccorlError(
+            f"{source.teleop}: LeRobot cannot make it: {error}"
+        ) from error
     leader = LeRobotLeader(device, source)
     leader.connect()
     return leader
@@ -122,19 +135,29 @@ def teleoperator_config(name: str, options: str = "") -> TeleoperatorConfig:
     missing = _register_all()
     choices = TeleoperatorConfig.get_known_choices()
     if name not in choices:
-        without = f" (without {', '.join(missing)}, which miss a package)" if missing else ""
+        without = (
+            f" (without {', '.join(missing)}, which miss a package)" if missing else ""
+        )
         raise TaccorlError(
             f"--source.teleop={name}: LeRobot has no teleoperator of that name; {nearest(name, choices)}{without}"
         )
     try:
-        given = yaml.safe_load(Path(options).expanduser().read_text(encoding="utf-8")) if options else {}
+        given = (
+            yaml.safe_load(Path(options).expanduser().read_text(encoding="utf-8"))
+            if options
+            else {}
+        )
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise TaccorlError(f"--source.options={options}: cannot be read: {' '.join(str(error).split())}") from error
+        raise TaccorlError(
+            f"--source.options={options}: cannot be read: {' '.join(str(error).split())}"
+        ) from error
     try:
         return draccus.decode(choices[name], given or {})
     except Exception as error:  # draccus has an own kind for each way to be wrong, and a config's own checks more
         said = " ".join(str(error).split())
-        raise TaccorlError(f"{name}: --source.options={options}: {json.dumps(given)} does not fit: {said}") from error
+        raise TaccorlError(
+            f"{name}: --source.options={options}: {json.dumps(given)} does not fit: {said}"
+        ) from error
 
 
 def _register_all() -> list[str]:
@@ -155,7 +178,9 @@ def _given(device: Teleoperator) -> list[str]:
     return list(features["names"]) if "names" in features else list(features)
 
 
-def match_names(given: Sequence[str], renamed: Mapping[str, str | None], teleop: str) -> list[str]:
+def match_names(
+    given: Sequence[str], renamed: Mapping[str, str | None], teleop: str
+) -> list[str]:
     """Return the device's names in the order of the twin's actions.
 
     Args:
@@ -169,21 +194,40 @@ def match_names(given: Sequence[str], renamed: Mapping[str, str | None], teleop:
     assert wanted is not None, "the data spec names the action's values"
     for theirs, ours in renamed.items():
         if theirs not in given:
-            raise TaccorlError(f"--source.names: {teleop} has no value {theirs!r}; {nearest(theirs, given)}")
+            raise TaccorlError(
+                f"--source.names: {teleop} has no value {theirs!r}; {nearest(theirs, given)}"
+            )
         if ours is not None and ours not in wanted:
-            raise TaccorlError(f"--source.names: {theirs}: the twin has no {ours!r}; {nearest(ours, wanted)}")
-    ours = {theirs: renamed.get(theirs, theirs) for theirs in given if renamed.get(theirs, theirs) is not None}
+            raise TaccorlError(
+                f"--source.names: {theirs}: the twin has no {ours!r}; {nearest(ours, wanted)}"
+            )
+    ours = {
+        theirs: renamed.get(theirs, theirs)
+        for theirs in given
+        if renamed.get(theirs, theirs) is not None
+    }
     missing = [name for name in wanted if name not in ours.values()]
     surplus = [theirs for theirs, name in ours.items() if name not in wanted]
-    doubled = [theirs for theirs, name in ours.items() if list(ours.values()).count(name) > 1]
+    doubled = [
+        theirs for theirs, name in ours.items() if list(ours.values()).count(name) > 1
+    ]
     if missing or surplus or doubled:
-        faults = [("missing", missing), ("left over", surplus), ("for the same value", doubled)]
-        said = "; ".join(f"{what}: {', '.join(names)}" for what, names in faults if names)
+        faults = [
+            ("missing", missing),
+            ("left over", surplus),
+            ("for the same value", doubled),
+        ]
+        said = "; ".join(
+            f"{what}: {', '.join(names)}" for what, names in faults if names
+        )
         raise TaccorlError(
             f"{teleop} has {len(given)} values, but the twin has {len(wanted)}. {said[0].upper()}{said[1:]}. State which is "
             "which: --source.names='{their_name: left_joint_1.pos, not_used: null, …}'"
         )
-    return [next(theirs for theirs, name in ours.items() if name == target) for target in wanted]
+    return [
+        next(theirs for theirs, name in ours.items() if name == target)
+        for target in wanted
+    ]
 
 
 def _check_units(source: LeaderSource) -> None:
@@ -203,7 +247,10 @@ def to_twin(values: np.ndarray, joint_unit: str, gripper_unit: str) -> np.ndarra
     rad, m: as they are. deg: π / 180. range_m100_100: −100 is our joint's lower limit, 100 its upper. range_0_100: 0 is closed,
     100 is 70 mm open.
     """
-    low, high = np.delete(ROBOT.action_low, _GRIPPERS), np.delete(ROBOT.action_high, _GRIPPERS)
+    low, high = (
+        np.delete(ROBOT.action_low, _GRIPPERS),
+        np.delete(ROBOT.action_high, _GRIPPERS),
+    )
     joints, grippers = np.delete(values, _GRIPPERS), values[_GRIPPERS]
     if joint_unit == "deg":
         joints = joints * math.pi / 180

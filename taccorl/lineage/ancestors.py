@@ -7,7 +7,16 @@ from typing import Any
 
 from taccorl.lineage.manifest import read_manifest
 
-CARRIED = ("stage", "stage_version", "key", "digest", "created", "config", "config_not_default", "inputs")
+CARRIED = (
+    "stage",
+    "stage_version",
+    "key",
+    "digest",
+    "created",
+    "config",
+    "config_not_default",
+    "inputs",
+)
 """Entries of a manifest that a descendant's manifest repeats."""
 
 Manifest = dict[str, Any]
@@ -17,7 +26,9 @@ Entry = dict[str, Any]
 
 
 def ancestors(
-    inputs: list[Entry], find_key: Callable[[str], Path | None], published: dict[str, Manifest] | None = None
+    inputs: list[Entry],
+    find_key: Callable[[str], Path | None],
+    published: dict[str, Manifest] | None = None,
 ) -> dict[str, Manifest]:
     """Key → manifest, with the entries ``CARRIED`` only, of all artefacts from which ``inputs`` were made, at any distance,
     sorted by key; without those that cannot be found. ``find_key``: ``Store.find_key``. ``published``: key → manifest that
@@ -35,7 +46,9 @@ def ancestors(
     return dict(sorted(found.items()))
 
 
-def _manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
+def _manifest_of(
+    entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]
+) -> Manifest:
     """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source."""
     key = entry["key"]
     if key is None:

@@ -28,14 +28,20 @@ def canonical(config: Any) -> Any:
 
 def canonical_text(config: Any) -> str:
     """Unique JSON text of ``config``, in ASCII, so that it does not depend on the locale."""
-    return json.dumps(canonical(config), sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return json.dumps(
+        canonical(config), sort_keys=True, allow_nan=False, separators=(",", ":")
+    )
 
 
 def _plain(value: Any, where: str) -> Any:
     if isinstance(value, enum.Enum):
         return value.name
     # A numpy scalar, by its shape, so that numpy need not be imported; an array of one element is still an array.
-    if type(value).__module__ == "numpy" and getattr(value, "shape", None) == () and hasattr(value, "item"):
+    if (
+        type(value).__module__ == "numpy"
+        and getattr(value, "shape", None) == ()
+        and hasattr(value, "item")
+    ):
         return _plain(value.item(), where)
     if value is None or isinstance(value, bool):
         return value
@@ -43,7 +49,9 @@ def _plain(value: Any, where: str) -> Any:
         return int(value)
     if isinstance(value, float):
         if not math.isfinite(value):
-            raise ConfigError(f"{where} is {value}: not a number that JSON or a key can hold. Use None for 'not set'.")
+            raise ConfigError(
+                f"{where} is {value}: not a number that JSON or a key can hold. Use None for 'not set'."
+            )
         return float(value)
     if isinstance(value, str):
         return str(value)
@@ -56,7 +64,10 @@ def _plain(value: Any, where: str) -> Any:
         }
         return dict(sorted(plain.items()))
     if isinstance(value, Mapping):
-        return {key: _plain(value[key], f"{where}.{key}") for key in _sorted_keys(value, where)}
+        return {
+            key: _plain(value[key], f"{where}.{key}")
+            for key in _sorted_keys(value, where)
+        }
     if isinstance(value, list | tuple):
         return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
     kind = type(value).__name__
@@ -69,7 +80,9 @@ def _plain(value: Any, where: str) -> Any:
 def _sorted_keys(value: Mapping[Any, Any], where: str) -> list[str]:
     for key in value:
         if not isinstance(key, str) or isinstance(key, enum.Enum):
-            raise ConfigError(f"{where} has the key {key!r} of type {type(key).__name__}; keys are text.")
+            raise ConfigError(
+                f"{where} has the key {key!r} of type {type(key).__name__}; keys are text."
+            )
     return sorted(value)
 
 
@@ -78,7 +91,9 @@ def _type_name(value: Any) -> str:
     if choice_name is not None:
         try:
             return choice_name(type(value))
-        except ValueError:  # the class is no registered choice, only derived from a registry
+        except (
+            ValueError
+        ):  # the class is no registered choice, only derived from a registry
             pass
     return type(value).__name__
 
@@ -96,7 +111,11 @@ def not_default(config: Any) -> dict[str, Any] | None:
         elif field.compare and field.default_factory is not dataclasses.MISSING:
             default[field.name] = canonical(field.default_factory())
     flat_default = flatten(default)
-    return {name: value for name, value in flatten(now).items() if flat_default.get(name, _ABSENT) != value}
+    return {
+        name: value
+        for name, value in flatten(now).items()
+        if flat_default.get(name, _ABSENT) != value
+    }
 
 
 def differences(old: Any, new: Any) -> list[str]:
@@ -124,7 +143,13 @@ def flatten(plain: Any, prefix: str = "") -> dict[str, Any]:
 
 def show(value: Any) -> str:
     """Text of a setting in the form in which a person would type it."""
-    return value if isinstance(value, str) else "absent" if value is _ABSENT else json.dumps(value)
+    return (
+        value
+        if isinstance(value, str)
+        else "absent"
+        if value is _ABSENT
+        else json.dumps(value)
+    )
 
 
 _ABSENT = object()

@@ -22,11 +22,15 @@ def check_writable(folder: Path, option: str = "--out") -> None:
     nearest one above it that exists, cannot be written to."""
     above = next(p for p in (folder, *folder.absolute().parents) if os.path.lexists(p))
     if not above.is_dir():
-        raise TaccorlError(f"{option}={folder}: {above} is not a folder: give another folder")
+        raise TaccorlError(
+            f"{option}={folder}: {above} is not a folder: give another folder"
+        )
     try:
         tempfile.TemporaryFile(dir=above).close()
     except OSError as error:
-        raise TaccorlError(f"{option}={folder}: {above} cannot be written to: give another folder") from error
+        raise TaccorlError(
+            f"{option}={folder}: {above} cannot be written to: give another folder"
+        ) from error
 
 
 def write_new(path: Path, text: str) -> None:
@@ -56,11 +60,15 @@ class Destinations:
 
     def present(self) -> list[Path]:
         """Paths that still contain the artefact that was published there."""
-        return [path for path, key in self._notes() if read_manifest(path).get("key") == key]
+        return [
+            path for path, key in self._notes() if read_manifest(path).get("key") == key
+        ]
 
     def gone(self) -> list[Path]:
         """Paths whose content was removed, moved or replaced."""
-        return [path for path, key in self._notes() if read_manifest(path).get("key") != key]
+        return [
+            path for path, key in self._notes() if read_manifest(path).get("key") != key
+        ]
 
     def _notes(self) -> list[tuple[Path, str]]:
         notes = [json.loads(note.read_bytes()) for note in self.folder.glob("*.json")]

@@ -52,14 +52,23 @@ class DigestCache:
         """The digest of ``path``, if it was recorded with the same ``stamp`` (as from `stamp`); else None."""
         file = self._entry(path)
         try:
-            entry = json.loads(self._kept[file] if file in self._kept else file.read_text())
+            entry = json.loads(
+                self._kept[file] if file in self._kept else file.read_text()
+            )
             return entry["digest"] if entry["stamp"] == stamp else None
-        except (OSError, ValueError, KeyError, TypeError):  # absent, or torn by a power cut: read the file again
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+        ):  # absent, or torn by a power cut: read the file again
             return None
 
     def put(self, path: Path, stamp: list[int], digest: str) -> None:
         """Store ``digest`` for a path and its ``stamp``."""
-        self._kept[self._entry(path)] = json.dumps({"path": os.fsdecode(path), "stamp": stamp, "digest": digest})
+        self._kept[self._entry(path)] = json.dumps(
+            {"path": os.fsdecode(path), "stamp": stamp, "digest": digest}
+        )
         if self.folder.parent.is_dir():
             self.write_kept()
 
@@ -69,7 +78,9 @@ class DigestCache:
             with contextlib.suppress(KeyError):  # another thread writes them, too
                 entry, text = self._kept.popitem()
                 entry.parent.mkdir(parents=True, exist_ok=True)
-                temp = entry.with_name(f"{entry.name}.{os.getpid()}-{os.urandom(4).hex()}")
+                temp = entry.with_name(
+                    f"{entry.name}.{os.getpid()}-{os.urandom(4).hex()}"
+                )
                 temp.write_text(text)
                 temp.replace(entry)
 
@@ -107,7 +118,9 @@ def stamp(path: Path) -> list[int]:
     try:
         info = path.stat()
     except FileNotFoundError:
-        raise LineageError(f"{path} does not exist" + (" (a broken link)" if path.is_symlink() else "")) from None
+        raise LineageError(
+            f"{path} does not exist" + (" (a broken link)" if path.is_symlink() else "")
+        ) from None
     if not stat.S_ISREG(info.st_mode):
         raise LineageError(
             f"{path} is not a regular file, so that it has no content to digest. Give a file, or a folder of files."
@@ -115,15 +128,25 @@ def stamp(path: Path) -> list[int]:
     return [info.st_size, info.st_mtime_ns, info.st_ctime_ns, info.st_ino]
 
 
-def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()) -> dict[str, Path]:
+def list_files(
+    folder: Path, *, hidden: bool = False, also: Collection[str] = ()
+) -> dict[str, Path]:
     """Files below ``folder``: relative posix path → path, sorted. Hidden files are included if ``hidden``, or if their relative
     paths are in ``also``. Raises LineageError: a folder cannot be read, or is a link."""
     found: dict[str, Path] = {}
-    shown = {path.as_posix() for name in map(PurePosixPath, also) for path in (name, *name.parents)}
+    shown = {
+        path.as_posix()
+        for name in map(PurePosixPath, also)
+        for path in (name, *name.parents)
+    }
     for where, folders, names in os.walk(folder, onerror=_cannot_read):
         base = Path(where).relative_to(folder)
         wanted = {n: (base / n).as_posix() for n in (*folders, *names)}
-        wanted = {n: rel for n, rel in wanted.items() if hidden or not n.startswith(".") or rel in shown}
+        wanted = {
+            n: rel
+            for n, rel in wanted.items()
+            if hidden or not n.startswith(".") or rel in shown
+        }
         folders[:] = [n for n in folders if n in wanted]
         for name in folders:
             if Path(where, name).is_symlink():
@@ -140,9 +163,19 @@ def _cannot_read(error: OSError) -> None:
 
 
 def digest_each(
-    folder: Path, cache: DigestCache | None = None, *, hidden: bool = False, also: Collection[str] = ()
+    folder: Path,
+    cache: DigestCache | None = None,
+    *,
+    hidden: bool = False,
+    also: Collection[str] = (),
 ) -> dict[str, str]:
     """``{relative path: digest}`` of the files below ``folder``; ``hidden`` and ``also`` choose them as in `list_files`."""
     files = list_files(folder, hidden=hidden, also=also)
     with ThreadPoolExecutor(READERS) as pool:  # hashing lets other threads run
-        return dict(zip(files, pool.map(lambda path: digest_file(path, cache), files.values()), strict=True))
+        return dict(
+            zip(
+                files,
+                pool.map(lambda path: digest_file(path, cache), files.values()),
+                strict=True,
+            )
+        )

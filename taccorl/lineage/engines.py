@@ -19,7 +19,14 @@ import draccus
 
 from taccorl.errors import TaccorlError
 from taccorl.lineage.errors import EngineError
-from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, attempt, run_in_processes
+from taccorl.lineage.processes import (
+    NO_CARE,
+    Care,
+    Done,
+    Failed,
+    attempt,
+    run_in_processes,
+)
 
 NAMED_FAILURES = 20  # in one message; the rest is counted
 NAME_LENGTH = 160
@@ -70,14 +77,24 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
 
         while len(outcomes) < len(items):
             self._run(fn, items, len(outcomes), short_name, take, care)
-            ended = {i: o for i, o in outcomes.items() if isinstance(o, Failed) and o.process}
+            ended = {
+                i: o for i, o in outcomes.items() if isinstance(o, Failed) and o.process
+            }
             if instead is not None and not len(ended) == len(items) > 1:
                 for index, outcome in sorted(ended.items()):
                     take(index, Done(instead(items[index], outcome)))
-        failures = [(short_name(items[i]), o) for i, o in sorted(outcomes.items()) if isinstance(o, Failed)]
+        failures = [
+            (short_name(items[i]), o)
+            for i, o in sorted(outcomes.items())
+            if isinstance(o, Failed)
+        ]
         if failures:
             raise EngineError(_failure_text(failures, len(items)))
-        return [outcome.result for _, outcome in sorted(outcomes.items()) if isinstance(outcome, Done)]
+        return [
+            outcome.result
+            for _, outcome in sorted(outcomes.items())
+            if isinstance(outcome, Done)
+        ]
 
     @abc.abstractmethod
     def _run(
@@ -109,7 +126,9 @@ class LocalEngine(Engine):
 
     def __post_init__(self) -> None:
         if self.workers < 1:
-            raise EngineError(f"--engine.workers={self.workers}: give at least one process")
+            raise EngineError(
+                f"--engine.workers={self.workers}: give at least one process"
+            )
 
     @property
     def at_once(self) -> int:
@@ -148,20 +167,29 @@ class RayEngine(Engine):
     def _run(self, fn, items, first, name, take, care) -> None:
         ray = start_ray()
         task = ray.remote(_outcomes).options(num_cpus=self.cpus_per_task)
-        shares = [range(start, len(items), self.tasks) for start in range(first, min(first + self.tasks, len(items)))]
-        running = {task.remote(fn, [items[i] for i in share], care): share for share in shares}
+        shares = [
+            range(start, len(items), self.tasks)
+            for start in range(first, min(first + self.tasks, len(items)))
+        ]
+        running = {
+            task.remote(fn, [items[i] for i in share], care): share for share in shares
+        }
         while running:
             (ended,), _ = ray.wait(list(running))
             share = running.pop(ended)
             try:
                 outcomes = ray.get(ended)
             except ray.exceptions.RayError as error:
-                outcomes = [Failed(f"its task ended without a result: {error}")] * len(share)
+                outcomes = [Failed(f"its task ended without a result: {error}")] * len(
+                    share
+                )
             for index, outcome in zip(share, outcomes, strict=True):
                 take(index, outcome)
 
 
-def _outcomes(fn: Callable[[Any], Any], items: list[Any], care: Care) -> list[Done | Failed]:
+def _outcomes(
+    fn: Callable[[Any], Any], items: list[Any], care: Care
+) -> list[Done | Failed]:
     """Outcomes of all items, in their order, from another process of this machine."""
     outcomes: dict[int, Done | Failed] = {}
     run_in_processes(fn, items, 1, str, outcomes.__setitem__, care)
@@ -174,7 +202,9 @@ def start_ray() -> Any:
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError as error:
-        raise TaccorlError('Ray is not installed: pip install "lerobot_policy_taccorl[ray]"') from error
+        raise TaccorlError(
+            'Ray is not installed: pip install "lerobot_policy_taccorl[ray]"'
+        ) from error
     address = os.environ.get("RAY_ADDRESS", "local")
     silent: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.WARNING}
     if address == "local":
@@ -184,13 +214,17 @@ def start_ray() -> Any:
     try:
         ray.init(address, ignore_reinit_error=True, **silent)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise TaccorlError(f"RAY_ADDRESS={address}: no Ray there ({error}); start it, or unset RAY_ADDRESS") from error
+        raise TaccorlError(
+            f"RAY_ADDRESS={address}: no Ray there ({error}); start it, or unset RAY_ADDRESS"
+        ) from error
     return ray
 
 
 def _failure_text(failures: list[tuple[str, Failed]], num_items: int) -> str:
     lines = [f"{len(failures)} of {num_items} items failed; the others are done:"]
-    lines += [f"  {name}: {failed.reason}" for name, failed in failures[:NAMED_FAILURES]]
+    lines += [
+        f"  {name}: {failed.reason}" for name, failed in failures[:NAMED_FAILURES]
+    ]
     if len(failures) > NAMED_FAILURES:
         lines.append(f"  and {len(failures) - NAMED_FAILURES} more")
     if trace := next((failed.trace for _, failed in failures if failed.trace), None):

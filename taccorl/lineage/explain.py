@@ -46,7 +46,9 @@ def trace(path: Path, store: Store | None) -> Origin:
         raise LineageError(f"{path} does not exist: nothing to explain.")
     folder = _artefact_around(path)
     tracer = _Tracer(store)
-    return tracer.raw(path, recorded=None) if folder is None else tracer.artefact(folder)
+    return (
+        tracer.raw(path, recorded=None) if folder is None else tracer.artefact(folder)
+    )
 
 
 def _artefact_around(path: Path) -> Path | None:
@@ -55,7 +57,9 @@ def _artefact_around(path: Path) -> Path | None:
         if manifest := read_manifest(folder):
             inside = path.relative_to(folder).as_posix()
             known = [*manifest["files"], manifest["place"]]
-            if inside == "." or any(name == inside or name.startswith(f"{inside}/") for name in known):
+            if inside == "." or any(
+                name == inside or name.startswith(f"{inside}/") for name in known
+            ):
                 return folder
     return None
 
@@ -69,7 +73,9 @@ class _Tracer:
         self.said: set[Path | str] = set()
         self.software: dict[str, str] = {}
         self.carried: dict[str, dict[str, Any]] = {}
-        self.listed: set[str] = set()  # digests of the sources that the datasets above name
+        self.listed: set[str] = (
+            set()
+        )  # digests of the sources that the datasets above name
 
     def artefact(self, folder: Path, recorded: str | None = None) -> Origin:
         manifest = read_manifest(folder)
@@ -78,9 +84,13 @@ class _Tracer:
             return Origin(f"{title}  (see above)")
         self.said.add(folder)
         now = digests_now(folder, self.cache)
-        origin = Origin(title, self.lines(folder, manifest), _changes(manifest["files"], now))
+        origin = Origin(
+            title, self.lines(folder, manifest), _changes(manifest["files"], now)
+        )
         if recorded not in (None, manifest["digest"], digest_files(now)):
-            origin.problems.append(f"holds something else now: {_digest(str(recorded))} went into the step above")
+            origin.problems.append(
+                f"holds something else now: {_digest(str(recorded))} went into the step above"
+            )
         origin.inputs = self.inputs(manifest)
         return origin
 
@@ -89,23 +99,40 @@ class _Tracer:
         self.carried |= manifest.get("ancestors", {})
         sources, above = manifest.get("sources", []), self.listed
         self.listed = above | {source["digest"] for source in sources}
-        origins = [self.source(Path(source["path"]), source["digest"]) for source in sources]
+        origins = [
+            self.source(Path(source["path"]), source["digest"]) for source in sources
+        ]
         origins += [self.input(entry) for entry in manifest["inputs"]]
         self.listed = above
         return origins
 
     def lines(self, folder: Path, manifest: dict[str, Any]) -> list[str]:
         made = f"made {manifest['created']} in {manifest['seconds']} s"
-        if manifest["software"] != self.software:  # mostly the same for the whole tree: said once
+        if (
+            manifest["software"] != self.software
+        ):  # mostly the same for the whole tree: said once
             self.software = manifest["software"]
-            made += " by " + ", ".join(f"{name} {version}" for name, version in self.software.items())
-        return [f"at {folder}: {len(manifest['files'])} files", made, f"config: {_config(manifest)}"]
+            made += " by " + ", ".join(
+                f"{name} {version}" for name, version in self.software.items()
+            )
+        return [
+            f"at {folder}: {len(manifest['files'])} files",
+            made,
+            f"config: {_config(manifest)}",
+        ]
 
     def input(self, entry: dict[str, Any]) -> Origin:
         path, recorded, key = Path(entry["path"]), entry["digest"], entry["key"]
-        if key is None and recorded in self.listed:  # equal content was read before, perhaps from elsewhere
+        if (
+            key is None and recorded in self.listed
+        ):  # equal content was read before, perhaps from elsewhere
             return Origin(f"source  {_digest(recorded)}  first read from {path}")
-        if not path.exists() and key and self.store and (moved := self.store.find_key(key)):
+        if (
+            not path.exists()
+            and key
+            and self.store
+            and (moved := self.store.find_key(key))
+        ):
             path = moved
         if path.exists() and read_manifest(path):
             return self.artefact(path, recorded)
@@ -113,7 +140,9 @@ class _Tracer:
             return self.gone(path, self.carried[key])
         if not path.exists() and key:
             title = f"artefact of key {key}  {path}  {_digest(recorded)}"
-            return Origin(title, problems=["missing: there is nothing at this path now"])
+            return Origin(
+                title, problems=["missing: there is nothing at this path now"]
+            )
         return self.source(path, recorded)
 
     def gone(self, path: Path, manifest: dict[str, Any]) -> Origin:
@@ -122,15 +151,25 @@ class _Tracer:
         if key in self.said:
             return Origin(f"{_title(manifest)}  (see above)")
         self.said.add(key)
-        where = f"not in the store any more: {path}" if path.name == key else f"not there any more: {path}"
-        origin = Origin(_title(manifest), [where, f"made {manifest['created']}", f"config: {_config(manifest)}"])
+        where = (
+            f"not in the store any more: {path}"
+            if path.name == key
+            else f"not there any more: {path}"
+        )
+        origin = Origin(
+            _title(manifest),
+            [where, f"made {manifest['created']}", f"config: {_config(manifest)}"],
+        )
         origin.inputs = self.inputs(manifest)
         return origin
 
     def source(self, path: Path, recorded: str) -> Origin:
         if path.exists():
             return self.raw(path, recorded)
-        return Origin(f"source  {path}  {_digest(recorded)}", problems=["missing: there is nothing at this path now"])
+        return Origin(
+            f"source  {path}  {_digest(recorded)}",
+            problems=["missing: there is nothing at this path now"],
+        )
 
     def raw(self, path: Path, recorded: str | None) -> Origin:
         now = content_digest(path, self.cache)
@@ -156,19 +195,38 @@ def _config(manifest: dict[str, Any]) -> str:
 def _settings(manifest: dict[str, Any]) -> str:
     changed = manifest["config_not_default"]
     if changed is not None:
-        text = ", ".join(f"{name}={_readable(value)}" for name, value in changed.items())
+        text = ", ".join(
+            f"{name}={_readable(value)}" for name, value in changed.items()
+        )
         return f"{text} (all else at its default)" if text else "all at its default"
-    settings = {name: value for name, value in flatten(manifest["config"]).items() if value is not None}
-    return ", ".join(f"{name or 'value'}={_readable(value)}" for name, value in settings.items()) or "none"
+    settings = {
+        name: value
+        for name, value in flatten(manifest["config"]).items()
+        if value is not None
+    }
+    return (
+        ", ".join(
+            f"{name or 'value'}={_readable(value)}" for name, value in settings.items()
+        )
+        or "none"
+    )
 
 
 def _readable(value: Any) -> str:
     """A setting for the eye: text as it is, nothing for what is not set, the first few of a long list."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{name}: {_readable(v)}" for name, v in value.items() if v is not None) + "}"
+        return (
+            "{"
+            + ", ".join(
+                f"{name}: {_readable(v)}" for name, v in value.items() if v is not None
+            )
+            + "}"
+        )
     if isinstance(value, list):
         shown = [_readable(item) for item in value if item is not None]
-        more = [f"… {len(shown) - SHOWN_ITEMS} more"] if len(shown) > SHOWN_ITEMS else []
+        more = (
+            [f"… {len(shown) - SHOWN_ITEMS} more"] if len(shown) > SHOWN_ITEMS else []
+        )
         return f"[{', '.join(shown[:SHOWN_ITEMS] + more)}]"
     if value is None or isinstance(value, bool):
         return str(value).lower()
@@ -182,9 +240,17 @@ def _changes(then: dict[str, str], now: dict[str, str]) -> list[str]:
         for name in then
         if name in now and now[name] != then[name]
     ]
-    found += [f"missing: {name}, {_digest(then[name])} then" for name in then if name not in now]
+    found += [
+        f"missing: {name}, {_digest(then[name])} then"
+        for name in then
+        if name not in now
+    ]
     found += [f"added since: {name}" for name in now if name not in then]
-    return found if len(found) <= SHOWN else [*found[:SHOWN], f"and {len(found) - SHOWN} more files like these"]
+    return (
+        found
+        if len(found) <= SHOWN
+        else [*found[:SHOWN], f"and {len(found) - SHOWN} more files like these"]
+    )
 
 
 def _digest(digest: str) -> str:
@@ -204,7 +270,11 @@ def render(origin: Origin) -> str:
 
 def _tree(origin: Origin) -> list[str]:
     inner = "│  " if origin.inputs else "   "
-    lines = [origin.title, *(f"{inner}{line}" for line in origin.lines), *(f"{inner}✗ {p}" for p in origin.problems)]
+    lines = [
+        origin.title,
+        *(f"{inner}{line}" for line in origin.lines),
+        *(f"{inner}✗ {p}" for p in origin.problems),
+    ]
     for i, child in enumerate(origin.inputs):
         last = i == len(origin.inputs) - 1
         first, *rest = _tree(child)

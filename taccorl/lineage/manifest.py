@@ -13,21 +13,44 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import taccorl
-from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest_files, list_files, stamp
+from taccorl.lineage.digest import (
+    DigestCache,
+    digest_each,
+    digest_file,
+    digest_files,
+    list_files,
+    stamp,
+)
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.files import write_durably
 
-MANIFEST_PLACES = ("manifest.json", DATASET_MANIFEST := "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
+MANIFEST_PLACES = (
+    "manifest.json",
+    DATASET_MANIFEST := "meta/taccorl/manifest.json",
+)  # an artefact; a LeRobot dataset
 CARD = "README.md"
 """File name of a dataset's card. It is written after the manifest and may be edited, so that it belongs to no artefact's
 digest."""
-FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
+FORMAT = (
+    1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
+)
 
 CHECKPOINT = "checkpoint"
 """Stage in the manifest of a policy's checkpoint, which no store has made."""
 _VERIFIED = ".verified.json"  # beside the manifest
 _MISSING = "missing"
-RECORDED_PACKAGES = ("numpy", "scipy", "av", "h5py", "mcap", "rosbags", "pyarrow", "lerobot", "torch", "mujoco")
+RECORDED_PACKAGES = (
+    "numpy",
+    "scipy",
+    "av",
+    "h5py",
+    "mcap",
+    "rosbags",
+    "pyarrow",
+    "lerobot",
+    "torch",
+    "mujoco",
+)
 """Packages whose versions manifests state."""
 
 
@@ -52,7 +75,11 @@ def _load(folder: Path, place: str) -> dict[str, Any]:
         content = json.loads(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError):
         return {}
-    if not isinstance(content, dict) or "taccorl_manifest" not in content or content.get("place") != place:
+    if (
+        not isinstance(content, dict)
+        or "taccorl_manifest" not in content
+        or content.get("place") != place
+    ):
         return {}
     if content["taccorl_manifest"] != FORMAT:
         raise LineageError(
@@ -64,20 +91,38 @@ def _load(folder: Path, place: str) -> dict[str, Any]:
 
 def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
     """Write ``manifest`` to its ``place`` in ``folder``; when the function returns, the file survives a power cut."""
-    write_durably(folder / place, json.dumps({"taccorl_manifest": FORMAT, "place": place} | manifest, indent=1) + "\n")
+    write_durably(
+        folder / place,
+        json.dumps({"taccorl_manifest": FORMAT, "place": place} | manifest, indent=1)
+        + "\n",
+    )
 
 
-def seal_checkpoint(folder: Path, keep: Collection[str] = (), stage: str = CHECKPOINT, place: str = "") -> None:
+def seal_checkpoint(
+    folder: Path, keep: Collection[str] = (), stage: str = CHECKPOINT, place: str = ""
+) -> None:
     """Write a manifest with the digests of the visible files of a checkpoint (or of a ``stage``, at ``place``); again when files
     are added. ``keep``: files whose digests in the present one are still right, so that weights of 14 GB are read once."""
     known, place = read_manifest(folder).get("files", {}), place or MANIFEST_PLACES[0]
-    paths = {name: path for name, path in list_files(folder).items() if name not in (place, CARD)}
+    paths = {
+        name: path
+        for name, path in list_files(folder).items()
+        if name not in (place, CARD)
+    }
     files = {name: known.get(name) if name in keep else None for name in paths}
     files = {name: digest or digest_file(paths[name]) for name, digest in files.items()}
     digest = digest_files(files)
     about = {"stage": stage, "stage_version": 1, "key": digest[:16], "digest": digest}
-    about |= {"created": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": 0.0}
-    about |= {"config": {}, "config_not_default": {}, "inputs": [], "software": software()}
+    about |= {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": 0.0,
+    }
+    about |= {
+        "config": {},
+        "config_not_default": {},
+        "inputs": [],
+        "software": software(),
+    }
     write_manifest(folder, place, about | {"files": files})
 
 
@@ -92,13 +137,23 @@ def require_checkpoint(folder: Path, name: str) -> list[str]:
             f"{name}: {place.name} is damaged; copy the checkpoint again, or remove it to load without digests"
         )
     found = None if is_verified(folder) else verify(folder)
-    if found and (bad := [*found.changed, *(f"{missing} (missing)" for missing in found.missing), *found.unreadable]):
+    if found and (
+        bad := [
+            *found.changed,
+            *(f"{missing} (missing)" for missing in found.missing),
+            *found.unreadable,
+        ]
+    ):
         more = f" and {len(bad) - 1} more files" if len(bad) > 1 else ""
         raise LineageError(
             f"{name}: {bad[0]}{more} {'are' if more else 'is'} damaged or changed since written: copy the checkpoint again, "
             f"or, if the change was intended, remove its {place.name}"
         )
-    return [file for file in list_files(folder) if file not in listed and file not in (place.name, CARD)]
+    return [
+        file
+        for file in list_files(folder)
+        if file not in listed and file not in (place.name, CARD)
+    ]
 
 
 def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str]:
@@ -114,7 +169,11 @@ def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str
 
 def content_digest(path: Path, cache: DigestCache | None = None) -> str:
     """SHA-256, 64 hexadecimal digits, of a file's bytes, or of the names and bytes of all files in a folder (``digests_now``)."""
-    return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
+    return (
+        digest_files(digests_now(path, cache))
+        if path.is_dir()
+        else digest_file(path, cache)
+    )
 
 
 @dataclass(frozen=True)
@@ -149,24 +208,49 @@ def verify(folder: Path) -> Verified | None:
         return None
     manifest = _load(folder, place)
     files = manifest.get("files")
-    if not isinstance(files, dict) or not files or manifest.get("digest") != digest_files(files):
-        raise LineageError(f"{folder / place}: is damaged: the digest of its list of files differs from the stated one")
+    if (
+        not isinstance(files, dict)
+        or not files
+        or manifest.get("digest") != digest_files(files)
+    ):
+        raise LineageError(
+            f"{folder / place}: is damaged: the digest of its list of files differs from the stated one"
+        )
     for name in files:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise LineageError(f"{folder / place}: is damaged: it lists {name!r}, which lies outside of {folder}")
+            raise LineageError(
+                f"{folder / place}: is damaged: it lists {name!r}, which lies outside of {folder}"
+            )
     with ThreadPoolExecutor(4) as pool:
-        found = dict(zip(files, pool.map(lambda name: _read_again(folder / name), files), strict=True))
+        found = dict(
+            zip(
+                files,
+                pool.map(lambda name: _read_again(folder / name), files),
+                strict=True,
+            )
+        )
     seen = {name: digest for name, (digest, _, _) in found.items()}
     result = Verified(
         len(files),
-        changed=tuple(name for name, digest in seen.items() if digest and digest != files[name]),
+        changed=tuple(
+            name for name, digest in seen.items() if digest and digest != files[name]
+        ),
         missing=tuple(name for name, (_, _, why) in found.items() if why == _MISSING),
-        unreadable=tuple(f"{name} ({why})" for name, (_, _, why) in found.items() if why and why != _MISSING),
+        unreadable=tuple(
+            f"{name} ({why})"
+            for name, (_, _, why) in found.items()
+            if why and why != _MISSING
+        ),
     )
     if seen == files:
         with contextlib.suppress(OSError):
-            marker = {"digest": manifest["digest"], "stamps": {name: mark for name, (_, mark, _) in found.items()}}
-            (folder / place).with_name(_VERIFIED).write_text(json.dumps(marker), encoding="ascii")
+            marker = {
+                "digest": manifest["digest"],
+                "stamps": {name: mark for name, (_, mark, _) in found.items()},
+            }
+            (folder / place).with_name(_VERIFIED).write_text(
+                json.dumps(marker), encoding="ascii"
+            )
     return result
 
 

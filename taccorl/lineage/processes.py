@@ -27,7 +27,9 @@ from taccorl.errors import DISK_FAULTS, TaccorlError
 from taccorl.lineage.errors import EngineError
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
-LOOK_S = 1.0  # how often to look for workers that died without closing their pipe, or hang
+LOOK_S = (
+    1.0  # how often to look for workers that died without closing their pipe, or hang
+)
 GRACE_S = 5.0  # how long a worker may tidy up before it is killed
 _numbers = itertools.count()  # of workers
 _FUNCTION, _ITEM = b"f", b"i"  # first byte of a message to a worker
@@ -75,8 +77,12 @@ def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
     try:
         return Done(fn(item))
     except Exception as error:
-        disk = error if isinstance(error, OSError) and error.errno in DISK_FAULTS else None
-        trace = None if disk or isinstance(error, TaccorlError) else traceback.format_exc()
+        disk = (
+            error if isinstance(error, OSError) and error.errno in DISK_FAULTS else None
+        )
+        trace = (
+            None if disk or isinstance(error, TaccorlError) else traceback.format_exc()
+        )
         return Failed(f"{type(error).__name__}: {error}", trace, disk=disk)
 
 
@@ -120,14 +126,19 @@ def run_in_processes(
     deaths = Counter[int]()
     with _pool(fn_bytes) as pool:
         while True:
-            new = [(i, pickled(items[i], f"item {name(items[i])}")) for i in range(known, len(items))]
+            new = [
+                (i, pickled(items[i], f"item {name(items[i])}"))
+                for i in range(known, len(items))
+            ]
             todo.extendleft(reversed(new))
             known = len(items)
             if not todo and not any(worker.index is not None for worker in pool):
                 if not again:
                     return
                 todo.append(again.popleft())
-            while len(pool) < workers and sum(not worker.ready for worker in pool) < len(todo):
+            while len(pool) < workers and sum(
+                not worker.ready for worker in pool
+            ) < len(todo):
                 pool.append(_Worker(fn_bytes))
             for worker, index, outcome in _looked_at(pool, care.limit_s):
                 if isinstance(outcome, Failed) and outcome.process == "crashed":
@@ -141,16 +152,22 @@ def run_in_processes(
                     worker.give(*todo.popleft())
 
 
-def _looked_at(pool: list["_Worker"], limit_s: float) -> Iterator[tuple["_Worker", int, "Done | Failed"]]:
+def _looked_at(
+    pool: list["_Worker"], limit_s: float
+) -> Iterator[tuple["_Worker", int, "Done | Failed"]]:
     """Wait until workers send results or end, at most ``LOOK_S``. Yields (worker, number of the item, outcome) for each item that
     ended; removes workers that ended from ``pool``."""
     looked_s = time.monotonic()
     spoke = set(wait([worker.pipe for worker in pool], timeout=LOOK_S))
-    passed_s = min(time.monotonic() - looked_s, 2 * LOOK_S)  # not what all of us were stopped for
+    passed_s = min(
+        time.monotonic() - looked_s, 2 * LOOK_S
+    )  # not what all of us were stopped for
     for worker in list(pool):
         worker.busy_s += passed_s
         worker.unseen_s += passed_s
-        if worker.pipe in spoke or worker.unseen_s >= LOOK_S:  # a system call for each: not for each message of another
+        if (
+            worker.pipe in spoke or worker.unseen_s >= LOOK_S
+        ):  # a system call for each: not for each message of another
             worker.unseen_s = 0.0
             news = worker.news(limit_s)
             if worker.is_dead:
@@ -252,7 +269,9 @@ class _Worker:
 
     def news(self, limit_s: float) -> list[tuple[int, Done | Failed]]:
         """What became of the item, if anything did; one that has taken longer than ``limit_s`` ends here."""
-        ended = self.process.exitcode is not None  # asked first: what it sent before it ended is still in the pipe
+        ended = (
+            self.process.exitcode is not None
+        )  # asked first: what it sent before it ended is still in the pipe
         try:
             message = pickle.loads(self.pipe.recv_bytes()) if self.pipe.poll() else None
         except (EOFError, OSError):
@@ -260,7 +279,11 @@ class _Worker:
         if message is None:
             if ended:
                 return self._died()
-            return self._end_hung(limit_s) if self.index is not None and self.busy_s > limit_s else []
+            return (
+                self._end_hung(limit_s)
+                if self.index is not None and self.busy_s > limit_s
+                else []
+            )
         if not self.ready:
             if isinstance(message, Failed):
                 raise EngineError(
@@ -286,7 +309,11 @@ class _Worker:
                 why += "A script that uses workers needs its start under `if __name__ == '__main__':`."
             raise EngineError(f"a worker process {how} before it could start. {why}")
         reason = f"the worker process {how} while it had this item"
-        return [] if self.index is None else [(self.index, Failed(reason, process="crashed"))]
+        return (
+            []
+            if self.index is None
+            else [(self.index, Failed(reason, process="crashed"))]
+        )
 
     def _end_hung(self, limit_s: float) -> list[tuple[int, Done | Failed]]:
         self.is_dead = True
@@ -312,11 +339,19 @@ def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int, number: int = 0) -
     global _number
     _number = number
     _die_with_parent(parent_pid)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which then ends us in order
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that a stage can tidy up
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the parent too, which then ends us in order
+    signal.signal(
+        signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM)
+    )  # so that a stage can tidy up
     loaded = attempt(pickle.loads, fn_bytes)
-    with contextlib.suppress(EOFError, ConnectionError):  # all work was done, perhaps before this was ready
-        pipe.send_bytes(pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None)))
+    with contextlib.suppress(
+        EOFError, ConnectionError
+    ):  # all work was done, perhaps before this was ready
+        pipe.send_bytes(
+            pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None))
+        )
         while isinstance(loaded, Done):
             message = pipe.recv_bytes()
             kind, content = message[:1], message[1:]
@@ -324,7 +359,9 @@ def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int, number: int = 0) -
                 pipe.send_bytes(_outcome_bytes(loaded.result, content))
             else:
                 loaded = attempt(pickle.loads, content)
-                pipe.send_bytes(pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None)))
+                pipe.send_bytes(
+                    pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None))
+                )
 
 
 def _outcome_bytes(fn: Callable[[Any], Any], item_bytes: bytes) -> bytes:
@@ -332,13 +369,19 @@ def _outcome_bytes(fn: Callable[[Any], Any], item_bytes: bytes) -> bytes:
     try:
         return pickle.dumps(outcome)
     except Exception as error:
-        return pickle.dumps(Failed(f"its result cannot be sent back to the parent process: {error}"))
+        return pickle.dumps(
+            Failed(f"its result cannot be sent back to the parent process: {error}")
+        )
 
 
 def _die_with_parent(parent_pid: int) -> None:
     """End this process as soon as its parent, the process ``parent_pid``, is gone, however the parent ended."""
-    threading.Thread(target=_end_after_parent, daemon=True).start()  # works everywhere, between two bytecodes
-    if sys.platform == "linux":  # the kernel does it at once, whatever this process is doing
+    threading.Thread(
+        target=_end_after_parent, daemon=True
+    ).start()  # works everywhere, between two bytecodes
+    if (
+        sys.platform == "linux"
+    ):  # the kernel does it at once, whatever this process is doing
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:  # it was gone before the lines above took effect
         os._exit(1)

@@ -40,7 +40,9 @@ class Unneeded:
 def open_store(root: Path) -> Store:
     """Open the existing store at ``root``. Raises LineageError: ``root`` is not a store."""
     if not is_store(root):
-        raise LineageError(f"{root} is not a taccorl store: it has no {MARKER}. Name the store with --store=FOLDER.")
+        raise LineageError(
+            f"{root} is not a taccorl store: it has no {MARKER}. Name the store with --store=FOLDER."
+        )
     return Store(root)
 
 
@@ -48,9 +50,19 @@ def unneeded(store: Store, keep: Sequence[Path] = ()) -> list[Unneeded]:
     """Artefacts that no published dataset and none of ``keep`` was made from, and leftovers; deletes nothing. Raises
     DatasetError: a dataset to keep does not exist or has no manifest, so that its inputs are unknown."""
     needed = _needed_keys(store, keep)
-    found = [_describe(path, path.name) for path in store.artefacts() if path.name not in needed]
-    leftovers = [(path, match[1]) for path in store.folders() if (match := LEFTOVER.fullmatch(path.name))]
-    return found + [_describe(path, key) for path, key in leftovers if not _is_alive(store, key)]
+    found = [
+        _describe(path, path.name)
+        for path in store.artefacts()
+        if path.name not in needed
+    ]
+    leftovers = [
+        (path, match[1])
+        for path in store.folders()
+        if (match := LEFTOVER.fullmatch(path.name))
+    ]
+    return found + [
+        _describe(path, key) for path, key in leftovers if not _is_alive(store, key)
+    ]
 
 
 def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
@@ -58,12 +70,16 @@ def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
     busy = []
     for folder in folders:
         if not folder.path.resolve().is_relative_to(store.root):
-            raise LineageError(f"{folder.path} lies outside the store {store.root}: not deleted.")
+            raise LineageError(
+                f"{folder.path} lies outside the store {store.root}: not deleted."
+            )
         try:
             with store.lock(folder.key, wait=False):
                 doomed = folder.path
                 if not folder.is_leftover:  # first out of sight in one step: a killed prune leaves no half artefact
-                    doomed = folder.path.with_name(f".{folder.key}.pruned-{os.getpid()}")
+                    doomed = folder.path.with_name(
+                        f".{folder.key}.pruned-{os.getpid()}"
+                    )
                     folder.path.rename(doomed)
                 shutil.rmtree(doomed)
         except Timeout:
@@ -76,13 +92,23 @@ def _needed_keys(store: Store, keep: Sequence[Path]) -> set[str]:
     datasets: list[Manifest] = []
     for path in keep:
         if not (manifest := read_manifest(path)):
-            problem = "has no taccorl manifest" if Path(path).exists() else "does not exist"
-            raise DatasetError(f"--keep={path} {problem}, so that its inputs are unknown. Nothing was deleted.")
+            problem = (
+                "has no taccorl manifest" if Path(path).exists() else "does not exist"
+            )
+            raise DatasetError(
+                f"--keep={path} {problem}, so that its inputs are unknown. Nothing was deleted."
+            )
         datasets.append(manifest)
     datasets += [read_manifest(path) for path in store.destinations.present()]
-    carried = {key: manifest for one in datasets for key, manifest in one.get("ancestors", {}).items()}
+    carried = {
+        key: manifest
+        for one in datasets
+        for key, manifest in one.get("ancestors", {}).items()
+    }
     inputs = [entry for one in datasets for entry in one["inputs"]]
-    return {one["key"] for one in datasets} | ancestors(inputs, store.find_key, carried).keys()
+    return {one["key"] for one in datasets} | ancestors(
+        inputs, store.find_key, carried
+    ).keys()
 
 
 def _is_alive(store: Store, key: str) -> bool:

@@ -38,7 +38,12 @@ from filelock import FileLock, Timeout
 
 from taccorl.errors import DISK_FAULTS, DatasetError, InTheWayError
 from taccorl.lineage.ancestors import ancestors
-from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
+from taccorl.lineage.canonical import (
+    canonical,
+    canonical_text,
+    differences,
+    not_default,
+)
 from taccorl.lineage.destinations import Destinations, is_free
 from taccorl.lineage.digest import (
     READERS,
@@ -97,7 +102,9 @@ class Store:
         """A raw file or folder (or an earlier artefact, at any path), addressed by its present content."""
         path = Path(path).absolute()
         if path.is_dir() and not list_files(path):
-            raise LineageError(f"{path} holds no files (files whose names start with a dot are not read).")
+            raise LineageError(
+                f"{path} holds no files (files whose names start with a dot are not read)."
+            )
         return Artefact(path, content_digest(path, self.digests))
 
     def dataset(self, root: Path) -> Artefact:
@@ -105,7 +112,11 @@ class Store:
         differ, because LeRobot's commands recompute statistics in place. Raises LineageError: a file of ``data`` or
         ``videos`` was changed or removed."""
         damaged = self.damaged(root) if read_manifest(root) else []
-        if changed := [name for name in damaged if name.startswith(("data/", "videos/", *MANIFEST_PLACES))]:
+        if changed := [
+            name
+            for name in damaged
+            if name.startswith(("data/", "videos/", *MANIFEST_PLACES))
+        ]:
             more = f" and {len(changed) - 1} more files" if len(changed) > 1 else ""
             raise LineageError(
                 f"{root}: {changed[0]}{more} {'are' if more else 'is'} damaged or changed since written (taccorl lineage "
@@ -117,14 +128,25 @@ class Store:
     def key(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> str:
         """Key of the artefact that ``stage`` makes from ``config`` and ``inputs``, 16 hexadecimal digits. Raises ConfigError:
         ``config`` has no plain-JSON form."""
-        parts = [stage.name, str(stage.version), canonical_text(config), *(artefact.digest for artefact in inputs)]
+        parts = [
+            stage.name,
+            str(stage.version),
+            canonical_text(config),
+            *(artefact.digest for artefact in inputs),
+        ]
         return digest_bytes(*(part.encode() for part in parts))[:KEY_DIGITS]
 
-    def find(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> Artefact | None:
+    def find(
+        self, stage: Stage, config: Any, inputs: Sequence[Artefact]
+    ) -> Artefact | None:
         """The artefact, if the store has it undamaged; else None. Never runs a stage."""
         key = self.key(stage, config, inputs)
         found = _with_key(self._place(stage, key), key)
-        return found if found is not None and not self._warn_of_damage(found.path) else None
+        return (
+            found
+            if found is not None and not self._warn_of_damage(found.path)
+            else None
+        )
 
     def damaged(self, folder: Path) -> list[str]:
         """Files of the artefact in ``folder`` that are not as its manifest lists them, as relative paths, or its manifest itself;
@@ -137,18 +159,28 @@ class Store:
         def is_damaged(name: str) -> bool:
             try:
                 return digest_file(folder / name, self.digests) != files[name]
-            except (OSError, LineageError):  # missing, a folder, or a disk that does not read it
+            except (
+                OSError,
+                LineageError,
+            ):  # missing, a folder, or a disk that does not read it
                 return True
 
         with ThreadPoolExecutor(READERS) as pool:
-            return [name for name, bad in zip(files, pool.map(is_damaged, files), strict=True) if bad]
+            return [
+                name
+                for name, bad in zip(files, pool.map(is_damaged, files), strict=True)
+                if bad
+            ]
 
     def _warn_of_damage(self, folder: Path) -> bool:
         damaged = self.damaged(folder)
         if damaged:
             more = f" and {len(damaged) - 1} more files" if len(damaged) > 1 else ""
             logger.warning(
-                "%s: %s%s damaged or changed since written, so that the artefact is not used", folder, damaged[0], more
+                "%s: %s%s damaged or changed since written, so that the artefact is not used",
+                folder,
+                damaged[0],
+                more,
             )
         return bool(damaged)
 
@@ -156,7 +188,14 @@ class Store:
         """The folder of the artefact with this key, whatever its stage; None if the store has none."""
         if not KEY.fullmatch(key):
             return None
-        return next((path for path in self.root.glob(f"[!.]*/{key}") if _is_own(path) and _is_own(path.parent)), None)
+        return next(
+            (
+                path
+                for path in self.root.glob(f"[!.]*/{key}")
+                if _is_own(path) and _is_own(path.parent)
+            ),
+            None,
+        )
 
     def artefacts(self) -> list[Path]:
         """The folders of all artefacts, sorted by stage and key."""
@@ -166,8 +205,17 @@ class Store:
         """Every folder below a stage's folder, sorted by path: artefacts, and temporary folders of running or dead runs."""
         if not self.root.is_dir():
             return []
-        stages = [path for path in sorted(self.root.iterdir()) if _is_own(path) and not path.name.startswith(".")]
-        return [path for stage in stages for path in sorted(stage.iterdir()) if _is_own(path)]
+        stages = [
+            path
+            for path in sorted(self.root.iterdir())
+            if _is_own(path) and not path.name.startswith(".")
+        ]
+        return [
+            path
+            for stage in stages
+            for path in sorted(stage.iterdir())
+            if _is_own(path)
+        ]
 
     def run(
         self,
@@ -206,7 +254,12 @@ class Store:
             return self._make(job)
 
     def _job(
-        self, stage: Stage, config: Any, inputs: list[Artefact], destination: Path | None, sources: list[Artefact]
+        self,
+        stage: Stage,
+        config: Any,
+        inputs: list[Artefact],
+        destination: Path | None,
+        sources: list[Artefact],
     ) -> "_Job":
         key = self.key(stage, config, inputs)
         if destination is None:
@@ -214,15 +267,39 @@ class Store:
                 raise LineageError(
                     f"stage {stage.name}: `sources` are written into a destination's manifest, but there is no destination."
                 )
-            return _Job(stage, config, inputs, key, self._place(stage, key), lock_name=key, temp_prefix=f".{key}.")
+            return _Job(
+                stage,
+                config,
+                inputs,
+                key,
+                self._place(stage, key),
+                lock_name=key,
+                temp_prefix=f".{key}.",
+            )
         final = Path(destination).absolute()
-        final = final.resolve() if is_free(final) else final.parent.resolve() / final.name
+        final = (
+            final.resolve() if is_free(final) else final.parent.resolve() / final.name
+        )
         if final.is_relative_to(self.root) or self.root.is_relative_to(final):
-            raise DatasetError(f"destination {final} and the store {self.root} contain one another; choose another.")
+            raise DatasetError(
+                f"destination {final} and the store {self.root} contain one another; choose another."
+            )
         lock_name = f"destination-{digest_bytes(str(final).encode())[:KEY_DIGITS]}"
         # Beside the user's folder: named after this store, whose lock alone tells if a temporary folder's maker lives.
-        temp_prefix = f".{final.name}.taccorl-{digest_bytes(str(self.root).encode())[:8]}-"
-        return _Job(stage, config, inputs, key, final, lock_name, temp_prefix, is_published=True, sources=sources)
+        temp_prefix = (
+            f".{final.name}.taccorl-{digest_bytes(str(self.root).encode())[:8]}-"
+        )
+        return _Job(
+            stage,
+            config,
+            inputs,
+            key,
+            final,
+            lock_name,
+            temp_prefix,
+            is_published=True,
+            sources=sources,
+        )
 
     def _make(self, job: "_Job") -> Artefact:
         for artefact in job.inputs:
@@ -230,19 +307,37 @@ class Store:
                 raise LineageError(
                     f"stage {job.stage.name}: its input {artefact.path} no longer exists. Make or restore it first."
                 )
-        temp = job.final.with_name(f"{job.temp_prefix}{os.getpid()}-{os.urandom(2).hex()}")
+        temp = job.final.with_name(
+            f"{job.temp_prefix}{os.getpid()}-{os.urandom(2).hex()}"
+        )
         temp.mkdir(parents=True)
         try:
             start_s = time.perf_counter()
             job.stage.fn(job.config, [artefact.path for artefact in job.inputs], temp)
             stamps = (
-                {name: stamp(path) for name, path in list_files(temp, hidden=True).items()} if temp.is_dir() else {}
+                {
+                    name: stamp(path)
+                    for name, path in list_files(temp, hidden=True).items()
+                }
+                if temp.is_dir()
+                else {}
             )
             if job.is_published:
                 self._share(temp, job.inputs)
-                stamps = {name: mark for name, mark in stamps.items() if stamp(temp / name) == mark}
-            manifest = _seal(temp, job, time.perf_counter() - start_s, self._origins(job) if job.is_published else {})
-            if job.is_published:  # before it is there, so that it is never there unknown to prune
+                stamps = {
+                    name: mark
+                    for name, mark in stamps.items()
+                    if stamp(temp / name) == mark
+                }
+            manifest = _seal(
+                temp,
+                job,
+                time.perf_counter() - start_s,
+                self._origins(job) if job.is_published else {},
+            )
+            if (
+                job.is_published
+            ):  # before it is there, so that it is never there unknown to prune
                 self.destinations.remember(job.final, job.key)
             try:
                 temp.rename(job.final)
@@ -257,8 +352,14 @@ class Store:
                     self.digests.put(job.final / name, before, manifest["files"][name])
             return Artefact(job.final, manifest["digest"])
         except BaseException as error:
-            if isinstance(error, OSError) and error.errno in DISK_FAULTS and error.filename is None:
-                error.filename = str(job.final)  # errors of writing to an open file name no place
+            if (
+                isinstance(error, OSError)
+                and error.errno in DISK_FAULTS
+                and error.filename is None
+            ):
+                error.filename = str(
+                    job.final
+                )  # errors of writing to an open file name no place
             shutil.rmtree(temp, ignore_errors=True)
             raise
 
@@ -270,24 +371,34 @@ class Store:
                 for name, digest in artefact.manifest.get("files", {}).items():
                     with contextlib.suppress(OSError):
                         path = artefact.path / name
-                        stored.setdefault(path.stat().st_size, []).append((path, digest))
+                        stored.setdefault(path.stat().st_size, []).append(
+                            (path, digest)
+                        )
         for name, path in list_files(temp).items():
             alike = stored.get(size := path.stat().st_size, [])
             if alike and size >= LINKED_FROM_BYTES and not name.startswith("meta/"):
                 wanted = digest_file(path)
-                with contextlib.suppress(OSError, LineageError):  # it goes on as the copy that it is
+                with contextlib.suppress(
+                    OSError, LineageError
+                ):  # it goes on as the copy that it is
                     any(
-                        digest == wanted == digest_file(source, self.digests) and clone_or_link(source, path)
+                        digest == wanted == digest_file(source, self.digests)
+                        and clone_or_link(source, path)
                         for source, digest in alike
                     )
 
     def _origins(self, job: "_Job") -> dict[str, Any]:
         """What a published manifest says more than one in the store: its sources, and what its inputs were made from."""
         each = dict.fromkeys(job.sources)  # a file of several recordings is named once
-        sources = [{"path": str(source.path.absolute()), "digest": source.digest} for source in each]
+        sources = [
+            {"path": str(source.path.absolute()), "digest": source.digest}
+            for source in each
+        ]
         return {
             "sources": sources,
-            "ancestors": ancestors([_entry(artefact) for artefact in job.inputs], self.find_key),
+            "ancestors": ancestors(
+                [_entry(artefact) for artefact in job.inputs], self.find_key
+            ),
         }
 
     def _existing(self, job: "_Job") -> Artefact | None:
@@ -298,7 +409,11 @@ class Store:
                 raise InTheWayError(_in_the_way(job))
             return None if damaged else found
         # LeRobot's commands change a dataset's meta in place
-        changed = [name for name in damaged if name in MANIFEST_PLACES or not name.startswith("meta/")]
+        changed = [
+            name
+            for name in damaged
+            if name in MANIFEST_PLACES or not name.startswith("meta/")
+        ]
         if changed:
             raise InTheWayError(
                 f"{job.final} is what this run makes, but {changed[0]} is damaged or changed since written (taccorl lineage "
@@ -343,8 +458,17 @@ class Store:
         except Timeout:
             if not wait:
                 raise
-            by = holder.read_text(encoding="utf-8") if holder.is_file() else "another process"
-            logger.warning("waiting for %s (store %s), held by %s; Ctrl-C ends this run", what or name, self.root, by)
+            by = (
+                holder.read_text(encoding="utf-8")
+                if holder.is_file()
+                else "another process"
+            )
+            logger.warning(
+                "waiting for %s (store %s), held by %s; Ctrl-C ends this run",
+                what or name,
+                self.root,
+                by,
+            )
             lock.acquire()
         try:
             holder.write_text(this_process(), encoding="utf-8")
@@ -372,7 +496,11 @@ class _Job:
         if not self.final.parent.is_dir():
             return []
         beside = self.final.parent.iterdir()
-        return [path for path in beside if path.name.startswith(self.temp_prefix) and path.is_dir()]
+        return [
+            path
+            for path in beside
+            if path.name.startswith(self.temp_prefix) and path.is_dir()
+        ]
 
 
 def is_store(root: Path) -> bool:
@@ -384,14 +512,18 @@ def _check(root: Path) -> None:
     if root.exists() and not root.is_dir():
         raise LineageError(f"store {root} is a file; give a folder.")
     if root.is_dir() and any(root.iterdir()) and not is_store(root):
-        raise LineageError(f"{root} is not a taccorl store (it has no {MARKER}) and not empty. Give a new folder.")
+        raise LineageError(
+            f"{root} is not a taccorl store (it has no {MARKER}) and not empty. Give a new folder."
+        )
 
 
 def _mark(root: Path) -> None:
     if not is_store(root):
         _check(root)
         root.mkdir(parents=True, exist_ok=True)
-        (root / MARKER).write_text(MARKER_TEXT)  # its existence is the mark, so a second writer does no harm
+        (root / MARKER).write_text(
+            MARKER_TEXT
+        )  # its existence is the mark, so a second writer does no harm
         logger.warning(
             "new store: %s keeps finished work, so that it is not repeated. --store=FOLDER (lerobot-train: "
             "--dataset.cache_store) names another place, taccorl lineage prune frees space",
@@ -405,10 +537,16 @@ def _is_own(path: Path) -> bool:
 
 def _with_key(folder: Path, key: str) -> Artefact | None:
     manifest = read_manifest(folder)
-    return Artefact(folder, manifest["digest"]) if manifest.get("key") == key and "digest" in manifest else None
+    return (
+        Artefact(folder, manifest["digest"])
+        if manifest.get("key") == key and "digest" in manifest
+        else None
+    )
 
 
-def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dict[str, Any]:
+def _seal(
+    temp: Path, job: _Job, seconds: float, origins: dict[str, Any]
+) -> dict[str, Any]:
     """Digest what the stage wrote, bring it to the disk, write the manifest; returns the manifest."""
     stage = job.stage
     files = digest_each(temp, hidden=True) if temp.is_dir() else {}
@@ -416,7 +554,9 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dic
         raise LineageError(
             f"stage {stage.name} wrote no file into its folder, but an artefact must have one. Correct the stage."
         )
-    if (place := stage.manifest if stage.manifest in files else manifest_place(temp)) is not None:
+    if (
+        place := stage.manifest if stage.manifest in files else manifest_place(temp)
+    ) is not None:
         raise LineageError(
             f"stage {stage.name} wrote {place} itself, which only the store may write. Do not write it in the stage."
         )
@@ -437,7 +577,13 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dic
         "files": files,
     }
     write_manifest(temp, stage.manifest, manifest)
-    for folder in {temp, *(path.parent for path in (temp / stage.manifest, *(temp / name for name in files)))}:
+    for folder in {
+        temp,
+        *(
+            path.parent
+            for path in (temp / stage.manifest, *(temp / name for name in files))
+        ),
+    }:
         flush(folder)
     return manifest
 
@@ -445,7 +591,9 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dic
 def _entry(artefact: Artefact) -> dict[str, Any]:
     """An input as a manifest names it; with its key, unless it is raw or was changed since it was made."""
     manifest = artefact.manifest
-    key = manifest["key"] if manifest and manifest["digest"] == artefact.digest else None
+    key = (
+        manifest["key"] if manifest and manifest["digest"] == artefact.digest else None
+    )
     return {"path": str(artefact.path), "digest": artefact.digest, "key": key}
 
 
@@ -454,12 +602,20 @@ def _in_the_way(job: _Job) -> str:
     way_out = "Nothing was changed: give another destination (--out), or move that one away yourself."
     manifest = read_manifest(job.final)
     if not manifest:
-        kind = f"a folder of {sum(1 for _ in job.final.rglob('*'))} entries" if job.final.is_dir() else "a file"
+        kind = (
+            f"a folder of {sum(1 for _ in job.final.rglob('*'))} entries"
+            if job.final.is_dir()
+            else "a file"
+        )
         return f"{job.final} is occupied: it is {kind} without a taccorl manifest; this run makes {wanted}. {way_out}"
     present = f"{manifest['stage']} v{manifest['stage_version']}, key {manifest['key']}, made {manifest['created']}"
     changes = differences(manifest["config"], canonical(job.config))
-    if [entry["digest"] for entry in manifest["inputs"]] != [artefact.digest for artefact in job.inputs]:
-        changes.append(f"inputs: {len(manifest['inputs'])} then, {len(job.inputs)} now, not the same content")
+    if [entry["digest"] for entry in manifest["inputs"]] != [
+        artefact.digest for artefact in job.inputs
+    ]:
+        changes.append(
+            f"inputs: {len(manifest['inputs'])} then, {len(job.inputs)} now, not the same content"
+        )
     return (
         f"{job.final} is occupied: it holds {present}; this run makes {wanted} "
         f"({'; '.join(changes) or 'same config and inputs'}). {way_out}"

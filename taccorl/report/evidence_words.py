@@ -31,7 +31,11 @@ def evidence_words(e: Evidence) -> str:
         return "weak"
     if e.score < SearchConfig().min_score:
         return "few places"
-    return "overwhelming" if e.bic >= OVERWHELMING_BIC and e.score >= OVERWHELMING_SCORE else "strong"
+    return (
+        "overwhelming"
+        if e.bic >= OVERWHELMING_BIC and e.score >= OVERWHELMING_SCORE
+        else "strong"
+    )
 
 
 def unjudged(d: Diagnosis, short: Mapping[str, Sequence[str]] | None = None) -> str:
@@ -57,7 +61,9 @@ def _to_mark(use: str, short: Mapping[str, Sequence[str]] | None) -> str:
         return f"mark one recording of each kind of motion for {use}"
     if short[use]:
         return f"mark one for {use} that reaches as far in {' and '.join(short[use])}"
-    return "both cover the same range of positions, velocities and commanded accelerations"
+    return (
+        "both cover the same range of positions, velocities and commanded accelerations"
+    )
 
 
 def may_be_two(d: Diagnosis) -> str:
@@ -69,9 +75,17 @@ def may_be_two(d: Diagnosis) -> str:
             continue
         own = next(e for e in found.evidence if e.name == found.added)
         for e in found.evidence:
-            simpler = len(e.values) < len(own.values) and e.name in {*cls.near_twins, *cls.equals_when_wide}
+            simpler = len(e.values) < len(own.values) and e.name in {
+                *cls.near_twins,
+                *cls.equals_when_wide,
+            }
             others = {*d.rivals.get(own.name, ()), *cls.reduces_to, *d.names}
-            if simpler and own.gain > 0.0 and e.name not in others and e.gain >= MOST_OF_IT * own.gain:
+            if (
+                simpler
+                and own.gain > 0.0
+                and e.name not in others
+                and e.gain >= MOST_OF_IT * own.gain
+            ):
                 return (
                     f"{own.name} may be {e.name}, which by itself removes {e.gain:.0%} of the error, and another effect: check "
                     f"with --without=[{own.name}] --until=noise_floor"
@@ -95,7 +109,9 @@ def may_stand_in(d: Diagnosis) -> str:
     if d.status not in ("something_else", "not_converged") or not names:
         return ""
     left = d.errors["after"]["validation"]
-    surest = f"; {names[0]}, which was added first, is the surest" if len(names) > 1 else ""
+    surest = (
+        f"; {names[0]}, which was added first, is the surest" if len(names) > 1 else ""
+    )
     return f"{left:.2f} noise floors remain, so {', '.join(names)} may stand in for an effect that is not known{surest}"
 
 
@@ -104,7 +120,10 @@ def untested_words(d: Diagnosis) -> str:
     after = d.errors["after"].get("test")
     if after is None or not d.untested:
         return ""
-    changes = ", ".join(f"{name} ({d.test_without[name]:.2f} without it, {after:.2f} with it)" for name in d.untested)
+    changes = ", ".join(
+        f"{name} ({d.test_without[name]:.2f} without it, {after:.2f} with it)"
+        for name in d.untested
+    )
     return f"test recordings gain nothing by {changes}: they lack what it acts on, or it stands in for another effect"
 
 
@@ -126,7 +145,9 @@ def excite_command(part: str, names: Sequence[str]) -> str:
 
 def _all_of(kind: str, names: Sequence[str]) -> bool:
     """Whether all effects ``names`` act on this kind of part; False without any."""
-    return bool(names) and all(cls is not None and kind in cls.kinds() for cls in map(effect_class, names))
+    return bool(names) and all(
+        cls is not None and kind in cls.kinds() for cls in map(effect_class, names)
+    )
 
 
 def recording_word(part: str, names: Sequence[str]) -> str:
@@ -138,7 +159,11 @@ def separable(d: Diagnosis, name: str, others: Iterable[str]) -> tuple[str, ...]
     """Those of ``others`` that some motion separates from the effect ``name``, beside the numbers that were fitted."""
     cls = effect_class(name) if "torque_ff" in d.base else None
     same = () if cls is None else cls.same_with_torque_ff
-    return tuple(other for other in others if other not in same and not nested_words(d, name, other))
+    return tuple(
+        other
+        for other in others
+        if other not in same and not nested_words(d, name, other)
+    )
 
 
 def nested_words(d: Diagnosis, one: str, other: str) -> str:
@@ -147,8 +172,14 @@ def nested_words(d: Diagnosis, one: str, other: str) -> str:
     for simple, general in ((one, other), (other, one)):
         cls = effect_class(general)
         for p in cls.parameters() if cls is not None else ():
-            key = f"{general}.{p.name}" if cls is not None and p.name == cls.reduces_to.get(simple) else ""
-            ends = next((o.intervals[key] for o in (*d.offers, d) if key in o.intervals), None)
+            key = (
+                f"{general}.{p.name}"
+                if cls is not None and p.name == cls.reduces_to.get(simple)
+                else ""
+            )
+            ends = next(
+                (o.intervals[key] for o in (*d.offers, d) if key in o.intervals), None
+            )
             if ends is not None and ends[0] <= p.low + NEARLY:
                 same = f"{general} is {simple} with one more number, {p.name}, of which {ends[0]:.2g} … {ends[1]:.2g} is known"
                 return f"{same}: at {p.low:g} both are the same, and no motion separates them. Take {simple}."
@@ -157,9 +188,17 @@ def nested_words(d: Diagnosis, one: str, other: str) -> str:
 
 def plannable(d: Diagnosis, name: str, others: Iterable[str]) -> list[str]:
     """Those of ``others`` that ``taccorl excite`` can separate from ``name``: none is in the file, the search has tried both."""
-    tried = {n for r in d.rounds[:1] for n in (*(e.name for e in r.evidence), *r.not_refitted)}
+    tried = {
+        n
+        for r in d.rounds[:1]
+        for n in (*(e.name for e in r.evidence), *r.not_refitted)
+    }
     apart = () if name in d.present else separable(d, name, others)
-    return [n for n in apart if effect_class(n) and n not in d.present and (name not in tried or n in tried)]
+    return [
+        n
+        for n in apart
+        if effect_class(n) and n not in d.present and (name not in tried or n in tried)
+    ]
 
 
 def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:

@@ -14,18 +14,34 @@ from matplotlib.figure import Figure
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.result import origin_words, shown, shown_unit
 
-MEASURED, BEFORE, AFTER, COMMAND, FLOOR = "#111111", "#d55e00", "#0072b2", "#7a7a7a", "#b8bec8"
+MEASURED, BEFORE, AFTER, COMMAND, FLOOR = (
+    "#111111",
+    "#d55e00",
+    "#0072b2",
+    "#7a7a7a",
+    "#b8bec8",
+)
 DOTS_PER_INCH = 110
 """Resolution of the figures."""
 
 
-def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[Origin]) -> Figure:
+def new_figure(
+    width_in: float, height_in: float, title: str, origins: Sequence[Origin]
+) -> Figure:
     """Create a figure of ``width_in`` × ``height_in`` inches with the origin of the data in its second title line."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH)
+    figure = Figure(
+        figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH
+    )
     FigureCanvasAgg(figure)
     figure.suptitle(f"{title}\n", fontsize=11, fontweight="bold", x=0.01, ha="left")
     figure.text(
-        0.012, 0.997 - 0.24 / height_in, origin_words(origins), fontsize=8, color="#6b7280", ha="left", va="top"
+        0.012,
+        0.997 - 0.24 / height_in,
+        origin_words(origins),
+        fontsize=8,
+        color="#6b7280",
+        ha="left",
+        va="top",
     )
     return figure
 
@@ -34,7 +50,15 @@ def floor_band(axes: Axes, floor: float, unit: str) -> None:
     """Draw the band of ± 2 noise floors, in which 95 % of a perfect twin's residual would lie. ``floor``: noise floor in
     ``unit``; the axis is in the unit for display (``shown_unit``)."""
     high = 2 * floor * shown_unit(unit)[0]
-    axes.axhspan(-high, high, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor: ± 2 × {shown(floor, unit)}", zorder=0)
+    axes.axhspan(
+        -high,
+        high,
+        color=FLOOR,
+        alpha=0.45,
+        lw=0,
+        label=f"noise floor: ± 2 × {shown(floor, unit)}",
+        zorder=0,
+    )
 
 
 def tidy(axes: Axes, x: str = "", y: str = "") -> None:
@@ -50,7 +74,14 @@ def tidy(axes: Axes, x: str = "", y: str = "") -> None:
 
 def legend(axes: Axes, columns: int = 4) -> None:
     """Draw the legend above the axes on the right, where it covers no line."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, fontsize=7.5, frameon=False, borderpad=0.1)
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=columns,
+        fontsize=7.5,
+        frameon=False,
+        borderpad=0.1,
+    )
 
 
 def robust_limit(values: np.ndarray, least: float) -> float:

@@ -9,7 +9,12 @@ from taccorl.report.section import Cell, Section, Value
 
 LONG_TEXT = 400
 """Most characters of a metadata record that are shown: rosbag2 writes pages of settings into one."""
-GRADES = {"written": "good", "split": "warning", "quarantined": "error", "refused": "error"}
+GRADES = {
+    "written": "good",
+    "split": "warning",
+    "quarantined": "error",
+    "refused": "error",
+}
 """Outcome of a recording → style."""
 
 
@@ -20,20 +25,45 @@ def ingested(report: dict[str, Any]) -> Section:
         name = r["recording"] + (f"#{r['part']}" if r["part"] else "")
         written = [e for e in r["episodes"] if e["outcome"] == "written"]
         grade = GRADES[r["outcome"]]
-        rows.append([name, Cell(_outcome(r), grade), str(len(written)), str(sum(e["rows"] for e in written))])
+        rows.append(
+            [
+                name,
+                Cell(_outcome(r), grade),
+                str(len(written)),
+                str(sum(e["rows"] for e in written)),
+            ]
+        )
         if r["reason"]:
-            lines.append(Cell(f"{r['outcome']} {name}: {without_place(r['reason'], r['recording'])}", grade))
+            lines.append(
+                Cell(
+                    f"{r['outcome']} {name}: {without_place(r['reason'], r['recording'])}",
+                    grade,
+                )
+            )
         if r["outcome"] != "written":
             lines.append(Cell(f"  look: {r['command']}", "bold"))
         for e in r["episodes"]:
             where = " ".join(w for w in (name, e["name"]) if w)
             found = (f for f in e["findings"] if f["severity"] != "note")
-            lines += [Cell(f"  {f['severity']}: {where}: {f['feature']}: {f['text']}", f["severity"]) for f in found]
-    unprotected = Counter(r["unprotected"] for r in report["recordings"] if r.get("unprotected"))
-    lines += [f"  note: {n} of {len(rows)} recordings: {text}" for text, n in unprotected.items()]
+            lines += [
+                Cell(
+                    f"  {f['severity']}: {where}: {f['feature']}: {f['text']}",
+                    f["severity"],
+                )
+                for f in found
+            ]
+    unprotected = Counter(
+        r["unprotected"] for r in report["recordings"] if r.get("unprotected")
+    )
+    lines += [
+        f"  note: {n} of {len(rows)} recordings: {text}"
+        for text, n in unprotected.items()
+    ]
     counts = ", ".join(f"{n} {outcome}" for outcome, n in report["outcomes"].items())
     heads = ("recording", "outcome", "episodes", "rows")
-    return Section(heads=heads, rows=rows, parts=[Section(text=[*lines, f"recordings: {counts}"])])
+    return Section(
+        heads=heads, rows=rows, parts=[Section(text=[*lines, f"recordings: {counts}"])]
+    )
 
 
 def _outcome(r: dict[str, Any]) -> str:
@@ -47,18 +77,45 @@ def _outcome(r: dict[str, Any]) -> str:
 
 def contents(inventory: Inventory) -> Section:
     """Channels, rates, gaps, clock skew and damage of one recording."""
-    files = f" ({len(inventory.source.files)} files)" if len(inventory.source.files) > 1 else ""
+    files = (
+        f" ({len(inventory.source.files)} files)"
+        if len(inventory.source.files) > 1
+        else ""
+    )
     known = inventory.times_known
     duration = f"{inventory.duration_s:.2f}" if known else "–"
     rows, lines = [], []
     for t in inventory.topics:
         timed = bool(t.rate_hz) and known
-        rate, gaps, gap = (f"{t.rate_hz:.1f}", str(t.num_gaps), f"{t.longest_gap_s:.3f}") if timed else ("–",) * 3
-        rows.append([t.topic, t.type.name, str(t.num_messages), rate, gaps, gap, _clock(t) if known else "–"])
-    lines: list[Value] = [f"names of {t.topic}: {', '.join(t.names)}" for t in inventory.topics if t.names]
+        rate, gaps, gap = (
+            (f"{t.rate_hz:.1f}", str(t.num_gaps), f"{t.longest_gap_s:.3f}")
+            if timed
+            else ("–",) * 3
+        )
+        rows.append(
+            [
+                t.topic,
+                t.type.name,
+                str(t.num_messages),
+                rate,
+                gaps,
+                gap,
+                _clock(t) if known else "–",
+            ]
+        )
+    lines: list[Value] = [
+        f"names of {t.topic}: {', '.join(t.names)}" for t in inventory.topics if t.names
+    ]
     unusable = {t.topic: t.unusable for t in inventory.topics if t.unusable}
-    lines += [f"without names or values {name}: {n} messages, which give no sample" for name, n in unusable.items()]
-    lines += [Cell(f"not decodable {t.problem}", "warning") for t in inventory.topics if t.problem]
+    lines += [
+        f"without names or values {name}: {n} messages, which give no sample"
+        for name, n in unusable.items()
+    ]
+    lines += [
+        Cell(f"not decodable {t.problem}", "warning")
+        for t in inventory.topics
+        if t.problem
+    ]
     for name, record in inventory.metadata.items():
         text = str(record)
         more = f" … ({len(text):,} characters)" if len(text) > LONG_TEXT else ""
@@ -66,7 +123,15 @@ def contents(inventory: Inventory) -> Section:
     lines += [Cell(f"damage {d}", "error") for d in inventory.damage]
     return Section(
         title=f"{inventory.source.name}{files}  {inventory.reader}, {duration} s",
-        heads=("topic", "type", "messages", "rate [Hz]", "gaps", "longest gap [s]", "clock"),
+        heads=(
+            "topic",
+            "type",
+            "messages",
+            "rate [Hz]",
+            "gaps",
+            "longest gap [s]",
+            "clock",
+        ),
         rows=rows,
         right=range(2, 6),
         parts=[Section(text=lines)],

@@ -12,13 +12,20 @@ def markdown(*sections: Section, level: int = 2) -> str:
     for s in sections:
         blocks += [f"{'#' * level} {printable(s.title)}"] * bool(s.title)
         if s.text:
-            blocks.append("\n".join(f"**{_text(v)}**" if s.style == "data" else f"- {_text(v)}" for v in s.text))
+            blocks.append(
+                "\n".join(
+                    f"**{_text(v)}**" if s.style == "data" else f"- {_text(v)}"
+                    for v in s.text
+                )
+            )
         if s.rows and any(s.heads):
             rules = ("--:" if k in s.right else ":--" for k in range(len(s.heads)))
             rows = [f"| {' | '.join(map(_text, row))} |" for row in (s.heads, *s.rows)]
             blocks.append("\n".join([rows[0], f"|{'|'.join(rules)}|", *rows[1:]]))
         elif s.rows:
-            blocks.append("\n".join(f"- {_text(name)}: {_text(value)}" for name, value in s.rows))
+            blocks.append(
+                "\n".join(f"- {_text(name)}: {_text(value)}" for name, value in s.rows)
+            )
         blocks += [_text(v) for v in s.notes]
         blocks += [f"```\n{s.command}\n```"] * bool(s.command)
         blocks += [markdown(*s.parts, level=level + 1)] * bool(s.parts)

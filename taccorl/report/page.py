@@ -21,9 +21,17 @@ def html(title: str, sections: Iterable[Section], generator: str) -> str:
     """Text of the page; ``generator`` is the text by which the file is recognised."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    made = Environment(loader=PackageLoader("taccorl.report", ""), autoescape=True, undefined=StrictUndefined)
+    made = Environment(
+        loader=PackageLoader("taccorl.report", ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+    )
     made.filters |= {"cell": cell, "uri": _uri}
-    words = {"title": title, "sections": list(sections), "generator": f"{generator}, taccorl {taccorl.__version__}"}
+    words = {
+        "title": title,
+        "sections": list(sections),
+        "generator": f"{generator}, taccorl {taccorl.__version__}",
+    }
     return made.get_template("page.html.j2").render(words)
 
 
@@ -46,7 +54,9 @@ def check_free(paths: Iterable[Path], generator: str, option: str) -> None:
             with path.open("rb") as file:
                 head = file.read(HEAD_BYTES)
         if path.exists() and generator.encode() not in head:
-            raise TaccorlError(f"{path}: already exists and is not a report of taccorl; give {option}, or remove it")
+            raise TaccorlError(
+                f"{path}: already exists and is not a report of taccorl; give {option}, or remove it"
+            )
 
 
 def write(texts: dict[Path, str]) -> None:
@@ -59,4 +69,6 @@ def write(texts: dict[Path, str]) -> None:
             part.write_text(text, encoding="utf-8")
             part.replace(path)
         except OSError as error:
-            raise TaccorlError(f"{path.parent}: the report cannot be written: {error}") from error
+            raise TaccorlError(
+                f"{path.parent}: the report cannot be written: {error}"
+            ) from error

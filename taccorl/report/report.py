@@ -81,7 +81,11 @@ class Report:
 
     def regimes(self) -> dict[str, RegimeErrors]:
         """Diagnosed joint → errors by recording and regime, of the final twin."""
-        return {f.part: regime_errors(traces) for f in self.found if (traces := self.last.of(f.part))}
+        return {
+            f.part: regime_errors(traces)
+            for f in self.found
+            if (traces := self.last.of(f.part))
+        }
 
     def verdicts(self) -> dict[str, Verdict]:
         """Diagnosed part → sentences of its verdict."""
@@ -94,11 +98,23 @@ class Report:
                 can_tell=f.can_tell,
                 known=f.known,
                 data=self.unsettled(f.part),
-                doubts=[*self._clock_or_effect(f.part, f.diagnosis), *(own.remarks if own else ())],
+                doubts=[
+                    *self._clock_or_effect(f.part, f.diagnosis),
+                    *(own.remarks if own else ()),
+                ],
                 options=self.options,
                 repeated=self._repeated(f.part),
-                floor=next((t.floor.words() for t in self.comparison.of(f.part) if t.floor.is_unknown), ""),
-                short={use: own.short(use, other) for use, other in _PAIRS} if own else None,
+                floor=next(
+                    (
+                        t.floor.words()
+                        for t in self.comparison.of(f.part)
+                        if t.floor.is_unknown
+                    ),
+                    "",
+                ),
+                short={use: own.short(use, other) for use, other in _PAIRS}
+                if own
+                else None,
                 worst=own.worst if own else None,
             )
             if self._is_input(f.part):  # excite plans motions by targets
@@ -113,7 +129,11 @@ class Report:
         """Text: most recordings of the part show a lead that the added effect and an offset of the clock explain alike."""
         moved = {t.recording for t in self.comparison.of(part)}
         clock = self.comparison.clock
-        led = [n for n in moved if any((f.check, f.feature) == (UNDECIDED, part) for f in clock.get(n, ()))]
+        led = [
+            n
+            for n in moved
+            if any((f.check, f.feature) == (UNDECIDED, part) for f in clock.get(n, ()))
+        ]
         names = [name for name in added(d) if name in LOOK_LIKE_LEADS]
         if not names or 2 * len(led) <= len(moved):
             return []
@@ -138,12 +158,31 @@ class Report:
         an offset; where the search may add another effect, only if it was there before the first one, too."""
         moved = {t.recording for t in self.comparison.of(part)}
         clock = self.comparison.clock
-        own = [(name, f) for name, found in self.findings.items() for f in found if f not in clock.get(name, ())]
+        own = [
+            (name, f)
+            for name, found in self.findings.items()
+            for f in found
+            if f not in clock.get(name, ())
+        ]
         goes_on = any(f.part == part and may_go_on(f.diagnosis) for f in self.found)
-        first = {(n, f.feature) for n, found in clock.items() for f in found if f.severity == "error"}
-        last = [(n, f) for n, found in self.last.clock.items() for f in found if not goes_on or (n, f.feature) in first]
+        first = {
+            (n, f.feature)
+            for n, found in clock.items()
+            for f in found
+            if f.severity == "error"
+        }
+        last = [
+            (n, f)
+            for n, found in self.last.clock.items()
+            for f in found
+            if not goes_on or (n, f.feature) in first
+        ]
         own += [(name, f) for name, f in last if not moved or f.feature == part]
-        return [f"{name}: {f.text}" for name, f in own if f.severity == "error" and (not moved or name in moved)]
+        return [
+            f"{name}: {f.text}"
+            for name, f in own
+            if f.severity == "error" and (not moved or name in moved)
+        ]
 
     def sections(self) -> list[Section]:
         """The page."""
@@ -151,13 +190,28 @@ class Report:
         twins = [one for one in (c, self.refitted, self.after) if one is not None]
         return [
             Section(text=[origin_words(self.origins)], style="data"),
-            *(map(verdict_section, verdicts.values()) if verdicts else [compared.verdict(c, self.after)]),
-            *([compared.signals(self.without_effects, self.after)] if c.signals else []),
+            *(
+                map(verdict_section, verdicts.values())
+                if verdicts
+                else [compared.verdict(c, self.after)]
+            ),
+            *(
+                [compared.signals(self.without_effects, self.after)]
+                if c.signals
+                else []
+            ),
             *([compared.touch(self.without_effects, self.after)] if c.touches else []),
             compared.cell_numbers(self.last),
             compared.how_far(*twins),
-            *(diagnosed(f, self.origins, regimes.get(f.part), self.options) for f in self.found),
-            compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
+            *(
+                diagnosed(f, self.origins, regimes.get(f.part), self.options)
+                for f in self.found
+            ),
+            compared.where(
+                self.without_effects,
+                self.origins,
+                self.after if self.refitted is not None else None,
+            ),
             compared.checked(self.findings),
             compared.not_compared(c),
             self._about(twins),
@@ -166,7 +220,10 @@ class Report:
     def _about(self, twins: Sequence[Comparison]) -> Section:
         split = self.comparison.split
         rows = [
-            ("beside it" if k else "twin", f"{one.twin}: {', '.join(one.effects) or 'no added effects'}")
+            (
+                "beside it" if k else "twin",
+                f"{one.twin}: {', '.join(one.effects) or 'no added effects'}",
+            )
             for k, one in enumerate(twins)
         ]
         for use in ("fit", "validation", "test"):
@@ -184,7 +241,12 @@ def write_report(report: Report, folder: Path) -> Section:
     TaccorlError: as ``check_folder``, or the folder cannot be written to."""
     replaced = check_folder(folder)
     numbers = json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n"
-    page.write({folder / NUMBERS: numbers, folder / PAGE: page.html(report.title, report.sections(), GENERATOR)})
+    page.write(
+        {
+            folder / NUMBERS: numbers,
+            folder / PAGE: page.html(report.title, report.sections(), GENERATOR),
+        }
+    )
     again = f" (replaced the report of {replaced})" if replaced else ""
     return Section(text=[f"wrote {folder / PAGE} and {NUMBERS}{again}"])
 
@@ -198,15 +260,25 @@ def check_folder(folder: Path, measurements: Path | None = None) -> str:
     """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
     is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read. Raises
     TaccorlError: another file has the report's name, the folder cannot be written, or it is the folder of the recordings."""
-    if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
-        raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
+    if (
+        measurements is not None
+        and measurements.is_dir()
+        and folder.resolve() == measurements.resolve()
+    ):
+        raise TaccorlError(
+            f"{folder}: contains the recordings; give another folder for the report"
+        )
     if folder.exists() and not folder.is_dir():
         raise TaccorlError(f"{folder}: is a file; give a folder for the report")
     check_writable(folder)
     page.check_free([folder / PAGE, folder / NUMBERS], GENERATOR, "another folder")
     if not (folder / PAGE).exists():
         return ""
-    return datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M")
+    return (
+        datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime)
+        .astimezone()
+        .strftime("%Y-%m-%d %H:%M")
+    )
 
 
 def as_json(report: Report) -> dict[str, Any]:
@@ -219,16 +291,28 @@ def as_json(report: Report) -> dict[str, Any]:
         "domains": sorted({origin.domain or "not stated" for origin in report.origins}),
         "provenance": dict(report.provenance),
         "twin": {"name": c.twin, "effects": list(c.effects)},
-        "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},
+        "mended_twin": None
+        if after is None
+        else {"name": after.twin, "effects": list(after.effects)},
         "recordings": c.split,
         "findings": plain(report.findings),
         "verdicts": plain(report.verdicts()),
-        "identified": {f.part: plain(f.known) for f in report.found if f.known is not None},
+        "identified": {
+            f.part: plain(f.known) for f in report.found if f.known is not None
+        },
         "scores": _scores(c),
         "scores_refitted": _scores(report.refitted),
         "scores_after": _scores(after),
-        "where": {"note": WHERE_NOT_WHY, "twin": drawn.twin, "cells": plain(report.cells())},
-        "along": [plain(curve) for signal, kind in drawn.signals for curve in curves(drawn, signal, kind)],
+        "where": {
+            "note": WHERE_NOT_WHY,
+            "twin": drawn.twin,
+            "cells": plain(report.cells()),
+        },
+        "along": [
+            plain(curve)
+            for signal, kind in drawn.signals
+            for curve in curves(drawn, signal, kind)
+        ],
         "regimes": plain(report.regimes()),
         "diagnoses": {f.part: _diagnosis(f.diagnosis) for f in report.found},
         "can_tell": {f.part: plain(f.can_tell) for f in report.found},
@@ -242,20 +326,34 @@ def _cell_numbers(c: Comparison) -> dict[str, Any]:
     first = c.touches[0] if c.touches else None
     if first is None or first.cells is None:
         return {}
-    errors = {"unit": first.unit, "load_unit": first.load_unit, "rmse_floors": plain(cell_errors(c.touches))}
+    errors = {
+        "unit": first.unit,
+        "load_unit": first.load_unit,
+        "rmse_floors": plain(cell_errors(c.touches)),
+    }
     return plain(first.cells) | errors
 
 
 def _scores(c: Comparison | None) -> list[dict[str, Any]]:
-    return [] if c is None else [plain(s) | {"ratio": s.ratio} for s in (*c.scores(), *c.pad_scores())]
+    return (
+        []
+        if c is None
+        else [plain(s) | {"ratio": s.ratio} for s in (*c.scores(), *c.pad_scores())]
+    )
 
 
 def _diagnosis(d: Diagnosis) -> dict[str, Any]:
     """Without the fits, whose residuals are as long as the recordings."""
     left = ("before", "after", "effects", "offers")
-    kept = {f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in left}
+    kept = {
+        f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in left
+    }
     offers = [plain(o) | {"effects": _effects(o.effects)} for o in d.offers]
-    return plain(kept) | {"words": d.words, "effects": _effects(d.effects), "offers": offers}
+    return plain(kept) | {
+        "words": d.words,
+        "effects": _effects(d.effects),
+        "offers": offers,
+    }
 
 
 def _effects(found: Sequence[Effect]) -> list[dict[str, Any]]:
@@ -265,7 +363,9 @@ def _effects(found: Sequence[Effect]) -> list[dict[str, Any]]:
 def plain(value: Any) -> Any:
     """``value`` as JSON knows it: dataclasses and mappings as objects, arrays as lists, a number that is none as null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {
+            f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)
+        }
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

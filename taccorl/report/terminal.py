@@ -44,14 +44,23 @@ def show(*sections: Section, indent: str = "") -> None:
         if s.only == "page":
             continue
         if s.title:
-            out.print("" if indent else "\n", Text(f"{indent}{s.title}", "bold"), sep="", soft_wrap=True)
+            out.print(
+                "" if indent else "\n",
+                Text(f"{indent}{s.title}", "bold"),
+                sep="",
+                soft_wrap=True,
+            )
         for number, value in enumerate(s.text):
-            out.print(_line(value, indent, s.style if number == 0 else ""), soft_wrap=True)
+            out.print(
+                _line(value, indent, s.style if number == 0 else ""), soft_wrap=True
+            )
         if s.rows and (any(s.heads) or len(s.rows[0]) != 2):
             out.print(_table(s, indent))
         elif s.rows:  # names and values
             for name, value in s.rows:
-                out.print(_line(name, indent) + Text(": ") + _line(value, ""), soft_wrap=True)
+                out.print(
+                    _line(name, indent) + Text(": ") + _line(value, ""), soft_wrap=True
+                )
         for value in s.notes:
             out.print(_line(value, indent, "note"), soft_wrap=True)
         if s.command:
@@ -65,12 +74,18 @@ def _line(value: Value, indent: str, style: str = "") -> RichText:
 
 
 def _table(s: Section, indent: str) -> Table:
-    table = Table(box=None, pad_edge=False, show_header=any(s.heads), padding=(0, 2, 0, 0))
+    table = Table(
+        box=None, pad_edge=False, show_header=any(s.heads), padding=(0, 2, 0, 0)
+    )
     for k in range(max(map(len, s.rows))):
         head = s.heads[k] if k < len(s.heads) else ""
         table.add_column(
-            Text(f"{indent if k == 0 else ''}{head}"), justify="right" if k in s.right else "left", overflow="fold"
+            Text(f"{indent if k == 0 else ''}{head}"),
+            justify="right" if k in s.right else "left",
+            overflow="fold",
         )
     for row in s.rows:
-        table.add_row(*(_line(value, indent if k == 0 else "") for k, value in enumerate(row)))
+        table.add_row(
+            *(_line(value, indent if k == 0 else "") for k, value in enumerate(row))
+        )
     return table

@@ -39,7 +39,12 @@ Kind = Literal[
     "data_first",
 ]
 """What a verdict says: nothing is missing, numbers of the file are off, effects are missing or tie, more is than was found, …"""
-ALIKE: tuple[Kind, ...] = ("not_converged", "gains_moved", "nothing_missing", "numbers_off")
+ALIKE: tuple[Kind, ...] = (
+    "not_converged",
+    "gains_moved",
+    "nothing_missing",
+    "numbers_off",
+)
 """Kinds of verdict that are named after a status of the search, and follow from this status alone."""
 FOUND: Mapping[Kind, str] = {
     "data_first": "{w.part}: settle the data before any effect is named: {w.first_fault}.",
@@ -62,7 +67,10 @@ UNCERTAIN: Mapping[Kind, str] = {
 }
 """Kind of low confidence → its first reason."""
 SCALED = "all efforts are off by one factor (effort_scale: a wrong torque constant)"
-LATE: Mapping[str, str] = {"command_delay": "positions and efforts", "sensor_delay": "positions"}
+LATE: Mapping[str, str] = {
+    "command_delay": "positions and efforts",
+    "sensor_delay": "positions",
+}
 """Name of an effect that is a delay → columns of a recording. If the logger had stored these columns late by that delay, the
 recording would look the same as one of a robot with the effect."""
 NEXT: Mapping[str, str] = {
@@ -130,16 +138,37 @@ def verdict(
     remarks = (*d.remarks, *doubts[:_MOST])
     finding = FOUND[kind].format(w=w, refitted=refitted_words(d))
     if d.changed and kind not in ("data_first", "not_converged"):
-        finding = f"{finding} Numbers of the file that change: {'; '.join(changed_words(d))}."
+        finding = (
+            f"{finding} Numbers of the file that change: {'; '.join(changed_words(d))}."
+        )
     reasons = [*_doubts(d, kind, short, floor)]
     if remarks:
-        reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
+        reasons.append(
+            f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below"
+        )
     # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
-    unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (floor and kind == "nothing_missing")
-    unsure = unsure or (added(d) and {*_open(d), *(c.name for c in d.changed if c.name in d.undetermined)})
+    unsure = (d.untested and d.errors[d.baseline]["validation"] <= LITTLE) or (
+        floor and kind == "nothing_missing"
+    )
+    unsure = unsure or (
+        added(d)
+        and {*_open(d), *(c.name for c in d.changed if c.name in d.undetermined)}
+    )
     tied = kind == "ties" or (kind == "numbers_off" and w.instead)
-    level: Level = "low" if unsure or kind in UNCERTAIN else "moderate" if reasons or tied else "high"
-    first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
+    level: Level = (
+        "low"
+        if unsure or kind in UNCERTAIN
+        else "moderate"
+        if reasons or tied
+        else "high"
+    )
+    first = (
+        [UNCERTAIN[kind].format(w=w)]
+        if kind in UNCERTAIN
+        else []
+        if reasons
+        else [w.ends]
+    )
     why = [reason.rstrip(".") for reason in (*first, *reasons)]
     more = f"; and {len(why) - _MOST} more" if len(why) > _MOST else ""
     words, command = _record_next(w, kind, can_tell, repeated, worst)
@@ -149,7 +178,8 @@ def verdict(
         level=level,
         finding=finding,
         confidence=f"Confidence {level}: {'; '.join(why[:_MOST])}{more}.",
-        record_next=bool(floor) * "The motion of the two recordings that differ a third time, for the noise floor. "
+        record_next=bool(floor)
+        * "The motion of the two recordings that differ a third time, for the noise floor. "
         + words,
         command=" ".join([command, *options]) if command else "",
         remarks=remarks,
@@ -158,7 +188,11 @@ def verdict(
 
 def refitted_words(d: Diagnosis) -> str:
     """Text that names the fit of all always fitted numbers without an added effect; for a joint these are the gains."""
-    return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
+    return (
+        "gains refitted"
+        if "kp" in d.base
+        else "with the numbers refitted that every fit adjusts"
+    )
 
 
 def changed_words(d: Diagnosis) -> list[str]:
@@ -177,15 +211,32 @@ def changed_words(d: Diagnosis) -> list[str]:
 def _change(c: Changed, d: Diagnosis) -> str:
     low, high = d.intervals.get(c.name, (c.after, c.after))
     if c.name == "loop_hz":
-        low, high = (1.0 / end if end > 0.0 else math.inf for end in reversed(d.intervals["loop_s"]))
-    edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
+        low, high = (
+            1.0 / end if end > 0.0 else math.inf
+            for end in reversed(d.intervals["loop_s"])
+        )
+    edit = (
+        f": write `{c.name}: {c.after:.4g}` there, or what the drive has"
+        * math.isinf(c.before)
+    )
     edit += f" or, as well, {' or '.join(c.ties)}" * bool(c.ties)
-    edit += f": a constant {'force' if c.unit == 'N' else 'torque'}, which may be a weight" * (c.name == "torque_ff")
-    edit += ": the effect speed_delay, which add-effect writes" * (c.name == "speed_delay_s")
-    edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (c.name == EFFORT_SCALE)
+    edit += (
+        f": a constant {'force' if c.unit == 'N' else 'torque'}, which may be a weight"
+        * (c.name == "torque_ff")
+    )
+    edit += ": the effect speed_delay, which add-effect writes" * (
+        c.name == "speed_delay_s"
+    )
+    edit += f": multiply efforts by {1 / c.after:.4g}, unless a mass is missing" * (
+        c.name == EFFORT_SCALE
+    )
     edit += f", or {SCALED}" * (EFFORT_SCALE in c.instead and bool(added(d)))
     ends = f"{clean(low, high - low)} … {clean(high, high - low)}"
-    ends = f"not determined: with other numbers any of {ends} fits" if c.name in d.undetermined else ends
+    ends = (
+        f"not determined: with other numbers any of {ends} fits"
+        if c.name in d.undetermined
+        else ends
+    )
     return f"{c.name} {c.was} → {clean(c.after, high - low)}{unit_words(c.unit)} ({ends}){edit}"
 
 
@@ -203,7 +254,9 @@ def added(d: Diagnosis) -> tuple[str, ...]:
 
 def _open(d: Diagnosis) -> list[str]:
     """Names of the added effects none of whose parameters the recordings determine."""
-    known = {name.partition(".")[0] for name in d.intervals if name not in d.undetermined}
+    known = {
+        name.partition(".")[0] for name in d.intervals if name not in d.undetermined
+    }
     unknown = {name.partition(".")[0] for name in d.undetermined} - known
     return [name for name in added(d) if name in unknown]
 
@@ -212,8 +265,13 @@ def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
     if data:
         return "data_first"
     if d.status in ("something_else", "too_many"):
-        first, after = (max(d.errors[stage]["validation"], 1.0) ** 2 for stage in (d.baseline, "after"))
-        most = d.standing_out or first - after >= SearchConfig().sure_gain * (first - 1.0)
+        first, after = (
+            max(d.errors[stage]["validation"], 1.0) ** 2
+            for stage in (d.baseline, "after")
+        )
+        most = d.standing_out or first - after >= SearchConfig().sure_gain * (
+            first - 1.0
+        )
         return "more" if {*added(d)} - {*_open(d)} and most else "something_else"
     if d.status in ALIKE:
         return d.status
@@ -235,7 +293,9 @@ class _Words:
 
     @property
     def first_fault(self) -> str:
-        return self.data[0] + (f" (and {len(self.data) - 1} more)" if len(self.data) > 1 else "")
+        return self.data[0] + (
+            f" (and {len(self.data) - 1} more)" if len(self.data) > 1 else ""
+        )
 
     @property
     def remains(self) -> str:
@@ -245,10 +305,23 @@ class _Words:
             return f"{alone}explains what is missing{f': with {self.names}, the nearest, {self.fell}' if added(self.d) else left}"
         place = self.d.standing_out[0]
         least = (1.0 - NEAR) ** 0.5 * place.error
-        near = {name: f"{name} ({error:.2f})" for name, error in self.d.nearest if error < least}
-        why = [e.verdict for r in self.d.rounds[-1:] for e in r.evidence if e.verdict and e.name in [*near][:1]]
+        near = {
+            name: f"{name} ({error:.2f})"
+            for name, error in self.d.nearest
+            if error < least
+        }
+        why = [
+            e.verdict
+            for r in self.d.rounds[-1:]
+            for e in r.evidence
+            if e.verdict and e.name in [*near][:1]
+        ]
         tried = f"nearest there: {_some([*near.values()])}{f', refused: {why[0]}' if why else ''}"
-        none = "none comes near to it there" if self.d.nearest else "none was tried there, in a test recording"
+        none = (
+            "none comes near to it there"
+            if self.d.nearest
+            else "none was tried there, in a test recording"
+        )
         left = f"{place.error:.2f} noise floors ({self.after:.2f} in all)"
         return f"explains what stands out: {place.words()}, {left}; {tried if near else none}"
 
@@ -259,13 +332,25 @@ class _Words:
     @property
     def moved(self) -> str:
         d = self.d
-        pairs = [(g, d.start.get(g, 0.0), d.base[g]) for g in ("kp", "kd") if g in d.base]
-        return ", ".join(f"{g} {old:.4g} → {new:.4g} (× {new / old:.2g})" for g, old, new in pairs if old)
+        pairs = [
+            (g, d.start.get(g, 0.0), d.base[g]) for g in ("kp", "kd") if g in d.base
+        ]
+        return ", ".join(
+            f"{g} {old:.4g} → {new:.4g} (× {new / old:.2g})"
+            for g, old, new in pairs
+            if old
+        )
 
     @property
     def off(self) -> str:
-        how = {c.effect or c.name: "off" if math.isfinite(c.before) else "not stated" for c in self.d.changed}
-        off = " and ".join(SCALED if n == EFFORT_SCALE else f"{n} of the file is {word}" for n, word in how.items())
+        how = {
+            c.effect or c.name: "off" if math.isfinite(c.before) else "not stated"
+            for c in self.d.changed
+        }
+        off = " and ".join(
+            SCALED if n == EFFORT_SCALE else f"{n} of the file is {word}"
+            for n, word in how.items()
+        )
         if not self.instead:
             return f"no effect is missing, but {off}: {self.fell}"
         missing = [name for name in self.instead if name != EFFORT_SCALE]
@@ -281,11 +366,20 @@ class _Words:
     @property
     def names(self) -> str:
         """Added effects, each with all others that may be missing in its place."""
-        links = {e.name: f"{e.name} in {link}" for e in self.d.effects if (link := getattr(e, "link", ""))}
+        links = {
+            e.name: f"{e.name} in {link}"
+            for e in self.d.effects
+            if (link := getattr(e, "link", ""))
+        }
         if self.d.or_in:
             last = "" if "payload" in links else " in the last link that it moves"
-            links["payload"] = " or in ".join((links.get("payload", f"payload{last}"), *self.d.or_in))
-        each = [" or ".join((links.get(name, name), *self.d.rivals.get(name, ()))) for name in added(self.d)]
+            links["payload"] = " or in ".join(
+                (links.get("payload", f"payload{last}"), *self.d.or_in)
+            )
+        each = [
+            " or ".join((links.get(name, name), *self.d.rivals.get(name, ())))
+            for name in added(self.d)
+        ]
         return ("; " if any(self.d.rivals.values()) else " and ").join(each)
 
     @property
@@ -294,14 +388,28 @@ class _Words:
         found = []
         for c in self.d.changed if added(self.d) else ():
             cls = effect_class(c.effect) if c.effect else None
-            own = [p for p in cls.parameters() if p.name == c.name.rpartition(".")[2]] if cls is not None else []
+            own = (
+                [p for p in cls.parameters() if p.name == c.name.rpartition(".")[2]]
+                if cls is not None
+                else []
+            )
             none = own[0].absent if own else None
             if none is not None and abs(c.after - none) < GONE * abs(c.before - none):
                 found.append(c.effect)
-        place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(found)
+        place = f" in place of the file's {' and '.join(dict.fromkeys(found))}" * bool(
+            found
+        )
         number, factor = self.d.or_number
-        off = SCALED if number == EFFORT_SCALE else f"{number} of the file is off by a factor of {factor:.4g}"
-        late = "".join(f", or its {LATE[name]} are logged late by as much" for name in added(self.d) if name in LATE)
+        off = (
+            SCALED
+            if number == EFFORT_SCALE
+            else f"{number} of the file is off by a factor of {factor:.4g}"
+        )
+        late = "".join(
+            f", or its {LATE[name]} are logged late by as much"
+            for name in added(self.d)
+            if name in LATE
+        )
         return place + f", or {off}" * bool(number) + late
 
     @property
@@ -309,10 +417,19 @@ class _Words:
         """The first number of each effect that was added: the absolute one where something fixes the scale of the torques."""
         if self.known is None:
             return ""
-        primary = self.known.absolute if self.known.pinned_by else self.known.identifiable
-        firsts = [next((n for n in primary if n.name.startswith(f"{name}.")), None) for name in added(self.d)]
+        primary = (
+            self.known.absolute if self.known.pinned_by else self.known.identifiable
+        )
+        firsts = [
+            next((n for n in primary if n.name.startswith(f"{name}.")), None)
+            for name in added(self.d)
+        ]
         words = [n.words() for n in firsts if n is not None]
-        reads = [f": {e.reads_as}" for e in self.d.effects if e.name in added(self.d) and e.reads_as]
+        reads = [
+            f": {e.reads_as}"
+            for e in self.d.effects
+            if e.name in added(self.d) and e.reads_as
+        ]
         return f" ({', '.join(words)}{''.join(reads)})" if words else ""
 
     @property
@@ -323,7 +440,9 @@ class _Words:
         whose = refitted_words(d) if stage == "fitted" else "the twin as it was"
         first, last = d.errors[stage], d.errors["after"]
         fell = f"the error falls from {first['validation']:.2f} ({whose}) to {last['validation']:.2f} noise floors"
-        return fell + (f" (test {of_test(first['test'], last['test'])})" if "test" in last else "")
+        return fell + (
+            f" (test {of_test(first['test'], last['test'])})" if "test" in last else ""
+        )
 
     @property
     def ends(self) -> str:
@@ -331,7 +450,9 @@ class _Words:
         return f"validation recordings end at {self.after:.2f}{test}"
 
 
-def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None, floor: str) -> Iterator[str]:
+def _doubts(
+    d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None, floor: str
+) -> Iterator[str]:
     if floor:
         yield f"the noise floor may be wrong, and every error with it: {floor}"
     after, first = d.errors["after"], d.errors[d.baseline]["validation"]
@@ -364,7 +485,9 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
         yield f"validation recordings keep {validation:.2f} of {first:.2f} floors, so little that no effect was looked for"
     words = {"": "", EFFORT_SCALE: "a wrong torque constant does as well"}
     also = words.get(d.or_number[0], "another gain does as well")
-    clock = "a clock that stamps readings late does as well" * bool({*LATE} & {*added(d)})
+    clock = "a clock that stamps readings late does as well" * bool(
+        {*LATE} & {*added(d)}
+    )
     yield from filter(None, (also, clock, unjudged(d, short), may_be_two(d)))
     if d.one_pose:
         yield (
@@ -374,12 +497,19 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None,
     if d.at_bound:
         yield f"{_some(d.at_bound)} at the end of its range"
     if unknown := [*_open(d), *(c.name for c in d.changed if c.name in d.undetermined)]:
-        beside = ", so that what was added may stand in for an effect that is not known" * bool(added(d))
+        beside = (
+            ", so that what was added may stand in for an effect that is not known"
+            * bool(added(d))
+        )
         yield f"the recordings do not determine {_some(unknown)}{beside}"
 
 
 def _record_next(
-    w: _Words, kind: Kind, can_tell: Identifiability | None, repeated: bool, worst: RegimeError | None
+    w: _Words,
+    kind: Kind,
+    can_tell: Identifiability | None,
+    repeated: bool,
+    worst: RegimeError | None,
 ) -> tuple[str, str]:
     """In words, and the command that plans it."""
     part, d = w.part, w.d
@@ -390,36 +520,71 @@ def _record_next(
         if repeated:
             return f"A {decides}", command
         what = decides.split()[0]
-        return f"One {what} twice (repeat_of), for a better noise floor, and a {decides}", command
+        return (
+            f"One {what} twice (repeat_of), for a better noise floor, and a {decides}",
+            command,
+        )
     if d.or_number[0] not in ("", EFFORT_SCALE):
-        return "The same motions at twice the gain, stated in measurements.yaml, or with the motor's effort.", ""
+        return (
+            "The same motions at twice the gain, stated in measurements.yaml, or with the motor's effort.",
+            "",
+        )
     if kind == "ties":
         tied = [name for name in added(d) if d.rivals.get(name)]
         name = next((n for n in tied if separable(d, n, d.rivals[n])), tied[0])
-        same, names = inseparable_words(d, name, d.rivals[name]), (name, *separable(d, name, d.rivals[name]))
+        same, names = (
+            inseparable_words(d, name, d.rivals[name]),
+            (name, *separable(d, name, d.rivals[name])),
+        )
         if len(names) == 1:
             return same, ""
         command = excite_command(part, names)
         classes = [cls for other in names if (cls := effect_class(other)) is not None]
-        how = ": " + " ".join(cls.to_record for cls in classes) if not command and classes else "."
+        how = (
+            ": " + " ".join(cls.to_record for cls in classes)
+            if not command and classes
+            else "."
+        )
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how}"
-        return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
+        return " ".join(
+            filter(None, (words, same, _other_pose(d) if d.one_pose else ""))
+        ), command
     if EFFORT_SCALE in (*w.instead, d.or_number[0]):
-        return "The same motions with a known load (`payload_kg`), whose part of the inertia is known.", ""
+        return (
+            "The same motions with a known load (`payload_kg`), whose part of the inertia is known.",
+            "",
+        )
     if w.instead:
-        own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)
+        own, apart = (
+            " and ".join(c.name for c in d.changed if c.instead),
+            separable(d, w.instead[0], w.instead),
+        )
         words = f"A wider motion, or another pose: it leaves {own} as before, but not the torque of {_some(w.instead)}."
         return words, excite_command(part, apart) if len(apart) > 1 else ""
     if kind == "nothing_missing":
-        hidden = [n for n in (can_tell.invisible if can_tell is not None else ()) if n not in d.present]
+        hidden = [
+            n
+            for n in (can_tell.invisible if can_tell is not None else ())
+            if n not in d.present
+        ]
         if not hidden:
             return "Nothing: every effect of a typical strength would have shown.", ""
         command = excite_command(part, hidden[:2]) if len(hidden) > 1 else ""
-        return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
+        return (
+            f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.",
+            command,
+        )
     if d.one_pose:
         name = next(iter(d.one_pose))
-        open_ = {*(can_tell.visible if can_tell is not None else ())} - {name, *d.present}
-        rivals = [n for n in ("unbalance", "cable_spring", *d.twins.get(name, {})) if n in open_]
+        open_ = {*(can_tell.visible if can_tell is not None else ())} - {
+            name,
+            *d.present,
+        }
+        rivals = [
+            n
+            for n in ("unbalance", "cable_spring", *d.twins.get(name, {}))
+            if n in open_
+        ]
         return _other_pose(d), excite_command(part, (name, rivals[0])) if rivals else ""
     return _a_check(w)
 
@@ -428,19 +593,39 @@ def _deciding(part: str, d: Diagnosis, worst: RegimeError | None) -> tuple[str, 
     """Of what is not explained: the recording that decides between the nearest effects, or has more of where the error is
     largest, or shows an effect more clearly."""
     near = [name for name, error in d.nearest if error <= d.standing_out[0].most]
-    near = near or [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names and e.gain >= NEAR]
-    best = [*near[:1], *(other for first in near[:1] for other in separable(d, first, near[1:])[:1])]
+    near = near or [
+        e.name
+        for r in d.rounds[-1:]
+        for e in r.evidence
+        if e.name not in d.names and e.gain >= NEAR
+    ]
+    best = [
+        *near[:1],
+        *(other for first in near[:1] for other in separable(d, first, near[1:])[:1]),
+    ]
     command = excite_command(part, best) if len(best) == 2 else ""
     what = recording_word(part, best or d.names)
     if command:
-        return f"{what} that decides between the nearest effects, {' and '.join(best)}.", command
+        return (
+            f"{what} that decides between the nearest effects, {' and '.join(best)}.",
+            command,
+        )
     if worst is not None:
         where = f"{worst.regime} ({worst.error:.2f} noise floors in {worst.recording})"
-        return f"{what} with more of the regime in which the error is largest: {where}.", ""
+        return (
+            f"{what} with more of the regime in which the error is largest: {where}.",
+            "",
+        )
     tried = [e.name for r in d.rounds[-1:] for e in r.evidence]
-    name = next((name for name in best or added(d) or tried if effect_class(name) is not None), None)
+    name = next(
+        (name for name in best or added(d) or tried if effect_class(name) is not None),
+        None,
+    )
     if name is None:
-        return f"{what} of another kind: slower and faster, with less and with more load.", ""
+        return (
+            f"{what} of another kind: slower and faster, with less and with more load.",
+            "",
+        )
     cls, twins = effect_class(name), plannable(d, name, d.twins.get(name, {}))
     how = f": {cls.to_record}" if cls is not None and cls.to_record else "."
     command = excite_command(part, (name, *twins[:1])) if twins else ""
@@ -452,13 +637,27 @@ def _a_check(w: _Words) -> tuple[str, str]:
     d, scale = w.d, ""
     if w.known is not None and not w.known.pinned_by:
         kp = next((n for n in w.known.absolute if n.name == "kp"), None)
-        scale = f" (K_p is known only to {kp.low:.3g} … {kp.high:.3g} {kp.unit})" if kp is not None else ""
+        scale = (
+            f" (K_p is known only to {kp.low:.3g} … {kp.high:.3g} {kp.unit})"
+            if kp is not None
+            else ""
+        )
     name = (*added(d), *(c.effect or c.name for c in d.changed))[0]
-    twins = plannable(d, name, d.twins.get(name) or getattr(effect_class(name), "near_twins", ()))
+    twins = plannable(
+        d, name, d.twins.get(name) or getattr(effect_class(name), "near_twins", ())
+    )
     command = excite_command(w.part, (name, *twins[:1])) if twins else ""
     what = f"A {recording_word(w.part, (name,))}"
-    check = f"{what} that tells {name} from its near-twin {twins[0]}, as a check" if command else ""
-    effort = f"; the motor's effort or a known payload, if absolute torques matter{scale}" if scale else ""
+    check = (
+        f"{what} that tells {name} from its near-twin {twins[0]}, as a check"
+        if command
+        else ""
+    )
+    effort = (
+        f"; the motor's effort or a known payload, if absolute torques matter{scale}"
+        if scale
+        else ""
+    )
     return f"{check or f'{what} of another kind, as a test'}{effort}.", command
 
 

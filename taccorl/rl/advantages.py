@@ -14,7 +14,13 @@ from torch import Tensor
 
 
 def estimate_advantages(
-    reward_TN: Tensor, value_TN: Tensor, next_value_TN: Tensor, end_TN: Tensor, *, gamma: float, gae_lambda: float
+    reward_TN: Tensor,
+    value_TN: Tensor,
+    next_value_TN: Tensor,
+    end_TN: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
 ) -> tuple[Tensor, Tensor]:
     """Return the advantages (T, N) and the returns (T, N) of a rollout of T decisions in N environments.
 
@@ -29,7 +35,9 @@ def estimate_advantages(
     advantage_TN, later_N = torch.zeros_like(reward_TN), torch.zeros_like(reward_TN[0])
     for t in reversed(range(len(reward_TN))):
         error_N = reward_TN[t] + gamma * next_value_TN[t] - value_TN[t]
-        advantage_TN[t] = later_N = error_N + gamma * gae_lambda * torch.where(end_TN[t], 0.0, later_N)
+        advantage_TN[t] = later_N = error_N + gamma * gae_lambda * torch.where(
+            end_TN[t], 0.0, later_N
+        )
     return advantage_TN, advantage_TN + value_TN
 
 
@@ -44,4 +52,8 @@ def explained_variance(value: Tensor, returns: Tensor) -> float:
 
     ``value`` V and ``returns`` R have the same shape (T, N). NaN if all returns are equal."""
     spread = returns.var(correction=0)
-    return float("nan") if spread == 0 else float(1 - (returns - value).var(correction=0) / spread)
+    return (
+        float("nan")
+        if spread == 0
+        else float(1 - (returns - value).var(correction=0) / spread)
+    )

@@ -41,17 +41,33 @@ class Anchor(Protocol):
 class RealAnchor:
     """Anchor with rows of a LeRobot dataset, drawn with replacement and passed through the policy's own preprocessor."""
 
-    def __init__(self, settings: AnchorSettings, policy: TactilePI05Policy, preprocessor: Any) -> None:
+    def __init__(
+        self, settings: AnchorSettings, policy: TactilePI05Policy, preprocessor: Any
+    ) -> None:
         """Raises TaccorlError: the dataset does not exist, is simulated, or has other features than the policy."""
-        self._policy, self._preprocessor, self._settings = policy, preprocessor, settings
+        self._policy, self._preprocessor, self._settings = (
+            policy,
+            preprocessor,
+            settings,
+        )
         root = settings.dataset
         if root is None or not (root / "meta" / "info.json").is_file():
-            raise TaccorlError(f"--anchor.dataset={root}: no LeRobot dataset (meta/info.json) there")
+            raise TaccorlError(
+                f"--anchor.dataset={root}: no LeRobot dataset (meta/info.json) there"
+            )
         features = Dataset(root).info["features"]
-        if missing := [key for key in policy.config.input_features or {} if key not in features]:
-            raise TaccorlError(f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy")
+        if missing := [
+            key for key in policy.config.input_features or {} if key not in features
+        ]:
+            raise TaccorlError(
+                f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy"
+            )
         if IS_SIM not in features and not settings.allow_simulated:
-            if twin := [origin for origin in origins_of(Dataset(root)) if origin.domain == "twin"]:
+            if twin := [
+                origin
+                for origin in origins_of(Dataset(root))
+                if origin.domain == "twin"
+            ]:
                 raise TaccorlError(
                     f"--anchor.dataset={root}: its episodes are {twin[0]}, not real. Give recordings (taccorl ingest) or "
                     "those of a surrogate (taccorl collect --domain=surrogate); --anchor.allow_simulated=true takes these "
@@ -63,18 +79,30 @@ class RealAnchor:
         named.cache, named.cache_store = settings.cache, str(settings.cache_store)
         # What LeRobot's make_dataset and our cache read from a training's configuration.
         read: dict[str, Any] = {"tolerance_s": 1e-4, "num_workers": 0, "rename_map": {}}
-        options: Any = SimpleNamespace(dataset=named, trainable_config=policy.config, **read)
+        options: Any = SimpleNamespace(
+            dataset=named, trainable_config=policy.config, **read
+        )
         self._dataset: Any = factory.make_dataset(options)
         policy.config.match_dataset(self._dataset.meta)
         self.rows = torch.arange(len(self._dataset))
         if IS_SIM in features:
-            is_sim = torch.as_tensor(self._dataset.hf_dataset.data.column(IS_SIM).to_numpy().astype("float32"))
+            is_sim = torch.as_tensor(
+                self._dataset.hf_dataset.data.column(IS_SIM)
+                .to_numpy()
+                .astype("float32")
+            )
             self.rows = torch.nonzero(is_sim.reshape(-1) < 0.5)[:, 0]
             if not len(self.rows):
-                raise TaccorlError(f"--anchor.dataset={root}: all of its rows are simulated ({IS_SIM})")
-        fixed = self._draw(_FIXED_BATCHES * settings.batch_size, torch.Generator().manual_seed(0))
+                raise TaccorlError(
+                    f"--anchor.dataset={root}: all of its rows are simulated ({IS_SIM})"
+                )
+        fixed = self._draw(
+            _FIXED_BATCHES * settings.batch_size, torch.Generator().manual_seed(0)
+        )
         # Frames that are missing are noticed now, not after hours of rollouts.
-        self._fixed = [preprocessor(self._batch(part)) for part in fixed.split(settings.batch_size)]
+        self._fixed = [
+            preprocessor(self._batch(part)) for part in fixed.split(settings.batch_size)
+        ]
         _log.info("anchor: %d rows of %s", len(self.rows), root)
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
@@ -82,7 +110,9 @@ class RealAnchor:
         self._policy.train()
         loss = 0.0
         for part in rows.split(micro_batch):
-            share = self._policy.forward(self._preprocessor(self._batch(part)))[0] * (len(part) / len(rows))
+            share = self._policy.forward(self._preprocessor(self._batch(part)))[0] * (
+                len(part) / len(rows)
+            )
             (self._settings.weight * share).backward()
             loss += float(share.detach())
         self._policy.eval()
@@ -99,7 +129,9 @@ class RealAnchor:
         return sum(losses) / len(losses)
 
     def _draw(self, num_rows: int, generator: torch.Generator) -> Tensor:
-        return self.rows[torch.randint(len(self.rows), (num_rows,), generator=generator)]
+        return self.rows[
+            torch.randint(len(self.rows), (num_rows,), generator=generator)
+        ]
 
     def _batch(self, rows: Tensor) -> dict[str, Any]:
         batch = default_collate(self._dataset.__getitems__(rows.tolist()))

@@ -31,7 +31,15 @@ _TRAIN_CONFIG = "train_config.json"  # lerobot-train's; names the dataset that t
 _TREE = "state"  # metadata of the file: JSON of everything but the tensors
 
 
-def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict[str, Any], *, is_best: bool) -> None:
+def save(
+    out: Path,
+    iteration: int,
+    opened: Checkpoint,
+    policy: Any,
+    state: dict[str, Any],
+    *,
+    is_best: bool,
+) -> None:
     """Write ``checkpoints/<iteration>``.
 
     Args:
@@ -58,7 +66,9 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     except (OSError, RuntimeError, SafetensorError) as error:
         shutil.rmtree(unfinished, ignore_errors=True)
         why = f"cannot be written ({str(error).splitlines()[0]}): is the disk full? Earlier checkpoints are complete"
-        raise TaccorlError(f"{folder}: {why}; free space and continue: --resume=true") from error
+        raise TaccorlError(
+            f"{folder}: {why}; free space and continue: --resume=true"
+        ) from error
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
     for name in (BEST, LAST) if is_best else (LAST,):
@@ -101,33 +111,64 @@ def load_state(policy_path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, framework="pt") as file:
             return _with_tensors(json.loads(file.metadata()[_TREE]), file)
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (
+        OSError,
+        SafetensorError,
+        ValueError,
+        KeyError,
+        TypeError,
+        RecursionError,
+    ) as error:
         why = f"cannot be read ({' '.join(str(error).split()) or type(error).__name__})"
         if not path.exists():
             old = path.with_name("state.pt").exists()
-            why = "does not exist" + (": an earlier taccorl pickled it, and nothing is unpickled" if old else "")
+            why = "does not exist" + (
+                ": an earlier taccorl pickled it, and nothing is unpickled"
+                if old
+                else ""
+            )
         way = f"start a new run from its policy, --policy.path={policy_path}"
-        raise TaccorlError(f"{path}: {why}; {way}, or link checkpoints/{LAST} to an earlier checkpoint") from error
+        raise TaccorlError(
+            f"{path}: {why}; {way}, or link checkpoints/{LAST} to an earlier checkpoint"
+        ) from error
 
 
 def _without_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
     """JSON of ``value``, with the names of its tensors and arrays, which are put into ``tensors``. A container or tensor is the
     object {kind: content}, so that an int stays an int as a key, and a tuple a tuple."""
     if isinstance(value, np.ndarray) and value.dtype == object:  # names and None
-        return {"objects": [list(value.shape), [_without_tensors(part, tensors) for part in value.flat]]}
+        return {
+            "objects": [
+                list(value.shape),
+                [_without_tensors(part, tensors) for part in value.flat],
+            ]
+        }
     if isinstance(value, Tensor | np.ndarray):
         name = str(len(tensors))
         is_tensor = isinstance(value, Tensor)
-        tensor = value.detach().to("cpu", copy=True) if is_tensor else torch.from_numpy(value.copy())
+        tensor = (
+            value.detach().to("cpu", copy=True)
+            if is_tensor
+            else torch.from_numpy(value.copy())
+        )
         tensors[name] = tensor.contiguous()
         return {"tensor" if is_tensor else "array": name}
     if isinstance(value, dict):
-        return {"dict": [[_without_tensors(part, tensors) for part in item] for item in value.items()]}
+        return {
+            "dict": [
+                [_without_tensors(part, tensors) for part in item]
+                for item in value.items()
+            ]
+        }
     if isinstance(value, list | tuple):
-        return {type(value).__name__: [_without_tensors(part, tensors) for part in value]}
+        return {
+            type(value).__name__: [_without_tensors(part, tensors) for part in value]
+        }
     if value is None or isinstance(value, int | float | str):
         return value
-    raise TypeError(f"a checkpoint's state holds a {type(value).__name__}, which has no form in JSON")
+    raise TypeError(
+        f"a checkpoint's state holds a {type(value).__name__}, which has no form in JSON"
+    )
 
 
 def _with_tensors(tree: Any, file: Any) -> Any:
@@ -139,9 +180,13 @@ def _with_tensors(tree: Any, file: Any) -> Any:
         tensor = file.get_tensor(content)
         return tensor if kind == "tensor" else tensor.numpy()
     if kind == "objects":
-        return np.fromiter((_with_tensors(part, file) for part in content[1]), dtype=object).reshape(content[0])
+        return np.fromiter(
+            (_with_tensors(part, file) for part in content[1]), dtype=object
+        ).reshape(content[0])
     if kind == "dict":
-        return {_with_tensors(key, file): _with_tensors(part, file) for key, part in content}
+        return {
+            _with_tensors(key, file): _with_tensors(part, file) for key, part in content
+        }
     parts = [_with_tensors(part, file) for part in content]
     return tuple(parts) if kind == "tuple" else parts
 

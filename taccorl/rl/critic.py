@@ -22,7 +22,12 @@ class Critic(nn.Module):
     square_P: Tensor
     count: Tensor
 
-    def __init__(self, num_features: int, num_privileged: int = 0, hidden: tuple[int, ...] = _HIDDEN) -> None:
+    def __init__(
+        self,
+        num_features: int,
+        num_privileged: int = 0,
+        hidden: tuple[int, ...] = _HIDDEN,
+    ) -> None:
         super().__init__()
         layers, width = list[nn.Module](), num_features + num_privileged
         for next_width in hidden:
@@ -33,7 +38,9 @@ class Critic(nn.Module):
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(*layers, last)
         self.register_buffer("mean_P", torch.zeros(num_privileged))
-        self.register_buffer("square_P", torch.zeros(num_privileged))  # sum of squared distances from the mean
+        self.register_buffer(
+            "square_P", torch.zeros(num_privileged)
+        )  # sum of squared distances from the mean
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()

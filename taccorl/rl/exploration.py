@@ -36,7 +36,12 @@ class Noise(NamedTuple):
 
 
 def measure_noise(
-    actor: FlowPolicy, sde: FlowSDE, batch: Batch, postprocess: Processor, robot: RobotConfig, seed: int
+    actor: FlowPolicy,
+    sde: FlowSDE,
+    batch: Batch,
+    postprocess: Processor,
+    robot: RobotConfig,
+    seed: int,
 ) -> list[Noise]:
     """Measure the noise of each denoising step (one stochastic step per decision), or give one entry with step −1 (all steps
     stochastic).
@@ -46,7 +51,9 @@ def measure_noise(
         postprocess: the policy's postprocessor: actions (B, n, A) → targets [rad, m].
         robot: the twin's robot, for the kinematics of the arms.
     """
-    draws = actor.draw(len(next(iter(batch.values()))), sde, torch.Generator().manual_seed(seed))
+    draws = actor.draw(
+        len(next(iter(batch.values()))), sde, torch.Generator().manual_seed(seed)
+    )
 
     def targets(step_BS: Tensor) -> Tensor:
         """(B, n, A) [rad, m]."""
@@ -57,10 +64,15 @@ def measure_noise(
     if sde.num_stochastic > 1:
         return [noise_of_targets(-1, robot, plain_BnA, targets(draws.step_BS))]
     noisy = [targets(torch.full_like(draws.step_BS, k)) for k in range(sde.num_steps)]
-    return [noise_of_targets(k, robot, plain_BnA, noisy_BnA) for k, noisy_BnA in enumerate(noisy)]
+    return [
+        noise_of_targets(k, robot, plain_BnA, noisy_BnA)
+        for k, noisy_BnA in enumerate(noisy)
+    ]
 
 
-def noise_of_targets(step: int, robot: RobotConfig, plain_BnA: Tensor, noisy_BnA: Tensor) -> Noise:
+def noise_of_targets(
+    step: int, robot: RobotConfig, plain_BnA: Tensor, noisy_BnA: Tensor
+) -> Noise:
     """Compare targets with and without noise, (B, n, A) float64 each [rad, m]; ``step`` is that of ``Noise``."""
     chains = torch.tensor(arm_chains(robot), dtype=torch.float64)
 
@@ -72,7 +84,16 @@ def noise_of_targets(step: int, robot: RobotConfig, plain_BnA: Tensor, noisy_BnA
     def rms(x: Tensor) -> float:
         return float((x**2).mean().sqrt())
 
-    noise, shift_mm = noisy_BnA - plain_BnA, 1e3 * (hands_m(noisy_BnA) - hands_m(plain_BnA))
-    joints, grippers = (noise[:, :, list(indices)] for indices in (ROBOT.joint_indices, ROBOT.gripper_indices))
-    hand_mm, offset_mm = rms(shift_mm.norm(dim=-1)), rms(shift_mm.mean(dim=2).norm(dim=-1))
+    noise, shift_mm = (
+        noisy_BnA - plain_BnA,
+        1e3 * (hands_m(noisy_BnA) - hands_m(plain_BnA)),
+    )
+    joints, grippers = (
+        noise[:, :, list(indices)]
+        for indices in (ROBOT.joint_indices, ROBOT.gripper_indices)
+    )
+    hand_mm, offset_mm = (
+        rms(shift_mm.norm(dim=-1)),
+        rms(shift_mm.mean(dim=2).norm(dim=-1)),
+    )
     return Noise(step, rms(joints), hand_mm, offset_mm, 1e3 * rms(grippers))

@@ -60,7 +60,9 @@ class FlowSDE:
 
     def __init__(self, settings: FlowSDESettings) -> None:
         self.num_steps, self.level = settings.num_steps, settings.level
-        self.num_stochastic = settings.num_steps if settings.stochastic_steps == "all" else 1
+        self.num_stochastic = (
+            settings.num_steps if settings.stochastic_steps == "all" else 1
+        )
         # Same operations, in the same order, as lerobot.policies.common.flow_matching.euler_integrate: results are bit-identical.
         self.dt = -1.0 / self.num_steps
         self.times = [1.0 + k * self.dt for k in range(self.num_steps)]
@@ -69,9 +71,18 @@ class FlowSDE:
     def stds(self) -> list[float]:
         """Standard deviation s_k of the noise of each of the K denoising steps, in normalised actions."""
         rest = [1 - t if t < 1 else -self.dt for t in self.times]
-        return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
+        return [
+            self.level * math.sqrt(-self.dt * t / r)
+            for t, r in zip(self.times, rest, strict=True)
+        ]
 
-    def draw(self, num_rows: int, shape: tuple[int, ...], generator: torch.Generator, device: Any = "cpu") -> Draws:
+    def draw(
+        self,
+        num_rows: int,
+        shape: tuple[int, ...],
+        generator: torch.Generator,
+        device: Any = "cpu",
+    ) -> Draws:
         """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), with ``generator`` on the CPU, so that they are
         the same for every device, and move them to ``device``."""
         initial = torch.randn(num_rows, *shape, generator=generator)
@@ -83,27 +94,41 @@ class FlowSDE:
             step = torch.full_like(step, -1)
         return Draws(initial.to(device), noise.to(device), step.to(device))
 
-    def mean(self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
+    def mean(
+        self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return mean (B, H, D) and standard deviation (B, 1, 1) of a chunk after one denoising step, in normalised actions.
 
         ``x_BHD`` is the chunk before the step, ``v_BHD`` its velocity, ``k_B`` the index of the step for each chunk, from 0.
         Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply."""
-        t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
-        std = torch.tensor(self.stds, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
+        t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][
+            :, None, None
+        ]
+        std = torch.tensor(self.stds, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][
+            :, None, None
+        ]
         euler_BHD = x_BHD + self.dt * v_BHD
         noise_hat_BHD = x_BHD + (1 - t) * v_BHD
-        return torch.where(noisy_BHD, euler_BHD - std**2 / (2 * t) * noise_hat_BHD, euler_BHD), std
+        return torch.where(
+            noisy_BHD, euler_BHD - std**2 / (2 * t) * noise_hat_BHD, euler_BHD
+        ), std
 
     def sample(self, velocity: Velocity, draws: Draws, scored_HD: Tensor) -> Sampled:
         """Sample chunks: denoise ``draws.initial_BHD`` with the stochastic steps of ``draws``. ``scored_HD`` (bool) marks the
         numbers of a chunk that get noise and count in the log-probability."""
         x, step_BS = draws.initial_BHD, draws.step_BS
-        before, after = torch.zeros_like(draws.noise_BSHD), torch.zeros_like(draws.noise_BSHD)
+        before, after = (
+            torch.zeros_like(draws.noise_BSHD),
+            torch.zeros_like(draws.noise_BSHD),
+        )
         log_prob_B = x.new_zeros(len(x))
         for k in range(self.num_steps):
             s = k if self.num_stochastic > 1 else 0
             is_noisy_B11 = (step_BS[:, s] == k)[:, None, None]
-            noisy_BHD, k_B = is_noisy_B11 & scored_HD, torch.full((len(x),), k, device=x.device)
+            noisy_BHD, k_B = (
+                is_noisy_B11 & scored_HD,
+                torch.full((len(x),), k, device=x.device),
+            )
             mean, std = self._step(velocity, x, k_B, noisy_BHD)
             new = torch.where(noisy_BHD, mean + std * draws.noise_BSHD[:, s], mean)
             before[:, s] = torch.where(is_noisy_B11, x, before[:, s])
@@ -113,7 +138,12 @@ class FlowSDE:
         return Sampled(x, before, after, log_prob_B)
 
     def log_prob(
-        self, velocity: Velocity, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor, scored_HD: Tensor
+        self,
+        velocity: Velocity,
+        before_BSHD: Tensor,
+        after_BSHD: Tensor,
+        step_BS: Tensor,
+        scored_HD: Tensor,
     ) -> Tensor:
         """(B,) log-density of stored stochastic steps, summed over steps and scored numbers; differentiable in ``velocity``."""
         total_B = before_BSHD.new_zeros(len(before_BSHD))
@@ -124,12 +154,16 @@ class FlowSDE:
             total_B = total_B + _log_density(after_BSHD[:, s], mean, std, noisy_BHD)
         return total_B
 
-    def _step(self, velocity: Velocity, x_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
+    def _step(
+        self, velocity: Velocity, x_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor
+    ) -> tuple[Tensor, Tensor]:
         t_B = torch.tensor(self.times, dtype=torch.float32, device=k_B.device)[k_B]
         return self.mean(x_BHD, velocity(x_BHD, t_B), k_B, noisy_BHD)
 
 
-def _log_density(x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor) -> Tensor:
+def _log_density(
+    x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor
+) -> Tensor:
     """(B,) sum of Gaussian log-densities of what is counted."""
     std = std.clamp(min=torch.finfo(x_BHD.dtype).tiny)  # level 0: nothing is counted
     z = (x_BHD - mean_BHD) / std

@@ -55,7 +55,11 @@ SaveEpisode = Callable[[Episode, Path], None]
 """Function that writes an episode as a file at a path."""
 
 
-def post_train(settings: PostTrainSettings, report: Report = print, save_episode: SaveEpisode | None = None) -> Path:
+def post_train(
+    settings: PostTrainSettings,
+    report: Report = print,
+    save_episode: SaveEpisode | None = None,
+) -> Path:
     """Run all iterations; returns the policy's folder of the last checkpoint. ``save_episode``: function that writes an episode
     of the rollouts as a file, such as ``views.episode.save_episode``. Raises TaccorlError: the policy, dataset, twin or
     folder does not fit, or GPU memory is exhausted."""
@@ -66,14 +70,21 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
     except torch.OutOfMemoryError as error:
         batch, num = settings.ppo.micro_batch, settings.env.num_envs
         way = f"Lower --ppo.micro_batch={batch} (results do not change), --env.num_envs={num} or the policy's image_resolution"
-        raise TaccorlError(f"post-training: out of GPU memory: {str(error).splitlines()[0]} {way}") from error
+        raise TaccorlError(
+            f"post-training: out of GPU memory: {str(error).splitlines()[0]} {way}"
+        ) from error
     return checkpoint.policy_folder(settings.out)
 
 
 class PostTraining:
     """One run of post-training: policy, environments, optimisers, checkpoints, and the loop of rollouts and updates."""
 
-    def __init__(self, settings: PostTrainSettings, report: Report, save_episode: SaveEpisode | None = None) -> None:
+    def __init__(
+        self,
+        settings: PostTrainSettings,
+        report: Report,
+        save_episode: SaveEpisode | None = None,
+    ) -> None:
         """Raises TaccorlError: as ``post_train``."""
         self.settings, self._report, self._save_episode = settings, report, save_episode
         _check_folder(settings)
@@ -81,9 +92,13 @@ class PostTraining:
         self._opened = _open(settings, twin)
         policy: Any = self._opened.load(settings.seed).policy
         torch.backends.cudnn.benchmark = False  # numbers of rows vary with the episodes that end; each would be tuned
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = settings.policy.tf32
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = (
+            settings.policy.tf32
+        )
         device = torch.device(str(policy.config.device))
-        self._actor = TactileFlowPolicy(policy, settings.policy, settings.noise.num_steps)
+        self._actor = TactileFlowPolicy(
+            policy, settings.policy, settings.noise.num_steps
+        )
         self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
         self._generator = torch.Generator().manual_seed(settings.seed)
         pictures = None
@@ -91,12 +106,20 @@ class PostTraining:
             pictures = ScenePictures.of_policy(policy.config)
             report(f"pictures of the rollouts: {pictures.config}")
         elif settings.env.pictures == "randomised":
-            report("note: --env.pictures=randomised has no effect: the policy uses no cameras")
-        self.world = TwinWorld(_shards(settings, twin, policy.config), self._opened, self._clock, pictures)
+            report(
+                "note: --env.pictures=randomised has no effect: the policy uses no cameras"
+            )
+        self.world = TwinWorld(
+            _shards(settings, twin, policy.config), self._opened, self._clock, pictures
+        )
         self.world.restart(settings.seed)
-        critic = Critic(self._actor.num_features, self.world.observe().privileged_NP.shape[1]).to(device)
+        critic = Critic(
+            self._actor.num_features, self.world.observe().privileged_NP.shape[1]
+        ).to(device)
         self._anchor = (
-            RealAnchor(settings.anchor, policy, self._opened.preprocessor) if settings.anchor.dataset else None
+            RealAnchor(settings.anchor, policy, self._opened.preprocessor)
+            if settings.anchor.dataset
+            else None
         )
         anchor = self._anchor if settings.anchor.weight > 0 else None
         self._ppo = PPO(self._actor, critic, self._sde, settings.ppo, anchor)
@@ -106,7 +129,9 @@ class PostTraining:
         self._recent: list[tuple[float, int]] = []
         """Success rate and number of episodes of the iterations, since the start or a collapse, in which episodes ended."""
         self._watch, self._wants_rerun = EpisodeWatch(), True
-        self._episode_decisions = math.ceil(self.world.limit_steps / policy.config.n_action_steps)
+        self._episode_decisions = math.ceil(
+            self.world.limit_steps / policy.config.n_action_steps
+        )
         """Decisions of an episode at its time limit."""
         if settings.resume and checkpoint.exists(settings.out):
             state = checkpoint.load_state(self._opened.path)
@@ -114,7 +139,13 @@ class PostTraining:
                 self._resume(state)
             except torch.OutOfMemoryError:
                 raise
-            except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            except (
+                LookupError,
+                TypeError,
+                ValueError,
+                AttributeError,
+                RuntimeError,
+            ) as error:
                 said = f"{type(error).__name__}: {' '.join(str(error).split())}"
                 raise TaccorlError(
                     f"--resume=true: the state in {self._opened.path.parent} does not fit: {said}"
@@ -130,17 +161,27 @@ class PostTraining:
         run_settings.write(self.settings)
         (out / PROGRESS).write_text("")
         num = sum(p.numel() for p in self._actor.trained_parameters())
-        self._report(f"post-training {self.settings.policy.path}: {num / 1e6:.2f} million weights are trained")
+        self._report(
+            f"post-training {self.settings.policy.path}: {num / 1e6:.2f} million weights are trained"
+        )
         if self._anchor is not None:
-            self._report(f"flow loss on fixed rows of {self.settings.anchor.dataset}: {self._anchor.drift():.4f}")
+            self._report(
+                f"flow loss on fixed rows of {self.settings.anchor.dataset}: {self._anchor.drift():.4f}"
+            )
         if self._sde.level > 0:
             self._report_noise(twin)
             if self.settings.noise_check:
                 self._check_noise()
 
     def _report_noise(self, twin: TwinConfig) -> None:
-        batch, postprocess, seed = self.world.observe().batch, self._opened.postprocessor, self.settings.seed
-        for one in measure_noise(self._actor, self._sde, batch, postprocess, twin.robot, seed):
+        batch, postprocess, seed = (
+            self.world.observe().batch,
+            self._opened.postprocessor,
+            self.settings.seed,
+        )
+        for one in measure_noise(
+            self._actor, self._sde, batch, postprocess, twin.robot, seed
+        ):
             self._report(
                 f"noise of level {self._sde.level:g} in {'all steps' if one.step < 0 else f'step {one.step}'}: "
                 f"joints {1e3 * one.joints_rad:.2f} mrad, hand {one.hand_mm:.2f} mm and {one.offset_mm:.2f} mm in the mean of a "
@@ -153,7 +194,9 @@ class PostTraining:
         for sde in (FlowSDE(dataclasses.replace(settings.noise, level=0.0)), self._sde):
             self.world.restart(settings.seed + _CHECK_SEED)
             generator = torch.Generator().manual_seed(settings.seed)
-            found = first_episodes(self.world, self._actor, sde, generator, self._episode_decisions)
+            found = first_episodes(
+                self.world, self._actor, sde, generator, self._episode_decisions
+            )
             rates.append(found.count(SUCCESS) / len(found))
         self.world.restart(settings.seed)
         self._clock.restart()
@@ -164,14 +207,23 @@ class PostTraining:
 
     def _resume(self, state: dict[str, Any]) -> None:
         settings = self.settings
-        progress, kept = settings.out / PROGRESS, _progress_until(settings.out / PROGRESS, state["iteration"])
+        progress, kept = (
+            settings.out / PROGRESS,
+            _progress_until(settings.out / PROGRESS, state["iteration"]),
+        )
         self._ppo.load_state_dict(state["ppo"])
         self.world.load_state_dict(state["world"])
         vars(self._watch).update(state["world"]["watch"])
         self._generator.set_state(state["generator"])
-        self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
+        self._iteration, self._best, self._recent = (
+            state["iteration"],
+            state["best"],
+            list(state["recent"]),
+        )
         if self._iteration > settings.iterations:
-            raise TaccorlError(f"--iterations={settings.iterations}: {self._iteration} are completed in {settings.out}")
+            raise TaccorlError(
+                f"--iterations={settings.iterations}: {self._iteration} are completed in {settings.out}"
+            )
         progress.write_text(kept, encoding="utf-8")
         run_settings.write(settings)  # with other iterations, perhaps
         self._report(f"resumed at iteration {self._iteration} of {settings.iterations}")
@@ -181,32 +233,53 @@ class PostTraining:
         """Run the remaining iterations."""
         settings, ppo, log = self.settings, self._ppo, _logger(self.settings)
         while self._iteration < settings.iterations:
-            rollout = collect(self.world, ppo, settings.env.decisions, self._generator, self._watch.see)
+            rollout = collect(
+                self.world,
+                ppo,
+                settings.env.decisions,
+                self._generator,
+                self._watch.see,
+            )
             with self._clock.part("update"):
                 facts = ppo.update(rollout.decisions, self._generator)
             if self._anchor is not None:
                 with self._clock.part("drift"):
                     facts["drift"] = self._anchor.drift()
             self._iteration += 1
-            row: dict[str, Any] = {"iteration": self._iteration, "decisions": self._iteration * len(rollout.decisions)}
+            row: dict[str, Any] = {
+                "iteration": self._iteration,
+                "decisions": self._iteration * len(rollout.decisions),
+            }
             seconds = {name: round(s, 3) for name, s in self._clock.restart().items()}
             row |= rollout.facts | facts | {"seconds": seconds}
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             log(row)
             self._report(_line(row))
-            if row["undone_steps"] and row["actor_steps"] == 1 and not settings.ppo.adapt_lr:
+            if (
+                row["undone_steps"]
+                and row["actor_steps"] == 1
+                and not settings.ppo.adapt_lr
+            ):
                 undone = f"the first step at --ppo.actor_lr={row['actor_lr']:g} was undone, as KL > --ppo.kl_stop: no learning"
-                self._report(f"warning: {undone}. Lower it, or begin with --ppo.adapt_lr=true")
+                self._report(
+                    f"warning: {undone}. Lower it, or begin with --ppo.adapt_lr=true"
+                )
             self._remember(row)
             self._guard_collapse()
             self._write_rerun()
-            if self._iteration % settings.save_freq == 0 or self._iteration == settings.iterations:
+            if (
+                self._iteration % settings.save_freq == 0
+                or self._iteration == settings.iterations
+            ):
                 self._save()
 
     def _remember(self, row: dict[str, Any]) -> None:
         """Keep the success of an iteration; not of the first ones, in which only short episodes can have ended."""
-        if row["episodes"] and self._iteration * self.settings.env.decisions >= self._episode_decisions:
+        if (
+            row["episodes"]
+            and self._iteration * self.settings.env.decisions >= self._episode_decisions
+        ):
             self._recent.append((row["success"], row["episodes"]))
 
     def _write_rerun(self) -> None:
@@ -224,7 +297,12 @@ class PostTraining:
         try:
             with self._clock.part("rerun"):
                 rrd.parent.mkdir(exist_ok=True)
-                self._save_episode(executed_again(watched, scenes, name, images=needs_images(self._opened.config)), rrd)
+                self._save_episode(
+                    executed_again(
+                        watched, scenes, name, images=needs_images(self._opened.config)
+                    ),
+                    rrd,
+                )
         except TaccorlError as error:  # a run goes on without a file to look at
             self._report(f"warning: no {rrd}: {error}")
         self._wants_rerun = False
@@ -232,7 +310,9 @@ class PostTraining:
     def _save(self) -> None:
         self._watch.ended, self._wants_rerun = None, True
         recent = self._recent[-self.settings.save_freq :]
-        score = sum(success * num for success, num in recent) / max(1, sum(num for _, num in recent))
+        score = sum(success * num for success, num in recent) / max(
+            1, sum(num for _, num in recent)
+        )
         is_best, self._best = score > self._best, max(score, self._best)
         state = {
             "ppo": self._ppo.state_dict(),
@@ -243,7 +323,14 @@ class PostTraining:
             "best": self._best,
             "recent": self._recent,
         }
-        checkpoint.save(self.settings.out, self._iteration, self._opened, self._actor.policy, state, is_best=is_best)
+        checkpoint.save(
+            self.settings.out,
+            self._iteration,
+            self._opened,
+            self._actor.policy,
+            state,
+            is_best=is_best,
+        )
         if self.settings.keep_checkpoints:
             checkpoint.prune(self.settings.out, self.settings.keep_checkpoints)
 
@@ -251,12 +338,22 @@ class PostTraining:
         """Go back to the best checkpoint, with half of the learning rate, if success has fallen by half for long."""
         count = self.settings.collapse_iterations
         last = self._recent[-count:]
-        if not count or len(last) < count or self._best == 0 or max(success for success, _ in last) >= 0.5 * self._best:
+        if (
+            not count
+            or len(last) < count
+            or self._best == 0
+            or max(success for success, _ in last) >= 0.5 * self._best
+        ):
             return
         folder = self.settings.out / "checkpoints" / checkpoint.BEST / checkpoint.POLICY
         load_checkpoint(self._actor.policy, str(folder))
         lr = 0.5 * self._ppo.actor_lr
-        self._ppo.load_state_dict({**checkpoint.load_state(folder)["ppo"], "num_updates": self._ppo.num_updates})
+        self._ppo.load_state_dict(
+            {
+                **checkpoint.load_state(folder)["ppo"],
+                "num_updates": self._ppo.num_updates,
+            }
+        )
         self._ppo.actor_lr, self._recent = lr, []
         fallen = f"success was below half of the best ({self._best:.1%}) for {count} iterations"
         self._report(
@@ -269,15 +366,24 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
     resumed = settings.resume and checkpoint.exists(settings.out)
     path = checkpoint.policy_folder(settings.out) if resumed else settings.policy.path
     if path is None:
-        raise TaccorlError("missing --policy.path=…/pretrained_model, a checkpoint of tactile_pi05")
+        raise TaccorlError(
+            "missing --policy.path=…/pretrained_model, a checkpoint of tactile_pi05"
+        )
     opened = open_checkpoint(path, settings.policy.device)
     config: Any = opened.config
     if config.type != "tactile_pi05":
-        raise TaccorlError(f"--policy.path={path}: is of type {config.type}; post-training supports only tactile_pi05")
-    config.pretrained_path = settings.policy.path  # where the run began, also after it was resumed
+        raise TaccorlError(
+            f"--policy.path={path}: is of type {config.type}; post-training supports only tactile_pi05"
+        )
+    config.pretrained_path = (
+        settings.policy.path
+    )  # where the run began, also after it was resumed
     config.dtype = "float32"  # a step of 5e-6 is lost in bfloat16
     tasks = [] if settings.env.task is None else [settings.env.task]
-    refuse_differences(preflight(opened.facts(), twin, tasks=tasks, pictures=settings.env.pictures), str(path))
+    refuse_differences(
+        preflight(opened.facts(), twin, tasks=tasks, pictures=settings.env.pictures),
+        str(path),
+    )
     return opened
 
 
@@ -315,7 +421,10 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             return RayShard(ray, make, envs["num_threads"])
         return ProcessShard(make) if env.shards > 1 else LocalShard(make)
 
-    return [shard(numbers) for numbers in np.array_split(np.arange(env.num_envs), env.shards)]
+    return [
+        shard(numbers)
+        for numbers in np.array_split(np.arange(env.num_envs), env.shards)
+    ]
 
 
 def _check_folder(settings: PostTrainSettings) -> None:
@@ -324,24 +433,35 @@ def _check_folder(settings: PostTrainSettings) -> None:
         run_settings.refuse_changes(settings)
         return
     if settings.anchor.weight > 0 and settings.anchor.dataset is None:
-        raise TaccorlError("missing --anchor.dataset=…, real demonstrations; without an anchor: --anchor.weight=0")
+        raise TaccorlError(
+            "missing --anchor.dataset=…, real demonstrations; without an anchor: --anchor.weight=0"
+        )
     run_settings.remove_unfinished(settings.out)
     if not is_free(settings.out):
-        raise TaccorlError(f"--out={settings.out}: holds files already: give another folder, or --resume=true to go on")
+        raise TaccorlError(
+            f"--out={settings.out}: holds files already: give another folder, or --resume=true to go on"
+        )
 
 
 def _progress_until(path: Path, iteration: int) -> str:
     """Lines of ``progress.jsonl`` up to ``iteration``; later ones have no checkpoint, and the last may be torn. Raises
     TaccorlError: one of them is not that of an iteration."""
     kept, done = "", 0
-    for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else [], 1):
+    for number, line in enumerate(
+        path.read_bytes().splitlines() if path.is_file() else [], 1
+    ):
         try:
-            if done == iteration or (done := int(json.loads(line)["iteration"])) > iteration:
+            if (
+                done == iteration
+                or (done := int(json.loads(line)["iteration"])) > iteration
+            ):
                 break
             kept += line.decode() + "\n"
         except (ValueError, LookupError, TypeError, RecursionError) as error:
             way = "correct it from a copy, or remove the file: only the curve is lost"
-            raise TaccorlError(f"--resume=true: {path}, line {number}: is damaged ({error}); {way}") from error
+            raise TaccorlError(
+                f"--resume=true: {path}, line {number}: is damaged ({error}); {way}"
+            ) from error
     return kept
 
 
@@ -357,7 +477,10 @@ def _logger(settings: PostTrainSettings) -> Callable[[dict[str, Any]], None]:
         resume="allow", project=asked.project, entity=asked.entity, mode=asked.mode,  # type: ignore[arg-type]
         name=out.name, dir=out, job_type="post-train", config=run_settings.to_json(settings),
     )  # fmt: skip
-    return lambda row: run.log({name: value for name, value in row.items() if value is not None}, step=row["iteration"])
+    return lambda row: run.log(
+        {name: value for name, value in row.items() if value is not None},
+        step=row["iteration"],
+    )
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -365,13 +488,17 @@ def _line(row: dict[str, Any]) -> str:
     if row["episodes"]:
         parts = [f"success {row['success']:.1%} of {row['episodes']} episodes"]
     if "later_episodes" in row:
-        parts[0] += f" ({row['later_success']:.1%} of {row['later_episodes']:.0f} begun in earlier states)"
+        parts[0] += (
+            f" ({row['later_success']:.1%} of {row['later_episodes']:.0f} begun in earlier states)"
+        )
     parts.append(f"explained variance {row['explained_variance']:.2f}")
     if "kl" in row:
         parts += [f"KL {row['last_kl']:.4f}", f"clipped {row['clip_fraction']:.1%}"]
     names = {"anchor_loss": "anchor", "drift": "flow loss on fixed real rows"}
     parts += [f"{text} {row[name]:.4f}" for name, text in names.items() if name in row]
     if row["undone_steps"]:
-        parts.append(f"{row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}")
+        parts.append(
+            f"{row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}"
+        )
     seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
     return f"iteration {row['iteration']}: {', '.join(parts)}; seconds: {seconds}"

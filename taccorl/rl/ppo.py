@@ -77,11 +77,24 @@ class PPO:
     round too coarsely for it (TF32)."""
 
     def __init__(
-        self, actor: FlowPolicy, critic: Critic, sde: FlowSDE, settings: PPOSettings, anchor: Anchor | None = None
+        self,
+        actor: FlowPolicy,
+        critic: Critic,
+        sde: FlowSDE,
+        settings: PPOSettings,
+        anchor: Anchor | None = None,
     ) -> None:
-        self.actor, self.critic, self.sde, self.settings, self.anchor = actor, critic, sde, settings, anchor
+        self.actor, self.critic, self.sde, self.settings, self.anchor = (
+            actor,
+            critic,
+            sde,
+            settings,
+            anchor,
+        )
         self.actor_optimizer = self._adam(actor.trained_parameters(), settings.actor_lr)
-        self.critic_optimizer = self._adam(list(critic.parameters()), settings.critic_lr)
+        self.critic_optimizer = self._adam(
+            list(critic.parameters()), settings.critic_lr
+        )
         self._before: Any = None
         """Copies of the actor's weights and of its optimiser's state from before the last step."""
         self.num_updates = 0
@@ -97,9 +110,13 @@ class PPO:
         self.actor_optimizer.param_groups[0]["lr"] = value
 
     def _adam(self, parameters: Sequence[nn.Parameter], lr: float) -> torch.optim.AdamW:
-        return torch.optim.AdamW(parameters, lr, betas=(0.9, 0.95), weight_decay=self.settings.weight_decay)
+        return torch.optim.AdamW(
+            parameters, lr, betas=(0.9, 0.95), weight_decay=self.settings.weight_decay
+        )
 
-    def update(self, decisions: Decisions, generator: torch.Generator) -> dict[str, float]:
+    def update(
+        self, decisions: Decisions, generator: torch.Generator
+    ) -> dict[str, float]:
         """Train on a rollout; each decision is used once in each epoch.
 
         Args:
@@ -112,11 +129,25 @@ class PPO:
         Raises:
             TaccorlError: a first ratio differs from 1 by more than ``ratio_guard``.
         """
-        settings, steps, actor_lr = self.settings, list[dict[str, float]](), self.actor_lr
+        settings, steps, actor_lr = (
+            self.settings,
+            list[dict[str, float]](),
+            self.actor_lr,
+        )
         for _ in range(settings.critic_epochs):
-            steps += [self._critic_step(decisions, rows) for rows in self._minibatches(len(decisions), generator)]
-        counts = {"actor_steps": 0, "skipped_steps": 0, "kl_stopped": 0, "undone_steps": 0}
-        counts["skipped_steps"] += sum(not math.isfinite(step["critic_grad_norm"]) for step in steps)
+            steps += [
+                self._critic_step(decisions, rows)
+                for rows in self._minibatches(len(decisions), generator)
+            ]
+        counts = {
+            "actor_steps": 0,
+            "skipped_steps": 0,
+            "kl_stopped": 0,
+            "undone_steps": 0,
+        }
+        counts["skipped_steps"] += sum(
+            not math.isfinite(step["critic_grad_norm"]) for step in steps
+        )
         if self.num_updates >= settings.critic_warmup:
             decisions = replace(decisions, advantage_M=normalise(decisions.advantage_M))
             actor_steps, last_kl = self._train_actor(decisions, generator, counts)
@@ -127,18 +158,31 @@ class PPO:
         facts: dict[str, list[float]] = {}
         for name, value in (item for step in steps for item in step.items()):
             facts.setdefault(name, []).append(value)
-        return {name: sum(values) / len(values) for name, values in facts.items()} | counts | {"actor_lr": actor_lr}
+        return (
+            {name: sum(values) / len(values) for name, values in facts.items()}
+            | counts
+            | {"actor_lr": actor_lr}
+        )
 
     def _train_actor(
         self, decisions: Decisions, generator: torch.Generator, counts: dict[str, int]
     ) -> tuple[list[dict[str, float]], float]:
         """All epochs, or up to the first step that goes too far. Facts of each minibatch; KL of the policy that remains, as last
         measured."""
-        steps, minibatches, kl, is_new = list[dict[str, float]](), list[Tensor](), 0.0, False
+        steps, minibatches, kl, is_new = (
+            list[dict[str, float]](),
+            list[Tensor](),
+            0.0,
+            False,
+        )
         for _ in range(self.settings.epochs):
             minibatches = self._minibatches(len(decisions), generator)
             for rows in minibatches:
-                steps.append(self._actor_gradient(decisions.rows(rows), generator, is_first=not steps))
+                steps.append(
+                    self._actor_gradient(
+                        decisions.rows(rows), generator, is_first=not steps
+                    )
+                )
                 if self._goes_too_far(steps[-1]["kl"], is_new, counts):
                     return steps, kl
                 kl = steps[-1]["kl"]
@@ -176,38 +220,64 @@ class PPO:
 
     @torch.no_grad()
     def _measure_kl(self, rows: Decisions) -> float:
-        return kl_divergence(torch.cat([self._log_ratios(rows.rows(part)) for part in self._micro_batches(rows)]))
+        return kl_divergence(
+            torch.cat(
+                [
+                    self._log_ratios(rows.rows(part))
+                    for part in self._micro_batches(rows)
+                ]
+            )
+        )
 
     def _adapt_lr(self, last_kl: float, counts: dict[str, int]) -> None:
         """Smaller after a step that was undone, larger after an iteration of small ones."""
         if counts["undone_steps"]:
-            self.actor_lr *= FIRST_STEP_UNDONE if counts["actor_steps"] == 1 else LATER_STEP_UNDONE
-        elif counts["actor_steps"] and not counts["kl_stopped"] and last_kl < SMALL_KL * self.settings.kl_stop:
-            self.actor_lr = max(self.actor_lr, min(SMALL_STEPS * self.actor_lr, MOST_LR * self.settings.actor_lr))
+            self.actor_lr *= (
+                FIRST_STEP_UNDONE if counts["actor_steps"] == 1 else LATER_STEP_UNDONE
+            )
+        elif (
+            counts["actor_steps"]
+            and not counts["kl_stopped"]
+            and last_kl < SMALL_KL * self.settings.kl_stop
+        ):
+            self.actor_lr = max(
+                self.actor_lr,
+                min(SMALL_STEPS * self.actor_lr, MOST_LR * self.settings.actor_lr),
+            )
 
     def _minibatches(self, num: int, generator: torch.Generator) -> list[Tensor]:
         order = torch.randperm(num, generator=generator).to(self.actor.scored_HD.device)
         return list(order.split(self.settings.batch_size))
 
     def _micro_batches(self, rows: Decisions) -> Sequence[Tensor]:
-        return torch.arange(len(rows), device=rows.log_prob_M.device).split(self.settings.micro_batch)
+        return torch.arange(len(rows), device=rows.log_prob_M.device).split(
+            self.settings.micro_batch
+        )
 
     def _critic_step(self, decisions: Decisions, rows: Tensor) -> dict[str, float]:
         self.critic_optimizer.zero_grad()
         values = self.critic(decisions.features_MF[rows], decisions.privileged_MP[rows])
         loss = 0.5 * ((values - decisions.return_M[rows]) ** 2).mean()
         loss.backward()
-        norm = float(nn.utils.clip_grad_norm_(self.critic.parameters(), self.settings.max_grad_norm))
+        norm = float(
+            nn.utils.clip_grad_norm_(
+                self.critic.parameters(), self.settings.max_grad_norm
+            )
+        )
         self._step(self.critic_optimizer, norm)
         return {"critic_loss": float(loss.detach()), "critic_grad_norm": norm}
 
-    def _actor_gradient(self, rows: Decisions, generator: torch.Generator, is_first: bool) -> dict[str, float]:
+    def _actor_gradient(
+        self, rows: Decisions, generator: torch.Generator, is_first: bool
+    ) -> dict[str, float]:
         """Accumulate the gradient of L over micro-batches, then clip it. The advantages are normalised."""
         self.actor_optimizer.zero_grad()
         log_ratios, losses = [], []
         for part in self._micro_batches(rows):
             log_ratio_M = self._log_ratios(rows.rows(part))
-            loss = policy_loss(log_ratio_M, rows.advantage_M[part], self.settings.clip) * (len(part) / len(rows))
+            loss = policy_loss(
+                log_ratio_M, rows.advantage_M[part], self.settings.clip
+            ) * (len(part) / len(rows))
             loss.backward()
             log_ratios.append(log_ratio_M.detach())
             losses.append(loss.detach())
@@ -227,13 +297,21 @@ class PPO:
                     "the policy's weights are float32, and that --policy.tf32=false"
                 )
         if self.anchor is not None:
-            found["anchor_loss"] = self.anchor.backward(generator, self.settings.micro_batch)
+            found["anchor_loss"] = self.anchor.backward(
+                generator, self.settings.micro_batch
+            )
         parameters = self.actor.trained_parameters()
-        return found | {"actor_grad_norm": float(nn.utils.clip_grad_norm_(parameters, self.settings.max_grad_norm))}
+        return found | {
+            "actor_grad_norm": float(
+                nn.utils.clip_grad_norm_(parameters, self.settings.max_grad_norm)
+            )
+        }
 
     def _log_ratios(self, rows: Decisions) -> Tensor:
         """(M,) log π − log π_old."""
-        now_M = self.actor.log_prob(rows.batch, self.sde, rows.before_MSHD, rows.after_MSHD, rows.step_MS)
+        now_M = self.actor.log_prob(
+            rows.batch, self.sde, rows.before_MSHD, rows.after_MSHD, rows.step_MS
+        )
         return now_M - rows.log_prob_M
 
     def _step(self, optimizer: torch.optim.Optimizer, grad_norm: float) -> bool:
@@ -245,7 +323,9 @@ class PPO:
 
     def state_dict(self) -> dict[str, Any]:
         """State of critic, optimisers and counters, without the policy's weights, as ``load_state_dict`` takes it."""
-        return {name: getattr(self, name).state_dict() for name in _PARTS} | {"num_updates": self.num_updates}
+        return {name: getattr(self, name).state_dict() for name in _PARTS} | {
+            "num_updates": self.num_updates
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from ``state_dict``."""
@@ -257,7 +337,9 @@ class PPO:
 def policy_loss(log_ratio_M: Tensor, advantage_M: Tensor, clip: float) -> Tensor:
     """Clipped loss of PPO, L_PPO (a scalar). ``advantage_M`` is normalised; ``clip`` is ε."""
     ratio_M = log_ratio_M.exp()
-    return -torch.minimum(ratio_M * advantage_M, ratio_M.clamp(1 - clip, 1 + clip) * advantage_M).mean()
+    return -torch.minimum(
+        ratio_M * advantage_M, ratio_M.clamp(1 - clip, 1 + clip) * advantage_M
+    ).mean()
 
 
 def kl_divergence(log_ratio_M: Tensor) -> float:

@@ -29,7 +29,11 @@ class Clock:
     """Wall time of the parts of an iteration [s]."""
 
     def __init__(self, device: Any = "cpu") -> None:
-        self._wait = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
+        self._wait = (
+            torch.cuda.synchronize
+            if torch.device(device).type == "cuda"
+            else lambda: None
+        )
         self.seconds = defaultdict[str, float](float)
 
     @contextmanager
@@ -93,7 +97,11 @@ class Rollout:
 
 @torch.no_grad()
 def collect(
-    world: World, learner: PPO, num_decisions: int, generator: torch.Generator, on_acted: OnActed | None = None
+    world: World,
+    learner: PPO,
+    num_decisions: int,
+    generator: torch.Generator,
+    on_acted: OnActed | None = None,
 ) -> Rollout:
     """Make T decisions in every environment, and compute their advantages.
 
@@ -123,27 +131,67 @@ def collect(
         if acted.last is not None and learner.settings.bootstrap_time_limit:
             with clock.part("policy"):
                 late_N = torch.from_numpy(acted.truncated_N).to(value_N.device)
-                last_N[late_N] = critic(actor.features(acted.last.batch), acted.last.privileged_NP)
-        end_N, step_N = acted.terminated_N | acted.truncated_N, draws.step_BS[:, 0].tolist()
-        ended += [(acted.outcome_N[i], acted.began_later_N[i], step_N[i]) for i in np.flatnonzero(end_N)]
+                last_N[late_N] = critic(
+                    actor.features(acted.last.batch), acted.last.privileged_NP
+                )
+        end_N, step_N = (
+            acted.terminated_N | acted.truncated_N,
+            draws.step_BS[:, 0].tolist(),
+        )
+        ended += [
+            (acted.outcome_N[i], acted.began_later_N[i], step_N[i])
+            for i in np.flatnonzero(end_N)
+        ]
         batches.append(seen.batch)
-        before_BSHD, after_BSHD, log_prob_B = sampled.before_BSHD, sampled.after_BSHD, sampled.log_prob_B
-        sampled_parts.append((before_BSHD, after_BSHD, draws.step_BS, log_prob_B, features_NF, seen.privileged_NP))
-        earned.append((value_N, *(torch.from_numpy(x).to(value_N) for x in (acted.reward_N, end_N)), last_N))
+        before_BSHD, after_BSHD, log_prob_B = (
+            sampled.before_BSHD,
+            sampled.after_BSHD,
+            sampled.log_prob_B,
+        )
+        sampled_parts.append(
+            (
+                before_BSHD,
+                after_BSHD,
+                draws.step_BS,
+                log_prob_B,
+                features_NF,
+                seen.privileged_NP,
+            )
+        )
+        earned.append(
+            (
+                value_N,
+                *(torch.from_numpy(x).to(value_N) for x in (acted.reward_N, end_N)),
+                last_N,
+            )
+        )
     seen = world.observe()
     with clock.part("policy"):
         next_N = critic(actor.features(seen.batch), seen.privileged_NP)
-    value_TN, reward_TN, end_TN, last_TN = (torch.stack(x) for x in zip(*earned, strict=True))
-    following_TN = torch.where(end_TN > 0, last_TN, torch.cat([value_TN[1:], next_N[None]]))
-    discounts = {"gamma": learner.settings.gamma, "gae_lambda": learner.settings.gae_lambda}
-    advantage_TN, return_TN = estimate_advantages(reward_TN, value_TN, following_TN, end_TN > 0, **discounts)
+    value_TN, reward_TN, end_TN, last_TN = (
+        torch.stack(x) for x in zip(*earned, strict=True)
+    )
+    following_TN = torch.where(
+        end_TN > 0, last_TN, torch.cat([value_TN[1:], next_N[None]])
+    )
+    discounts = {
+        "gamma": learner.settings.gamma,
+        "gae_lambda": learner.settings.gae_lambda,
+    }
+    advantage_TN, return_TN = estimate_advantages(
+        reward_TN, value_TN, following_TN, end_TN > 0, **discounts
+    )
     decisions = Decisions(
         {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]},
-        *(torch.cat(x) for x in zip(*sampled_parts, strict=True)),  # in the order of the fields
+        *(
+            torch.cat(x) for x in zip(*sampled_parts, strict=True)
+        ),  # in the order of the fields
         advantage_M=advantage_TN.flatten(),
         return_M=return_TN.flatten(),
     )
-    from_reset = [(outcome, step) for outcome, began_later, step in ended if not began_later]
+    from_reset = [
+        (outcome, step) for outcome, began_later, step in ended if not began_later
+    ]
     outcomes = Counter(outcome for outcome, _ in from_reset)
     facts: dict[str, Any] = {
         "episodes": len(from_reset),
@@ -153,8 +201,13 @@ def collect(
         "return": float(return_TN.mean()),
         "advantage_std": float(advantage_TN.std(correction=0)),
     }
-    if later := [outcome == SUCCESS for outcome, began_later, _ in ended if began_later]:
-        facts |= {"later_episodes": float(len(later)), "later_success": sum(later) / len(later)}
+    if later := [
+        outcome == SUCCESS for outcome, began_later, _ in ended if began_later
+    ]:
+        facts |= {
+            "later_episodes": float(len(later)),
+            "later_success": sum(later) / len(later),
+        }
     for k in range(sde.num_steps) if sde.num_stochastic == 1 else ():
         if won := [outcome == SUCCESS for outcome, step in from_reset if step == k]:
             facts[f"success_step_{k}"] = sum(won) / len(won)
@@ -162,7 +215,11 @@ def collect(
 
 
 def first_episodes(
-    world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, max_decisions: int
+    world: World,
+    actor: FlowPolicy,
+    sde: FlowSDE,
+    generator: torch.Generator,
+    max_decisions: int,
 ) -> list[str | None]:
     """Return the outcome of the first episode of each of the N environments in a world that was just restarted: ``success``,
     ``timeout`` or the failure; None: it has not ended after ``max_decisions`` chunks."""

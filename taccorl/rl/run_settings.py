@@ -33,21 +33,37 @@ def stored_options(out: Path, given: Collection[str]) -> list[str]:
     """Options (``--ppo.clip=0.2``) with which the run in ``out`` was begun, except those whose names are ``given``. Raises
     TaccorlError: there is no run in ``out``."""
     names = to_json(PostTrainSettings()).keys() - {_TWIN_DIGEST, *given}
-    stored = {name: value for name, value in _read(out).items() if name in names and value is not None}
-    return [f"--{name}={json.dumps(value)}" for name, value in stored.items()]  # JSON is YAML
+    stored = {
+        name: value
+        for name, value in _read(out).items()
+        if name in names and value is not None
+    }
+    return [
+        f"--{name}={json.dumps(value)}" for name, value in stored.items()
+    ]  # JSON is YAML
 
 
 def refuse_changes(settings: PostTrainSettings) -> None:
     """Check that a run can be resumed with these settings. Raises TaccorlError: there is no run in ``settings.out``, it has
     other settings, or its twin has changed."""
     before, now = to_json(PostTrainSettings()) | _read(settings.out), to_json(settings)
-    if gone := [f"--{name}={value}" for name, value in before.items() if name not in now]:
+    if gone := [
+        f"--{name}={value}" for name, value in before.items() if name not in now
+    ]:
         way = "start a new run from its policy, --policy.path=…/checkpoints/last/pretrained_model"
-        raise TaccorlError(f"--resume=true: {settings.out} has {', '.join(gone)}, which no longer exists: {way}")
-    changed = [name for name in now if name not in _MAY_CHANGE and before[name] != now[name]]
+        raise TaccorlError(
+            f"--resume=true: {settings.out} has {', '.join(gone)}, which no longer exists: {way}"
+        )
+    changed = [
+        name for name in now if name not in _MAY_CHANGE and before[name] != now[name]
+    ]
     if changed:
-        differences = "; ".join(f"--{name} {before[name]} there, {now[name]} here" for name in changed)
-        raise TaccorlError(f"--resume=true: {settings.out}: {differences}. Give the settings of its start, or none")
+        differences = "; ".join(
+            f"--{name} {before[name]} there, {now[name]} here" for name in changed
+        )
+        raise TaccorlError(
+            f"--resume=true: {settings.out}: {differences}. Give the settings of its start, or none"
+        )
 
 
 def _read(out: Path) -> dict[str, Any]:
@@ -59,14 +75,23 @@ def _read(out: Path) -> dict[str, Any]:
             f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume out to start one"
         ) from None
     except (ValueError, TypeError) as error:
-        raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON of the settings of a run: {error}") from error
+        raise TaccorlError(
+            f"--resume=true: {out / SETTINGS}: is not JSON of the settings of a run: {error}"
+        ) from error
 
 
 def to_json(settings: PostTrainSettings) -> dict[str, Any]:
     """Name, such as ``ppo.clip``, → value; paths are absolute."""
     values: dict[str, Any] = {}
     for name, value in dataclasses.asdict(settings).items():
-        values |= {f"{name}.{inner}": v for inner, v in value.items()} if isinstance(value, dict) else {name: value}
+        values |= (
+            {f"{name}.{inner}": v for inner, v in value.items()}
+            if isinstance(value, dict)
+            else {name: value}
+        )
     values = {name: value for name, value in values.items() if name not in _NOT_STORED}
     values[_TWIN_DIGEST] = digest_file(settings.env.twin) if settings.env.twin else None
-    return {name: str(v.resolve()) if isinstance(v, Path) else v for name, v in values.items()}
+    return {
+        name: str(v.resolve()) if isinstance(v, Path) else v
+        for name, v in values.items()
+    }

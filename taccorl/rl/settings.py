@@ -65,9 +65,13 @@ class EnvSettings:
         _at_least("env.", self, num_envs=1, decisions=1, threads=1)
         _one_of("env.pictures", self.pictures, ("clear", "randomised"))
         if not 1 <= self.shards <= self.num_envs:
-            raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
+            raise TaccorlError(
+                f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}"
+            )
         if not 0 <= self.start_share < 1:
-            raise TaccorlError(f"--env.start_share={self.start_share:g}: give a share, 0 or more and below 1")
+            raise TaccorlError(
+                f"--env.start_share={self.start_share:g}: give a share, 0 or more and below 1"
+            )
 
 
 @dataclass(kw_only=True)
@@ -151,7 +155,9 @@ class PPOSettings:
 
     def __post_init__(self) -> None:
         _at_least("ppo.", self, epochs=1, batch_size=1, micro_batch=1, critic_epochs=1)
-        _at_least("ppo.", self, actor_lr=0, critic_lr=0, critic_warmup=0, kl_stop=0, clip=0)
+        _at_least(
+            "ppo.", self, actor_lr=0, critic_lr=0, critic_warmup=0, kl_stop=0, clip=0
+        )
 
 
 @dataclass(kw_only=True)

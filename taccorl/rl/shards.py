@@ -59,7 +59,9 @@ class ProcessShard(Shard):
 
     def __init__(self, make: Callable[[], TwinShard]) -> None:
         """``make``: function that makes the ``TwinShard``; it is pickled, and called in the other process."""
-        context = multiprocessing.get_context("forkserver")  # imports once, and forks before there are threads
+        context = multiprocessing.get_context(
+            "forkserver"
+        )  # imports once, and forks before there are threads
         context.set_forkserver_preload([__name__])
         self._pipe, there = context.Pipe()
         self.process = context.Process(target=_serve, args=(there, make), daemon=True)

@@ -45,24 +45,45 @@ class StartStates:
         the episode has ended."""
         if not self._share:
             return
-        subtask, counts = sim.judge.subtask, [len(subtasks) for subtasks in sim.task.subtasks().values()]
+        subtask, counts = (
+            sim.judge.subtask,
+            [len(subtasks) for subtasks in sim.task.subtasks().values()],
+        )
         in_time_N = sim.judge.steps <= (1 - _TIME_LEFT) * sim.judge.limit_steps
-        held_N = ((subtask >= 1) & (subtask < counts)).all(axis=1) & (sim.judge.held == 0) & in_time_N & ~over_N
+        held_N = (
+            ((subtask >= 1) & (subtask < counts)).all(axis=1)
+            & (sim.judge.held == 0)
+            & in_time_N
+            & ~over_N
+        )
         for i in np.flatnonzero(held_N & (self._rng.random(len(held_N)) < _KEPT)):
-            self._kept[self._next : self._next + 1] = [(sim.snapshot(np.array([i])), window_NWK[i].copy())]
+            self._kept[self._next : self._next + 1] = [
+                (sim.snapshot(np.array([i])), window_NWK[i].copy())
+            ]
             self._next = (self._next + 1) % self._size
 
     def draw(self, over_N: np.ndarray) -> dict[int, tuple[Snapshot, np.ndarray]]:
         """Draw which of the environments where ``over_N`` (bool) is true start in a stored state: their numbers, with the state
         and its window of touch (W, K)."""
-        chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
+        chosen_N = (
+            over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
+        )
         numbers = self._rng.integers(max(1, len(self._kept)), size=chosen_N.sum())
-        return {int(i): self._kept[k] for i, k in zip(np.flatnonzero(chosen_N), numbers, strict=True)}
+        return {
+            int(i): self._kept[k]
+            for i, k in zip(np.flatnonzero(chosen_N), numbers, strict=True)
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it."""
-        kept = [(dataclasses.asdict(snapshot), window) for snapshot, window in self._kept]
-        return {"kept": kept, "next": self._next, "generator": self._rng.bit_generator.state}
+        kept = [
+            (dataclasses.asdict(snapshot), window) for snapshot, window in self._kept
+        ]
+        return {
+            "kept": kept,
+            "next": self._next,
+            "generator": self._rng.bit_generator.state,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from ``state_dict``."""

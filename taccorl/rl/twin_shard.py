@@ -98,13 +98,21 @@ class TwinShard:
         self._window_steps = (history - 1) * stride + 1
         self._root, self._episode_N = 0, np.zeros(envs.num_envs, dtype=np.int64)
         self._began_later_N = np.zeros(envs.num_envs, dtype=bool)
-        self._window_NWK = np.zeros((0,))  # W control steps, of which the policy gets every ``stride``-th
+        self._window_NWK = np.zeros(
+            (0,)
+        )  # W control steps, of which the policy gets every ``stride``-th
 
     def facts(self) -> ShardFacts:
         """Facts about the environments that do not change."""
         envs = self.envs
         names = part_pose_names(envs.sim.task)
-        return ShardFacts(envs.num_envs, envs.task, envs.task_description, names, envs.sim.judge.limit_steps)
+        return ShardFacts(
+            envs.num_envs,
+            envs.task,
+            envs.task_description,
+            names,
+            envs.sim.judge.limit_steps,
+        )
 
     def restart(self, seed: int) -> None:
         """Start new episodes with the seed sequence of ``seed``."""
@@ -128,16 +136,29 @@ class TwinShard:
         chunk = self.envs.step_chunk(actions_NnA)
         facts = self.envs.facts()
         truncated, over = chunk.truncated, chunk.truncated | chunk.terminated
-        outcome = np.where(facts["is_success"], SUCCESS, np.where(over, facts["failure"], np.array(None)))
+        outcome = np.where(
+            facts["is_success"],
+            SUCCESS,
+            np.where(over, facts["failure"], np.array(None)),
+        )
         windows = np.concatenate([self._window_NWK, chunk.tactile], axis=1)
-        ends = self._window_steps + chunk.num_steps  # readings after the end of an episode do not count
-        self._window_NWK = np.stack([w[end - self._window_steps : end] for w, end in zip(windows, ends, strict=True)])
+        ends = (
+            self._window_steps + chunk.num_steps
+        )  # readings after the end of an episode do not count
+        self._window_NWK = np.stack(
+            [
+                w[end - self._window_steps : end]
+                for w, end in zip(windows, ends, strict=True)
+            ]
+        )
         self.starts.see(self.envs.sim, self._window_NWK, over)
         acted = Acted(
             reward_N=chunk.reward,
             terminated_N=chunk.terminated,
             truncated_N=truncated,
-            last={key: x[truncated] for key, x in self.observe().items()} if truncated.any() else None,
+            last={key: x[truncated] for key, x in self.observe().items()}
+            if truncated.any()
+            else None,
             outcome_N=outcome,
             began_later_N=self._began_later_N.copy(),
             num_steps_N=chunk.num_steps,
@@ -152,18 +173,25 @@ class TwinShard:
     def reset(self, rows_N: np.ndarray) -> None:
         """Begin the next episode in the environments where ``rows_N`` (bool) is true."""
         self._episode_N[rows_N] += 1
-        observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": rows_N})
+        observation, _ = self.envs.reset(
+            seed=self._seeds(), options={"reset_mask": rows_N}
+        )
         self._window_NWK[rows_N] = self._repeated(observation[TACTILE_KEY][rows_N])
         self._began_later_N[rows_N] = False
         if drawn := self.starts.draw(rows_N):
             states, windows = zip(*drawn.values(), strict=True)
             chosen_N = np.isin(np.arange(len(rows_N)), list(drawn))
             state = Snapshot.joined(states)
-            self.envs.reset(seed=self._seeds(), options={"reset_mask": chosen_N, "state": state})
+            self.envs.reset(
+                seed=self._seeds(), options={"reset_mask": chosen_N, "state": state}
+            )
             self._window_NWK[chosen_N], self._began_later_N[chosen_N] = windows, True
 
     def _seeds(self) -> list[int]:
-        return [episode_seed(self._root, self._first + i, int(k)) for i, k in enumerate(self._episode_N)]
+        return [
+            episode_seed(self._root, self._first + i, int(k))
+            for i, k in enumerate(self._episode_N)
+        ]
 
     def _repeated(self, reading_NK: np.ndarray) -> np.ndarray:
         """(N, W, K): before an episode's first reading there were none; it is repeated, as in datasets."""
@@ -174,10 +202,20 @@ class TwinShard:
         if not self._privileged:
             return np.zeros((num, 0))
         elapsed = facts["steps"] / sim.judge.limit_steps
-        columns = [sim.arrays["qpos"], sim.arrays["qvel"], facts["subtask"], facts["partial"], elapsed]
+        columns = [
+            sim.arrays["qpos"],
+            sim.arrays["qvel"],
+            facts["subtask"],
+            facts["partial"],
+            elapsed,
+        ]
         columns += list(facts["measures"].values())
-        numbers = np.concatenate([np.asarray(x, dtype=np.float64).reshape(num, -1) for x in columns], axis=1)
-        return np.nan_to_num(numbers, nan=0.0, posinf=0.0, neginf=0.0)  # of a diverged simulation
+        numbers = np.concatenate(
+            [np.asarray(x, dtype=np.float64).reshape(num, -1) for x in columns], axis=1
+        )
+        return np.nan_to_num(
+            numbers, nan=0.0, posinf=0.0, neginf=0.0
+        )  # of a diverged simulation
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls
@@ -195,9 +233,14 @@ class TwinShard:
         """Restore a state from ``state_dict``, of as many environments. Raises TaccorlError: the state is of another task,
         difficulty, twin or randomisation."""
         self._root, self._episode_N = state["root"], state["episode"].copy()
-        self._window_NWK, self._began_later_N = state["window"].copy(), state["began_later"].copy()
+        self._window_NWK, self._began_later_N = (
+            state["window"].copy(),
+            state["began_later"].copy(),
+        )
         self.starts.load_state_dict(state["starts"])
-        self.envs.reset(seed=self._seeds(), options={"state": Snapshot(**state["snapshot"])})
+        self.envs.reset(
+            seed=self._seeds(), options={"state": Snapshot(**state["snapshot"])}
+        )
 
     def close(self) -> None:
         """Close the environments."""
@@ -211,4 +254,6 @@ def make_shard(envs: dict[str, Any], **options: Any) -> TwinShard:
         envs: arguments of ``TaccorlVectorEnv`` but ``autoreset``.
         options: further arguments of ``TwinShard``.
     """
-    return TwinShard(TaccorlVectorEnv(**envs, autoreset=AutoresetMode.DISABLED), **options)
+    return TwinShard(
+        TaccorlVectorEnv(**envs, autoreset=AutoresetMode.DISABLED), **options
+    )

@@ -31,7 +31,11 @@ class TwinWorld:
     """``World`` of one task in the twin, of shards that compute at the same time."""
 
     def __init__(
-        self, shards: Sequence[Shard], opened: Checkpoint, clock: Clock, pictures: ScenePictures | None = None
+        self,
+        shards: Sequence[Shard],
+        opened: Checkpoint,
+        clock: Clock,
+        pictures: ScenePictures | None = None,
     ) -> None:
         """
         Args:
@@ -45,18 +49,38 @@ class TwinWorld:
                 on the poses of other parts.
         """
         config: Any = opened.config
-        if config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY) is not NormalizationMode.IDENTITY:
-            raise TaccorlError("post-training: --policy.normalization_mapping of pictures (VISUAL) must be IDENTITY")
+        if (
+            config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY)
+            is not NormalizationMode.IDENTITY
+        ):
+            raise TaccorlError(
+                "post-training: --policy.normalization_mapping of pictures (VISUAL) must be IDENTITY"
+            )
         self.shards, self.clock, self._pictures = list(shards), clock, pictures
-        self._preprocessor, self._postprocessor = opened.preprocessor, opened.postprocessor
+        self._preprocessor, self._postprocessor = (
+            opened.preprocessor,
+            opened.postprocessor,
+        )
         all_facts: list[ShardFacts] = self._each("facts")
         facts = all_facts[0]
         if config.part_poses:
             require_same_parts(config, facts.task, facts.part_names)
-        self.limit_steps, self._instruction, self._device = facts.limit_steps, facts.instruction, config.device
+        self.limit_steps, self._instruction, self._device = (
+            facts.limit_steps,
+            facts.instruction,
+            config.device,
+        )
         inputs = config.input_features
-        self._cameras = [IMAGE_KEYS[name] for name in ROBOT.cameras if IMAGE_KEYS[name] in inputs]
-        self._kept = {*inputs, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK, HAND_POSES, PART_POSES}
+        self._cameras = [
+            IMAGE_KEYS[name] for name in ROBOT.cameras if IMAGE_KEYS[name] in inputs
+        ]
+        self._kept = {
+            *inputs,
+            OBS_LANGUAGE_TOKENS,
+            OBS_LANGUAGE_ATTENTION_MASK,
+            HAND_POSES,
+            PART_POSES,
+        }
         ends = np.cumsum([own.num_envs for own in all_facts])
         self.num_envs, self._ends = int(ends[-1]), ends[:-1]
 
@@ -77,34 +101,64 @@ class TwinWorld:
 
     def act(self, actions_NnA: Tensor) -> Acted:
         with self.clock.part("policy"):
-            actions = self._postprocessor(actions_NnA).to("cpu").numpy().astype(np.float32)
+            actions = (
+                self._postprocessor(actions_NnA).to("cpu").numpy().astype(np.float32)
+            )
         with self.clock.part("physics"):
             parts: list[Acted] = self._each("act", np.split(actions, self._ends))
         last = [part.last for part in parts if part.last is not None]
-        columns = {name: [getattr(part, name) for part in parts] for name in Acted._fields if name != "last"}
+        columns = {
+            name: [getattr(part, name) for part in parts]
+            for name in Acted._fields
+            if name != "last"
+        }
         joined = {name: np.concatenate(values) for name, values in columns.items()}
         return Acted(**joined, last=self._seen(last) if last else None)
 
     def _seen(self, parts: Sequence[Observation]) -> Observations:
         observation = parts[0]
         if len(parts) > 1:
-            observation = {key: np.concatenate([part[key] for part in parts]) for key in observation}
-        privileged_NP = torch.from_numpy(observation[PRIVILEGED]).float().to(self._device)
+            observation = {
+                key: np.concatenate([part[key] for part in parts])
+                for key in observation
+            }
+        privileged_NP = (
+            torch.from_numpy(observation[PRIVILEGED]).float().to(self._device)
+        )
         with self.clock.part("policy"):
-            numbers = {key: observation[key] for key in (STATE_KEY, TACTILE_KEY, PARTS_KEY) if key in observation}
-            found = policy_batch(self._preprocessor, numbers, [self._instruction] * len(privileged_NP))
-            batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
-            batch |= self._seen_pictures({key: observation[key] for key in self._cameras}, observation[SCENE])
+            numbers = {
+                key: observation[key]
+                for key in (STATE_KEY, TACTILE_KEY, PARTS_KEY)
+                if key in observation
+            }
+            found = policy_batch(
+                self._preprocessor, numbers, [self._instruction] * len(privileged_NP)
+            )
+            batch: Batch = {
+                k: x.to(self._device) for k, x in found.items() if k in self._kept
+            }
+            batch |= self._seen_pictures(
+                {key: observation[key] for key in self._cameras}, observation[SCENE]
+            )
         return Observations(batch, privileged_NP)
 
     def _seen_pictures(self, clear: Observation, scene_N2: np.ndarray) -> Batch:
         """(N, 3, rows, columns) uint8, a quarter of float32: what is stored for the update is what the policy saw."""
         if self._pictures is None or not clear:
             return {
-                key: torch.from_numpy(x).to(self._device).permute(0, 3, 1, 2).contiguous() for key, x in clear.items()
+                key: torch.from_numpy(x)
+                .to(self._device)
+                .permute(0, 3, 1, 2)
+                .contiguous()
+                for key, x in clear.items()
             }
         changed = self._pictures(clear, scene_N2[:, 0], scene_N2[:, 1])
-        return {**changed, PICTURES_CHANGED: torch.ones(len(scene_N2), dtype=torch.bool, device=self._device)}
+        return {
+            **changed,
+            PICTURES_CHANGED: torch.ones(
+                len(scene_N2), dtype=torch.bool, device=self._device
+            ),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls

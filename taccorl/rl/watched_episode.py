@@ -57,18 +57,29 @@ class EpisodeWatch:
         """Record one decision, with the critic's values before it."""
         actions_nA = acted.actions_NnA[0, : acted.num_steps_N[0]].copy()
         self.chunks.append(actions_nA)
-        self.values.append(np.full(len(actions_nA), float(value_N[0]), dtype=np.float32))
+        self.values.append(
+            np.full(len(actions_nA), float(value_N[0]), dtype=np.float32)
+        )
         if acted.outcome_N[0] is None:
             return
         # An episode that began in a state of an earlier one cannot be executed again from its seed.
         if self.ended is None and not acted.began_later_N[0]:
-            seed, outcome, partial = int(acted.seed_N[0]), str(acted.outcome_N[0]), int(acted.partial_N[0])
-            actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
+            seed, outcome, partial = (
+                int(acted.seed_N[0]),
+                str(acted.outcome_N[0]),
+                int(acted.partial_N[0]),
+            )
+            actions_TA, values_T = (
+                np.concatenate(self.chunks),
+                np.concatenate(self.values),
+            )
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)
         self.chunks, self.values = [], []
 
 
-def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool) -> Episode:
+def executed_again(
+    watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool
+) -> Episode:
     """Execute a watched episode again; returns its rows with the feature ``rl.value``. Raises TaccorlError: the repeated
     episode has another outcome."""
     steps = len(watched.actions_TA)
@@ -76,9 +87,25 @@ def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, imag
         policy=policy, task=scenes.tasks[0], seed=watched.seed, outcome=watched.outcome, partial=watched.partial,
         max_partial=0, steps=steps, time_s=steps / CONTROL_HZ, subtask_end_s={}, clipped_steps=0,
     )  # fmt: skip
-    rollout = Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names))), np.zeros((0, len(ROBOT.arms))))
+    rollout = Rollout(
+        row,
+        watched.actions_TA,
+        np.zeros((0, len(ROBOT.action_names))),
+        np.zeros((0, len(ROBOT.arms))),
+    )
     episode = execute_again(scenes, rollout, images=images).episode
     assert episode is not None, "it was executed"
-    value = FeatureSpec(dtype="float32", shape=(1,), unit="1", frame="critic", rate_hz=CONTROL_HZ, range=(-1e12, 1e12))
-    spec = dataclasses.replace(episode.spec, features=episode.spec.features | {VALUE: value})
-    return dataclasses.replace(episode, spec=spec, arrays=episode.arrays | {VALUE: watched.values_T[:, None]})
+    value = FeatureSpec(
+        dtype="float32",
+        shape=(1,),
+        unit="1",
+        frame="critic",
+        rate_hz=CONTROL_HZ,
+        range=(-1e12, 1e12),
+    )
+    spec = dataclasses.replace(
+        episode.spec, features=episode.spec.features | {VALUE: value}
+    )
+    return dataclasses.replace(
+        episode, spec=spec, arrays=episode.arrays | {VALUE: watched.values_T[:, None]}
+    )

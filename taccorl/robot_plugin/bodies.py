@@ -18,7 +18,9 @@ from taccorl.robot_plugin.pads import PadDriver, PadsConfig
 from taccorl.robot_plugin.surrogate_link import SurrogateLink
 from taccorl.robots import ROBOT
 
-ARM_NAMES = tuple(name.replace("_joint", "_joint_") + ".pos" for name in ROBOT.action_names)
+ARM_NAMES = tuple(
+    name.replace("_joint", "_joint_") + ".pos" for name in ROBOT.action_names
+)
 """(14,) names of state and action in the data spec: left_joint_1.pos … right_gripper.pos."""
 Listener = Callable[[str, float, str, Any], None]
 """Function that is called with every sample: kind (state, camera), time [s], name of the camera, and value. A state is (3, A):
@@ -67,7 +69,9 @@ class Body(Protocol):
 def tell(listeners: Sequence[Listener], sample: Sample) -> None:
     """Pass a sample of a robot that measures no velocities to listeners."""
     unknown = np.full(len(sample.position), np.nan)
-    state = np.stack([sample.position, unknown, unknown if sample.effort is None else sample.effort])
+    state = np.stack(
+        [sample.position, unknown, unknown if sample.effort is None else sample.effort]
+    )
     for listener in listeners:
         listener("state", sample.stamps_s["state"], "", state)
         for name, picture in sample.pictures.items():
@@ -83,10 +87,16 @@ class LeRobotBody:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.names = tuple(robot.action_features)
-        self.cameras = {k: v[:2] for k, v in robot.observation_features.items() if isinstance(v, tuple)}
+        self.cameras = {
+            k: v[:2]
+            for k, v in robot.observation_features.items()
+            if isinstance(v, tuple)
+        }
         unread = [name for name in self.names if name not in robot.observation_features]
         if unread:
-            raise TaccorlError(f"robot {robot.name}: commands {', '.join(unread)}, but does not measure it")
+            raise TaccorlError(
+                f"robot {robot.name}: commands {', '.join(unread)}, but does not measure it"
+            )
         self.listeners: list[Listener] = []
 
     def connect(self) -> None:
@@ -105,10 +115,16 @@ class LeRobotBody:
         stamps = {"state": before_s}
         for name in self.cameras:
             # LeRobot's cameras state when a picture was taken; perf_counter is CLOCK_MONOTONIC on Linux.
-            taken_s = getattr(getattr(self.robot, "cameras", {}).get(name), "latest_timestamp", None)
+            taken_s = getattr(
+                getattr(self.robot, "cameras", {}).get(name), "latest_timestamp", None
+            )
             stamps[f"camera:{name}"] = before_s if taken_s is None else taken_s
         position = np.array([float(seen[name]) for name in self.names])
-        found = Sample(position=position, pictures={c: np.asarray(seen[c]) for c in self.cameras}, stamps_s=stamps)
+        found = Sample(
+            position=position,
+            pictures={c: np.asarray(seen[c]) for c in self.cameras},
+            stamps_s=stamps,
+        )
         tell(self.listeners, found)
         return found
 
@@ -128,15 +144,22 @@ class SurrogateArms:
 
     def connect(self) -> None:
         facts = self.link.connect()
-        self.origin, self.instruction = Origin.read(facts["origin"]), str(facts["instruction"])
+        self.origin, self.instruction = (
+            Origin.read(facts["origin"]),
+            str(facts["instruction"]),
+        )
         self.task = str(facts["task"])
-        wrong = {n: facts["cameras"].get(n) for n in self.cameras if facts["cameras"].get(n) != list(self.cameras[n])}
+        wrong = {
+            n: facts["cameras"].get(n)
+            for n in self.cameras
+            if facts["cameras"].get(n) != list(self.cameras[n])
+        }
         if wrong:
             self.link.close()
-            text = (
-                f"surrogate on port {self.link.port}: its cameras are {facts['cameras'] or 'none'}, not {self.cameras}"
+            text = f"surrogate on port {self.link.port}: its cameras are {facts['cameras'] or 'none'}, not {self.cameras}"
+            raise TaccorlError(
+                f"{text}: give --robot.camera_names=[…], --robot.camera_px, or serve with --camera_px"
             )
-            raise TaccorlError(f"{text}: give --robot.camera_names=[…], --robot.camera_px, or serve with --camera_px")
         self._wait()
 
     def reset(self, seed: int | None) -> None:
@@ -146,11 +169,17 @@ class SurrogateArms:
 
     def _wait(self) -> None:
         until = time.monotonic() + 15.0
-        while not self.link.states or any(name not in self.link.pictures for name in self.cameras):
+        while not self.link.states or any(
+            name not in self.link.pictures for name in self.cameras
+        ):
             if time.monotonic() > until:
-                silent = [n for n in self.cameras if n not in self.link.pictures] or ["joint states"]
+                silent = [n for n in self.cameras if n not in self.link.pictures] or [
+                    "joint states"
+                ]
                 self.link.close()
-                raise TaccorlError(f"surrogate on port {self.link.port}: nothing comes of {', '.join(silent)}")
+                raise TaccorlError(
+                    f"surrogate on port {self.link.port}: nothing comes of {', '.join(silent)}"
+                )
             time.sleep(0.01)
 
     def disconnect(self) -> None:
@@ -166,9 +195,13 @@ class SurrogateArms:
 
     def read(self) -> Sample:
         stamp_s, (position, _, effort) = self.link.states[-1]
-        found = Sample(position=position.copy(), effort=effort, stamps_s={"state": stamp_s})
+        found = Sample(
+            position=position.copy(), effort=effort, stamps_s={"state": stamp_s}
+        )
         for name in self.cameras:
-            found.stamps_s[f"camera:{name}"], found.pictures[name] = self.link.pictures[name]
+            found.stamps_s[f"camera:{name}"], found.pictures[name] = self.link.pictures[
+                name
+            ]
         return found
 
     def send(self, target: np.ndarray) -> None:

@@ -30,8 +30,20 @@ import torch
 from lerobot import __version__ as lerobot_version
 from lerobot.configs import FeatureType, RGBEncoderConfig
 
-from taccorl.data.dataset import BOOKKEEPING, DOMAINS, PROVENANCE, Dataset, dataset_spec_to_json, write_records
-from taccorl.data.lerobot_format import ENCODERS, LARGE_FEATURE, lerobot_features, write_exact_statistics
+from taccorl.data.dataset import (
+    BOOKKEEPING,
+    DOMAINS,
+    PROVENANCE,
+    Dataset,
+    dataset_spec_to_json,
+    write_records,
+)
+from taccorl.data.lerobot_format import (
+    ENCODERS,
+    LARGE_FEATURE,
+    lerobot_features,
+    write_exact_statistics,
+)
 from taccorl.data.origin import Origin
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError, printable
@@ -50,12 +62,21 @@ RECORDED = "recorded"
 _DATASETS = (
     "lerobot.scripts.lerobot_record",
     "__main__",
-    *(f"lerobot.rollout.strategies.{name}" for name in ("episodic", "sentry", "highlight", "dagger")),
+    *(
+        f"lerobot.rollout.strategies.{name}"
+        for name in ("episodic", "sentry", "highlight", "dagger")
+    ),
 )
-_POLICIES = ("lerobot.rollout.strategies.core", "lerobot.rollout.strategies.base", "lerobot.rollout.inference.rtc")
+_POLICIES = (
+    "lerobot.rollout.strategies.core",
+    "lerobot.rollout.strategies.base",
+    "lerobot.rollout.inference.rtc",
+)
 _NICENESS = 5  # of the thread that predicts chunks: a third of the loop's weight where both want the same core
 _MOST_LATE_S = 0.02  # of a sleep, that the next one regains
-_touch: Any = None  # feature of the robot that LeRobot has made, before it makes a dataset
+_touch: Any = (
+    None  # feature of the robot that LeRobot has made, before it makes a dataset
+)
 _policy: Any = None  # configuration of the policy that rollout has loaded, before it makes the robot
 
 
@@ -87,9 +108,14 @@ class TouchFeature(tuple):
         """Feature of these pads; of the data spec, if they are its pads."""
         found = cls((pads.num_taxels,))
         found.pads, found.origin = pads, origin
-        found.described = dict(lerobot_features(load_dataset_spec(find_spec(SPEC)), [TACTILE])[TACTILE])
+        found.described = dict(
+            lerobot_features(load_dataset_spec(find_spec(SPEC)), [TACTILE])[TACTILE]
+        )
         if pads.names != ROBOT.pads:
-            touch = found.described["tactile"] | {"layout": [1, *pads.layout], "pads": list(pads.names)}
+            touch = found.described["tactile"] | {
+                "layout": [1, *pads.layout],
+                "pads": list(pads.names),
+            }
             found.described |= {"shape": (pads.num_taxels,), "tactile": touch}
         if origin.domain is not None:
             found.described[DOMAINS] = [origin.domain]
@@ -102,7 +128,9 @@ def window() -> tuple[int, int]:
     return (_policy.tactile_history, _policy.tactile_stride) if is_felt else (1, 1)
 
 
-def check_policy(features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float) -> None:
+def check_policy(
+    features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float
+) -> None:
     """Check the policy that rollout has loaded, if there is one, against the robot: its ``features`` of observations, the
     ``names`` of its actions, its pads and its rate [Hz]. Raises TaccorlError: they are others."""
     if (policy := _policy) is None:
@@ -113,25 +141,50 @@ def check_policy(features: dict[str, Any], names: Sequence[str], pads: "Pads | N
             continue
         there = features.get(camera)
         if there is None:
-            others = ", ".join(k for k, v in features.items() if isinstance(v, tuple) and len(v) == 3) or "none"
-            raise TaccorlError(f"the policy was trained with the camera {camera}, the robot has {others}")
+            others = (
+                ", ".join(
+                    k
+                    for k, v in features.items()
+                    if isinstance(v, tuple) and len(v) == 3
+                )
+                or "none"
+            )
+            raise TaccorlError(
+                f"the policy was trained with the camera {camera}, the robot has {others}"
+            )
         if tuple(feature.shape) not in ((there[2], *there[:2]), there):
-            raise TaccorlError(f"camera {camera}: the policy takes {tuple(feature.shape)}, the robot gives {there}")
+            raise TaccorlError(
+                f"camera {camera}: the policy takes {tuple(feature.shape)}, the robot gives {there}"
+            )
     theirs = list(getattr(policy, "action_feature_names", None) or names)
     if set(theirs) != set(names):
         other = sorted(set(theirs) ^ set(names))
-        raise TaccorlError(f"the policy's actions differ from the robot's: {', '.join(other[:4])}; use its own robot")
+        raise TaccorlError(
+            f"the policy's actions differ from the robot's: {', '.join(other[:4])}; use its own robot"
+        )
     if theirs != list(names):
-        raise TaccorlError(f"the policy's actions are in another order than the robot's: {', '.join(theirs[:3])} …")
+        raise TaccorlError(
+            f"the policy's actions are in another order than the robot's: {', '.join(theirs[:3])} …"
+        )
     rate = getattr(policy, "fps", None)
     if rate is not None and rate != fps:
-        raise TaccorlError(f"the policy was trained at {rate:g} Hz, --robot.fps={fps:g}: give its rate to both")
+        raise TaccorlError(
+            f"the policy was trained at {rate:g} Hz, --robot.fps={fps:g}: give its rate to both"
+        )
     touch = getattr(policy, "tactile_format", None)
     if getattr(policy, "tactile", False) and pads is None:
-        raise TaccorlError("the policy was trained with touch, but the robot has no pads: give --robot.pads")
-    if touch is not None and pads is not None and (list(touch.layout), touch.pads) != (pads.layout, pads.names):
+        raise TaccorlError(
+            "the policy was trained with touch, but the robot has no pads: give --robot.pads"
+        )
+    if (
+        touch is not None
+        and pads is not None
+        and (list(touch.layout), touch.pads) != (pads.layout, pads.names)
+    ):
         own = f"{', '.join(pads.names)} of {pads.layout[1:]}"
-        raise TaccorlError(f"the policy takes the pads {', '.join(touch.pads)} of {list(touch.layout[1:])}, not {own}")
+        raise TaccorlError(
+            f"the policy takes the pads {', '.join(touch.pads)} of {list(touch.layout[1:])}, not {own}"
+        )
 
 
 def check_units() -> None:
@@ -142,8 +195,14 @@ def check_units() -> None:
     from taccorl.sim.twin import TwinConfig
 
     path = Path(getattr(_policy, "pretrained_path", None) or os.devnull)
-    checks = preflight(open_checkpoint(path, "cpu").facts(), TwinConfig()) if path.is_dir() else ()
-    refuse_differences([check for check in checks if check.what.startswith("range of")], str(path))
+    checks = (
+        preflight(open_checkpoint(path, "cpu").facts(), TwinConfig())
+        if path.is_dir()
+        else ()
+    )
+    refuse_differences(
+        [check for check in checks if check.what.startswith("range of")], str(path)
+    )
 
 
 def install() -> bool:
@@ -154,31 +213,70 @@ def install() -> bool:
     for module in ("lerobot.datasets.pipeline_features", "lerobot.rollout.context"):
         _replace(sys.modules.get(module), "hw_to_dataset_features", _with_touch)
     _replace(sys, "excepthook", _in_a_sentence)
-    _replace(sys.modules.get("lerobot.rollout.context"), "_load_pretrained_policy", _remembered)
-    _replace(sys.modules.get("lerobot.rollout.context"), "create_inference_engine", _paced)
+    _replace(
+        sys.modules.get("lerobot.rollout.context"),
+        "_load_pretrained_policy",
+        _remembered,
+    )
+    _replace(
+        sys.modules.get("lerobot.rollout.context"), "create_inference_engine", _paced
+    )
     rtc = sys.modules.get("lerobot.rollout.inference.rtc")
-    queue, tracker = getattr(rtc, "ActionQueue", None), getattr(rtc, "LatencyTracker", None)
+    queue, tracker = (
+        getattr(rtc, "ActionQueue", None),
+        getattr(rtc, "LatencyTracker", None),
+    )
     _replace(queue, "get_left_over", _from_now("original_queue"))
     _replace(queue, "get_processed_left_over", _from_now("queue"))
-    _replace(queue, "get_action_index", lambda _: lambda self: max(0, self.last_index - 1))
+    _replace(
+        queue, "get_action_index", lambda _: lambda self: max(0, self.last_index - 1)
+    )
     # 0.6.1 drops of a chunk what its latency lasts, up to 2 more than was executed meanwhile; guides what is beyond the last
     # chunk's end towards 0; and never forgets the latency of the first chunk, which loads kernels (its pull request 4454).
-    _replace(queue, "_check_and_resolve_delays", lambda _: lambda self, _, before: self.last_index - before)
+    _replace(
+        queue,
+        "_check_and_resolve_delays",
+        lambda _: lambda self, _, before: self.last_index - before,
+    )
     _replace(queue, "_replace_actions_queue", _kept_from_now)
     # A chunk is begun so early that none is executed beyond its first ``n_action_steps``, if it takes as long as the last.
-    _replace(queue, "qsize", lambda theirs: lambda self: theirs(self) - max(0, getattr(self, "executed", 0) - 1))
-    _replace(rtc, "_normalize_prev_actions_length", lambda _: lambda actions, target_steps: actions[:target_steps])
-    _replace(tracker, "max", lambda _: lambda self: max([*self._values][1:][-20:] or self._values, default=0.0))
+    _replace(
+        queue,
+        "qsize",
+        lambda theirs: (
+            lambda self: theirs(self) - max(0, getattr(self, "executed", 0) - 1)
+        ),
+    )
+    _replace(
+        rtc,
+        "_normalize_prev_actions_length",
+        lambda _: lambda actions, target_steps: actions[:target_steps],
+    )
+    _replace(
+        tracker,
+        "max",
+        lambda _: (
+            lambda self: max([*self._values][1:][-20:] or self._values, default=0.0)
+        ),
+    )
     _replace(getattr(rtc, "RTCInferenceEngine", None), "_rtc_loop", _at_lower_priority)
     for names, field in ((_DATASETS, "newest"), (_POLICIES, "window")):
         for module in names:
             _replace(sys.modules.get(module), "log_visualization_data", _with_pads)
             _replace(sys.modules.get(module), "precise_sleep", _regained)
-            _replace(sys.modules.get(module), "build_dataset_frame", functools.partial(_framed, field=field))
+            _replace(
+                sys.modules.get(module),
+                "build_dataset_frame",
+                functools.partial(_framed, field=field),
+            )
             _replace(sys.modules.get(module), "record_loop", _in_order)
-    episodic = getattr(sys.modules.get("lerobot.rollout.strategies.episodic"), "EpisodicStrategy", None)
+    episodic = getattr(
+        sys.modules.get("lerobot.rollout.strategies.episodic"), "EpisodicStrategy", None
+    )
     _replace(episodic, "_policy_loop", _in_order)
-    dataset = getattr(sys.modules.get("lerobot.datasets.lerobot_dataset"), "LeRobotDataset", None)
+    dataset = getattr(
+        sys.modules.get("lerobot.datasets.lerobot_dataset"), "LeRobotDataset", None
+    )
     if dataset is not None and not hasattr(dataset.create.__func__, "theirs"):
         dataset.create = classmethod(_marked(dataset.create.__func__, _with_units))
     _replace(dataset, "finalize", _with_provenance)
@@ -213,8 +311,12 @@ def _remembered(theirs: Callable) -> Callable:
         global _policy
         policy, _policy = theirs(policy_config), policy_config
         if policy_config.device == "cpu":
-            torch.set_num_threads(1)  # more would take the CPUs of the loop, and wait for each other on a busy machine
-        return policy.requires_grad_(False)  # guidance differentiates by the actions only
+            torch.set_num_threads(
+                1
+            )  # more would take the CPUs of the loop, and wait for each other on a busy machine
+        return policy.requires_grad_(
+            False
+        )  # guidance differentiates by the actions only
 
     return load
 
@@ -224,13 +326,23 @@ def _paced(theirs: Callable) -> Callable:
     at once if chunks have 30 actions or fewer: guided actions then guide the next, and observations have little effect."""
 
     def create(config: Any, *, policy: Any, **more: Any) -> Any:
-        chunk, taken = (getattr(policy.config, name, None) for name in ("chunk_size", "n_action_steps"))
+        chunk, taken = (
+            getattr(policy.config, name, None)
+            for name in ("chunk_size", "n_action_steps")
+        )
         if chunk and taken and hasattr(config, "queue_threshold"):
-            config.queue_threshold = min(config.queue_threshold, chunk - taken if taken < chunk else chunk // 2)
-        engine, robot = theirs(config, policy=policy, **more), getattr(more["robot_wrapper"], "inner", None)
+            config.queue_threshold = min(
+                config.queue_threshold, chunk - taken if taken < chunk else chunk // 2
+            )
+        engine, robot = (
+            theirs(config, policy=policy, **more),
+            getattr(more["robot_wrapper"], "inner", None),
+        )
         if robot is not None and hasattr(robot, "guard"):
             robot.instruct(more["task"])
-            engine.get_action = _none_past_a_hold(engine, lambda: robot.guard)  # each connection has its own
+            engine.get_action = _none_past_a_hold(
+                engine, lambda: robot.guard
+            )  # each connection has its own
         return engine
 
     return create
@@ -253,11 +365,19 @@ def _none_past_a_hold(engine: Any, guard: Callable[[], Any]) -> Callable:
 
 def _from_now(name: str) -> Callable[[Any], Callable]:
     """What is left of a queue, from the action of the newest observation's period on (executed already), as in the next chunk."""
-    return lambda _: lambda self: q if (q := getattr(self, name)) is None else q[max(0, self.last_index - 1) :].clone()
+    return lambda _: (
+        lambda self: (
+            q
+            if (q := getattr(self, name)) is None
+            else q[max(0, self.last_index - 1) :].clone()
+        )
+    )
 
 
 def _kept_from_now(theirs: Callable) -> Callable:
-    def replace(self: Any, original: torch.Tensor, processed: torch.Tensor, executed: int) -> None:
+    def replace(
+        self: Any, original: torch.Tensor, processed: torch.Tensor, executed: int
+    ) -> None:
         """Keep the action of the newest observation's period (executed, but of the last chunk): the next may begin with it."""
         theirs(self, original, processed, max(0, executed - 1))
         self.executed, self.last_index = executed, min(executed, 1)
@@ -289,8 +409,16 @@ def _regained(theirs: Callable) -> Callable:
 
 def _with_pads(theirs: Callable) -> Callable:
     def show(mode: str, observation: Any = None, **more: Any) -> None:
-        touch = [value.picture() for value in (observation or {}).values() if isinstance(value, TouchReading)]
-        theirs(mode, observation=observation | {"touch": touch[0]} if touch else observation, **more)
+        touch = [
+            value.picture()
+            for value in (observation or {}).values()
+            if isinstance(value, TouchReading)
+        ]
+        theirs(
+            mode,
+            observation=observation | {"touch": touch[0]} if touch else observation,
+            **more,
+        )
 
     return show
 
@@ -298,7 +426,9 @@ def _with_pads(theirs: Callable) -> Callable:
 def _in_order(theirs: Callable) -> Callable:
     def loop(*strategy: Any, robot: Any, dataset: Any = None, **more: Any) -> None:
         begin = getattr(getattr(robot, "inner", robot), "begin_episode", None)
-        if begin is not None and dataset is not None:  # without a dataset it is the time between episodes
+        if (
+            begin is not None and dataset is not None
+        ):  # without a dataset it is the time between episodes
             getattr(robot, "inner", robot).instruct(more.get("single_task") or "")
             for one in strategy:
                 one._engine.stop()  # real-time chunking would begin with a chunk of the last episode's end
@@ -313,16 +443,24 @@ def _in_order(theirs: Callable) -> Callable:
 
 
 def _with_units(theirs: Callable) -> Callable:
-    def create(cls: Any, repo_id: str, fps: int, features: dict, *args: Any, **kwargs: Any) -> Any:
-        is_ours = "tactile" in features.get(TACTILE, {}) and "names" not in features[TACTILE]
+    def create(
+        cls: Any, repo_id: str, fps: int, features: dict, *args: Any, **kwargs: Any
+    ) -> Any:
+        is_ours = (
+            "tactile" in features.get(TACTILE, {}) and "names" not in features[TACTILE]
+        )
         if not is_ours:
             return theirs(cls, repo_id, fps, features, *args, **kwargs)
         if kwargs.get("rgb_encoder") == RGBEncoderConfig():
             # Videos of several codecs do not merge; LeRobot's default also costs three times as much.
-            kwargs["rgb_encoder"] = RGBEncoderConfig(**ENCODERS[load_dataset_spec(find_spec(SPEC)).video_codec])
+            kwargs["rgb_encoder"] = RGBEncoderConfig(
+                **ENCODERS[load_dataset_spec(find_spec(SPEC)).video_codec]
+            )
         made = theirs(cls, repo_id, fps, _stated(features), *args, **kwargs)
         made.is_recorded = True
-        atexit.register(remove_empty, made.root, made.root.stat().st_ino)  # not even finalized if nothing connects
+        atexit.register(
+            remove_empty, made.root, made.root.stat().st_ino
+        )  # not even finalized if nothing connects
         return made
 
     return create
@@ -332,8 +470,15 @@ def remove_empty(root: Path, inode: int) -> None:
     """Remove the folder of a dataset that was made here and has no episode, which LeRobot would refuse in the next try. A folder
     that took its place, one with an episode on disk, and files that are not LeRobot's stay."""
     with contextlib.suppress(OSError, ValueError, KeyError):
-        is_empty = json.loads((root / "meta" / "info.json").read_bytes())["total_episodes"] == 0
-        if is_empty and root.stat().st_ino == inode and not [*root.rglob("*.parquet"), *root.rglob("*.mp4")]:
+        is_empty = (
+            json.loads((root / "meta" / "info.json").read_bytes())["total_episodes"]
+            == 0
+        )
+        if (
+            is_empty
+            and root.stat().st_ino == inode
+            and not [*root.rglob("*.parquet"), *root.rglob("*.mp4")]
+        ):
             for name in ("data", "images", "meta", "videos"):
                 shutil.rmtree(root / name, ignore_errors=True)
             root.rmdir()
@@ -342,11 +487,24 @@ def remove_empty(root: Path, inode: int) -> None:
 def _with_provenance(theirs: Callable) -> Callable:
     def finalize(self: Any) -> None:
         is_done = self._is_finalized or self.writer is None
-        is_ours = hasattr(self, "is_recorded") or read_manifest(self.root).get("stage") == RECORDED  # --resume
+        is_ours = (
+            hasattr(self, "is_recorded")
+            or read_manifest(self.root).get("stage") == RECORDED
+        )  # --resume
         with contextlib.suppress(OSError):
-            if is_ours and not is_done and shutil.disk_usage(self.root).free < _FULL_BYTES:
-                again = "with --resume=true" if self.meta.total_episodes else "by the same command"
-                logging.error(f"{self.root}: its disk is full, an episode is lost; make room and record again, {again}")
+            if (
+                is_ours
+                and not is_done
+                and shutil.disk_usage(self.root).free < _FULL_BYTES
+            ):
+                again = (
+                    "with --resume=true"
+                    if self.meta.total_episodes
+                    else "by the same command"
+                )
+                logging.error(
+                    f"{self.root}: its disk is full, an episode is lost; make room and record again, {again}"
+                )
         theirs(self)
         if is_done or self.writer is None or not is_ours:
             return
@@ -361,41 +519,78 @@ def state_provenance(root: Path, touch: TouchFeature) -> None:
     """Add to a recorded dataset what LeRobot's files cannot state (units, ranges, origin, baselines), as ``taccorl ingest`` does,
     and exact statistics: those of 0.6.1 are wrong for what hardly moves. Nothing is added to a dataset of other joints."""
     path = root / PROVENANCE / "episodes.json"
-    records = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []  # of earlier sessions: --resume
+    records = (
+        json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    )  # of earlier sessions: --resume
     (root / DATASET_MANIFEST).unlink(missing_ok=True)
     spec, dataset = load_dataset_spec(find_spec(SPEC)), Dataset(root)
     own = [key for key in dataset.info["features"] if key not in BOOKKEEPING]
     stated = lerobot_features(spec, [key for key in own if key in spec.features])
     write_exact_statistics(root, smaller_than=LARGE_FEATURE)
-    if set(own) - set(stated) or any(dataset.info["features"][k]["names"] != f["names"] for k, f in stated.items()):
+    if set(own) - set(stated) or any(
+        dataset.info["features"][k]["names"] != f["names"] for k, f in stated.items()
+    ):
         return
-    assert touch.pads.baseline is not None, "episodes come from a robot that was connected"
-    known = {"part": None, "source_digest": "", "start_ns": 0, "success": None, "timing": [], "stages": []}
-    known |= {"simulation": None, "baselines": {TACTILE: touch.pads.baseline.tolist()}} | touch.origin.record()
+    assert touch.pads.baseline is not None, (
+        "episodes come from a robot that was connected"
+    )
+    known = {
+        "part": None,
+        "source_digest": "",
+        "start_ns": 0,
+        "success": None,
+        "timing": [],
+        "stages": [],
+    }
+    known |= {
+        "simulation": None,
+        "baselines": {TACTILE: touch.pads.baseline.tolist()},
+    } | touch.origin.record()
     for k in range(len(records), dataset.num_episodes):
-        what = {"recording": f"lerobot episode {k}", "rows": dataset.num_rows(k), "instruction": dataset.tasks(k)[0][1]}
+        what = {
+            "recording": f"lerobot episode {k}",
+            "rows": dataset.num_rows(k),
+            "instruction": dataset.tasks(k)[0][1],
+        }
         records.append(what | known)
     write_records(root, records)
-    text = json.dumps(dataset_spec_to_json(dataclasses.replace(spec, features={k: spec.features[k] for k in own})))
+    text = json.dumps(
+        dataset_spec_to_json(
+            dataclasses.replace(spec, features={k: spec.features[k] for k in own})
+        )
+    )
     (root / PROVENANCE / "dataset_spec.json").write_text(text, encoding="utf-8")
     seal_checkpoint(root, stage=RECORDED, place=DATASET_MANIFEST)
 
 
 def _with_touch(theirs: Callable) -> Callable:
-    def to_features(hw_features: dict[str, Any], prefix: str, use_video: bool = True) -> dict[str, dict]:
+    def to_features(
+        hw_features: dict[str, Any], prefix: str, use_video: bool = True
+    ) -> dict[str, dict]:
         global _touch
-        touch = {key: value for key, value in hw_features.items() if isinstance(value, TouchFeature)}
+        touch = {
+            key: value
+            for key, value in hw_features.items()
+            if isinstance(value, TouchFeature)
+        }
         _touch = next(iter(touch.values()), _touch)
-        features = theirs({k: v for k, v in hw_features.items() if k not in touch}, prefix, use_video)
+        features = theirs(
+            {k: v for k, v in hw_features.items() if k not in touch}, prefix, use_video
+        )
         # Without names: LeRobot would merge those of vectors.
-        own = {key: {k: v for k, v in f.described.items() if k != "names"} for key, f in touch.items()}
+        own = {
+            key: {k: v for k, v in f.described.items() if k != "names"}
+            for key, f in touch.items()
+        }
         return features | {f"{prefix}.{key}": feature for key, feature in own.items()}
 
     return to_features
 
 
 def _framed(theirs: Callable, field: str) -> Callable:
-    def frame(ds_features: dict[str, dict], values: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+    def frame(
+        ds_features: dict[str, dict], values: dict[str, Any], prefix: str
+    ) -> dict[str, np.ndarray]:
         found = theirs(ds_features, values, prefix)
         for key, value in values.items():
             if isinstance(value, TouchReading) and f"{prefix}.{key}" in ds_features:
@@ -407,7 +602,9 @@ def _framed(theirs: Callable, field: str) -> Callable:
 
 def _stated(features: dict[str, dict]) -> dict[str, dict]:
     """Features of a dataset with touch as the data spec states them, where they are those of the data spec."""
-    domains = {DOMAINS: features[TACTILE][DOMAINS]} if DOMAINS in features[TACTILE] else {}
+    domains = (
+        {DOMAINS: features[TACTILE][DOMAINS]} if DOMAINS in features[TACTILE] else {}
+    )
     spec = load_dataset_spec(find_spec(SPEC))
     stated = lerobot_features(spec, ["observation.state", "action"])
     found = {key: dict(feature) for key, feature in features.items()}
@@ -415,5 +612,8 @@ def _stated(features: dict[str, dict]) -> dict[str, dict]:
         if key in found and list(found[key]["names"] or ()) == ours["names"]:
             found[key] = ours | domains
     found[TACTILE] |= {"names": None}
-    order = [*(k for k in spec.features if k in found), *(k for k in found if k not in spec.features)]
+    order = [
+        *(k for k in spec.features if k in found),
+        *(k for k in found if k not in spec.features),
+    ]
     return {key: found[key] for key in order}

@@ -31,11 +31,18 @@ class McapLog:
     written any more (a full disk), the recording ends with an error in the log, and the robot goes on."""
 
     def __init__(
-        self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float], rates_hz: Mapping[str, float]
+        self,
+        path: Path,
+        origin: Origin,
+        instruction: str,
+        clock: Callable[[], float],
+        rates_hz: Mapping[str, float],
     ) -> None:
         """``rates_hz``: topic → rate [Hz], where it is not that of the drivers."""
         if path.exists():
-            raise TaccorlError(f"--robot.record={path}: exists; give another file, or remove it")
+            raise TaccorlError(
+                f"--robot.record={path}: exists; give another file, or remove it"
+            )
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file, self._lock = path.open("wb"), threading.Lock()
         self._writer = Writer(self._file, compression=CompressionType.LZ4)
@@ -43,7 +50,10 @@ class McapLog:
         self._writer.start(profile=self._messages.profile, library="taccorl")
         rates = {RATE_OF + topic: f"{rate_hz:g}" for topic, rate_hz in rates_hz.items()}
         self._writer.add_metadata("taccorl", {**labelled(origin), **rates})
-        self._clock, self._zero_ns = clock, time.time_ns() - round(clock() * 1e9)  # Unix time of the clock's 0
+        self._clock, self._zero_ns = (
+            clock,
+            time.time_ns() - round(clock() * 1e9),
+        )  # Unix time of the clock's 0
         self.instruction, self._open, self._in_episode = instruction, True, False
         self._last: dict[str, float] = {}
 
@@ -55,7 +65,11 @@ class McapLog:
         """(14,) command [rad, m] that is sent now. The first one begins an episode."""
         if not self._in_episode:
             self._in_episode = True
-            self._write(drivers.EPISODE_TOPIC, messages.STRING, {"data": f"start:{self.instruction}"})
+            self._write(
+                drivers.EPISODE_TOPIC,
+                messages.STRING,
+                {"data": f"start:{self.instruction}"},
+            )
         self._last["command"] = self._clock()
         none = np.zeros(ROBOT.num_actions)
         self._joints(drivers.COMMAND_TOPICS, self._last["command"], target, none, none)
@@ -66,7 +80,9 @@ class McapLog:
             return
         self._last[camera] = stamp_s
         if not isinstance(picture, bytes):
-            picture = drivers.jpeg(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _JPEG_QUALITY)
+            picture = drivers.jpeg(
+                cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _JPEG_QUALITY
+            )
         header = self._header(stamp_s, f"{camera}_color_optical_frame")
         message = {"header": header, "format": "jpeg", "data": picture}
         self._write(drivers.CAMERA_TOPICS[camera], messages.COMPRESSED_IMAGE, message)
@@ -79,7 +95,12 @@ class McapLog:
     def pause(self) -> None:
         """End the episode at its last command; the next one begins another."""
         if self._in_episode:
-            self._write(drivers.EPISODE_TOPIC, messages.STRING, {"data": "end"}, self._last["command"])
+            self._write(
+                drivers.EPISODE_TOPIC,
+                messages.STRING,
+                {"data": "end"},
+                self._last["command"],
+            )
             self._in_episode = False
 
     def close(self) -> None:
@@ -90,22 +111,45 @@ class McapLog:
                 self._unless_full(last)
             self._open = False
 
-    def _joints(self, topics: dict[str, str], stamp_s: float, *values: np.ndarray) -> None:
+    def _joints(
+        self, topics: dict[str, str], stamp_s: float, *values: np.ndarray
+    ) -> None:
         position = drivers.as_piper_publishes(values[0][None])[0]
         for arm, topic in topics.items():
             own, joints = ROBOT.arm_slice(arm), ROBOT.joint_slice(arm)
-            message = {"header": self._header(stamp_s, ""), "name": list(drivers.JOINT_NAMES)}
-            message |= {"position": position[own].tolist(), "velocity": _known(values[1][joints])}
-            self._write(topic, messages.JOINT_STATE, message | {"effort": _known(values[2][own])})
+            message = {
+                "header": self._header(stamp_s, ""),
+                "name": list(drivers.JOINT_NAMES),
+            }
+            message |= {
+                "position": position[own].tolist(),
+                "velocity": _known(values[1][joints]),
+            }
+            self._write(
+                topic,
+                messages.JOINT_STATE,
+                message | {"effort": _known(values[2][own])},
+            )
 
     def _header(self, stamp_s: float, frame_id: str) -> dict[str, Any]:
         ns = self._zero_ns + round(stamp_s * 1e9)
-        return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame_id}
+        return {
+            "stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9},
+            "frame_id": frame_id,
+        }
 
-    def _write(self, topic: str, kind: str, message: dict[str, Any], log_s: float | None = None) -> None:
+    def _write(
+        self, topic: str, kind: str, message: dict[str, Any], log_s: float | None = None
+    ) -> None:
         now_s = self._clock() if log_s is None else log_s
         with self._lock:
-            self._unless_full(self._messages.write, topic, kind, message, self._zero_ns + round(now_s * 1e9))
+            self._unless_full(
+                self._messages.write,
+                topic,
+                kind,
+                message,
+                self._zero_ns + round(now_s * 1e9),
+            )
 
     def _unless_full(self, write: Callable[..., Any], *values: Any) -> None:
         if self._open:
@@ -113,7 +157,11 @@ class McapLog:
                 write(*values)
             except OSError as error:
                 self._open = False
-                _log.error("%s: the recording ends here, unfinished: %s", self._file.name, error)
+                _log.error(
+                    "%s: the recording ends here, unfinished: %s",
+                    self._file.name,
+                    error,
+                )
                 with contextlib.suppress(OSError):
                     self._file.close()
 

@@ -73,7 +73,9 @@ class FlexiTacPads(PadsConfig):
 
     def open(self, name: str) -> PadDriver:
         if len(set(self.ports.values())) < len(self.ports):
-            raise TaccorlError(f"pads.ports: {self.ports}: a port is given twice; each pad has its own")
+            raise TaccorlError(
+                f"pads.ports: {self.ports}: a port is given twice; each pad has its own"
+            )
         return FlexiTacDriver(name, self.ports[name])
 
 
@@ -96,7 +98,9 @@ class DriverPads(PadsConfig):
         try:
             return getattr(importlib.import_module(module), function)(name)
         except (ImportError, AttributeError, ValueError) as error:
-            raise TaccorlError(f"pads.open_with={self.open_with}: {error}; give module:function") from error
+            raise TaccorlError(
+                f"pads.open_with={self.open_with}: {error}; give module:function"
+            ) from error
 
 
 class FlexiTacDriver:
@@ -106,7 +110,9 @@ class FlexiTacDriver:
         try:
             sensor = importlib.import_module("flexitac").FlexiTacSensor
         except ImportError as error:
-            raise TaccorlError("pads.type=flexitac needs the package flexitac: pip install flexitac") from error
+            raise TaccorlError(
+                "pads.type=flexitac needs the package flexitac: pip install flexitac"
+            ) from error
         try:
             # A baseline is given so that the sensor does not calibrate by itself; only raw frames are used.
             self._sensor: Any = sensor(port, baseline=0.0, read_timeout_s=0.5).open()
@@ -135,13 +141,19 @@ class Pads:
     ) -> None:
         self.config, self.names = config, config.names
         self._identity, self._listen, self._clock = identity, listen, clock
-        self.spec: SensorSpec = load_sensor_spec(data_specs_folder() / "sensors" / f"{SENSOR}.yaml")
+        self.spec: SensorSpec = load_sensor_spec(
+            data_specs_folder() / "sensors" / f"{SENSOR}.yaml"
+        )
         if not self.names:
-            raise TaccorlError("pads: no pad is named; give pads.ports={left_a: /dev/ttyUSB0}, in the dataset's order")
+            raise TaccorlError(
+                "pads: no pad is named; give pads.ports={left_a: /dev/ttyUSB0}, in the dataset's order"
+            )
         self.baseline: np.ndarray | None = None
         """(K,) resting counts; None before ``connect``."""
         size = round(_KEPT_S * self.spec.rate_hz)
-        self._frames: dict[str, deque[tuple[float, np.ndarray]]] = {n: deque(maxlen=size) for n in self.names}
+        self._frames: dict[str, deque[tuple[float, np.ndarray]]] = {
+            n: deque(maxlen=size) for n in self.names
+        }
         self._drivers: dict[str, PadDriver] = {}
         self._threads: list[threading.Thread] = []
         self._ended = threading.Event()
@@ -164,7 +176,11 @@ class Pads:
         try:
             for name in self.names:
                 self._drivers[name] = self.config.open(name)
-                self._threads.append(threading.Thread(target=self._read, args=(name,), daemon=True, name=f"pad {name}"))
+                self._threads.append(
+                    threading.Thread(
+                        target=self._read, args=(name,), daemon=True, name=f"pad {name}"
+                    )
+                )
                 self._threads[-1].start()
             self.calibrate(timeout_s)
             self._identify()
@@ -177,12 +193,16 @@ class Pads:
         or is touched."""
         rule, begin_s, parts = self.spec.baseline, self._clock(), []
         for name in self.names:
-            first = np.stack(self._newest(name, begin_s, rule.frames, timeout_s)).astype(np.int64)
+            first = np.stack(
+                self._newest(name, begin_s, rule.frames, timeout_s)
+            ).astype(np.int64)
             baseline = np.round(np.median(first, axis=0)).astype(np.int64)
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
                 text = f"pad {name}: counts spread by {spread:.0f} about their median, at most by {rule.max_spread_count:g}"
-                raise TaccorlError(f"{text} at rest: is it touched? Open the grippers, and connect again")
+                raise TaccorlError(
+                    f"{text} at rest: is it touched? Open the grippers, and connect again"
+                )
             parts.append(baseline)
         self.baseline = np.concatenate(parts)
 
@@ -194,11 +214,17 @@ class Pads:
             while self._frames[name][0][0] < begin_s:
                 self._frames[name].popleft()
 
-    def _newest(self, name: str, begin_s: float, count: int, timeout_s: float) -> list[np.ndarray]:
-        while len(new := [f for t, f in list(self._frames[name]) if t >= begin_s]) < count:
+    def _newest(
+        self, name: str, begin_s: float, count: int, timeout_s: float
+    ) -> list[np.ndarray]:
+        while (
+            len(new := [f for t, f in list(self._frames[name]) if t >= begin_s]) < count
+        ):
             if self._clock() - begin_s > timeout_s:
                 text = f"pad {name}: {len(new)} frames in {timeout_s:g} s, not {count}"
-                raise TaccorlError(f"{text}: {self._faults.get(name) or 'is it plugged in?'}")
+                raise TaccorlError(
+                    f"{text}: {self._faults.get(name) or 'is it plugged in?'}"
+                )
             time.sleep(0.005)
         return new[:count]
 
@@ -211,19 +237,37 @@ class Pads:
             driver.close()
         self._threads, self._drivers = [], {}
 
-    def at(self, time_s: float, *, rows: int = 1, period_s: float = 0.0) -> tuple[np.ndarray, dict[str, float]]:
+    def at(
+        self, time_s: float, *, rows: int = 1, period_s: float = 0.0
+    ) -> tuple[np.ndarray, dict[str, float]]:
         """(rows, K) int16 counts above baseline at ``time_s`` and before it, one every ``period_s``, oldest first; and the age of
         each pad's newest frame [s], inf without one. Before the first frame there was none: it is repeated."""
         assert self.baseline is not None, "connect first"
-        grid_ns = np.round((time_s - np.arange(rows)[::-1] * period_s) * NS_PER_S).astype(np.int64)
+        grid_ns = np.round(
+            (time_s - np.arange(rows)[::-1] * period_s) * NS_PER_S
+        ).astype(np.int64)
         parts, ages = [], {}
         for name in self.names:
             frames = list(self._frames[name])
-            frames = frames[max(bisect.bisect(frames, time_s - (rows - 1) * period_s, key=itemgetter(0)) - 1, 0) :]
-            stamps_ns = np.round(np.array([t for t, _ in frames]) * NS_PER_S).astype(np.int64)
-            found = match(grid_ns, stamps_ns - round(self.spec.scan_time_s * NS_PER_S), "hold")
+            frames = frames[
+                max(
+                    bisect.bisect(
+                        frames, time_s - (rows - 1) * period_s, key=itemgetter(0)
+                    )
+                    - 1,
+                    0,
+                ) :
+            ]
+            stamps_ns = np.round(np.array([t for t, _ in frames]) * NS_PER_S).astype(
+                np.int64
+            )
+            found = match(
+                grid_ns, stamps_ns - round(self.spec.scan_time_s * NS_PER_S), "hold"
+            )
             ages[name] = float(found.age_s[-1])
-            values = [frames[max(int(k), 0)][1] for k in found.index[:, 0]] if frames else []
+            values = (
+                [frames[max(int(k), 0)][1] for k in found.index[:, 0]] if frames else []
+            )
             empty = np.zeros((rows, self.spec.rows * self.spec.columns), np.int64)
             parts.append(np.stack(values).astype(np.int64) if values else empty)
         above = np.concatenate(parts, axis=1) - self.baseline
@@ -234,12 +278,17 @@ class Pads:
         while not self._ended.is_set():
             try:
                 stamp_s, frame = self._drivers[name].read()
-            except (OSError, ValueError) as error:  # TimeoutError is an OSError; a pad that comes back is read again
+            except (
+                OSError,
+                ValueError,
+            ) as error:  # TimeoutError is an OSError; a pad that comes back is read again
                 self._faults[name] = str(error) or type(error).__name__
                 self._ended.wait(0.01)
                 continue
             if frame.shape != wire:
-                self._faults[name] = f"frames of {frame.shape}, but {self.spec.name} sends {wire}"
+                self._faults[name] = (
+                    f"frames of {frame.shape}, but {self.spec.name} sends {wire}"
+                )
                 return
             if self._listen is not None:
                 self._listen(stamp_s, name, frame)
@@ -251,19 +300,35 @@ class Pads:
         if self._identity is None:
             return
         assert self.baseline is not None
-        now = dict(zip(self.names, np.split(self.baseline, len(self.names)), strict=True))
+        now = dict(
+            zip(self.names, np.split(self.baseline, len(self.names)), strict=True)
+        )
         if not self._identity.is_file():
             self._identity.parent.mkdir(parents=True, exist_ok=True)
-            self._identity.write_text(json.dumps({n: v.astype(int).tolist() for n, v in now.items()}), encoding="utf-8")
-            _log.info("resting counts of the pads stored in %s, to compare the next connection with", self._identity)
+            self._identity.write_text(
+                json.dumps({n: v.astype(int).tolist() for n, v in now.items()}),
+                encoding="utf-8",
+            )
+            _log.info(
+                "resting counts of the pads stored in %s, to compare the next connection with",
+                self._identity,
+            )
             return
-        stored = {n: np.array(v) for n, v in json.loads(self._identity.read_text(encoding="utf-8")).items()}
+        stored = {
+            n: np.array(v)
+            for n, v in json.loads(self._identity.read_text(encoding="utf-8")).items()
+        }
         way_out = f"If pads were changed on purpose, remove {self._identity}"
         for name, counts in now.items():
-            likeness = {other: float(np.corrcoef(counts, of)[0, 1]) for other, of in stored.items()}
+            likeness = {
+                other: float(np.corrcoef(counts, of)[0, 1])
+                for other, of in stored.items()
+            }
             best = max(likeness, key=lambda n: likeness[n], default="")
             if best and best != name and likeness[best] > SAME_PAD:
-                raise TaccorlError(f"pad {name}: on its port is {best}: pads are exchanged; correct ports. {way_out}")
+                raise TaccorlError(
+                    f"pad {name}: on its port is {best}: pads are exchanged; correct ports. {way_out}"
+                )
             if likeness.get(name, 0.0) <= SAME_PAD:
                 text = f"pad {name}: its resting counts differ from those of before: is it touched, or another pad? {way_out}"
                 raise TaccorlError(text)

@@ -19,7 +19,9 @@ from taccorl.robots import ROBOT
 
 MOTORS = (*ROBOT.joints, "gripper")  # the plug-in's names: joint1 … joint6, gripper
 _RAD, _M = np.pi / 180_000, 1e-6  # of one count of the plug-in's ranges
-_FROM_LOW = ROBOT.per_action(100.0, 0.0)  # the plug-in's units from the lower end of a range to its 0
+_FROM_LOW = ROBOT.per_action(
+    100.0, 0.0
+)  # the plug-in's units from the lower end of a range to its 0
 _OLDEST_MS = 10_000  # ages are judged by safety, not by the camera
 
 
@@ -37,15 +39,23 @@ class TwoPipers:
             text = "--robot.type=bi_piper_flexitac needs the plug-in: pip install lerobot_robot_wego_piper"
             raise TaccorlError(text) from error
         if config.left_can == config.right_can:
-            raise TaccorlError(f"--robot.left_can and --robot.right_can are both {config.left_can}: give each its own")
+            raise TaccorlError(
+                f"--robot.left_can and --robot.right_can are both {config.left_can}: give each its own"
+            )
         ports = {"left": config.left_can, "right": config.right_can}
         self.arms: dict[str, Any] = {
-            arm: plugin.PiperFollower(plugin.PiperFollowerConfig(port=port, id=arm)) for arm, port in ports.items()
+            arm: plugin.PiperFollower(plugin.PiperFollowerConfig(port=port, id=arm))
+            for arm, port in ports.items()
         }
         if config.cameras and tuple(config.cameras) != ROBOT.cameras:
-            raise TaccorlError(f"--robot.cameras: {', '.join(config.cameras)}; name them {', '.join(ROBOT.cameras)}")
+            raise TaccorlError(
+                f"--robot.cameras: {', '.join(config.cameras)}; name them {', '.join(ROBOT.cameras)}"
+            )
         self._cameras: dict[str, Any] = make_cameras_from_configs(config.cameras)
-        self.cameras = {name: (camera.height, camera.width) for name, camera in self._cameras.items()}
+        self.cameras = {
+            name: (camera.height, camera.width)
+            for name, camera in self._cameras.items()
+        }
         self.listeners: list[Listener] = []
         self._low, self._unit = self._ranges()
 
@@ -66,7 +76,9 @@ class TwoPipers:
             try:
                 robot.connect(calibrate=False)
             except (OSError, RuntimeError, ValueError) as error:
-                raise TaccorlError(f"the {arm} arm does not answer: {error}; piper-doctor says more") from error
+                raise TaccorlError(
+                    f"the {arm} arm does not answer: {error}; piper-doctor says more"
+                ) from error
         for camera in self._cameras.values():
             camera.connect()
 
@@ -84,11 +96,15 @@ class TwoPipers:
     def read(self) -> Sample:
         now_s = time.monotonic()
         seen = [self.arms[arm].get_observation() for arm in ROBOT.arms]
-        theirs = np.array([float(one[f"{motor}.pos"]) for one in seen for motor in MOTORS])
+        theirs = np.array(
+            [float(one[f"{motor}.pos"]) for one in seen for motor in MOTORS]
+        )
         found = Sample(position=self.to_ours(theirs), stamps_s={"state": now_s})
         for name, camera in self._cameras.items():
             found.pictures[name] = np.asarray(camera.read_latest(_OLDEST_MS))
-            found.stamps_s[f"camera:{name}"] = now_s if camera.latest_timestamp is None else camera.latest_timestamp
+            found.stamps_s[f"camera:{name}"] = (
+                now_s if camera.latest_timestamp is None else camera.latest_timestamp
+            )
         tell(self.listeners, found)
         return found
 
@@ -96,7 +112,12 @@ class TwoPipers:
         theirs = self.to_theirs(target)
         for arm, robot in self.arms.items():
             values = theirs[ROBOT.arm_slice(arm)].tolist()
-            robot.send_action({f"{motor}.pos": value for motor, value in zip(MOTORS, values, strict=True)})
+            robot.send_action(
+                {
+                    f"{motor}.pos": value
+                    for motor, value in zip(MOTORS, values, strict=True)
+                }
+            )
 
     def to_ours(self, theirs: np.ndarray) -> np.ndarray:
         """(14,) of the plug-in's units in [rad, m]."""

@@ -36,7 +36,9 @@ class SafetyConfig:
     Empty: those of the PiPER; required for other robots, because their units are their own."""
     ranges: dict[str, list[float]] = field(default_factory=dict)
     """Name of an action → lowest and highest target; those of the PiPER are known."""
-    workspace_m: list[float] = field(default_factory=lambda: [-0.1, 0.75, -0.6, 0.6, 0.0, 0.9])
+    workspace_m: list[float] = field(
+        default_factory=lambda: [-0.1, 0.75, -0.6, 0.6, 0.0, 0.9]
+    )
     """Box in the twin's world in which the hands must stay: x, y, z, lowest and highest each [m]. PiPER only; [] for none."""
     pad_sum_count: float = 40_000.0
     """Largest sum of a pad's counts above baseline; 384 taxels of 255 counts are 98 thousand."""
@@ -93,21 +95,48 @@ class Guard:
     TaccorlError: the unit of a robot's speeds is not stated, or an option names no action."""
 
     def __init__(
-        self, config: SafetyConfig, names: Sequence[str], period_s: float, clock: Callable[[], float], *, piper: bool
+        self,
+        config: SafetyConfig,
+        names: Sequence[str],
+        period_s: float,
+        clock: Callable[[], float],
+        *,
+        piper: bool,
     ) -> None:
-        self.config, self.names, self.period_s, self._clock = config, tuple(names), period_s, clock
-        self._speed = self._by_name("max_speed", config.max_speed or (PIPER_SPEED if piper else {}), required=True)
-        self._effort = self._by_name("effort", config.effort or (PIPER_EFFORT if piper else {}))
-        self._low, self._high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+        self.config, self.names, self.period_s, self._clock = (
+            config,
+            tuple(names),
+            period_s,
+            clock,
+        )
+        self._speed = self._by_name(
+            "max_speed",
+            config.max_speed or (PIPER_SPEED if piper else {}),
+            required=True,
+        )
+        self._effort = self._by_name(
+            "effort", config.effort or (PIPER_EFFORT if piper else {})
+        )
+        self._low, self._high = (
+            np.full(len(names), -np.inf),
+            np.full(len(names), np.inf),
+        )
         if piper:
             self._low, self._high = ROBOT.action_low.copy(), ROBOT.action_high.copy()
         for name, ends in config.ranges.items():
             if name not in names or len(ends) != 2 or not ends[0] < ends[1]:
-                raise TaccorlError(f"safety.ranges: {name}: {ends}: give [low, high] of one of {', '.join(names)}")
+                raise TaccorlError(
+                    f"safety.ranges: {name}: {ends}: give [low, high] of one of {', '.join(names)}"
+                )
             self._low[names.index(name)], self._high[names.index(name)] = ends
         box = config.workspace_m
-        if box and (len(box) != 6 or not all(a < b for a, b in zip(box[::2], box[1::2], strict=True))):
-            raise TaccorlError(f"safety.workspace_m={box}: give [x_low, x_high, y_low, y_high, z_low, z_high] m, or []")
+        if box and (
+            len(box) != 6
+            or not all(a < b for a, b in zip(box[::2], box[1::2], strict=True))
+        ):
+            raise TaccorlError(
+                f"safety.workspace_m={box}: give [x_low, x_high, y_low, y_high, z_low, z_high] m, or []"
+            )
         self._box = np.array(box).reshape(3, 2) if box and piper else None
         self._hands = _hands() if self._box is not None else None
         self.stopped = ""
@@ -118,9 +147,16 @@ class Guard:
         """Reason for which the arms hold at present; empty while they follow."""
         self.counts = {"pass": 0, "limit": 0, "hold": 0, "stop": 0}
         self._sent: np.ndarray | None = None
-        self._sent_s, self._asked_s, self._late_s = clock(), clock(), 0.0  # _late_s: between actions, lately
+        self._sent_s, self._asked_s, self._late_s = (
+            clock(),
+            clock(),
+            0.0,
+        )  # _late_s: between actions, lately
         self._observed: Observed | None = None
-        self._at_s, self._rate = clock(), np.zeros(len(names))  # of the observed position: its time, its change [1/s]
+        self._at_s, self._rate = (
+            clock(),
+            np.zeros(len(names)),
+        )  # of the observed position: its time, its change [1/s]
 
     def observed(self, seen: Observed) -> Reaction | None:
         """Take note of an observation; returns a reaction if it demands one at once."""
@@ -132,10 +168,17 @@ class Guard:
             return None
         for pad, count in seen.pad_counts.items():
             if count > self.config.pad_sum_count:
-                return self.stop(f"pad {pad} is pressed: {count:.0f} counts, at most {self.config.pad_sum_count:.0f}")
-        if seen.effort is not None and (over := np.abs(seen.effort) > self._effort).any():
+                return self.stop(
+                    f"pad {pad} is pressed: {count:.0f} counts, at most {self.config.pad_sum_count:.0f}"
+                )
+        if (
+            seen.effort is not None
+            and (over := np.abs(seen.effort) > self._effort).any()
+        ):
             k = int(np.argmax(over))
-            return self.stop(f"effort of {self.names[k]}: {seen.effort[k]:.1f}, at most {self._effort[k]:g}")
+            return self.stop(
+                f"effort of {self.names[k]}: {seen.effort[k]:.1f}, at most {self._effort[k]:g}"
+            )
         return self._beyond(seen.position, "is")
 
     def command(self, action: Mapping[str, float]) -> Reaction:
@@ -147,7 +190,9 @@ class Guard:
             return self.stop(f"an action without {', '.join(missing)}")
         target = np.array([float(action[name]) for name in self.names])
         if not np.isfinite(target).all():
-            return self.stop(f"action {self.names[int(np.argmin(np.isfinite(target)))]} is not finite")
+            return self.stop(
+                f"action {self.names[int(np.argmin(np.isfinite(target)))]} is not finite"
+            )
         passed_s = self._clock() - self._asked_s if self._sent is not None else 0.0
         self._late_s, self._asked_s = max(0.9 * self._late_s, passed_s), self._clock()
         if self._observed is None:
@@ -158,15 +203,21 @@ class Guard:
             _log.warning("the arms follow again: %s is over", self.holding)
             self.holding = ""
         before = self._observed.position if self._sent is None else self._sent
-        passed_s = min(max(self._clock() - self._sent_s, self.period_s), 2 * self.period_s)
-        limited = np.clip(target, before - self._speed * passed_s, before + self._speed * passed_s)
+        passed_s = min(
+            max(self._clock() - self._sent_s, self.period_s), 2 * self.period_s
+        )
+        limited = np.clip(
+            target, before - self._speed * passed_s, before + self._speed * passed_s
+        )
         limited = np.clip(limited, self._low, self._high)
         if (reaction := self._beyond(limited, "would be")) is not None:
             return reaction
         kind = "pass" if np.allclose(limited, target, rtol=0, atol=1e-6) else "limit"
         self._sent, self._sent_s = limited, self._clock()
         self.counts[kind] += 1
-        return Reaction(kind=kind, target=limited, reason="" if kind == "pass" else "speed or range")
+        return Reaction(
+            kind=kind, target=limited, reason="" if kind == "pass" else "speed or range"
+        )
 
     def tick(self) -> Reaction | None:
         """To be called at least once a period, also if nobody commands: the watchdog. Returns a reaction if one is due."""
@@ -205,7 +256,10 @@ class Guard:
             reason += f"; the loop was late: no action for {self._late_s:.2f} s"
         self.stopped, self.is_lost = reason, is_lost
         self.counts["stop"] += 1
-        _log.error("STOPPED: %s; no command is accepted until the robot is connected again", reason)
+        _log.error(
+            "STOPPED: %s; no command is accepted until the robot is connected again",
+            reason,
+        )
         return Reaction(kind="stop", target=self._here(), reason=reason)
 
     def _here(self) -> np.ndarray | None:
@@ -214,9 +268,13 @@ class Guard:
         if self._observed is None:
             return None
         passed_s = min(self._clock() - self._at_s, 2 * self.period_s)
-        here = np.clip(self._observed.position + passed_s * self._rate, self._low, self._high)
+        here = np.clip(
+            self._observed.position + passed_s * self._rate, self._low, self._high
+        )
         if self._sent is not None:
-            rests = np.abs(self._sent - here) <= _AT_TARGET * self._speed * self.period_s
+            rests = (
+                np.abs(self._sent - here) <= _AT_TARGET * self._speed * self.period_s
+            )
             rests |= ["gripper" in name for name in self.names]
             here[rests] = self._sent[rests]
         return here
@@ -239,7 +297,9 @@ class Guard:
                 reason = f"{channel} is {age_s:.2f} s old, at most {self.config.stop_after_s:g} s"
                 return self.stop(reason, is_lost=True)
             if age_s > (most_s := self._most_s(channel)):
-                return self._hold(f"{channel} is {age_s:.2f} s old, at most {most_s:g} s")
+                return self._hold(
+                    f"{channel} is {age_s:.2f} s old, at most {most_s:g} s"
+                )
         return None
 
     def _beyond(self, position: np.ndarray, verb: str) -> Reaction | None:
@@ -249,21 +309,40 @@ class Guard:
         for arm, hand in zip(ROBOT.arms, self._hands(position), strict=True):
             if (hand < self._box[:, 0]).any() or (hand > self._box[:, 1]).any():
                 place = ", ".join(f"{x:.3f}" for x in hand)
-                return self.stop(f"the {arm} hand {verb} at ({place}) m, outside of safety.workspace_m")
+                return self.stop(
+                    f"the {arm} hand {verb} at ({place}) m, outside of safety.workspace_m"
+                )
         return None
 
-    def _by_name(self, option: str, limits: Mapping[str, float], *, required: bool = False) -> np.ndarray:
+    def _by_name(
+        self, option: str, limits: Mapping[str, float], *, required: bool = False
+    ) -> np.ndarray:
         """(A,) limits: of each action's name the first whose end fits."""
-        found = [next((v for end, v in limits.items() if name.endswith(end)), math.inf) for name in self.names]
-        unused = [end for end in limits if not any(name.endswith(end) for name in self.names)]
-        without = [name for name, value in zip(self.names, found, strict=True) if math.isinf(value)]
+        found = [
+            next((v for end, v in limits.items() if name.endswith(end)), math.inf)
+            for name in self.names
+        ]
+        unused = [
+            end for end in limits if not any(name.endswith(end) for name in self.names)
+        ]
+        without = [
+            name
+            for name, value in zip(self.names, found, strict=True)
+            if math.isinf(value)
+        ]
         if unused:
-            raise TaccorlError(f"safety.{option}: no action ends with {unused[0]}; actions: {', '.join(self.names)}")
+            raise TaccorlError(
+                f"safety.{option}: no action ends with {unused[0]}; actions: {', '.join(self.names)}"
+            )
         if required and without:
             text = f"safety.{option}: no limit for {without[0]}, whose unit only its robot knows"
-            raise TaccorlError(f"{text}; give one per second: --robot.safety.{option}='{{pos: 90}}' for degrees")
+            raise TaccorlError(
+                f"{text}; give one per second: --robot.safety.{option}='{{pos: 90}}' for degrees"
+            )
         if any(not value > 0 for value in found):
-            raise TaccorlError(f"safety.{option}: {dict(limits)}: limits must be above 0")
+            raise TaccorlError(
+                f"safety.{option}: {dict(limits)}: limits must be above 0"
+            )
         return np.array(found)
 
 
@@ -272,5 +351,9 @@ def _hands() -> Callable[[np.ndarray], list[np.ndarray]]:
     from taccorl.sim.robot import RobotConfig
     from taccorl.tasks.experts.kinematics import ArmKinematics
 
-    arms = {arm: ArmKinematics(arm, RobotConfig()) for arm in ROBOT.arms}  # in torch it takes 1 ms of every period
-    return lambda state: [one.pose(state[ROBOT.joint_slice(arm)])[:3, 3] for arm, one in arms.items()]
+    arms = {
+        arm: ArmKinematics(arm, RobotConfig()) for arm in ROBOT.arms
+    }  # in torch it takes 1 ms of every period
+    return lambda state: [
+        one.pose(state[ROBOT.joint_slice(arm)])[:3, 3] for arm, one in arms.items()
+    ]

@@ -19,7 +19,14 @@ from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate.cases import draw_case, draw_secret
-from taccorl.surrogate.drivers import CAMERA_HZ, JOINT_HZ, PAD_HZ, PAD_WIRE_SHAPE, DriverConfig, jpeg
+from taccorl.surrogate.drivers import (
+    CAMERA_HZ,
+    JOINT_HZ,
+    PAD_HZ,
+    PAD_WIRE_SHAPE,
+    DriverConfig,
+    jpeg,
+)
 from taccorl.surrogate.recordings import EFFORT_QUANTUM_NM, NOISE_RAD, QUANTUM_RAD
 
 FAULTS = {
@@ -77,12 +84,16 @@ def hidden_twin(config: SurrogateConfig) -> TwinConfig:
     twin = load_twin(config.twin) if config.twin else TwinConfig()
     if config.secret is None and not config.effects:
         return twin
-    names = draw_secret(config.secret or 0) if config.effects is None else config.effects
+    names = (
+        draw_secret(config.secret or 0) if config.effects is None else config.effects
+    )
     hidden = draw_case(names, config.secret or 0).hidden
     outside = [h.name for h in hidden if not h.registered]
     if outside:
         text = f"--secret={config.secret}: hides {', '.join(outside)}, which the twin cannot simulate in contact"
-        raise TaccorlError(f"{text}; give another --secret, or --effects=[coulomb_friction]")
+        raise TaccorlError(
+            f"{text}; give another --secret, or --effects=[coulomb_friction]"
+        )
     twin.effects = [*twin.effects, *(h.effect() for h in hidden)]
     return twin
 
@@ -97,15 +108,31 @@ class SurrogateBody:
             if fault not in FAULTS:
                 raise TaccorlError(f"--faults={fault}: {nearest(fault, FAULTS)}")
         if config.task not in tasks:
-            raise TaccorlError(f"--task={config.task}: {nearest(config.task, list(tasks))}")
+            raise TaccorlError(
+                f"--task={config.task}: {nearest(config.task, list(tasks))}"
+            )
         self.config, self.faults = config, set(config.faults)
-        self.sim = Simulation(tasks.get(config.task)(config.difficulty), hidden_twin(config))
+        self.sim = Simulation(
+            tasks.get(config.task)(config.difficulty), hidden_twin(config)
+        )
         self.cameras = ROBOT.cameras if config.camera_px else ()
-        hidden = "no hidden effect" if config.secret is None and not config.effects else "hidden effects"
-        self.origin = Origin("surrogate", f"surrogate robot (the twin with {hidden}), not a robot")
-        dice = np.random.default_rng(zlib.crc32(b"pads of the surrogate"))  # the same pads in every session
-        self.baselines = np.round(dice.uniform(10, 40, (len(ROBOT.pads), *PAD_WIRE_SHAPE)))
-        self._physics = round(self.sim.config.physics.steps_per_control_step * CONTROL_HZ / PAD_HZ)
+        hidden = (
+            "no hidden effect"
+            if config.secret is None and not config.effects
+            else "hidden effects"
+        )
+        self.origin = Origin(
+            "surrogate", f"surrogate robot (the twin with {hidden}), not a robot"
+        )
+        dice = np.random.default_rng(
+            zlib.crc32(b"pads of the surrogate")
+        )  # the same pads in every session
+        self.baselines = np.round(
+            dice.uniform(10, 40, (len(ROBOT.pads), *PAD_WIRE_SHAPE))
+        )
+        self._physics = round(
+            self.sim.config.physics.steps_per_control_step * CONTROL_HZ / PAD_HZ
+        )
         self.ticks, self.scene_seed = 0, config.seed - 1
         self.reset(config.seed)
 
@@ -128,20 +155,30 @@ class SurrogateBody:
         """Move to ``target`` (14,) [rad, m] within 1/30 s, in a straight line, as in the twin. Raises TaccorlError: a value is
         not finite."""
         if not np.isfinite(target).all():
-            raise TaccorlError(f"command: {ROBOT.action_names[int(np.argmin(np.isfinite(target)))]} is not finite")
+            raise TaccorlError(
+                f"command: {ROBOT.action_names[int(np.argmin(np.isfinite(target)))]} is not finite"
+            )
         self._from, self._since = self._target, self.ticks
         self._goal = np.clip(target, ROBOT.action_low, ROBOT.action_high)
 
     def hold(self) -> None:
         """Come to rest: the present position becomes the target at once."""
-        here = np.clip(self.sim.proprioception()[0], ROBOT.action_low, ROBOT.action_high)
-        here[ROBOT.gripper_indices] = self._target[ROBOT.gripper_indices]  # what is gripped stays gripped
+        here = np.clip(
+            self.sim.proprioception()[0], ROBOT.action_low, ROBOT.action_high
+        )
+        here[ROBOT.gripper_indices] = self._target[
+            ROBOT.gripper_indices
+        ]  # what is gripped stays gripped
         self._from = self._goal = self._target = here
 
     def outcome(self) -> dict[str, Any]:
         """What the task's own predicate says of the episode so far: a judge beside the robot, no sensor of it."""
         found = self.sim.judge.outcome
-        said = {"success": bool(found.success[0]), "failure": str(found.failure[0]), "partial": int(found.partial[0])}
+        said = {
+            "success": bool(found.success[0]),
+            "failure": str(found.failure[0]),
+            "partial": int(found.partial[0]),
+        }
         return said | {"seconds": self._steps / CONTROL_HZ, "seed": self.scene_seed}
 
     def lead_on(self) -> None:
@@ -149,25 +186,35 @@ class SurrogateBody:
         from taccorl.episodes.sources.expert import ExpertSource
 
         if self._expert is None:
-            self._expert = ExpertSource().actions(self.sim, np.random.default_rng([self.scene_seed, 1]))
+            self._expert = ExpertSource().actions(
+                self.sim, np.random.default_rng([self.scene_seed, 1])
+            )
         try:
             self.lead = np.asarray(next(self._expert).sent, dtype=float)
         except (StopIteration, UnreachableError):
             self._expert = iter(())
 
-    def tick(self, behind: int = 0, lead: Callable[[], bool] = lambda: False) -> list[Message]:
+    def tick(
+        self, behind: int = 0, lead: Callable[[], bool] = lambda: False
+    ) -> list[Message]:
         """Advance by 10 ms; returns the messages, due in the future. ``behind``: ticks by which the caller is late; pictures
         are then left out. ``lead``: whether the leader moves."""
         states: list[tuple[float, np.ndarray]] = []
         now_s = self.ticks * self.TICK_S
         every = round(self._physics * PAD_HZ / JOINT_HZ)
-        passed = self.ticks - self._since + np.arange(every, self._physics + 1, every)[:, None, None] / self._physics
+        passed = (
+            self.ticks
+            - self._since
+            + np.arange(every, self._physics + 1, every)[:, None, None] / self._physics
+        )
         share = np.minimum(passed * self.TICK_S * CONTROL_HZ, 1.0)
         line = self._from + share * (self._goal - self._from)
         self._target = self._goal if share[-1, 0, 0] == 1.0 else line[-1, 0]
 
         def see(step: int) -> None:
-            states.append((now_s + step * self.sim.config.physics.timestep_s, self._state()))
+            states.append(
+                (now_s + step * self.sim.config.physics.timestep_s, self._state())
+            )
 
         at = range(every, self._physics + 1, every)
         self.sim.advance(line, every, watch=Watch(at, see))
@@ -179,12 +226,19 @@ class SurrogateBody:
                 self.lead_on()
         now_s = self.ticks * self.TICK_S
         scanned, self._scan = self._scan, self._frames()
-        return [*self._telemetry(now_s, states, scanned), *self._pictures(now_s, behind)]
+        return [
+            *self._telemetry(now_s, states, scanned),
+            *self._pictures(now_s, behind),
+        ]
 
     def _state(self) -> np.ndarray:
         """(3, 14) angles [rad, m] and efforts [N·m, N], with an encoder's noise and steps; velocities are not measured (NaN)."""
-        noise = self._rng.normal(0, NOISE_RAD, ROBOT.num_actions) * ROBOT.per_action(1.0, 0.05)
-        position = np.round((self.sim.proprioception()[0] + noise) / QUANTUM_RAD) * QUANTUM_RAD
+        noise = self._rng.normal(0, NOISE_RAD, ROBOT.num_actions) * ROBOT.per_action(
+            1.0, 0.05
+        )
+        position = (
+            np.round((self.sim.proprioception()[0] + noise) / QUANTUM_RAD) * QUANTUM_RAD
+        )
         effort = np.round(self.sim.effort()[0] / EFFORT_QUANTUM_NM) * EFFORT_QUANTUM_NM
         if "jammed" in self.faults:
             effort[1] += 60.0
@@ -195,18 +249,38 @@ class SurrogateBody:
         clean = self.sim.sensor.clean_counts(self.sim.reading())[0].swapaxes(1, 2)
         if "pressed_pad" in self.faults:
             clean[0] += 200.0
-        counts = self.baselines + clean + self._rng.normal(0, DriverConfig.pad_noise_counts, clean.shape)
+        counts = (
+            self.baselines
+            + clean
+            + self._rng.normal(0, DriverConfig.pad_noise_counts, clean.shape)
+        )
         wire = np.clip(np.round(counts), 0, 255).astype(np.uint8)
         if "exchanged_pads" in self.faults:
             wire = wire[[2, 1, 0, 3]]
         return wire
 
-    def _telemetry(self, now_s: float, states: list[tuple[float, np.ndarray]], scanned: np.ndarray) -> list[Message]:
-        pads = [k for k, _ in enumerate(ROBOT.pads) if not (k == 0 and "silent_pad" in self.faults)]
+    def _telemetry(
+        self, now_s: float, states: list[tuple[float, np.ndarray]], scanned: np.ndarray
+    ) -> list[Message]:
+        pads = [
+            k
+            for k, _ in enumerate(ROBOT.pads)
+            if not (k == 0 and "silent_pad" in self.faults)
+        ]
         late_s = LATE_S if "late_state" in self.faults else 0.0
         header = {"stamps_s": [s for s, _ in states], "lead": self.lead.tolist()}
-        joints = Message("state", self._due(now_s + late_s), header, np.stack([x for _, x in states]).tobytes())
-        touch = Message("pads", self._due(now_s), {"stamps_s": [now_s], "pads": pads}, scanned[pads].tobytes())
+        joints = Message(
+            "state",
+            self._due(now_s + late_s),
+            header,
+            np.stack([x for _, x in states]).tobytes(),
+        )
+        touch = Message(
+            "pads",
+            self._due(now_s),
+            {"stamps_s": [now_s], "pads": pads},
+            scanned[pads].tobytes(),
+        )
         return [joints, touch]
 
     def _pictures(self, now_s: float, behind: int) -> list[Message]:
@@ -216,8 +290,15 @@ class SurrogateBody:
             phase = self.ticks + k * round(PAD_HZ / CAMERA_HZ / len(self.cameras))
             number = phase * CAMERA_HZ // PAD_HZ
             faults = self.faults if camera == "front" else set()
-            late = behind > _DRAWN_MAX_BEHIND and self.ticks - self._drawn.get(camera, -PAD_HZ) < _DRAWN_AT_LEAST
-            if number == (phase - 1) * CAMERA_HZ // PAD_HZ or late or "dead_camera" in faults:
+            late = (
+                behind > _DRAWN_MAX_BEHIND
+                and self.ticks - self._drawn.get(camera, -PAD_HZ) < _DRAWN_AT_LEAST
+            )
+            if (
+                number == (phase - 1) * CAMERA_HZ // PAD_HZ
+                or late
+                or "dead_camera" in faults
+            ):
                 continue
             self._drawn[camera] = self.ticks
             if "slow_camera" in faults and number % 5:
@@ -227,20 +308,31 @@ class SurrogateBody:
                 picture = self.sim.render([camera], size=size)[camera][0, :, :, ::-1]
                 # The low bits of a real picture are never twice the same.
                 noisy = picture ^ self._rng.integers(0, 4, picture.shape, np.uint8)
-                self._last_jpeg[camera] = jpeg(np.ascontiguousarray(noisy), DriverConfig.jpeg_quality)
+                self._last_jpeg[camera] = jpeg(
+                    np.ascontiguousarray(noisy), DriverConfig.jpeg_quality
+                )
             header = {"camera": camera, "stamps_s": [now_s]}
             due_s = self._due(now_s + _CAMERA_LATENCY_S)
             found.append(Message("camera", due_s, header, self._last_jpeg[camera]))
         return found
 
     def _due(self, due_s: float) -> float:
-        return due_s + (self._rng.uniform(0, JITTER_S) if "jitter" in self.faults else 0.0)
+        return due_s + (
+            self._rng.uniform(0, JITTER_S) if "jitter" in self.faults else 0.0
+        )
 
     def facts(self) -> Mapping[str, Any]:
         """What a client is told of the robot: no pose, no effect, nothing that a robot would not know of itself."""
         px = self.config.camera_px
-        told = {"task": self.config.task, "instruction": self.sim.task.instruction, "seed": self.scene_seed}
-        return told | {"cameras": {name: [px, px] for name in self.cameras}, "origin": dict(self.origin.record())}
+        told = {
+            "task": self.config.task,
+            "instruction": self.sim.task.instruction,
+            "seed": self.scene_seed,
+        }
+        return told | {
+            "cameras": {name: [px, px] for name in self.cameras},
+            "origin": dict(self.origin.record()),
+        }
 
     def close(self) -> None:
         """Free OpenGL contexts and threads."""

@@ -34,12 +34,22 @@ class SurrogateLink:
     message after which the connection counts as lost [s of ``clock``]."""
 
     def __init__(
-        self, port: int, role: str = ROBOT_ROLE, lost_s: float = LOST_S, clock: Callable[[], float] = time.monotonic
+        self,
+        port: int,
+        role: str = ROBOT_ROLE,
+        lost_s: float = LOST_S,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.port, self.role, self.lost_s, self._clock = port, role, lost_s, clock
-        self.states: deque[tuple[float, np.ndarray]] = deque(maxlen=64)  # stamp [s], (3, 14) position, velocity, effort
-        self.pads: dict[str, queue.SimpleQueue[tuple[float, np.ndarray]]] = {n: queue.SimpleQueue() for n in ROBOT.pads}
-        self.pictures: dict[str, tuple[float, np.ndarray]] = {}  # stamp [s], RGB: decoded beside the loop
+        self.states: deque[tuple[float, np.ndarray]] = deque(
+            maxlen=64
+        )  # stamp [s], (3, 14) position, velocity, effort
+        self.pads: dict[str, queue.SimpleQueue[tuple[float, np.ndarray]]] = {
+            n: queue.SimpleQueue() for n in ROBOT.pads
+        }
+        self.pictures: dict[
+            str, tuple[float, np.ndarray]
+        ] = {}  # stamp [s], RGB: decoded beside the loop
         self.lead: list[float] | None = None
         self.listeners: list[Any] = []
         """Called with (kind, stamp [s], name, value) of every sample, in the link's thread."""
@@ -61,7 +71,9 @@ class SurrogateLink:
 
     def connect(self, timeout_s: float = 3.0) -> Mapping[str, Any]:
         """Connect; returns the surrogate's facts. Raises TaccorlError: nobody answers, or somebody else drives it."""
-        if self.heard_s == -np.inf:  # a surrogate that was there once may be on its way back
+        if (
+            self.heard_s == -np.inf
+        ):  # a surrogate that was there once may be on its way back
             try:
                 create_connection(("127.0.0.1", self.port), timeout_s).close()
             except (OSError, OverflowError) as error:  # no such port
@@ -70,10 +82,14 @@ class SurrogateLink:
         receiver, self._wake = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
         receiver.bind(inside)
         self._wake.connect(inside)
-        self._thread = threading.Thread(target=self._run, args=(receiver,), daemon=True, name="surrogate link")
+        self._thread = threading.Thread(
+            target=self._run, args=(receiver,), daemon=True, name="surrogate link"
+        )
         self._thread.start()
         try:
-            return self.request("hello", timeout_s, role=self.role, name=f"process {os.getpid()}")
+            return self.request(
+                "hello", timeout_s, role=self.role, name=f"process {os.getpid()}"
+            )
         except TaccorlError:
             self.close()
             raise
@@ -82,7 +98,9 @@ class SurrogateLink:
         """Say goodbye and end the thread; no error if the surrogate is gone."""
         if self._thread is not None:
             with contextlib.suppress(TaccorlError):
-                self.request("bye", 0.5)  # before the next connection's hello, which goes another way
+                self.request(
+                    "bye", 0.5
+                )  # before the next connection's hello, which goes another way
             self._wake.send(b"")
             self._thread.join()
             self._wake.close()
@@ -103,17 +121,23 @@ class SurrogateLink:
                 reply = self._replies.get(timeout=left)
                 if reply.get("id") == number:
                     if "refused" in reply:
-                        raise TaccorlError(f"surrogate on port {self.port}: {reply['refused']}")
+                        raise TaccorlError(
+                            f"surrogate on port {self.port}: {reply['refused']}"
+                        )
                     return reply
         raise self._absent()
 
     def _absent(self) -> TaccorlError:
         text = f"no surrogate answers on port {self.port} of this machine: start one with taccorl serve-surrogate "
-        return TaccorlError(f"{text}--port={self.port}, and wait until it says listening")
+        return TaccorlError(
+            f"{text}--port={self.port}, and wait until it says listening"
+        )
 
     def _run(self, receiver: zmq.Socket) -> None:
         socket = zmq.Context.instance().socket(zmq.DEALER)
-        socket.setsockopt(zmq.LINGER, 0)  # nothing of this connection may reach the next server on the port
+        socket.setsockopt(
+            zmq.LINGER, 0
+        )  # nothing of this connection may reach the next server on the port
         socket.connect(f"tcp://127.0.0.1:{self.port}")
         poller = zmq.Poller()
         for one in (receiver, socket):
@@ -138,7 +162,9 @@ class SurrogateLink:
         header = json.loads(text)
         kind, stamps_s = header["kind"], header.get("stamps_s")
         if kind == "reply":
-            if "seed" in header:  # of hello or reset: the samples so far are of another scene
+            if (
+                "seed" in header
+            ):  # of hello or reset: the samples so far are of another scene
                 self.states.clear()
                 self.pictures.clear()
             self._replies.put(header)
@@ -148,16 +174,25 @@ class SurrogateLink:
             self.lead = header["lead"]
             found = np.frombuffer(payload).reshape(-1, 3, ROBOT.num_actions)
             self.states.extend(zip(stamps_s, found, strict=True))
-            samples = [("state", stamp, "", value) for stamp, value in zip(stamps_s, found, strict=True)]
+            samples = [
+                ("state", stamp, "", value)
+                for stamp, value in zip(stamps_s, found, strict=True)
+            ]
         elif kind == "camera":
             decoded = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
             assert decoded is not None, "the surrogate sends JPEG"
-            self.pictures[header["camera"]] = stamps_s[0], cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+            self.pictures[header["camera"]] = (
+                stamps_s[0],
+                cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB),
+            )
             samples = [("camera", stamps_s[0], header["camera"], payload)]
         else:
             names = [ROBOT.pads[k] for k in header["pads"]]
             frames = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
-            samples = [("pad", stamps_s[0], name, frame) for name, frame in zip(names, frames, strict=True)]
+            samples = [
+                ("pad", stamps_s[0], name, frame)
+                for name, frame in zip(names, frames, strict=True)
+            ]
             for _, stamp, name, frame in samples:
                 self.pads[name].put((stamp, frame))
                 if self.pads[name].qsize() > 4096:  # 40 s: nobody reads them

@@ -23,7 +23,14 @@ from lerobot.rollout.inference import RTCInferenceConfig
 from lerobot.utils.random_utils import set_seed
 
 from taccorl.errors import TaccorlError, nearest
-from taccorl.evaluation.episodes import ROWS_FILE, SUCCESS, SUMMARY_FILE, EpisodeRow, read_rows, write_rows
+from taccorl.evaluation.episodes import (
+    ROWS_FILE,
+    SUCCESS,
+    SUMMARY_FILE,
+    EpisodeRow,
+    read_rows,
+    write_rows,
+)
 from taccorl.evaluation.evaluate import is_stored
 from taccorl.report.evaluated import Evaluation
 from taccorl.robot_plugin import lerobot_hooks
@@ -73,14 +80,26 @@ class Trials:
             config = draccus.decode(RobotConfig, options)
         except (draccus.utils.DecodingError, ValueError, ImportError) as error:
             known, kind = RobotConfig.get_known_choices(), options["type"]
-            text = f".type={kind}: {nearest(kind, known)}" if kind not in known else f": {' '.join(str(error).split())}"
+            text = (
+                f".type={kind}: {nearest(kind, known)}"
+                if kind not in known
+                else f": {' '.join(str(error).split())}"
+            )
             raise TaccorlError(f"--robot{text}") from error
         if not isinstance(config, TouchOptions):
             text = "has no limits and stops: give --robot.type=touch_robot --robot.robot='{type: …}'"
             raise TaccorlError(f"--robot.type={options['type']}: {text}")
         if config.dry_run or config.record:
-            raise TaccorlError("--robot.dry_run, --robot.record: a trial moves, and has its own recording: remove them")
-        made = _Rollout(robot=config, policy=policy, task=task.instruction, device=policy.device, fps=CONTROL_HZ)
+            raise TaccorlError(
+                "--robot.dry_run, --robot.record: a trial moves, and has its own recording: remove them"
+            )
+        made = _Rollout(
+            robot=config,
+            policy=policy,
+            task=task.instruction,
+            device=policy.device,
+            fps=CONTROL_HZ,
+        )
         if hasattr(policy, "rtc_config"):
             made.inference = RTCInferenceConfig()
         lerobot_hooks.install()
@@ -92,17 +111,29 @@ class Trials:
         self.link = body.link if isinstance(body, SurrogateArms) else None
         if isinstance(body, SurrogateArms) and body.task != task.name:
             self.robot.disconnect()
-            raise TaccorlError(f"--task={task.name}: the surrogate on that port runs {body.task}")
+            raise TaccorlError(
+                f"--task={task.name}: the surrogate on that port runs {body.task}"
+            )
 
-    def trial(self, name: str, seed: int, limit_s: float, record: Path | None) -> EpisodeRow:
+    def trial(
+        self, name: str, seed: int, limit_s: float, record: Path | None
+    ) -> EpisodeRow:
         """Run one trial of at most ``limit_s``, recorded in the file ``record``. ``seed``: of the scene, on a surrogate. Raises
         Void: the trial cannot be counted; Quit: the person who judges ends the evaluation."""
         robot, ctx = self.robot, self._ctx
         if robot.is_connected:
             robot.disconnect()
         robot.config.record, self._limit_s, homes = record, limit_s, False
-        ctx.runtime.cfg.duration = limit_s if self.link is None else 0  # a surrogate's own time counts
-        if self.link is None and _line(f"put the scene in order, then Enter (q ends). Meanwhile: {_KEYS}") == "q":
+        ctx.runtime.cfg.duration = (
+            limit_s if self.link is None else 0
+        )  # a surrogate's own time counts
+        if (
+            self.link is None
+            and _line(
+                f"put the scene in order, then Enter (q ends). Meanwhile: {_KEYS}"
+            )
+            == "q"
+        ):
             raise Quit("ended by q")
         self._found = []
         self._ended.clear()
@@ -114,8 +145,13 @@ class Trials:
             judge.start()
             self._strategy.run(ctx)
             if self._strategy._engine.failed:
-                raise TaccorlError("the policy predicts no actions; LeRobot's messages above say why")
-            verdict, homes = self._found[0] if self._found else Verdict("timeout"), self.link is None
+                raise TaccorlError(
+                    "the policy predicts no actions; LeRobot's messages above say why"
+                )
+            verdict, homes = (
+                self._found[0] if self._found else Verdict("timeout"),
+                self.link is None,
+            )
         except Stopped as error:
             if robot.guard.is_lost:
                 raise Void(str(error)) from error
@@ -124,15 +160,29 @@ class Trials:
             raise Void(str(error)) from error
         finally:
             self._ended.set()
-            self._strategy._teardown_hardware(ctx.hardware, return_to_initial_position=homes)
+            self._strategy._teardown_hardware(
+                ctx.hardware, return_to_initial_position=homes
+            )
         if isinstance(verdict, TaccorlError):
-            raise verdict if isinstance(verdict, Quit) else Void(str(verdict)) from verdict
-        while self.link is None and (answer := _line(f"{verdict.outcome} {verdict.reason}: Enter keeps it; {_KEYS}")):
+            raise (
+                verdict if isinstance(verdict, Quit) else Void(str(verdict))
+            ) from verdict
+        while self.link is None and (
+            answer := _line(
+                f"{verdict.outcome} {verdict.reason}: Enter keeps it; {_KEYS}"
+            )
+        ):
             verdict = self._of_key(answer) or verdict
         if verdict.outcome == "void":
             raise Void("by key")
-        periods, counts = np.array(robot.timing.get("period", (np.nan,))), robot.guard.counts
-        measures = {"period_mean_ms": 1e3 * periods.mean(), "period_p99_ms": 1e3 * float(np.percentile(periods, 99))}
+        periods, counts = (
+            np.array(robot.timing.get("period", (np.nan,))),
+            robot.guard.counts,
+        )
+        measures = {
+            "period_mean_ms": 1e3 * periods.mean(),
+            "period_p99_ms": 1e3 * float(np.percentile(periods, 99)),
+        }
         measures["holds"] = counts["hold"]
         return EpisodeRow(
             policy=name,
@@ -142,10 +192,14 @@ class Trials:
             partial=verdict.partial,
             max_partial=self.task.max_partial,
             steps=len(robot.timing.get("period", ())) + 1,
-            time_s=float(np.nansum(periods)) if verdict.time_s is None else verdict.time_s,
+            time_s=float(np.nansum(periods))
+            if verdict.time_s is None
+            else verdict.time_s,
             subtask_end_s={},
             clipped_steps=counts["limit"],
-            measures={k: round(float(v), 2) for k, v in measures.items() if np.isfinite(v)},
+            measures={
+                k: round(float(v), 2) for k, v in measures.items() if np.isfinite(v)
+            },
             reason=verdict.reason,
         )
 
@@ -163,7 +217,11 @@ class Trials:
     def _verdict(self) -> Verdict | None:
         """The surrogate's verdict, or that of a line that was typed; None: none yet."""
         if self.link is None:
-            return self._of_key(_line()) if select.select([sys.stdin], [], [], 0)[0] else None
+            return (
+                self._of_key(_line())
+                if select.select([sys.stdin], [], [], 0)[0]
+                else None
+            )
         said = self.link.request("outcome")["outcome"]
         outcome = SUCCESS if said["success"] else said["failure"]
         outcome = outcome or "timeout" * (said["seconds"] >= self._limit_s)
@@ -190,30 +248,58 @@ def _line(question: str = "") -> str:
 
 
 def evaluate_on_robot(
-    found: Evaluation, policy: Any, options: dict[str, Any], out: Path, recordings: Path | None
+    found: Evaluation,
+    policy: Any,
+    options: dict[str, Any],
+    out: Path,
+    recordings: Path | None,
 ) -> Evaluation:
     """``found`` with the trials of its scenes' seeds, of which those that ``out`` has are not repeated; after each trial its rows
     and summary are written there. ``recordings``: folder of the trials' recordings. Raises TaccorlError: as ``Trials``; ``out``
     holds something else; ``MOST_VOID`` trials in a row are void; a person ends it."""
-    scenes, label = found.scenes, "a surrogate" if options["type"] == "taccorl_surrogate" else options["type"]
+    scenes, label = (
+        found.scenes,
+        "a surrogate" if options["type"] == "taccorl_surrogate" else options["type"],
+    )
     found.policies[0].name += f" on {label}"
     origin = f"Run on {label}{', not a robot' if label == 'a surrogate' else ', judged by a person'}"
-    found = dataclasses.replace(found, robot={"options": options, "origin": origin, "void": []})
+    found = dataclasses.replace(
+        found, robot={"options": options, "origin": origin, "void": []}
+    )
     found = dataclasses.replace(found, **_kept(found, out))
     task, rows, void = tasks.get(scenes.tasks[0]), list(found.rows), found.robot["void"]
-    limit_s = task.time_limit_s if scenes.episode_length is None else scenes.episode_length / CONTROL_HZ
-    left, in_a_row = [seed for seed in scenes.seeds if seed not in {row.seed for row in rows}], 0
+    limit_s = (
+        task.time_limit_s
+        if scenes.episode_length is None
+        else scenes.episode_length / CONTROL_HZ
+    )
+    left, in_a_row = (
+        [seed for seed in scenes.seeds if seed not in {row.seed for row in rows}],
+        0,
+    )
     set_seed(scenes.seed)
     trials = Trials(options, policy, task)
     try:
         while left:
-            path = recordings / f"{task.name}_seed_{left[0]}.mcap" if recordings and trials.robot.is_piper else None
+            path = (
+                recordings / f"{task.name}_seed_{left[0]}.mcap"
+                if recordings and trials.robot.is_piper
+                else None
+            )
             if path is not None:
                 path.unlink(missing_ok=True)  # of a void trial
-            print(f"trial {len(rows) + 1} of {scenes.episodes}, seed {left[0]}", flush=True)
+            print(
+                f"trial {len(rows) + 1} of {scenes.episodes}, seed {left[0]}",
+                flush=True,
+            )
             try:
-                rows.append(trials.trial(found.policies[0].name, left[0], limit_s, path))
-                print(f"  {rows[-1].outcome} after {rows[-1].time_s:.1f} s {rows[-1].reason}".rstrip(), flush=True)
+                rows.append(
+                    trials.trial(found.policies[0].name, left[0], limit_s, path)
+                )
+                print(
+                    f"  {rows[-1].outcome} after {rows[-1].time_s:.1f} s {rows[-1].reason}".rstrip(),
+                    flush=True,
+                )
                 left, in_a_row = left[1:], 0
             except Void as error:
                 void.append({"seed": left[0], "reason": str(error)})
@@ -221,9 +307,14 @@ def evaluate_on_robot(
                 in_a_row += 1
             found = dataclasses.replace(found, rows=rows)
             write_rows(rows, out / ROWS_FILE)
-            (out / SUMMARY_FILE).write_text(json.dumps(found.to_json(), indent=1, ensure_ascii=False), encoding="utf-8")
+            (out / SUMMARY_FILE).write_text(
+                json.dumps(found.to_json(), indent=1, ensure_ascii=False),
+                encoding="utf-8",
+            )
             if in_a_row == MOST_VOID:
-                raise Quit(f"{in_a_row} void trials in a row, the last: {void[-1]['reason']}")
+                raise Quit(
+                    f"{in_a_row} void trials in a row, the last: {void[-1]['reason']}"
+                )
     except (Quit, KeyboardInterrupt) as error:
         text = f"{str(error) or 'Ctrl-C'}; {len(rows)} trials are kept: the same command goes on"
         raise TaccorlError(text) from error
@@ -237,12 +328,23 @@ def _kept(found: Evaluation, out: Path) -> dict[str, Any]:
     if not out.is_dir() or {path.name for path in out.iterdir()} <= {"trials"}:
         return {}
     if not is_stored(out):
-        raise TaccorlError(f"--out={out}: holds files already; nothing was changed: give another folder or move it")
-    there, here = (json.loads(text) for text in ((out / SUMMARY_FILE).read_text("utf-8"), json.dumps(found.to_json())))
+        raise TaccorlError(
+            f"--out={out}: holds files already; nothing was changed: give another folder or move it"
+        )
+    there, here = (
+        json.loads(text)
+        for text in (
+            (out / SUMMARY_FILE).read_text("utf-8"),
+            json.dumps(found.to_json()),
+        )
+    )
     void = there.get("robot", {}).pop("void", [])
     here["robot"].pop("void")
     for what in ("policies", "scenes", "robot"):
         if there.get(what) != here[what]:
             text = f"--out={out}: holds other {what}: {there.get(what)}, not {here[what]}; give another folder"
             raise TaccorlError(text)
-    return {"rows": read_rows(out / ROWS_FILE) if there["scores"] else [], "robot": {**found.robot, "void": void}}
+    return {
+        "rows": read_rows(out / ROWS_FILE) if there["scores"] else [],
+        "robot": {**found.robot, "void": void},
+    }

@@ -41,7 +41,9 @@ class Inertia:
         if self.about == "com":
             return np.array(self.inertia_kgm2)
         x, y, z = self.com_link_m
-        shift = np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+        shift = np.array(
+            [y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z]
+        )
         return np.array(self.inertia_kgm2) - self.mass_kg * shift
 
 
@@ -80,7 +82,10 @@ class PadLayout:
         """Return the positions of the columns, (columns,), along the pad's x axis and of the rows, (rows,), along its y axis [m];
         0 is the pad's middle.
         """
-        x, y = ((np.arange(n) - (n - 1) / 2) * self.pitch_m for n in (self.columns, self.rows))
+        x, y = (
+            (np.arange(n) - (n - 1) / 2) * self.pitch_m
+            for n in (self.columns, self.rows)
+        )
         return x, y
 
 
@@ -88,32 +93,54 @@ class PadLayout:
 class CameraMount:
     """Nominal mount of one colour camera of the robot: body, position, direction, model."""
 
-    name: str  # Name of the camera, as in the dataset's key ``observation.images.<name>``
+    name: (
+        str  # Name of the camera, as in the dataset's key ``observation.images.<name>``
+    )
     body: str = "world"  # Body to which the camera is fixed
     model: str  # Name of its imager in ``taccorl.sim.cameras.COLOR_SENSORS``
     position_m: tuple[float, float, float]  # Optical centre in the body's frame [m]
-    look_at_m: tuple[float, float, float]  # Point in the body's frame that appears in the middle of the picture [m]
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction in the body's frame that points up in the picture
+    look_at_m: tuple[
+        float, float, float
+    ]  # Point in the body's frame that appears in the middle of the picture [m]
+    up: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        1.0,
+    )  # Direction in the body's frame that points up in the picture
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSpec:
     """A robot of equal arms with a two-finger gripper each. State and action have the same numbers in the same order."""
 
-    arms: tuple[str, ...]  # Names of the arms; they are the prefixes of the names of everything on an arm
-    joints: tuple[str, ...]  # Names of one arm's joints without the arm's prefix, base to hand
-    links: tuple[Link, ...]  # Links of one arm, base to hand: link k is moved by joint k
-    kp_nm_per_rad: tuple[float, ...]  # K_p of each joint's controller [N·m/rad], in τ = K_p (q* − q) − K_d q̇ + T_ref
+    arms: tuple[
+        str, ...
+    ]  # Names of the arms; they are the prefixes of the names of everything on an arm
+    joints: tuple[
+        str, ...
+    ]  # Names of one arm's joints without the arm's prefix, base to hand
+    links: tuple[
+        Link, ...
+    ]  # Links of one arm, base to hand: link k is moved by joint k
+    kp_nm_per_rad: tuple[
+        float, ...
+    ]  # K_p of each joint's controller [N·m/rad], in τ = K_p (q* − q) − K_d q̇ + T_ref
     kd_nms_per_rad: tuple[float, ...]  # K_d of each joint's controller [N·m·s/rad]
     torque_ff_nm: tuple[float, ...]  # T_ref of each joint's controller [N·m]
-    fingers: tuple[str, ...]  # Names of the fingers of one gripper; each finger has a pad
+    fingers: tuple[
+        str, ...
+    ]  # Names of the fingers of one gripper; each finger has a pad
     finger_stroke_m: float  # Travel of each finger [m]
     finger_from_hand_m: float  # Distance of the fingers' origin from the hand's origin, along the hand's z axis [m]
-    tcp_from_hand_m: float  # Distance of the TCP from the hand's origin, along the hand's z axis [m]
+    tcp_from_hand_m: (
+        float  # Distance of the TCP from the hand's origin, along the hand's z axis [m]
+    )
     grip_force_max_n: float  # Greatest closing force of each finger [N]
     pad: PadLayout  # Taxels of every pad
     pad_thickness_m: float  # Height of the taxels above the finger [m]
-    camera_mounts: tuple[CameraMount, ...]  # Cameras, in the order of the dataset's keys
+    camera_mounts: tuple[
+        CameraMount, ...
+    ]  # Cameras, in the order of the dataset's keys
 
     @property
     def hand(self) -> str:
@@ -160,7 +187,9 @@ class RobotSpec:
     @cached_property
     def action_names(self) -> tuple[str, ...]:
         """(A,) names ``<arm>_<joint>`` and ``<arm>_gripper`` of the numbers of an action."""
-        return tuple(f"{arm}_{name}" for arm in self.arms for name in (*self.joints, "gripper"))
+        return tuple(
+            f"{arm}_{name}" for arm in self.arms for name in (*self.joints, "gripper")
+        )
 
     def arm_slice(self, arm: str) -> slice:
         """Slice of the joints and the gripper of ``arm`` in an action of A numbers.
@@ -209,14 +238,18 @@ class RobotSpec:
 
         A gripper's limit is 0, which float32 has.
         """
-        low = np.nextafter(self._limits[:, 0], np.float32(1), dtype=np.float32).astype(float)
+        low = np.nextafter(self._limits[:, 0], np.float32(1), dtype=np.float32).astype(
+            float
+        )
         low[self.gripper_indices] = 0.0
         return low
 
     @cached_property
     def action_high(self) -> np.ndarray:
         """(A,) float64 upper limits [rad, m], rounded to float32 inwards."""
-        return np.nextafter(self._limits[:, 1], np.float32(0), dtype=np.float32).astype(float)
+        return np.nextafter(self._limits[:, 1], np.float32(0), dtype=np.float32).astype(
+            float
+        )
 
     @property
     def _limits(self) -> np.ndarray:

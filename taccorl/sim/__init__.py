@@ -11,5 +11,11 @@ if _wanted:
     try:
         import mujoco as _mujoco  # noqa: F401
     except (AttributeError, ImportError, OSError, RuntimeError) as error:
-        _install = f" On Debian: apt-get install {_DEBIAN[_wanted]};" if _wanted in _DEBIAN else ""
-        raise TaccorlError(f"MUJOCO_GL={_wanted} does not load ({error}).{_install} Set egl, or unset it") from error
+        _install = (
+            f" On Debian: apt-get install {_DEBIAN[_wanted]};"
+            if _wanted in _DEBIAN
+            else ""
+        )
+        raise TaccorlError(
+            f"MUJOCO_GL={_wanted} does not load ({error}).{_install} Set egl, or unset it"
+        ) from error

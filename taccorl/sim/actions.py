@@ -15,7 +15,10 @@ _ABSURD = ROBOT.per_action(2 * np.pi, 0.5)  # rad, m beyond a limit: another uni
 def beyond_reason(actions: np.ndarray) -> np.ndarray:
     """For ``actions`` (…, A) [rad, m]: (…, A) bool, true for NaN, or so far beyond the limits that the action must be in another
     unit. Values slightly beyond are clipped."""
-    return ~((actions >= ROBOT.action_low - _ABSURD) & (actions <= ROBOT.action_high + _ABSURD))
+    return ~(
+        (actions >= ROBOT.action_low - _ABSURD)
+        & (actions <= ROBOT.action_high + _ABSURD)
+    )
 
 
 def check_actions(actions: np.ndarray) -> None:

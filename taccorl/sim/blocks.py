@@ -22,9 +22,13 @@ class Blocks:
             work(0, num_sims)
             return
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.num_threads - 1, thread_name_prefix="taccorl")
+            self._pool = ThreadPoolExecutor(
+                self.num_threads - 1, thread_name_prefix="taccorl"
+            )
         ends = [num_sims * k // count for k in range(count + 1)]
-        others = [self._pool.submit(work, *block) for block in itertools.pairwise(ends[1:])]
+        others = [
+            self._pool.submit(work, *block) for block in itertools.pairwise(ends[1:])
+        ]
         work(0, ends[1])
         for other in others:
             other.result()

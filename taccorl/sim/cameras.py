@@ -36,8 +36,16 @@ def letterbox_window(recorded: tuple[int, int], frame: tuple[int, int]) -> Windo
 
     It uses the arithmetic of ``taccorl.data.pictures.letterbox``; a test compares both."""
     factor = min(frame[0] / recorded[0], frame[1] / recorded[1])
-    rows, columns = max(1, round(recorded[0] * factor)), max(1, round(recorded[1] * factor))
-    return Window(top=(frame[0] - rows) // 2, left=(frame[1] - columns) // 2, rows=rows, columns=columns)
+    rows, columns = (
+        max(1, round(recorded[0] * factor)),
+        max(1, round(recorded[1] * factor)),
+    )
+    return Window(
+        top=(frame[0] - rows) // 2,
+        left=(frame[1] - columns) // 2,
+        rows=rows,
+        columns=columns,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,11 +115,18 @@ def sensor_intrinsics(model: str, rows: int, columns: int) -> Intrinsics:
     800 (78.8° × 63.3°). Units differ by up to 3°: give the camera_info of your own where you have it. Raises TaccorlError:
     no such model."""
     if model not in COLOR_SENSORS:
-        raise TaccorlError(f"camera model {model!r}: no intrinsics; {nearest(model, COLOR_SENSORS)}")
+        raise TaccorlError(
+            f"camera model {model!r}: no intrinsics; {nearest(model, COLOR_SENSORS)}"
+        )
     sensor = COLOR_SENSORS[model]
     focal = sensor.focal_px * max(rows / sensor.rows, columns / sensor.columns)
     return Intrinsics(
-        rows=rows, columns=columns, fx_px=focal, fy_px=focal, cx_px=(columns - 1) / 2, cy_px=(rows - 1) / 2
+        rows=rows,
+        columns=columns,
+        fx_px=focal,
+        fy_px=focal,
+        cx_px=(columns - 1) / 2,
+        cy_px=(rows - 1) / 2,
     )
 
 
@@ -155,12 +170,20 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         if (self.look_at_m is None) == (self.quat_wxyz is None):
-            raise TaccorlError(f"camera {self.name}: give either look_at_m or quat_wxyz, exactly one of them")
+            raise TaccorlError(
+                f"camera {self.name}: give either look_at_m or quat_wxyz, exactly one of them"
+            )
         if not all(0 < n <= MOST_PX for n in self.recording_size):
-            raise TaccorlError(f"camera {self.name}: recording_size {self.recording_size}: from 1 to {MOST_PX}")
-        if self.intrinsics and (self.intrinsics.rows, self.intrinsics.columns) != tuple(self.recording_size):
+            raise TaccorlError(
+                f"camera {self.name}: recording_size {self.recording_size}: from 1 to {MOST_PX}"
+            )
+        if self.intrinsics and (self.intrinsics.rows, self.intrinsics.columns) != tuple(
+            self.recording_size
+        ):
             size = f"{self.intrinsics.rows}×{self.intrinsics.columns}"
-            raise TaccorlError(f"camera {self.name}: intrinsics of {size} pictures, not {self.recording_size}")
+            raise TaccorlError(
+                f"camera {self.name}: intrinsics of {size} pictures, not {self.recording_size}"
+            )
 
     def recorded_intrinsics(self) -> Intrinsics:
         """Intrinsics of the stream as recorded, before the letterbox."""
@@ -172,29 +195,41 @@ class CameraConfig:
         if self.quat_wxyz is not None:
             quat = np.array(self.quat_wxyz, float)
         else:
-            quat = look_at_quat(position, np.array(self.look_at_m, float), np.array(self.up, float))
+            quat = look_at_quat(
+                position, np.array(self.look_at_m, float), np.array(self.up, float)
+            )
         return offset_pose(position, quat, self.offset)
 
 
 def bench_cameras() -> tuple[CameraConfig, ...]:
     """The robot's cameras at their nominal mounts, in the order of ``ROBOT.camera_mounts``."""
-    return tuple(CameraConfig(**dataclasses.asdict(mount)) for mount in ROBOT.camera_mounts)
+    return tuple(
+        CameraConfig(**dataclasses.asdict(mount)) for mount in ROBOT.camera_mounts
+    )
 
 
-def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> np.ndarray:
+def look_at_quat(
+    position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray
+) -> np.ndarray:
     """Quaternion wxyz (4,) of a camera at ``position_m`` (3,) with ``target_m`` (3,) in the middle of its picture and ``up``
     (3,) pointing up in it; all in one frame. Raises TaccorlError: the target is the position, or lies straight along ``up``."""
     back = np.asarray(position_m, float) - target_m
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(back))):
-        raise TaccorlError(f"camera: from {position_m} to {target_m} is parallel to up = {up}: give another `up`")
+        raise TaccorlError(
+            f"camera: from {position_m} to {target_m} is parallel to up = {up}: give another `up`"
+        )
     back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
     quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).ravel())
+    mujoco.mju_mat2Quat(
+        quat, np.stack([right, np.cross(back, right), back], axis=1).ravel()
+    )
     return quat
 
 
-def offset_pose(position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOffset) -> tuple[np.ndarray, np.ndarray]:
+def offset_pose(
+    position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOffset
+) -> tuple[np.ndarray, np.ndarray]:
     """Move a camera pose by ``offset`` in its own frame: R = R₀·exp(ω), p = p₀ + R₀·t. Bit-identical at zero.
 
     Takes and returns position ``position_m`` (3,) and quaternion ``quat_wxyz`` (4,) of the camera frame, both in the body's
@@ -202,7 +237,9 @@ def offset_pose(position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOff
     vector = np.array(offset.rotation_rad, float)
     angle = float(np.linalg.norm(vector))
     turn, moved, shift = np.empty(4), np.empty(4), np.empty(3)
-    mujoco.mju_axisAngle2Quat(turn, vector / angle if angle else np.array([1.0, 0.0, 0.0]), angle)
+    mujoco.mju_axisAngle2Quat(
+        turn, vector / angle if angle else np.array([1.0, 0.0, 0.0]), angle
+    )
     mujoco.mju_mulQuat(moved, quat_wxyz, turn)
     mujoco.mju_rotVecQuat(shift, np.array(offset.translation_m, float), quat_wxyz)
     return position_m + shift, moved
@@ -215,12 +252,18 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig]) -> None:
         body = spec.worldbody if config.body == "world" else spec.body(config.body)
         if body is None:
             known = [b.name for b in spec.bodies]
-            raise TaccorlError(f"camera {config.name}: no body {config.body!r}; {nearest(config.body, known)}")
+            raise TaccorlError(
+                f"camera {config.name}: no body {config.body!r}; {nearest(config.body, known)}"
+            )
         if spec.camera(config.name) is not None:
-            raise TaccorlError(f"camera {config.name}: the model has a camera of that name already")
+            raise TaccorlError(
+                f"camera {config.name}: the model has a camera of that name already"
+            )
         rows, columns = config.recording_size
         position, quat = config.pose()
-        camera = body.add_camera(name=config.name, pos=position, quat=quat, resolution=[columns, rows])
+        camera = body.add_camera(
+            name=config.name, pos=position, quat=quat, resolution=[columns, rows]
+        )
         camera.fovy = math.degrees(config.recorded_intrinsics().vertical_fov_rad)
         if config.intrinsics is not None:
             _draw_measured(camera, config.intrinsics)
@@ -229,14 +272,23 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig]) -> None:
 def _draw_measured(camera: mujoco.MjsCamera, measured: Intrinsics) -> None:
     """Draw fx ≠ fy and a principal point off the centre. MuJoCo's interactive viewer stretches such a camera to its window,
     which is why nominal ones go by their angle alone."""
-    camera.sensor_size = [measured.columns * 1e-6, measured.rows * 1e-6]  # only its ratio to focal_pixel counts
+    camera.sensor_size = [
+        measured.columns * 1e-6,
+        measured.rows * 1e-6,
+    ]  # only its ratio to focal_pixel counts
     camera.focal_pixel = [measured.fx_px, measured.fy_px]
     # Found by rendering: MuJoCo 4.0 moves the picture against this offset, both across and down.
-    camera.principal_pixel = [(measured.columns - 1) / 2 - measured.cx_px, (measured.rows - 1) / 2 - measured.cy_px]
+    camera.principal_pixel = [
+        (measured.columns - 1) / 2 - measured.cx_px,
+        (measured.rows - 1) / 2 - measured.cy_px,
+    ]
 
 
 def project(
-    points_world: np.ndarray, position_world: np.ndarray, world_from_camera: np.ndarray, intrinsics: Intrinsics
+    points_world: np.ndarray,
+    position_world: np.ndarray,
+    world_from_camera: np.ndarray,
+    intrinsics: Intrinsics,
 ) -> np.ndarray:
     """Project ``points_world`` (…, 3) [m] to pixels (…, 2) as (u, v) = (column, row); NaN for points behind the camera.
 

@@ -23,9 +23,13 @@ class ControllerConfig:
 
     Each list has one number for each joint of an arm, from base to hand, and holds for all arms."""
 
-    kp_nm_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kp_nm_per_rad))
+    kp_nm_per_rad: list[float] = field(
+        default_factory=lambda: list(ROBOT.kp_nm_per_rad)
+    )
     """K_p [N·m/rad]."""
-    kd_nms_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kd_nms_per_rad))
+    kd_nms_per_rad: list[float] = field(
+        default_factory=lambda: list(ROBOT.kd_nms_per_rad)
+    )
     """K_d [N·m·s/rad]."""
     torque_ff_nm: list[float] = field(default_factory=lambda: list(ROBOT.torque_ff_nm))
     """T_ref [N·m]."""
@@ -34,10 +38,16 @@ class ControllerConfig:
         for name in ("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"):
             values = getattr(self, name)
             if len(values) != ROBOT.num_joints:
-                raise TaccorlError(f"controller.{name}: {len(values)} values for {ROBOT.num_joints} joints: {values}")
+                raise TaccorlError(
+                    f"controller.{name}: {len(values)} values for {ROBOT.num_joints} joints: {values}"
+                )
         # Without stiffness no joint has a place where it rests.
         check_numbers(
-            "controller", self, finite=("torque_ff_nm",), not_negative=("kd_nms_per_rad",), positive=("kp_nm_per_rad",)
+            "controller",
+            self,
+            finite=("torque_ff_nm",),
+            not_negative=("kd_nms_per_rad",),
+            positive=("kp_nm_per_rad",),
         )
 
 
@@ -51,29 +61,60 @@ class MotorEffort:
         on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
         own = np.where(on_joint, model.actuator_trnid[:, 0], -1)
         self._limited = np.array(
-            [k for k, motor in enumerate(motors) if on_joint[motor] and model.jnt_actfrclimited[own[motor]]], dtype=int
+            [
+                k
+                for k, motor in enumerate(motors)
+                if on_joint[motor] and model.jnt_actfrclimited[own[motor]]
+            ],
+            dtype=int,
         )
         if self._limited.size:
             joints = own[motors[self._limited]]
-            self._dofs, self._carries = model.jnt_dofadr[joints], model.jnt_actgravcomp[joints] != 0
-            self._gear = np.where(own[:, None] == joints, model.actuator_gear[:, :1], 0.0)
-            self._given, self._carried = batch.bind("qfrc_actuator"), batch.bind("qfrc_gravcomp")
+            self._dofs, self._carries = (
+                model.jnt_dofadr[joints],
+                model.jnt_actgravcomp[joints] != 0,
+            )
+            self._gear = np.where(
+                own[:, None] == joints, model.actuator_gear[:, :1], 0.0
+            )
+            self._given, self._carried = (
+                batch.bind("qfrc_actuator"),
+                batch.bind("qfrc_gravcomp"),
+            )
 
     def __call__(self) -> np.ndarray:
         """(N, number of motors) [N·m, N] in the newest physics step, without gravity compensation."""
         effort = self._force[:, self._motors]
         if self._limited.size:
-            asked = self._force @ self._gear + np.where(self._carries, self._carried[:, self._dofs], 0.0)
+            asked = self._force @ self._gear + np.where(
+                self._carries, self._carried[:, self._dofs], 0.0
+            )
             effort[:, self._limited] += self._given[:, self._dofs] - asked
         return effort
 
 
-def add_actuators(spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller: ControllerConfig) -> None:
+def add_actuators(
+    spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller: ControllerConfig
+) -> None:
     """Add one position actuator per joint, ``left_joint1`` …, and per gripper, ``left_gripper``; a gripper's control is the
     opening between the pads [m]."""
-    gains = zip(ROBOT.joints, controller.kp_nm_per_rad, controller.kd_nms_per_rad, controller.torque_ff_nm, strict=True)
+    gains = zip(
+        ROBOT.joints,
+        controller.kp_nm_per_rad,
+        controller.kd_nms_per_rad,
+        controller.torque_ff_nm,
+        strict=True,
+    )
     for joint, kp, kd, torque_ff in gains:
-        _affine(spec, f"{arm}_{joint}", mujoco.mjtTrn.mjTRN_JOINT, f"{arm}_{joint}", kp, kd, torque_ff)
+        _affine(
+            spec,
+            f"{arm}_{joint}",
+            mujoco.mjtTrn.mjTRN_JOINT,
+            f"{arm}_{joint}",
+            kp,
+            kd,
+            torque_ff,
+        )
     opening = spec.add_tendon(name=f"{arm}_opening")
     opening.wrap_joint(f"{arm}_finger_a", 1)
     opening.wrap_joint(f"{arm}_finger_b", 1)
@@ -91,10 +132,19 @@ def add_actuators(spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller:
 
 
 def _affine(
-    spec: mujoco.MjSpec, name: str, transmission: mujoco.mjtTrn, target: str, kp: float, kd: float, bias: float
+    spec: mujoco.MjSpec,
+    name: str,
+    transmission: mujoco.mjtTrn,
+    target: str,
+    kp: float,
+    kd: float,
+    bias: float,
 ) -> mujoco.MjsActuator:
     actuator = spec.add_actuator(name=name, trntype=transmission, target=target)
-    actuator.gaintype, actuator.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+    actuator.gaintype, actuator.biastype = (
+        mujoco.mjtGain.mjGAIN_FIXED,
+        mujoco.mjtBias.mjBIAS_AFFINE,
+    )
     actuator.gainprm[0] = kp
     actuator.biasprm[:3] = [bias, -kp, -kd]
     return actuator

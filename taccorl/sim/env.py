@@ -26,11 +26,28 @@ class TaccorlEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012
 
-    def __init__(self, task: str, *, images: bool = True, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        task: str,
+        *,
+        images: bool = True,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
         """``settings`` and errors: ``TaccorlVectorEnv``."""
-        one: dict[str, Any] = {"num_threads": 1, "autoreset": AutoresetMode.DISABLED, "render_mode": render_mode}
-        self._envs = TaccorlVectorEnv(task, images="always" if images else "never", **settings, **one)
-        self.task, self.task_description, self.render_mode = task, self._envs.task_description, render_mode
+        one: dict[str, Any] = {
+            "num_threads": 1,
+            "autoreset": AutoresetMode.DISABLED,
+            "render_mode": render_mode,
+        }
+        self._envs = TaccorlVectorEnv(
+            task, images="always" if images else "never", **settings, **one
+        )
+        self.task, self.task_description, self.render_mode = (
+            task,
+            self._envs.task_description,
+            render_mode,
+        )
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
@@ -49,18 +66,30 @@ class TaccorlEnv(gymnasium.Env):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; returns observation and ``info``. ``options={"state": snapshot}`` begins it bit-exactly from the
         state that ``sim.snapshot()`` returned."""
-        observation, _ = self._envs.reset(seed=None if seed is None else [seed], options=options)
+        observation, _ = self._envs.reset(
+            seed=None if seed is None else [seed], options=options
+        )
         super().reset(seed=seed)
         return _only(observation), _only(self._envs.facts())
 
-    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control step (1/30 s) with the targets ``action`` (14,) [rad, m].
 
         Returns observation, reward, terminated, truncated and ``info``, as gymnasium defines them. Raises TaccorlError:
         wrong shape, or a target that is NaN or far beyond the limits."""
-        observation, reward, terminated, truncated, _ = self._envs.step(shaped(action)[None])
+        observation, reward, terminated, truncated, _ = self._envs.step(
+            shaped(action)[None]
+        )
         facts = _only(self._envs.facts())
-        return _only(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), facts
+        return (
+            _only(observation),
+            float(reward[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            facts,
+        )
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The front camera's picture (224, 224, 3) uint8 RGB; None without ``render_mode``."""
@@ -74,8 +103,14 @@ class TaccorlEnv(gymnasium.Env):
 
 def _only(batch: dict[str, Any]) -> dict[str, Any]:
     """The one row of each array; single values as Python's own."""
-    rows = {name: _only(values) if isinstance(values, dict) else values[0] for name, values in batch.items()}
-    return {name: value.item() if isinstance(value, np.generic) else value for name, value in rows.items()}
+    rows = {
+        name: _only(values) if isinstance(values, dict) else values[0]
+        for name, values in batch.items()
+    }
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in rows.items()
+    }
 
 
 def env_id(task: str) -> str:

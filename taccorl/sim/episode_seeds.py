@@ -12,7 +12,9 @@ from taccorl.errors import TaccorlError
 def episode_seed(root: int, index: int, episode: int) -> int:
     """Scene seed (0 … 2³² − 1) of the ``episode``-th episode of environment ``index``, both from 0: a pure function of ``root``,
     the first seed, and both numbers."""
-    return int(np.random.SeedSequence(root, spawn_key=(index, episode)).generate_state(1)[0])
+    return int(
+        np.random.SeedSequence(root, spawn_key=(index, episode)).generate_state(1)[0]
+    )
 
 
 class EpisodeSeeds:
@@ -26,7 +28,12 @@ class EpisodeSeeds:
         self.num_envs = num_envs
         self._roots, self._indices = [0] * num_envs, [0] * num_envs
         self._itself_first, self._num_drawn = [False] * num_envs, [0] * num_envs
-        self.begin(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed, range(num_envs))
+        self.begin(
+            int(np.random.SeedSequence().generate_state(1)[0])
+            if seed is None
+            else seed,
+            range(num_envs),
+        )
 
     def begin(self, seed: int | Sequence[int], ids: Sequence[int] | range) -> None:
         """Restart the seed sequences of environments ``ids``. Raises TaccorlError: a seed is negative, or the number of seeds
@@ -34,7 +41,9 @@ class EpisodeSeeds:
         alone = not isinstance(seed, int | np.integer)
         seeds: list[int] = list(seed) if alone else [seed] * self.num_envs  # pyright: ignore[reportArgumentType, reportAssignmentType]
         if len(seeds) != self.num_envs or any(s < 0 for s in seeds):
-            raise TaccorlError(f"seed: {seed} is neither a number ≥ 0 nor {self.num_envs}, one per environment")
+            raise TaccorlError(
+                f"seed: {seed} is neither a number ≥ 0 nor {self.num_envs}, one per environment"
+            )
         for i in ids:
             self._roots[i], self._indices[i] = int(seeds[i]), 0 if alone else i
             self._itself_first[i], self._num_drawn[i] = alone, 0

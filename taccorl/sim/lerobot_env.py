@@ -19,10 +19,18 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 def raw_names(observation: Observation) -> dict[str, Any]:
     """Return an observation, or a batch of them, under LeRobot's raw names: ``agent_pos``, ``tactile``, ``environment_state`` and
     ``pixels``; the last two only if it has part poses and pictures. Counts become float32, as LeRobot's recorder requires."""
-    pixels = {name: observation[IMAGE_KEYS[name]] for name in ROBOT.cameras if IMAGE_KEYS[name] in observation}
+    pixels = {
+        name: observation[IMAGE_KEYS[name]]
+        for name in ROBOT.cameras
+        if IMAGE_KEYS[name] in observation
+    }
     return {
         **({"pixels": pixels} if pixels else {}),
-        **({"environment_state": observation[PARTS_KEY]} if PARTS_KEY in observation else {}),
+        **(
+            {"environment_state": observation[PARTS_KEY]}
+            if PARTS_KEY in observation
+            else {}
+        ),
         "agent_pos": observation[STATE_KEY],
         "tactile": observation[TACTILE_KEY].astype(np.float32),
     }
@@ -32,10 +40,16 @@ def _raw_space(space: gymnasium.Space) -> gymnasium.spaces.Dict:
     assert isinstance(space, gymnasium.spaces.Dict)
     counts = space[TACTILE_KEY]
     assert isinstance(counts, gymnasium.spaces.Box)
-    tactile = gymnasium.spaces.Box(counts.low.astype(np.float32), counts.high.astype(np.float32))
-    pixels = gymnasium.spaces.Dict({name: space[IMAGE_KEYS[name]] for name in ROBOT.cameras})
+    tactile = gymnasium.spaces.Box(
+        counts.low.astype(np.float32), counts.high.astype(np.float32)
+    )
+    pixels = gymnasium.spaces.Dict(
+        {name: space[IMAGE_KEYS[name]] for name in ROBOT.cameras}
+    )
     parts = {"environment_state": space[PARTS_KEY]} if PARTS_KEY in space.spaces else {}
-    return gymnasium.spaces.Dict({"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile, **parts})
+    return gymnasium.spaces.Dict(
+        {"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile, **parts}
+    )
 
 
 class _Raw(gymnasium.Env if TYPE_CHECKING else object):
@@ -65,6 +79,14 @@ class LeRobotVectorEnv(_Raw, TaccorlVectorEnv):  # pyright: ignore[reportIncompa
     after its end."""
 
     def __init__(self, task: str, num_envs: int, **settings: Any) -> None:
-        super().__init__(task, num_envs, images="always", autoreset=gymnasium.vector.AutoresetMode.DISABLED, **settings)
+        super().__init__(
+            task,
+            num_envs,
+            images="always",
+            autoreset=gymnasium.vector.AutoresetMode.DISABLED,
+            **settings,
+        )
         self.single_observation_space = _raw_space(self.single_observation_space)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, num_envs
+        )

@@ -25,7 +25,9 @@ _DEBIAN_EGL = "libegl1 libgl1-mesa-dri"
 _DEVICE = "MUJOCO_EGL_DEVICE_ID"
 # The process that first made a context. Its drawing threads do not survive a fork, and Mesa would wait for them for ever.
 _gl_process: int | None = None
-_left_to_parent: list[Any] = []  # contexts that a forked child inherited: freeing them there would wait as well
+_left_to_parent: list[
+    Any
+] = []  # contexts that a forked child inherited: freeing them there would wait as well
 
 
 class View(NamedTuple):
@@ -39,7 +41,9 @@ class View(NamedTuple):
 class Canvas:
     """OpenGL buffers: MuJoCo's own buffer, as large as one view, and the sheet on which views are collected."""
 
-    def __init__(self, model: mujoco.MjModel, cell: tuple[int, int], max_sheet_px: int) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, cell: tuple[int, int], max_sheet_px: int
+    ) -> None:
         self._process = os.getpid()
         self._cell = cell
         self._assets = _assets(model)
@@ -53,11 +57,15 @@ class Canvas:
             from OpenGL import GL
 
             self.driver = f"{_text(GL.GL_RENDERER)}, OpenGL {_text(GL.GL_VERSION)}"
-            longest = min(max_sheet_px, int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE)))
+            longest = min(
+                max_sheet_px, int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
+            )
         self._most = (longest // cell[0], longest // cell[1])  # cells down and across
         if not all(self._most):
             self.free()
-            raise TaccorlError(f"pictures of {cell[0]}×{cell[1]} pixels: the largest sheet here is {longest} wide")
+            raise TaccorlError(
+                f"pictures of {cell[0]}×{cell[1]} pixels: the largest sheet here is {longest} wide"
+            )
 
     @contextlib.contextmanager
     def current(self) -> Iterator[None]:
@@ -67,7 +75,12 @@ class Canvas:
         with self._context.as_current():
             yield
 
-    def draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], views: list[View], out: np.ndarray) -> None:
+    def draw(
+        self,
+        sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]],
+        views: list[View],
+        out: np.ndarray,
+    ) -> None:
         """Render the views of each of ``sims`` (model, data) and write them to ``out`` (cameras, simulations, rows, columns, 3)
         uint8 RGB."""
         count = len(views) * out.shape[1]
@@ -87,29 +100,55 @@ class Canvas:
                     _deal(sheet.read(held, self._mjr), views, out, first)
                     first, held = first + held, 0
 
-    def _draw_view(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> None:
+    def _draw_view(
+        self, model: mujoco.MjModel, data: mujoco.MjData, view: View
+    ) -> None:
         # Without decoration (contacts, tendons …), as without sites above: no camera sees them.
         seen = mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC
-        mujoco.mjv_updateScene(model, data, self._option, None, view.camera, seen, self._scene)
-        mujoco.mjr_render(mujoco.MjrRect(0, 0, view.window.columns, view.window.rows), self._scene, self._mjr)
+        mujoco.mjv_updateScene(
+            model, data, self._option, None, view.camera, seen, self._scene
+        )
+        mujoco.mjr_render(
+            mujoco.MjrRect(0, 0, view.window.columns, view.window.rows),
+            self._scene,
+            self._mjr,
+        )
 
-    def labels(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> tuple[np.ndarray, np.ndarray]:
+    def labels(
+        self, model: mujoco.MjModel, data: mujoco.MjData, view: View
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the id of the geom that each pixel of a view's window shows, (rows, columns) int32, −1 for none, and its depth
         along the optical axis, (rows, columns) float64 [m]."""
-        flags, rows, columns = self._scene.flags.copy(), view.window.rows, view.window.columns
-        self._scene.flags[[int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]] = 1
+        flags, rows, columns = (
+            self._scene.flags.copy(),
+            view.window.rows,
+            view.window.columns,
+        )
+        self._scene.flags[
+            [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
+        ] = 1
         try:
             self._draw_view(model, data, view)
         finally:
             self._scene.flags[:] = flags
-        color, depth = np.empty((rows, columns, 3), np.uint8), np.empty((rows, columns), np.float32)
-        self._mjr.readDepthMap = int(mujoco.mjtDepthMap.mjDEPTH_ZEROFAR)  # reversed, as it is kept: nothing is lost
-        mujoco.mjr_readPixels(color, depth, mujoco.MjrRect(0, 0, columns, rows), self._mjr)
+        color, depth = (
+            np.empty((rows, columns, 3), np.uint8),
+            np.empty((rows, columns), np.float32),
+        )
+        self._mjr.readDepthMap = int(
+            mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        )  # reversed, as it is kept: nothing is lost
+        mujoco.mjr_readPixels(
+            color, depth, mujoco.MjrRect(0, 0, columns, rows), self._mjr
+        )
         shown = self._scene.geoms[: self._scene.ngeom]
         geom_of = np.full(len(shown) + 1, -1, np.int32)
         geom_of[[geom.segid + 1 for geom in shown]] = [geom.objid for geom in shown]
         number = color.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
-        near, far = (float(z) * model.stat.extent for z in (model.vis.map.znear, model.vis.map.zfar))
+        near, far = (
+            float(z) * model.stat.extent
+            for z in (model.vis.map.znear, model.vis.map.zfar)
+        )
         depth_m = near * far / (near + depth.astype(float) * (far - near))
         return geom_of[number[::-1]], depth_m[::-1]
 
@@ -145,20 +184,40 @@ class _Sheet:
     def __init__(self, cell: tuple[int, int], down: int, across: int) -> None:
         from OpenGL import GL
 
-        self._gl, self._cell, self._across, self.capacity = GL, cell, across, down * across
+        self._gl, self._cell, self._across, self.capacity = (
+            GL,
+            cell,
+            across,
+            down * across,
+        )
         self._pixels = np.empty((down * cell[0], across * cell[1], 3), np.uint8)
         self._color, self._frame = GL.glGenRenderbuffers(1), GL.glGenFramebuffers(1)
         GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, self._color)
-        GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, GL.GL_RGBA8, across * cell[1], down * cell[0])
+        GL.glRenderbufferStorage(
+            GL.GL_RENDERBUFFER, GL.GL_RGBA8, across * cell[1], down * cell[0]
+        )
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._frame)
-        GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, GL.GL_COLOR_ATTACHMENT0, GL.GL_RENDERBUFFER, self._color)
+        GL.glFramebufferRenderbuffer(
+            GL.GL_FRAMEBUFFER, GL.GL_COLOR_ATTACHMENT0, GL.GL_RENDERBUFFER, self._color
+        )
 
     def keep(self, number: int, mjr: mujoco.MjrContext) -> None:
         """Copy what lies in MuJoCo's buffer to cell ``number``."""
         gl, (rows, columns) = self._gl, self._cell
         x, y = number % self._across * columns, number // self._across * rows
         gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._frame)
-        gl.glBlitFramebuffer(0, 0, columns, rows, x, y, x + columns, y + rows, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
+        gl.glBlitFramebuffer(
+            0,
+            0,
+            columns,
+            rows,
+            x,
+            y,
+            x + columns,
+            y + rows,
+            gl.GL_COLOR_BUFFER_BIT,
+            gl.GL_NEAREST,
+        )
         gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, mjr.offFBO)
 
     def read(self, count: int, mjr: mujoco.MjrContext) -> list[np.ndarray]:
@@ -169,9 +228,19 @@ class _Sheet:
         pixels = self._pixels.reshape(-1)[: np.prod(shape)].reshape(shape)
         gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._frame)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
-        gl.glReadPixels(0, 0, pixels.shape[1], pixels.shape[0], gl.GL_RGB, gl.GL_UNSIGNED_BYTE, pixels)
+        gl.glReadPixels(
+            0,
+            0,
+            pixels.shape[1],
+            pixels.shape[0],
+            gl.GL_RGB,
+            gl.GL_UNSIGNED_BYTE,
+            pixels,
+        )
         mujoco.mjr_restoreBuffer(mjr)
-        strips = pixels.reshape(-1, rows, across, columns, 3)[:, ::-1].swapaxes(1, 2)  # OpenGL's rows go upwards
+        strips = pixels.reshape(-1, rows, across, columns, 3)[:, ::-1].swapaxes(
+            1, 2
+        )  # OpenGL's rows go upwards
         return [strip[: count - i * across] for i, strip in enumerate(strips)]
 
     def free(self) -> None:
@@ -179,15 +248,23 @@ class _Sheet:
         self._gl.glDeleteRenderbuffers(1, [self._color])
 
 
-def _deal(strips: list[np.ndarray], views: list[View], out: np.ndarray, first: int) -> None:
+def _deal(
+    strips: list[np.ndarray], views: list[View], out: np.ndarray, first: int
+) -> None:
     """Put cells, the first of which is view ``first`` of all simulations' views, into their cameras' windows of ``out``, as
     ``Canvas.draw`` has it; bars stay black."""
     for cells in strips:
         for number, view in enumerate(views):
             mine, window = (number - first) % len(views), view.window
-            drawn = cells[mine :: len(views), -window.rows :, : window.columns]  # into the cell's lower left
+            drawn = cells[
+                mine :: len(views), -window.rows :, : window.columns
+            ]  # into the cell's lower left
             frames = out[number, (first + mine) // len(views) :][: len(drawn)]
-            frames[:, window.top : window.top + window.rows, window.left : window.left + window.columns] = drawn
+            frames[
+                :,
+                window.top : window.top + window.rows,
+                window.left : window.left + window.columns,
+            ] = drawn
         first += len(cells)
 
 
@@ -201,7 +278,9 @@ def _assets(model: mujoco.MjModel) -> tuple[int, int, int, int]:
     return model.ngeom, model.nmesh, model.ntex, model.nmat
 
 
-def _open(model: mujoco.MjModel, cell: tuple[int, int]) -> tuple[Any, mujoco.MjrContext]:
+def _open(
+    model: mujoco.MjModel, cell: tuple[int, int]
+) -> tuple[Any, mujoco.MjrContext]:
     """An OpenGL context and MuJoCo's resources in it, with an off-screen buffer of one view. Raises TaccorlError: names what is
     missing."""
     global _gl_process
@@ -209,10 +288,14 @@ def _open(model: mujoco.MjModel, cell: tuple[int, int]) -> tuple[Any, mujoco.Mjr
         raise _forked()
     plain = copy.copy(model)
     plain.vis.global_.offwidth, plain.vis.global_.offheight = cell[1], cell[0]
-    plain.vis.quality.offsamples = plain.vis.quality.shadowsize = 0  # no multisampling, no shadows
+    plain.vis.quality.offsamples = plain.vis.quality.shadowsize = (
+        0  # no multisampling, no shadows
+    )
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted in ("disable", "disabled", "off", "false", "0"):
-        raise TaccorlError(f"pictures: MUJOCO_GL={wanted} switches OpenGL off: unset it, or request no images")
+        raise TaccorlError(
+            f"pictures: MUJOCO_GL={wanted} switches OpenGL off: unset it, or request no images"
+        )
     try:
         context = _new_context(wanted, cell)
         _gl_process = os.getpid()
@@ -257,19 +340,31 @@ def _num_cards() -> int:
 
     cards = 0
     for device in egl_ext.eglQueryDevicesEXT():
-        with contextlib.suppress(Exception):  # PyOpenGL's, for a device without CUDA, such as Mesa's
+        with contextlib.suppress(
+            Exception
+        ):  # PyOpenGL's, for a device without CUDA, such as Mesa's
             egl_ext.eglQueryDeviceAttribEXT(device, egl_ext.EGL_CUDA_DEVICE_NV)
             cards += 1
-    visible = [card for card in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if card.strip().isdecimal()]
+    visible = [
+        card
+        for card in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+        if card.strip().isdecimal()
+    ]
     return min(cards, len(visible) or cards)
 
 
 def _missing(wanted: str, error: Exception) -> str:
     platform_set = os.environ.get("PYOPENGL_PLATFORM", "")
     if wanted == "osmesa":
-        what, remedy = "no OpenGL through OSMesa (MUJOCO_GL=osmesa)", "On Debian: apt-get install libosmesa6"
+        what, remedy = (
+            "no OpenGL through OSMesa (MUJOCO_GL=osmesa)",
+            "On Debian: apt-get install libosmesa6",
+        )
     elif wanted not in ("", "egl"):
-        what, remedy = f"no OpenGL through a window (MUJOCO_GL={wanted})", "MUJOCO_GL=egl needs no display"
+        what, remedy = (
+            f"no OpenGL through a window (MUJOCO_GL={wanted})",
+            "MUJOCO_GL=egl needs no display",
+        )
     elif platform_set not in ("", "egl"):
         what, remedy = f"PYOPENGL_PLATFORM={platform_set} keeps EGL out", "Unset it"
     else:

@@ -47,7 +47,9 @@ class Judge:
         self.failure = np.full(num_sims, "", dtype=object)
         self.lasted = np.zeros((num_sims, len(task.failures)), dtype=np.int64)
         """(N, categories) control steps for which each failure has been seen without a break."""
-        self._limits = np.array([max(1, round(seconds * control_hz)) for seconds in task.failures.values()])
+        self._limits = np.array(
+            [max(1, round(seconds * control_hz)) for seconds in task.failures.values()]
+        )
         self.subtask = np.zeros((num_sims, len(ROBOT.arms)), dtype=np.int64)
         """(N, 2) index of each arm's current subtask; one past the last when all are done."""
         self.verdict: Verdict | None = None
@@ -83,12 +85,20 @@ class Judge:
         self.held = np.where(stepped, held, self.held)
         self.success |= running & (self.held >= self.hold_steps)
         running &= ~self.success
-        seen = np.array([verdict.failures[name] for name in self.task.failures], bool).reshape(-1, len(self.held)).T
-        self.lasted = np.where(stepped[:, None], np.where(seen, self.lasted + 1, 0), self.lasted)
+        seen = (
+            np.array([verdict.failures[name] for name in self.task.failures], bool)
+            .reshape(-1, len(self.held))
+            .T
+        )
+        self.lasted = np.where(
+            stepped[:, None], np.where(seen, self.lasted + 1, 0), self.lasted
+        )
         failed, late = self.lasted >= self._limits, self.steps >= self.limit_steps
         if failed.any() or late.any() or scene.diverged.any():
             first = np.column_stack([failed, np.ones(len(self.held), bool)]).argmax(1)
-            failure = np.array([*self.task.failures, ""], dtype=object)[first]  # the first, or none
+            failure = np.array([*self.task.failures, ""], dtype=object)[
+                first
+            ]  # the first, or none
             failure[(failure == "") & late] = "timeout"
             failure[scene.diverged] = "diverged"
             self.failure[running] = failure[running]
@@ -111,7 +121,9 @@ class Judge:
             for name in ("held", "lasted", "steps", "success", "failure", "subtask")
         }
 
-    def restore(self, rows: dict[str, np.ndarray], ids: np.ndarray, scene: "Simulation") -> None:
+    def restore(
+        self, rows: dict[str, np.ndarray], ids: np.ndarray, scene: "Simulation"
+    ) -> None:
         """Set the counters of the simulations ``ids`` (n,) from ``rows``, which ``snapshot`` returned."""
         for name, values in rows.items():
             getattr(self, name)[ids] = values

@@ -26,7 +26,14 @@ from taccorl.robots.robot_spec import PadLayout
 from taccorl.sim.felt_shapes import shapes_of
 from taccorl.sim.touch_kernel import FeltGeoms, Fields, Pads, compression, penetration
 
-KINEMATIC_FIELDS = ("site_xpos", "site_xmat", "geom_xpos", "geom_xmat", "cvel", "subtree_com")
+KINEMATIC_FIELDS = (
+    "site_xpos",
+    "site_xmat",
+    "geom_xpos",
+    "geom_xmat",
+    "cvel",
+    "subtree_com",
+)
 """Fields of ``mujoco.MjData`` from which touch is computed."""
 
 
@@ -94,18 +101,27 @@ class PadArray:
     on every pad. Raises TaccorlError: a pad has no site or no geom, or a geom is of a kind whose depth is not implemented
     (``shapes_of``)."""
 
-    def __init__(self, model: mujoco.MjModel, pads: Sequence[str], layout: PadLayout = ROBOT.pad) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, pads: Sequence[str], layout: PadLayout = ROBOT.pad
+    ) -> None:
         self.pads = tuple(pads)
         x, y = layout.taxel_axes_m()
         self.taxel_pos_pad = np.stack(
-            [np.tile(x, layout.rows), np.repeat(y, layout.columns), np.zeros(layout.num_taxels)], axis=1
+            [
+                np.tile(x, layout.rows),
+                np.repeat(y, layout.columns),
+                np.zeros(layout.num_taxels),
+            ],
+            axis=1,
         )
         """(K, 3) m."""
         self._site = np.array([_id(model, "site", pad) for pad in pads])
         self._box = np.array([_id(model, "geom", pad) for pad in pads])
         self._finger = model.site_bodyid[self._site]
         self._plate = model.geom_bodyid[self._box]
-        self._sprung = np.flatnonzero(model.body_weldid[self._plate] != model.body_weldid[self._finger])
+        self._sprung = np.flatnonzero(
+            model.body_weldid[self._plate] != model.body_weldid[self._finger]
+        )
         self._plate_point, self._plate_normal = self._undeformed(model)
         felt = self._felt_geoms(model)
         self._shapes = shapes_of(model, np.flatnonzero(felt.any(axis=0)).tolist())
@@ -129,7 +145,9 @@ class PadArray:
             plate_normal=self._plate_normal,
             root=model.body_rootid.copy(),
             half_m=np.array([x.max(), y.max(), 0.0]),
-            grid=np.stack([*self.taxel_pos_pad[:, :2].T, np.ones(layout.num_taxels)]).astype(np.float32),
+            grid=np.stack(
+                [*self.taxel_pos_pad[:, :2].T, np.ones(layout.num_taxels)]
+            ).astype(np.float32),
         )
 
     @property
@@ -150,10 +168,15 @@ class PadArray:
     def _felt_geoms(self, model: mujoco.MjModel) -> np.ndarray:
         """(P, ngeom) bool."""
         collides = (model.geom_contype | model.geom_conaffinity) != 0
-        tree, weld = model.body_treeid[model.geom_bodyid], model.body_weldid[model.geom_bodyid]
+        tree, weld = (
+            model.body_treeid[model.geom_bodyid],
+            model.body_weldid[model.geom_bodyid],
+        )
         felt = np.empty((len(self.pads), model.ngeom), bool)
         for p, finger in enumerate(self._finger):
-            own = (weld == model.body_weldid[finger]) | ((tree == model.body_treeid[finger]) & (tree >= 0))
+            own = (weld == model.body_weldid[finger]) | (
+                (tree == model.body_treeid[finger]) & (tree >= 0)
+            )
             own[np.delete(self._box, p)] = False
             own[self._box[p]] = True
             felt[p] = collides & ~own
@@ -176,17 +199,31 @@ class PadArray:
         In the taxel frame a plate is the plane n · p = n · p₀, so c(x, y) = (n_x x + n_y y − n · p₀) / n_z. Its points move with
         v + ω × p, so that at a fixed taxel ċ = −(n · v + (n × ω) · p) / n_z with p = (x, y, −c)."""
         fields = self._fields(state)
-        touch = Touch(*np.empty((2, len(fields.cvel), len(self._sprung), self._pads.grid.shape[1]), np.float32))
+        touch = Touch(
+            *np.empty(
+                (2, len(fields.cvel), len(self._sprung), self._pads.grid.shape[1]),
+                np.float32,
+            )
+        )
         compression(self._pads, fields, *touch)
         return touch
 
-    def _past_surface(self, state: Kinematics, start: int, end: int | None, *, off_sinking: bool) -> Touch:
+    def _past_surface(
+        self, state: Kinematics, start: int, end: int | None, *, off_sinking: bool
+    ) -> Touch:
         fields = self._fields(state, start, end)
-        touch = Touch(*np.zeros((2, len(fields.cvel), len(self.pads), self._pads.grid.shape[1]), np.float32))
+        touch = Touch(
+            *np.zeros(
+                (2, len(fields.cvel), len(self.pads), self._pads.grid.shape[1]),
+                np.float32,
+            )
+        )
         penetration(self._geoms, self._shapes, self._pads, fields, off_sinking, *touch)
         return touch
 
-    def _fields(self, state: Kinematics, start: int = 0, end: int | None = None) -> Fields:
+    def _fields(
+        self, state: Kinematics, start: int = 0, end: int | None = None
+    ) -> Fields:
         views = [getattr(state, name)[start:end] for name in KINEMATIC_FIELDS]
         for view in views:
             view.flags.writeable = False  # of all states alike, or Numba compiles the kernel once more (12 s)
@@ -202,5 +239,7 @@ class PadArray:
 def _id(model: mujoco.MjModel, kind: Literal["site", "geom"], pad: str) -> int:
     names = [getattr(model, kind)(i).name for i in range(getattr(model, f"n{kind}"))]
     if pad not in names:
-        raise TaccorlError(f"pad {pad!r}: the model has no {kind} of that name; {nearest(pad, names)}")
+        raise TaccorlError(
+            f"pad {pad!r}: the model has no {kind} of that name; {nearest(pad, names)}"
+        )
     return names.index(pad)

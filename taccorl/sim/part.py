@@ -36,7 +36,10 @@ impedance of (0.99, 0.999) is too hard: a part that slides in the hand then pops
 Priority 1: the part's friction and stiffness count, not the table's or the pad's, because the paper randomises the part's
 friction. Friction itself is ``geom_friction``, which ``Batch.expand`` gives each sim."""
 PART_FRICTION = 0.5  # middle of the paper's U(0.3, 0.7), App. E
-_TORSION_M, _ROLLING_M = 0.002, 0.0001  # torsional and rolling friction; a contact patch of some mm
+_TORSION_M, _ROLLING_M = (
+    0.002,
+    0.0001,
+)  # torsional and rolling friction; a contact patch of some mm
 
 COLORS: Mapping[str, tuple[float, float, float]] = {
     "glass": (0.62, 0.86, 0.90),
@@ -57,25 +60,38 @@ COLORS: Mapping[str, tuple[float, float, float]] = {
 # Per side; 0.001 is easy, 0.0003 hard. A choice between 0.06 mm (Isaac Lab's Factory) and 3 mm (ManiSkill's PegInsertionSide).
 CLEARANCE_M = 0.0005
 _FINGER_ROOM_M = 0.004  # between the fingers' tips and what lies below them
-TCP_ABOVE_M = ROBOT.pad.length_m / 2 + _FINGER_ROOM_M  # lowest TCP over a surface: the pads reach 32 mm beyond it
+TCP_ABOVE_M = (
+    ROBOT.pad.length_m / 2 + _FINGER_ROOM_M
+)  # lowest TCP over a surface: the pads reach 32 mm beyond it
 
 
-def frame_pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:
+def frame_pose(
+    x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)
+) -> np.ndarray:
     """Pose (4, 4) of a frame with the axes ``x_axis`` and ``z_axis``, perpendicular unit vectors of 3 numbers, and its origin at
     ``at`` [m]."""
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x_axis, np.cross(z_axis, x_axis), z_axis, at
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = (
+        x_axis,
+        np.cross(z_axis, x_axis),
+        z_axis,
+        at,
+    )
     return pose
 
 
-LEADING_END = frame_pose(z_axis=(0, 0, -1))  # of a part whose origin is at its tip and whose z runs to its tail
+LEADING_END = frame_pose(
+    z_axis=(0, 0, -1)
+)  # of a part whose origin is at its tip and whose z runs to its tail
 
 
 def check_clearance(name: str, clearance_m: float) -> None:
     """Check the clearance ``clearance_m`` on each side between a part and the hole of the part ``name``. Raises TaccorlError:
     it is not within 0 and 2 mm."""
     if not 0 < clearance_m <= 0.002:
-        raise TaccorlError(f"{name}: clearance_m={clearance_m} is not within 0 and 0.002 m; the default is 0.0005")
+        raise TaccorlError(
+            f"{name}: clearance_m={clearance_m} is not within 0 and 0.002 m; the default is 0.0005"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,9 +136,15 @@ class Part:
     clamped: bool = False  # True: fixed to the bench (a mocap body); False: free
     table_from_part: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) pose of the part when it rests on a table whose top is z = 0."""
-    mate: Mate | None = None  # Leading end that goes into another part's hole; None: it has none
-    holes: Mapping[str, Hole] = field(default_factory=dict)  # Name → hole for another part's mate
-    grasps: Mapping[str, Grasp] = field(default_factory=dict)  # Name → way to grip the part
+    mate: Mate | None = (
+        None  # Leading end that goes into another part's hole; None: it has none
+    )
+    holes: Mapping[str, Hole] = field(
+        default_factory=dict
+    )  # Name → hole for another part's mate
+    grasps: Mapping[str, Grasp] = field(
+        default_factory=dict
+    )  # Name → way to grip the part
     seats: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Kind of another part → pose (4, 4) in this part's frame at which it is placed at reset."""
 
@@ -134,7 +156,10 @@ class Part:
     @property
     def com_part_m(self) -> np.ndarray:
         """(3,) centre of mass in the part's frame [m]."""
-        return sum((s.mass_kg * s.com_part_m for s in self.solids), np.zeros(3)) / self.mass_kg
+        return (
+            sum((s.mass_kg * s.com_part_m for s in self.solids), np.zeros(3))
+            / self.mass_kg
+        )
 
 
 class Fit(NamedTuple):
@@ -146,7 +171,9 @@ class Fit(NamedTuple):
     turn_rad: np.ndarray  # Angle about the axis to the nearest rotation that looks the same [rad]; 0 for a round part
 
 
-def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_turns: int | None) -> Fit:
+def measure_fit(
+    world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_turns: int | None
+) -> Fit:
     """Depth, lateral error, tilt and turn of mates in holes, each (…).
 
     ``world_from_hole`` and ``world_from_mate`` (…, 4, 4) are the poses of ``Hole`` and ``Mate``; ``num_turns`` is that of the
@@ -156,16 +183,26 @@ def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_tu
     shift = world_from_mate[..., :3, 3] - world_from_hole[..., :3, 3]
     seen = (turned @ shift[..., None])[..., 0]
     x, y, depth = seen[..., 0], seen[..., 1], seen[..., 2]
-    tilt = np.arctan2(np.hypot(hole_from_mate[..., 0, 2], hole_from_mate[..., 1, 2]), hole_from_mate[..., 2, 2])
+    tilt = np.arctan2(
+        np.hypot(hole_from_mate[..., 0, 2], hole_from_mate[..., 1, 2]),
+        hole_from_mate[..., 2, 2],
+    )
     turn = np.arctan2(
-        hole_from_mate[..., 1, 0] - hole_from_mate[..., 0, 1], np.einsum("...ii", hole_from_mate[..., :2, :2])
+        hole_from_mate[..., 1, 0] - hole_from_mate[..., 0, 1],
+        np.einsum("...ii", hole_from_mate[..., :2, :2]),
     )
     period = 2 * math.pi / num_turns if num_turns else math.inf
-    turn = np.zeros_like(turn) if num_turns is None else turn - period * np.round(turn / period)
+    turn = (
+        np.zeros_like(turn)
+        if num_turns is None
+        else turn - period * np.round(turn / period)
+    )
     return Fit(depth, np.hypot(x, y), tilt, turn)
 
 
-def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION) -> mujoco.MjsBody:
+def add_part(
+    spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION
+) -> mujoco.MjsBody:
     """Add a part to the world of ``spec``, at rest on the table at the origin; returns its body.
 
     A reset then moves the part: a loose one by the ``qpos`` of its free joint, a clamped one, which is a mocap body without
@@ -173,17 +210,31 @@ def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION
     ``rack_0``, ``rack_1`` … ``friction``: coefficient of sliding friction of its geoms."""
     rest = part.table_from_part
     quat = Rotation.from_matrix(rest[:3, :3]).as_quat(scalar_first=True)
-    body = spec.worldbody.add_body(name=part.name, pos=rest[:3, 3], quat=quat, mocap=part.clamped)
+    body = spec.worldbody.add_body(
+        name=part.name, pos=rest[:3, 3], quat=quat, mocap=part.clamped
+    )
     if not part.clamped:
         body.add_freejoint(name=part.name)
     for color in sorted({solid.color for solid in part.solids if solid.touches}):
-        spec.add_material(name=f"{part.name}_{color}", rgba=(*COLORS[color], 1), specular=0, shininess=0)
+        spec.add_material(
+            name=f"{part.name}_{color}",
+            rgba=(*COLORS[color], 1),
+            specular=0,
+            shininess=0,
+        )
     for i, solid in enumerate(part.solids):
         settings = dict(
-            PART_CONTACT, friction=(friction, _TORSION_M, _ROLLING_M), material=f"{part.name}_{solid.color}"
+            PART_CONTACT,
+            friction=(friction, _TORSION_M, _ROLLING_M),
+            material=f"{part.name}_{solid.color}",
         )
         if not solid.touches:
-            settings = {"contype": 0, "conaffinity": 0, "group": 5, "rgba": (0, 0, 0, 0)}
+            settings = {
+                "contype": 0,
+                "conaffinity": 0,
+                "group": 5,
+                "rgba": (0, 0, 0, 0),
+            }
         add_geom(spec, body, solid, f"{part.name}_{i}", **settings)
     return body
 
@@ -193,5 +244,9 @@ def on_table(part: Part, xy_m: np.ndarray, yaw_rad: float) -> np.ndarray:
     vertical, with its origin above ``xy_m`` (2,)."""
     rest = part.table_from_part
     turned = Rotation.from_euler("z", yaw_rad)
-    pos = np.array([*xy_m, rest[2, 3] + 0.0002])  # a hair above: no contact to begin with
-    return np.r_[pos, (turned * Rotation.from_matrix(rest[:3, :3])).as_quat(scalar_first=True)]
+    pos = np.array(
+        [*xy_m, rest[2, 3] + 0.0002]
+    )  # a hair above: no contact to begin with
+    return np.r_[
+        pos, (turned * Rotation.from_matrix(rest[:3, :3])).as_quat(scalar_first=True)
+    ]

@@ -47,4 +47,6 @@ def part_poses(sim: _Posed) -> np.ndarray:
     for body in posed_bodies(sim.task):
         pose = sim.poses(body)
         numbers += [pose[:, :3, 3], pose[:, :3, 0], pose[:, :3, 1]]
-    return np.concatenate([np.zeros((sim.num_sims, 0)), *numbers], axis=1).astype(np.float32)
+    return np.concatenate([np.zeros((sim.num_sims, 0)), *numbers], axis=1).astype(
+        np.float32
+    )

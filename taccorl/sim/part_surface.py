@@ -31,9 +31,13 @@ class Surface:
 
     The surface point nearest to an inner point is its projection on a piece, or on an edge at which the part is concave."""
 
-    corners_m: np.ndarray  # (Q, E, 3) corners of each piece; the last corner is repeated up to E
+    corners_m: (
+        np.ndarray
+    )  # (Q, E, 3) corners of each piece; the last corner is repeated up to E
     normals: np.ndarray  # (Q, 3) outward unit normal of each piece
-    side_normals: np.ndarray  # (Q, E, 3) unit normal of each side of a piece, outward, in the piece's plane
+    side_normals: (
+        np.ndarray
+    )  # (Q, E, 3) unit normal of each side of a piece, outward, in the piece's plane
     side_offsets_m: np.ndarray  # (Q, E) offset of each side: n · p of its points
     edges_m: np.ndarray  # (M, 2, 3) start and end of each edge
 
@@ -50,25 +54,37 @@ class Surface:
         def near(corners_m: np.ndarray) -> np.ndarray:
             """(C, B) bool: the bounding boxes of corners (B, N, 3) reach to within ``NEAR_M`` of the cells."""
             low, high = corners_m.min(axis=1), corners_m.max(axis=1)
-            gap = np.maximum(0, np.maximum(low - centres[:, None], centres[:, None] - high) - size / 2)
+            gap = np.maximum(
+                0,
+                np.maximum(low - centres[:, None], centres[:, None] - high) - size / 2,
+            )
             return _dot(gap, gap) < NEAR_M**2
 
-        above = np.abs(centres @ self.normals.T - _dot(self.normals, self.corners_m[:, 0]))
+        above = np.abs(
+            centres @ self.normals.T - _dot(self.normals, self.corners_m[:, 0])
+        )
         reaches = above < NEAR_M + size / 2 * np.abs(self.normals).sum(axis=1)
-        return Cells(low, size, counts, near(self.corners_m) & reaches, near(self.edges_m))
+        return Cells(
+            low, size, counts, near(self.corners_m) & reaches, near(self.edges_m)
+        )
 
     @property
     def piece_table(self) -> np.ndarray:
         """(Q, 8) normal, offset, and centre and radius² of a sphere around each piece."""
         centres = self.corners_m.mean(axis=1)
-        radius = np.linalg.norm(self.corners_m - centres[:, None], axis=2).max(axis=1) + TOUCH_M
+        radius = (
+            np.linalg.norm(self.corners_m - centres[:, None], axis=2).max(axis=1)
+            + TOUCH_M
+        )
         offsets = _dot(self.normals, self.corners_m[:, 0])
         return np.column_stack([self.normals, offsets, centres, radius**2])
 
     @property
     def edge_table(self) -> np.ndarray:
         """(M, 6) start and vector of each edge."""
-        return np.concatenate([self.edges_m[:, 0], self.edges_m[:, 1] - self.edges_m[:, 0]], axis=1)
+        return np.concatenate(
+            [self.edges_m[:, 0], self.edges_m[:, 1] - self.edges_m[:, 0]], axis=1
+        )
 
 
 class Cells(NamedTuple):
@@ -108,14 +124,36 @@ class Covered(NamedTuple):
 def surface_of(solids: Sequence[Polyhedron]) -> tuple[Surface, list[Covered]]:
     """Return the surface of the union of convex solids in one frame, and for each solid, in their order, the areas of its faces
     that others cover."""
-    low = np.array([np.min([c.min(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) - TOUCH_M
-    high = np.array([np.max([c.max(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) + TOUCH_M
+    low = (
+        np.array(
+            [
+                np.min([c.min(axis=0) for c in solid.corners_m], axis=0)
+                for solid in solids
+            ]
+        )
+        - TOUCH_M
+    )
+    high = (
+        np.array(
+            [
+                np.max([c.max(axis=0) for c in solid.corners_m], axis=0)
+                for solid in solids
+            ]
+        )
+        + TOUCH_M
+    )
     pieces: list[tuple[np.ndarray, np.ndarray]] = []  # corners, normal
     covered = [Covered(np.zeros(len(solid.normals), bool), []) for solid in solids]
     for s, solid in enumerate(solids):
-        near = [i for i in range(len(solids)) if i != s and (low[i] <= high[s]).all() and (low[s] <= high[i]).all()]
+        near = [
+            i
+            for i in range(len(solids))
+            if i != s and (low[i] <= high[s]).all() and (low[s] <= high[i]).all()
+        ]
         for face, normal in enumerate(solid.normals):
-            uncovered, patches = _split(solid.corners_m[face], normal, [solids[i] for i in near])
+            uncovered, patches = _split(
+                solid.corners_m[face], normal, [solids[i] for i in near]
+            )
             pieces += [(corners, normal) for corners in uncovered]
             rectangles = _rectangles(solid.corners_m[face], normal, patches)
             if not uncovered or len(rectangles) > _MAX_RECTANGLES:
@@ -123,28 +161,48 @@ def surface_of(solids: Sequence[Polyhedron]) -> tuple[Surface, list[Covered]]:
             else:
                 covered[s].places.extend((face, *rectangle) for rectangle in rectangles)
     num_sides = max(len(corners) for corners, _ in pieces)
-    side_normals, side_offsets = np.zeros((len(pieces), num_sides, 3)), np.ones((len(pieces), num_sides))
+    side_normals, side_offsets = (
+        np.zeros((len(pieces), num_sides, 3)),
+        np.ones((len(pieces), num_sides)),
+    )
     for q, (corners, normal) in enumerate(pieces):
         sides = np.cross(np.roll(corners, -1, axis=0) - corners, normal)
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        side_normals[q, : len(corners)], side_offsets[q, : len(corners)] = sides, _dot(sides, corners)
+        side_normals[q, : len(corners)], side_offsets[q, : len(corners)] = (
+            sides,
+            _dot(sides, corners),
+        )
     surface = Surface(
-        corners_m=np.array([np.pad(c, ((0, num_sides - len(c)), (0, 0)), mode="edge") for c, _ in pieces]),
+        corners_m=np.array(
+            [
+                np.pad(c, ((0, num_sides - len(c)), (0, 0)), mode="edge")
+                for c, _ in pieces
+            ]
+        ),
         normals=np.array([normal for _, normal in pieces]),
         side_normals=side_normals,
         side_offsets_m=side_offsets,
-        edges_m=_hollow_edges([(*piece, sides) for piece, sides in zip(pieces, side_normals, strict=True)]),
+        edges_m=_hollow_edges(
+            [(*piece, sides) for piece, sides in zip(pieces, side_normals, strict=True)]
+        ),
     )
     return surface, covered
 
 
-def _hollow_edges(pieces: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+def _hollow_edges(
+    pieces: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> np.ndarray:
     """(M, 2, 3) starts and ends of the edges between pieces (corners, normal, sides' normals) but where two of them meet
     in a convex edge or in one plane, which is never the nearest."""
     meeting: dict[tuple, list[tuple]] = {}
     for corners, normal, sides in pieces:
-        for start, end, side in zip(corners, np.roll(corners, -1, axis=0), sides, strict=False):
-            ends = sorted(tuple(np.round(corner / TOUCH_M).astype(int).tolist()) for corner in (start, end))
+        for start, end, side in zip(
+            corners, np.roll(corners, -1, axis=0), sides, strict=False
+        ):
+            ends = sorted(
+                tuple(np.round(corner / TOUCH_M).astype(int).tolist())
+                for corner in (start, end)
+            )
             meeting.setdefault(tuple(ends), []).append((start, end, normal, side))
     hollow = []
     for same in meeting.values():
@@ -201,9 +259,16 @@ def _rectangles(
     for patch in patches:
         low, high = (patch @ axes.T).min(axis=0), (patch @ axes.T).max(axis=0)
         i = 0
-        while i < len(found):  # as one with any that it fits on to, and then again with the others
-            both_low, both_high = np.minimum(low, found[i][0]), np.maximum(high, found[i][1])
-            if np.prod(both_high - both_low) <= 1.1 * (np.prod(high - low) + np.prod(found[i][1] - found[i][0])):
+        while i < len(
+            found
+        ):  # as one with any that it fits on to, and then again with the others
+            both_low, both_high = (
+                np.minimum(low, found[i][0]),
+                np.maximum(high, found[i][1]),
+            )
+            if np.prod(both_high - both_low) <= 1.1 * (
+                np.prod(high - low) + np.prod(found[i][1] - found[i][0])
+            ):
                 found.pop(i)
                 low, high, i = both_low, both_high, 0
             else:
@@ -215,7 +280,9 @@ def _rectangles(
 def _cut(corners: np.ndarray, height: np.ndarray) -> np.ndarray:
     """The part of a convex polygon (N, 3) whose height (N,) is not above 0."""
     kept = []
-    for p, q, hp, hq in zip(corners, np.roll(corners, -1, axis=0), height, np.roll(height, -1), strict=True):
+    for p, q, hp, hq in zip(
+        corners, np.roll(corners, -1, axis=0), height, np.roll(height, -1), strict=True
+    ):
         if hp <= 0:
             kept.append(p)
         if hp * hq < 0:

@@ -28,11 +28,18 @@ def polyhedron(vertices_m: np.ndarray) -> Polyhedron:
     """The convex hull of ``vertices_m`` (V, 3) [m], with coplanar facets merged."""
     hull = ConvexHull(vertices_m)
     facets = vertices_m[hull.simplices]
-    area = np.linalg.norm(np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0]), axis=1
+    )
     normals, offsets, corners = [], [], []
     outer = vertices_m[hull.vertices]
-    for facet in np.argsort(-area, kind="stable"):  # a sliver's own normal may be anything, so the largest first
-        if any(np.abs(facets[facet] @ n - o).max() < FLAT_M for n, o in zip(normals, offsets, strict=True)):
+    for facet in np.argsort(
+        -area, kind="stable"
+    ):  # a sliver's own normal may be anything, so the largest first
+        if any(
+            np.abs(facets[facet] @ n - o).max() < FLAT_M
+            for n, o in zip(normals, offsets, strict=True)
+        ):
             continue
         rough = hull.equations[facet]
         face = outer[np.abs(outer @ rough[:3] + rough[3]) < FLAT_M]

@@ -38,7 +38,9 @@ OBJECT_FRICTION = Row(name="friction", low=(0.3,), high=(0.7,), unit="1")
 """Sliding friction coefficient of all parts."""
 
 
-def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> dict[str, np.ndarray]:
+def draw(
+    rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0
+) -> dict[str, np.ndarray]:
     """Draw a value for every one of ``rows``: name → (components,) in the row's unit.
 
     ``scale`` multiplies the ranges about their middle; 0 gives the nominal scene. The number of random draws does not depend on
@@ -48,5 +50,7 @@ def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> d
         low, high = np.array(row.low), np.array(row.high)
         made = rng.random() < row.probability
         value = rng.uniform(low, high)
-        values[row.name] = row.absent + scale * (value - row.absent) if made else row.absent
+        values[row.name] = (
+            row.absent + scale * (value - row.absent) if made else row.absent
+        )
     return values

@@ -54,7 +54,9 @@ class Renderer:
         self._gl: Canvas | None = None
         self._scratch: tuple[Batch, mujoco.MjModel, mujoco.MjData] | None = None
 
-    def render(self, datas: Iterable[mujoco.MjData], num: int | None = None) -> np.ndarray:
+    def render(
+        self, datas: Iterable[mujoco.MjData], num: int | None = None
+    ) -> np.ndarray:
         """Pictures (simulations, cameras, rows, columns, 3) uint8, a new array.
 
         Args:
@@ -71,7 +73,10 @@ class Renderer:
         return self._draw(((data.model, data) for data in datas), num)
 
     def render_batch(
-        self, batch: Batch, ids: Sequence[int] | np.ndarray | None = None, place: Place | None = None
+        self,
+        batch: Batch,
+        ids: Sequence[int] | np.ndarray | None = None,
+        place: Place | None = None,
     ) -> np.ndarray:
         """Pictures of the current states of a batch's simulations: (simulations, cameras, rows, columns, 3) uint8, a new array.
 
@@ -97,9 +102,15 @@ class Renderer:
         canvas, found = self._canvas(), []
         with canvas.current():
             for view in self._views:
-                geoms, depth_m = np.full(self._shape, -1, np.int32), np.full(self._shape, np.inf)
+                geoms, depth_m = (
+                    np.full(self._shape, -1, np.int32),
+                    np.full(self._shape, np.inf),
+                )
                 window = view.window
-                inside = np.s_[window.top : window.top + window.rows, window.left : window.left + window.columns]
+                inside = np.s_[
+                    window.top : window.top + window.rows,
+                    window.left : window.left + window.columns,
+                ]
                 geoms[inside], depth = canvas.labels(data.model, data, view)
                 depth_m[inside] = np.where(geoms[inside] >= 0, depth, np.inf)
                 found.append((geoms, depth_m))
@@ -117,12 +128,18 @@ class Renderer:
             if place:
                 place(sim, data)
             mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)  # for cameras and lights that follow a centre of mass
+            mujoco.mj_comPos(
+                model, data
+            )  # for cameras and lights that follow a centre of mass
             mujoco.mj_camlight(model, data)
             yield model, data
 
-    def _draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], num_sims: int) -> np.ndarray:
-        out = np.zeros((len(self._views), num_sims, *self._shape, 3), np.uint8)  # each camera's pictures are contiguous
+    def _draw(
+        self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], num_sims: int
+    ) -> np.ndarray:
+        out = np.zeros(
+            (len(self._views), num_sims, *self._shape, 3), np.uint8
+        )  # each camera's pictures are contiguous
         if out.size:
             canvas = self._canvas()
             with canvas.current():
@@ -131,7 +148,10 @@ class Renderer:
 
     def _canvas(self) -> "Canvas":
         if self._gl is None:
-            cell = (max(v.window.rows for v in self._views), max(v.window.columns for v in self._views))
+            cell = (
+                max(v.window.rows for v in self._views),
+                max(v.window.columns for v in self._views),
+            )
             self._gl = Canvas(self._model, cell, self._max_sheet_px)
         return self._gl
 
@@ -161,7 +181,9 @@ class Renderer:
 def _view(model: mujoco.MjModel, name: str, shape: tuple[int, int]) -> View:
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
     if index < 0:
-        raise TaccorlError(f"no camera {name!r}; {nearest(name, (model.camera(i).name for i in range(model.ncam)))}")
+        raise TaccorlError(
+            f"no camera {name!r}; {nearest(name, (model.camera(i).name for i in range(model.ncam)))}"
+        )
     camera = mujoco.MjvCamera()
     camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, index
     columns, rows = (int(n) for n in model.cam_resolution[index])
@@ -183,10 +205,17 @@ def style(spec: mujoco.MjSpec) -> None:
     visual.quality.offsamples = visual.quality.shadowsize = 0
     visual.quality.numslices, visual.quality.numstacks = 20, 10
     visual.global_.offwidth, visual.global_.offheight = 1280, 960
-    visual.headlight.ambient, visual.headlight.diffuse, visual.headlight.specular = [0.30] * 3, [0.20] * 3, [0.0] * 3
+    visual.headlight.ambient, visual.headlight.diffuse, visual.headlight.specular = (
+        [0.30] * 3,
+        [0.20] * 3,
+        [0.0] * 3,
+    )
     spec.stat.extent = 1.0  # [m]; the clipping distances are its multiples
     visual.map.znear, visual.map.zfar = 0.01, 10.0
-    for name, direction, strength in (("key", (-0.4, -0.6, -1.0), 0.55), ("fill", (0.5, 0.7, -0.6), 0.15)):
+    for name, direction, strength in (
+        ("key", (-0.4, -0.6, -1.0), 0.55),
+        ("fill", (0.5, 0.7, -0.6), 0.15),
+    ):
         spec.worldbody.add_light(
             name=f"{name}_light",
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -215,8 +244,18 @@ def _table_material(spec: mujoco.MjSpec) -> mujoco.MjsMaterial:
     size = 128
     coarse = np.random.default_rng(0).uniform(0.9, 1.0, (size // 8, size // 8))
     grain = np.kron(coarse, np.ones((8, 8)))
-    texture = spec.add_texture(name=TABLE, type=mujoco.mjtTexture.mjTEXTURE_2D, width=size, height=size, nchannel=3)
-    texture.data = np.repeat(np.round(255 * grain).astype(np.uint8)[..., None], 3, axis=-1).tobytes()
-    material = spec.add_material(name=TABLE, texuniform=True, texrepeat=[4, 4], specular=0.0)
+    texture = spec.add_texture(
+        name=TABLE,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=size,
+        height=size,
+        nchannel=3,
+    )
+    texture.data = np.repeat(
+        np.round(255 * grain).astype(np.uint8)[..., None], 3, axis=-1
+    ).tobytes()
+    material = spec.add_material(
+        name=TABLE, texuniform=True, texrepeat=[4, 4], specular=0.0
+    )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = TABLE
     return material

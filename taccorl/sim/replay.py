@@ -33,7 +33,12 @@ class Replay:
     """(T, 14) motor torques [N·m] and gripper forces [N] at the end of the interval in which each command is in force."""
 
 
-def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarray | None = None) -> Replay:
+def replay(
+    sim: Simulation,
+    targets: np.ndarray,
+    rate_hz: float,
+    start: np.ndarray | None = None,
+) -> Replay:
     """Simulate the commands ``targets`` (T, 14) [rad, m] at ``rate_hz`` in simulation 0, from its present scene; the caller
     resets it before.
 
@@ -42,24 +47,44 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
     as measured when the first command was sent; the first targets by default. Raises TaccorlError: the period is no whole
     number of physics steps, or a shape is wrong."""
     targets = np.asarray(targets, dtype=float)
-    if targets.ndim != 2 or targets.shape[1] != ROBOT.num_actions or not np.isfinite(targets).all():
-        raise TaccorlError(f"replay: targets of shape {targets.shape}, not (T, {ROBOT.num_actions}) finite rad and m")
+    if (
+        targets.ndim != 2
+        or targets.shape[1] != ROBOT.num_actions
+        or not np.isfinite(targets).all()
+    ):
+        raise TaccorlError(
+            f"replay: targets of shape {targets.shape}, not (T, {ROBOT.num_actions}) finite rad and m"
+        )
     steps = 1.0 / (rate_hz * sim.config.physics.timestep_s)
     if abs(steps - round(steps)) > 1e-6:
-        raise TaccorlError(f"replay: {rate_hz:g} Hz is {steps:.3f} physics steps; resample to 30, 100 or 200 Hz")
+        raise TaccorlError(
+            f"replay: {rate_hz:g} Hz is {steps:.3f} physics steps; resample to 30, 100 or 200 Hz"
+        )
     parts = math.ceil(_COMMAND_HZ / rate_hz)
     while round(steps) % parts:
         parts -= 1
-    share = np.arange(1, parts + 1)[:, None, None] / parts if parts > 1 else np.zeros((1, 1, 1))  # as Simulation.step
+    share = (
+        np.arange(1, parts + 1)[:, None, None] / parts
+        if parts > 1
+        else np.zeros((1, 1, 1))
+    )  # as Simulation.step
     sim.place_arms(targets[0] if start is None else start, targets[0])
     reported, counts, effort = [], [], []
     for target, following in zip(targets, [*targets[1:], targets[-1]], strict=True):
         reported.append(sim.proprioception()[0])
         counts.append(sim.touch()[0])
         line = target + share * (following - target)
-        sim.advance(np.broadcast_to(line, (parts, sim.num_sims, len(target))), round(steps) // parts)
+        sim.advance(
+            np.broadcast_to(line, (parts, sim.num_sims, len(target))),
+            round(steps) // parts,
+        )
         effort.append(sim.effort()[0])
-    return Replay(np.arange(len(targets)) / rate_hz, np.array(reported), np.array(counts), np.array(effort))
+    return Replay(
+        np.arange(len(targets)) / rate_hz,
+        np.array(reported),
+        np.array(counts),
+        np.array(effort),
+    )
 
 
 def replay_episode(sim: Simulation, episode: Episode) -> Episode:
@@ -70,7 +95,11 @@ def replay_episode(sim: Simulation, episode: Episode) -> Episode:
     rest. Raises TaccorlError: the episode does not state its action_time, or a wrong rate or shape (``replay``)."""
     episode.spec.require_action_time(episode.name)
     state, action = episode.arrays["observation.state"], episode.executed()
-    in_force = np.concatenate([action[:1], action[:-1]]) if episode.spec.action_time == "next_row" else action
+    in_force = (
+        np.concatenate([action[:1], action[:-1]])
+        if episode.spec.action_time == "next_row"
+        else action
+    )
     done = replay(sim, in_force, episode.spec.fps, state[0])
     arrays = {"observation.state": done.reported.astype(np.float32), "action": action}
     if "observation.tactile" in episode.spec.features:

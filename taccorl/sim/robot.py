@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
-from taccorl.robots.bimanual_piper import CAPSULES, DARK, FINGER_MASS_KG, HAND_BOXES, INERTIAS, PAD_COLOR, STEEL
+from taccorl.robots.bimanual_piper import (
+    CAPSULES,
+    DARK,
+    FINGER_MASS_KG,
+    HAND_BOXES,
+    INERTIAS,
+    PAD_COLOR,
+    STEEL,
+)
 from taccorl.sim.settings import check_numbers
 
 
@@ -53,9 +61,13 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         if self.inertias not in INERTIAS:
-            raise TaccorlError(f"robot.inertias: no mass set {self.inertias!r}; {nearest(self.inertias, INERTIAS)}")
+            raise TaccorlError(
+                f"robot.inertias: no mass set {self.inertias!r}; {nearest(self.inertias, INERTIAS)}"
+            )
         if self.pads not in ("sprung", "rigid"):
-            raise TaccorlError(f"robot.pads: {self.pads!r} is neither 'sprung' nor 'rigid'")
+            raise TaccorlError(
+                f"robot.pads: {self.pads!r} is neither 'sprung' nor 'rigid'"
+            )
         if len(self.pad_tilt_stiffness_nm_per_rad) != 2:
             raise TaccorlError(
                 f"robot.pad_tilt_stiffness_nm_per_rad: {self.pad_tilt_stiffness_nm_per_rad} is not two numbers; give one "
@@ -65,7 +77,11 @@ class RobotConfig:
             "robot",
             self,
             finite=("mount_height_m", "gravity_compensation"),
-            not_negative=("armature_kgm2", "pad_damping_ns_per_m", "grip_damping_ns_per_m"),
+            not_negative=(
+                "armature_kgm2",
+                "pad_damping_ns_per_m",
+                "grip_damping_ns_per_m",
+            ),
             positive=(
                 "mount_spacing_m",
                 "pad_stiffness_n_per_m",
@@ -88,7 +104,9 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
         turn = np.zeros_like(pose)
         turn[..., 3, 3] = 1.0
         turn[..., :3, :3] = (
-            Rotation.from_rotvec(joints_rad[..., i, None].reshape(-1, 1) * np.array([0.0, 0.0, 1.0]))
+            Rotation.from_rotvec(
+                joints_rad[..., i, None].reshape(-1, 1) * np.array([0.0, 0.0, 1.0])
+            )
             .as_matrix()
             .reshape(*joints_rad.shape[:-1], 3, 3)
         )
@@ -97,7 +115,9 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
     return poses
 
 
-_SIDE_BIT = {arm: 2 << a for a, arm in enumerate(ROBOT.arms)}  # an arm touches parts, table, other arms, never itself
+_SIDE_BIT = {
+    arm: 2 << a for a, arm in enumerate(ROBOT.arms)
+}  # an arm touches parts, table, other arms, never itself
 PART_BIT = 1
 """Bit of ``contype`` and ``conaffinity`` of parts (MuJoCo's default), pads and table; arms have it in ``conaffinity`` only."""
 
@@ -111,26 +131,71 @@ def mount_pos_world_m(arm: str, config: RobotConfig) -> tuple[float, float, floa
 def add_arm(spec: mujoco.MjSpec, arm: str, config: RobotConfig) -> None:
     """Add one arm at its mount. Names: ``left_link1`` … ``left_link6``, joints ``left_joint1`` …, ``left_finger_a``, pads
     ``left_a``, site ``left_tcp``; each taxel frame is the site named like its pad, at the undeformed pad's surface."""
-    base = spec.worldbody.add_body(name=f"{arm}_base_link", pos=mount_pos_world_m(arm, config))
-    _geom(base, arm, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.055, 0.035, 0], pos=[0, 0, 0.035], rgba=STEEL)
+    base = spec.worldbody.add_body(
+        name=f"{arm}_base_link", pos=mount_pos_world_m(arm, config)
+    )
+    _geom(
+        base,
+        arm,
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[0.055, 0.035, 0],
+        pos=[0, 0, 0.035],
+        rgba=STEEL,
+    )
     if config.mount_height_m > 0:
         half = config.mount_height_m / 2
-        _geom(base, arm, type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.06, 0.06, half], pos=[0, 0, -half], rgba=DARK)
+        _geom(
+            base,
+            arm,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[0.06, 0.06, half],
+            pos=[0, 0, -half],
+            rgba=DARK,
+        )
     body = base
-    for joint, link, inertia in zip(ROBOT.joints, ROBOT.links, INERTIAS[config.inertias], strict=True):
-        quat = Rotation.from_euler("xyz", link.rpy_parent_rad).as_quat(scalar_first=True)
-        body = body.add_body(name=f"{arm}_{link.name}", pos=link.pos_parent_m, quat=quat)
+    for joint, link, inertia in zip(
+        ROBOT.joints, ROBOT.links, INERTIAS[config.inertias], strict=True
+    ):
+        quat = Rotation.from_euler("xyz", link.rpy_parent_rad).as_quat(
+            scalar_first=True
+        )
+        body = body.add_body(
+            name=f"{arm}_{link.name}", pos=link.pos_parent_m, quat=quat
+        )
         body.gravcomp = config.gravity_compensation
-        body.mass, body.ipos, body.explicitinertial = inertia.mass_kg, inertia.com_link_m, True
+        body.mass, body.ipos, body.explicitinertial = (
+            inertia.mass_kg,
+            inertia.com_link_m,
+            True,
+        )
         body.fullinertia = inertia.about_com_kgm2()
-        body.add_joint(name=f"{arm}_{joint}", axis=[0, 0, 1], range=link.range_rad, armature=config.armature_kgm2)
+        body.add_joint(
+            name=f"{arm}_{joint}",
+            axis=[0, 0, 1],
+            range=link.range_rad,
+            armature=config.armature_kgm2,
+        )
         for owner, start, end, radius, color in CAPSULES:
             if owner == link.name:
                 capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-                _geom(body, arm, type=capsule, fromto=[*start, *end], size=[radius, 0, 0], rgba=color)
+                _geom(
+                    body,
+                    arm,
+                    type=capsule,
+                    fromto=[*start, *end],
+                    size=[radius, 0, 0],
+                    rgba=color,
+                )
     for centre, half, color in HAND_BOXES:
-        _geom(body, arm, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=centre, rgba=color)
-    body.add_site(name=f"{arm}_tcp", pos=[0, 0, ROBOT.tcp_from_hand_m], size=[0.002, 0.002, 0.002], group=4)
+        _geom(
+            body, arm, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=centre, rgba=color
+        )
+    body.add_site(
+        name=f"{arm}_tcp",
+        pos=[0, 0, ROBOT.tcp_from_hand_m],
+        size=[0.002, 0.002, 0.002],
+        group=4,
+    )
     for finger in ROBOT.fingers:
         _add_finger(spec, body, arm, finger, config)
     # One motor drives both fingers through a rack: they stay mirror images.
@@ -147,29 +212,60 @@ def add_arm(spec: mujoco.MjSpec, arm: str, config: RobotConfig) -> None:
 
 def _geom(body: mujoco.MjsBody, arm: str, **settings) -> None:
     others = sum(bit for other, bit in _SIDE_BIT.items() if other != arm)
-    body.add_geom(contype=_SIDE_BIT[arm], conaffinity=PART_BIT | others, mass=0, **settings)
+    body.add_geom(
+        contype=_SIDE_BIT[arm], conaffinity=PART_BIT | others, mass=0, **settings
+    )
 
 
-def _add_finger(spec: mujoco.MjSpec, hand: mujoco.MjsBody, arm: str, finger: str, config: RobotConfig) -> None:
+def _add_finger(
+    spec: mujoco.MjSpec,
+    hand: mujoco.MjsBody,
+    arm: str,
+    finger: str,
+    config: RobotConfig,
+) -> None:
     """Finger ``a`` sits on the +y side of link 6 and opens along +y; ``b`` is its mirror image."""
     side = 1.0 if finger == "a" else -1.0
     pad_z = ROBOT.tcp_from_hand_m - ROBOT.finger_from_hand_m
-    body = hand.add_body(name=f"{arm}_finger_{finger}", pos=[0, 0, ROBOT.finger_from_hand_m])
+    body = hand.add_body(
+        name=f"{arm}_finger_{finger}", pos=[0, 0, ROBOT.finger_from_hand_m]
+    )
     body.gravcomp = config.gravity_compensation
-    body.mass, body.ipos, body.explicitinertial = FINGER_MASS_KG[config.inertias], [0, side * 0.01, 0.02], True
+    body.mass, body.ipos, body.explicitinertial = (
+        FINGER_MASS_KG[config.inertias],
+        [0, side * 0.01, 0.02],
+        True,
+    )
     body.inertia = [2e-5, 2e-5, 5e-6]
     slide = mujoco.mjtJoint.mjJNT_SLIDE
     # The armature is the gripper motor's rotor as the finger feels it; damping its gear. Neither is published.
     motor, stroke = {"armature": 0.1, "damping": 5.0}, [0, ROBOT.finger_stroke_m]
-    body.add_joint(name=f"{arm}_finger_{finger}", type=slide, axis=[0, side, 0], range=stroke, **motor)
+    body.add_joint(
+        name=f"{arm}_finger_{finger}",
+        type=slide,
+        axis=[0, side, 0],
+        range=stroke,
+        **motor,
+    )
     box = mujoco.mjtGeom.mjGEOM_BOX
     back = side * (ROBOT.pad_thickness_m + 0.0055)
-    _geom(body, arm, type=box, size=[0.011, 0.005, 0.043], pos=[0, back, pad_z - 0.012], rgba=DARK)
+    _geom(
+        body,
+        arm,
+        type=box,
+        size=[0.011, 0.005, 0.043],
+        pos=[0, back, pad_z - 0.012],
+        rgba=DARK,
+    )
     holder = body
     if config.pads == "sprung":
         holder = body.add_body(name=f"{arm}_pad_{finger}", pos=[0, 0, 0])
         holder.gravcomp = config.gravity_compensation
-        holder.mass, holder.ipos, holder.explicitinertial = 0.004, [0, side * ROBOT.pad_thickness_m / 2, pad_z], True
+        holder.mass, holder.ipos, holder.explicitinertial = (
+            0.004,
+            [0, side * ROBOT.pad_thickness_m / 2, pad_z],
+            True,
+        )
         holder.inertia = [1.4e-6, 1.4e-6, 2e-7]
         holder.add_joint(
             name=f"{arm}_{finger}_spring",
@@ -179,14 +275,18 @@ def _add_finger(spec: mujoco.MjSpec, hand: mujoco.MjsBody, arm: str, finger: str
             stiffness=config.pad_stiffness_n_per_m,
             damping=config.pad_damping_ns_per_m,
         )
-        for axis, stiffness in zip("xz", config.pad_tilt_stiffness_nm_per_rad, strict=True):
+        for axis, stiffness in zip(
+            "xz", config.pad_tilt_stiffness_nm_per_rad, strict=True
+        ):
             holder.add_joint(
                 name=f"{arm}_{finger}_tilt_{axis}",
                 axis=[axis == "x", 0, axis == "z"],
                 pos=[0, side * ROBOT.pad_thickness_m / 2, pad_z],
                 range=[-0.1, 0.1],
                 stiffness=stiffness,
-                damping=stiffness * config.pad_damping_ns_per_m / config.pad_stiffness_n_per_m,
+                damping=stiffness
+                * config.pad_damping_ns_per_m
+                / config.pad_stiffness_n_per_m,
             )
     holder.add_geom(
         name=f"{arm}_{finger}",
@@ -203,7 +303,13 @@ def _add_finger(spec: mujoco.MjSpec, hand: mujoco.MjsBody, arm: str, finger: str
     z_axis, y_axis = np.array([0.0, -side, 0.0]), np.array([0.0, 0.0, 1.0])
     matrix = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis], axis=1)
     quat = Rotation.from_matrix(matrix).as_quat(scalar_first=True)
-    body.add_site(name=f"{arm}_{finger}", pos=[0, 0, pad_z], quat=quat, size=[0.001, 0.001, 0.001], group=4)
+    body.add_site(
+        name=f"{arm}_{finger}",
+        pos=[0, 0, pad_z],
+        quat=quat,
+        size=[0.001, 0.001, 0.001],
+        group=4,
+    )
     spec.add_exclude(bodyname1=holder.name, bodyname2=hand.name)
 
 

@@ -21,12 +21,20 @@ def scene_digest(task: "Task", config: "TwinConfig", scale: float) -> float:
 
     An effect's interval and evidence are not included: they do not change the motion. A fraction, so that it stays within the
     range that a dataset declares for ``sim.state``. ``scale`` is the factor on the ranges of the randomisation."""
-    bare = [dataclasses.replace(effect, interval={}, evidence="") for effect in config.effects]
+    bare = [
+        dataclasses.replace(effect, interval={}, evidence="")
+        for effect in config.effects
+    ]
     config = dataclasses.replace(config, effects=bare)
     try:
         twin = twin_text(config)
     except TaccorlError:
         twin = repr(config)  # classes that are not registered: no file can name them
-    scene = {"task": task.name, "difficulty": task.difficulty, "twin": twin, "randomization": float(scale)}
+    scene = {
+        "task": task.name,
+        "difficulty": task.difficulty,
+        "twin": twin,
+        "randomization": float(scale),
+    }
     digest = hashlib.sha256(canonical_text(scene).encode()).digest()
     return (int.from_bytes(digest[:8], "big") >> (64 - _BITS)) / 2**_BITS

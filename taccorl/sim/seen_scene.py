@@ -69,10 +69,14 @@ class SeenScene:
         """(N, 4, 32, 12) float32 readings of the pads before gain, noise and rounding: a function of the state and of the memory
         of effects only."""
         spec = self.sensor.spec
-        reading = np.empty((self.num_sims, len(ROBOT.pads), spec.rows, spec.columns), np.float32)
+        reading = np.empty(
+            (self.num_sims, len(ROBOT.pads), spec.rows, spec.columns), np.float32
+        )
 
         def read(start: int, end: int) -> None:
-            reading[start:end] = self.sensor.reading(*self.pads.touch(self.batch, start, end), None)
+            reading[start:end] = self.sensor.reading(
+                *self.pads.touch(self.batch, start, end), None
+            )
 
         self.blocks.run(read, self.num_sims)
         for transform in self.sensor.transforms:
@@ -96,7 +100,10 @@ class SeenScene:
         return above
 
     def render(
-        self, cameras: Sequence[str] | None = None, ids: np.ndarray | None = None, size: tuple[int, int] = (224, 224)
+        self,
+        cameras: Sequence[str] | None = None,
+        ids: np.ndarray | None = None,
+        size: tuple[int, int] = (224, 224),
     ) -> dict[str, np.ndarray]:
         """Camera → (n, rows, columns, 3) uint8 RGB, letterboxed as in a dataset.
 
@@ -113,22 +120,33 @@ class SeenScene:
                 if past:
                     place_past(data, past.positions[sim], past.time_s[sim], age_s)
 
-            pictures = self._renderer(same, size).render_batch(self.batch, ids, late if age_s else None)
+            pictures = self._renderer(same, size).render_batch(
+                self.batch, ids, late if age_s else None
+            )
             found |= {name: pictures[:, k] for k, name in enumerate(same)}
         return {name: self._given(name, found[name]) for name in names}
 
     def render_states(
-        self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
+        self,
+        states: np.ndarray,
+        cameras: Sequence[str],
+        size: tuple[int, int] = (224, 224),
     ) -> Iterator[dict[str, np.ndarray]]:
         """Camera → (rows, columns, 3) uint8 RGB for each of the stored ``states`` (T, row_size), one after the other. As
         ``draw_states``, with the memory of ``DRAWN_TOGETHER`` of them."""
         for first in range(0, max(len(states), 1), DRAWN_TOGETHER):
             part = states[first : first + DRAWN_TOGETHER]
             drawn = self.draw_states(part, cameras, size)
-            yield from ({name: pictures[k] for name, pictures in drawn.items()} for k in range(len(part)))
+            yield from (
+                {name: pictures[k] for name, pictures in drawn.items()}
+                for k in range(len(part))
+            )
 
     def draw_states(
-        self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
+        self,
+        states: np.ndarray,
+        cameras: Sequence[str],
+        size: tuple[int, int] = (224, 224),
     ) -> dict[str, np.ndarray]:
         """Render ``states`` (T, row_size) as ``state_rows`` returns them. Returns each camera's name → (T, rows, columns, 3)
         uint8 RGB.
@@ -137,15 +155,21 @@ class SeenScene:
         size."""
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(f"states to draw: rows (T, {self.row_size}) of state_rows, found {states.shape}")
+            raise TaccorlError(
+                f"states to draw: rows (T, {self.row_size}) of state_rows, found {states.shape}"
+            )
         memory = self.row_memory(states) if self.effects.past else {}
         data = mujoco.MjData(self.model)
 
         def placed(age_s: float) -> Iterator[mujoco.MjData]:
             for k, physics in enumerate(states[:, 1 : 1 + self.batch.nstate]):
-                mujoco.mj_setState(self.model, data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
+                mujoco.mj_setState(
+                    self.model, data, physics, mujoco.mjtState.mjSTATE_INTEGRATION
+                )
                 if age_s:
-                    place_past(data, memory[PAST_POSITIONS][k], memory[PAST_TIME_S][k], age_s)
+                    place_past(
+                        data, memory[PAST_POSITIONS][k], memory[PAST_TIME_S][k], age_s
+                    )
                 mujoco.mj_kinematics(self.model, data)
                 mujoco.mj_comPos(self.model, data)
                 mujoco.mj_camlight(self.model, data)
@@ -160,7 +184,10 @@ class SeenScene:
     def _by_age(self, cameras: tuple[str, ...]) -> list[tuple[float, tuple[str, ...]]]:
         """(how late their pictures are, cameras): all at once where none is late."""
         ages = {name: self.effects.picture_age_s(name) for name in cameras}
-        return [(age, tuple(n for n in cameras if ages[n] == age)) for age in dict.fromkeys(ages.values())]
+        return [
+            (age, tuple(n for n in cameras if ages[n] == age))
+            for age in dict.fromkeys(ages.values())
+        ]
 
     def _given(self, camera: str, pictures: np.ndarray) -> np.ndarray:
         """What a camera gives of pictures (n, rows, columns, 3) that were drawn of it."""
@@ -206,9 +233,16 @@ class SeenScene:
         """(N, 3) linear velocity of the origin of the body's frame in N simulations, in world coordinates [m/s]."""
         k = self._body(body)
         spatial = self.arrays["cvel"][:, k]
-        turn, arm = spatial[:, :3], self.arrays["xpos"][:, k] - self.arrays["subtree_com"][:, self.model.body_rootid[k]]
+        turn, arm = (
+            spatial[:, :3],
+            self.arrays["xpos"][:, k]
+            - self.arrays["subtree_com"][:, self.model.body_rootid[k]],
+        )
         # Written out: np.cross costs ten times as much on a few rows.
-        across = turn[:, [1, 2, 0]] * arm[:, [2, 0, 1]] - turn[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
+        across = (
+            turn[:, [1, 2, 0]] * arm[:, [2, 0, 1]]
+            - turn[:, [2, 0, 1]] * arm[:, [1, 2, 0]]
+        )
         return spatial[:, 3:] + across
 
     def pads_touching(self, body: str) -> np.ndarray:
@@ -219,7 +253,9 @@ class SeenScene:
         """Contact of a pair of bodies in ``task.mating``, each (N,): whether they touch, deepest penetration [m] and net
         normal force [N]."""
         if (body, other) not in self._mating:
-            raise TaccorlError(f"contact {body}–{other}: task {self.task.name} has only the pairs {list(self._mating)}")
+            raise TaccorlError(
+                f"contact {body}–{other}: task {self.task.name} has only the pairs {list(self._mating)}"
+            )
         data, at, force = self.arrays["sensordata"], *self._mating[body, other]
         net_n = np.linalg.norm(data[:, force : force + 3], axis=1)
         return Contact(data[:, at] > 0, np.maximum(-data[:, at + 1], 0.0), net_n)

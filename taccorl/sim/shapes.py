@@ -21,10 +21,14 @@ from taccorl.errors import TaccorlError
 
 # N vertices of an outline
 
-_CONVEX_TOLERANCE_M = 1e-12  # how far a corner may lie inside the hull and still count as straight
+_CONVEX_TOLERANCE_M = (
+    1e-12  # how far a corner may lie inside the hull and still count as straight
+)
 
 
-def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = False) -> np.ndarray:
+def circle_outline(
+    radius_m: float, num_sides: int, *, circumscribed: bool = False
+) -> np.ndarray:
     """Regular polygon (N, 2) [m] of N = ``num_sides`` corners that approximates a circle; with ``circumscribed`` (for holes) the
     whole circle lies inside it."""
     corner_m = radius_m / math.cos(math.pi / num_sides) if circumscribed else radius_m
@@ -35,7 +39,9 @@ def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = Fal
 def triangle_outline(side_m: float) -> np.ndarray:
     """Equilateral triangle (3, 2) [m] about its centroid; one corner points to +y."""
     height = side_m * math.sqrt(3) / 2
-    return np.array([(-side_m / 2, -height / 3), (side_m / 2, -height / 3), (0, 2 * height / 3)])
+    return np.array(
+        [(-side_m / 2, -height / 3), (side_m / 2, -height / 3), (0, 2 * height / 3)]
+    )
 
 
 def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
@@ -46,7 +52,9 @@ def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
     radius = width_m / (2 + math.sqrt(2))
     centre = radius / math.sqrt(2)
     angle = np.linspace(-math.pi / 4, 3 * math.pi / 4, arc_sides + 1)
-    right = np.stack([centre + radius * np.cos(angle), centre + radius * np.sin(angle)], axis=1)
+    right = np.stack(
+        [centre + radius * np.cos(angle), centre + radius * np.sin(angle)], axis=1
+    )
     right[-1, 0] = 0.0  # the notch
     left = right[-2::-1] * (-1, 1)
     outline = np.concatenate([[(0.0, -radius * math.sqrt(2))], right, left])
@@ -62,11 +70,18 @@ def offset_outline(outline_m: np.ndarray, clearance_m: float) -> np.ndarray:
     side_in, side_out = _unit(outline_m - before), _unit(after - outline_m)
     normal_in, normal_out = _outward(side_in), _outward(side_out)
     # The moved corner p + v lies on both moved sides: v · n_in = v · n_out = clearance.
-    moved = outline_m + clearance_m * (normal_in + normal_out) / (1 + np.sum(normal_in * normal_out, axis=1))[:, None]
+    moved = (
+        outline_m
+        + clearance_m
+        * (normal_in + normal_out)
+        / (1 + np.sum(normal_in * normal_out, axis=1))[:, None]
+    )
     length = np.sum((np.roll(moved, -1, axis=0) - moved) * side_out, axis=1)
     if length.min() <= 0 or not Polygon(moved).is_valid:
         side = int(length.argmin())
-        raise TaccorlError(f"side {side} vanishes when moved out by {clearance_m * 1e3:g} mm; use a smaller clearance")
+        raise TaccorlError(
+            f"side {side} vanishes when moved out by {clearance_m * 1e3:g} mm; use a smaller clearance"
+        )
     return moved
 
 
@@ -82,8 +97,12 @@ def _outward(sides: np.ndarray) -> np.ndarray:
 def convex_partition(region: Polygon) -> list[np.ndarray]:
     """Return convex outlines that tile ``region`` exactly, each (N, 2) [m] counter-clockwise, of the region's own vertices
     only."""
-    triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(region)))
-    corners = [[(x, y) for x, y in triangle.exterior.coords[:-1]] for triangle in triangles]
+    triangles = shapely.orient_polygons(
+        shapely.get_parts(shapely.constrained_delaunay_triangles(region))
+    )
+    corners = [
+        [(x, y) for x, y in triangle.exterior.coords[:-1]] for triangle in triangles
+    ]
     merged = [_merge(corners, longest_first) for longest_first in (True, False)]
     return [np.array(piece) for piece in min(merged, key=len)]
 
@@ -96,10 +115,14 @@ def _merge(polygons: list[list[_Point]], longest_first: bool) -> list[list[_Poin
     pieces = dict(enumerate(polygons))
     owner = {side: i for i, corners in pieces.items() for side in _sides(corners)}
     inner = [(a, b) for a, b in owner if (b, a) in owner and a < b]
-    for a, b in sorted(inner, key=lambda side: (math.dist(*side), side), reverse=longest_first):
+    for a, b in sorted(
+        inner, key=lambda side: (math.dist(*side), side), reverse=longest_first
+    ):
         one, other = owner[a, b], owner[b, a]
         union = _between(pieces[one], b, a) + _between(pieces[other], a, b)[1:-1]
-        if one == other or not all(_is_convex_at(union, union.index(corner)) for corner in (a, b)):
+        if one == other or not all(
+            _is_convex_at(union, union.index(corner)) for corner in (a, b)
+        ):
             continue
         pieces[one] = union
         del pieces[other]
@@ -119,7 +142,11 @@ def _between(corners: list[_Point], first: _Point, last: _Point) -> list[_Point]
 
 
 def _is_convex_at(corners: list[_Point], i: int) -> bool:
-    (ax, ay), (bx, by), (cx, cy) = corners[i - 1], corners[i], corners[(i + 1) % len(corners)]
+    (ax, ay), (bx, by), (cx, cy) = (
+        corners[i - 1],
+        corners[i],
+        corners[(i + 1) % len(corners)],
+    )
     cross = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
     return cross >= -_CONVEX_TOLERANCE_M * math.dist((ax, ay), (cx, cy))
 
@@ -183,7 +210,11 @@ class Capsule(Solid):
 
     @property
     def volume_m3(self) -> float:
-        return math.pi * self.radius_m**2 * (2 * self.half_height_m + 4 / 3 * self.radius_m)
+        return (
+            math.pi
+            * self.radius_m**2
+            * (2 * self.half_height_m + 4 / 3 * self.radius_m)
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,7 +236,9 @@ class Prism(Solid):
         return (self.part_from_solid @ (x, y, 0.0, 1.0))[:3]
 
 
-def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "grey") -> Box:
+def box_between(
+    low_m: Sequence[float], high_m: Sequence[float], color: str = "grey"
+) -> Box:
     """The axis-parallel box between the corners ``low_m`` and ``high_m``, (x, y, z) each, in the part's frame."""
     low, high = np.asarray(low_m, float), np.asarray(high_m, float)
     pose = np.eye(4)
@@ -214,7 +247,9 @@ def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "g
     return Box(half_m=(x, y, z), part_from_solid=pose, color=color)
 
 
-def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey") -> list[Solid]:
+def extrude(
+    region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey"
+) -> list[Solid]:
     """Extrude ``region`` [m], in the part's x and y, from ``z_low_m`` to ``z_high_m``; returns exact boxes for axis-parallel
     rectangles, prisms for the rest."""
     pose = np.eye(4)
@@ -226,7 +261,14 @@ def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey
             solids.append(box_between([*low, z_low_m], [*high, z_high_m], color))
         else:
             half = (z_high_m - z_low_m) / 2
-            solids.append(Prism(outline_m=outline, half_height_m=half, part_from_solid=pose, color=color))
+            solids.append(
+                Prism(
+                    outline_m=outline,
+                    half_height_m=half,
+                    part_from_solid=pose,
+                    color=color,
+                )
+            )
     return solids
 
 
@@ -238,28 +280,47 @@ def moved[S: Solid](solid: S, part_from_frame: np.ndarray) -> S:
 def with_mass[S: Solid](solids: Sequence[S], mass_kg: float) -> list[S]:
     """Return the solids with ``mass_kg`` distributed among them by volume, in their order."""
     volume = sum(solid.volume_m3 for solid in solids)
-    return [replace(solid, mass_kg=mass_kg * solid.volume_m3 / volume) for solid in solids]
+    return [
+        replace(solid, mass_kg=mass_kg * solid.volume_m3 / volume) for solid in solids
+    ]
 
 
-def add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, solid: Solid, name: str, **settings) -> mujoco.MjsGeom:
+def add_geom(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, solid: Solid, name: str, **settings
+) -> mujoco.MjsGeom:
     """Add one solid as the geom ``name`` of ``body``; a prism becomes a mesh of that name. Inertia is exact.
 
     ``settings`` are geom attributes (contact, material)."""
     settings |= {"pos": solid.part_from_solid[:3, 3], "mass": solid.mass_kg}
-    settings["quat"] = Rotation.from_matrix(solid.part_from_solid[:3, :3]).as_quat(scalar_first=True)
+    settings["quat"] = Rotation.from_matrix(solid.part_from_solid[:3, :3]).as_quat(
+        scalar_first=True
+    )
     match solid:
         case Box():
-            return body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=solid.half_m, **settings)
+            return body.add_geom(
+                name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=solid.half_m, **settings
+            )
         case Cylinder() | Capsule():
-            kinds = {Cylinder: mujoco.mjtGeom.mjGEOM_CYLINDER, Capsule: mujoco.mjtGeom.mjGEOM_CAPSULE}
+            kinds = {
+                Cylinder: mujoco.mjtGeom.mjGEOM_CYLINDER,
+                Capsule: mujoco.mjtGeom.mjGEOM_CAPSULE,
+            }
             size = [solid.radius_m, solid.half_height_m, 0]
-            return body.add_geom(name=name, type=kinds[type(solid)], size=size, **settings)
+            return body.add_geom(
+                name=name, type=kinds[type(solid)], size=size, **settings
+            )
         case Prism():
-            heights = np.repeat([-solid.half_height_m, solid.half_height_m], len(solid.outline_m))
-            vertices = np.concatenate([np.tile(solid.outline_m, (2, 1)), heights[:, None]], axis=1)
+            heights = np.repeat(
+                [-solid.half_height_m, solid.half_height_m], len(solid.outline_m)
+            )
+            vertices = np.concatenate(
+                [np.tile(solid.outline_m, (2, 1)), heights[:, None]], axis=1
+            )
             # The hull is the prism itself, so its inertia is exact.
             convex = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
             spec.add_mesh(name=name, uservert=vertices.ravel(), inertia=convex)
-            return body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **settings)
+            return body.add_geom(
+                name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **settings
+            )
         case _:
             raise TypeError(f"{name}: no MuJoCo geom for a {type(solid).__name__}")

@@ -32,10 +32,26 @@ from taccorl.sim.warp_batch import Unsupported, check_supported, make_batch
 SUB_COMMANDS = 5
 """Number of intermediate targets in one control step: targets change linearly, at 150 Hz, since a robot's driver does not jump
 either."""
-_WARNINGS = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
+_WARNINGS = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 _UNSTABLE = np.array([int(warning) for warning in _WARNINGS])
 _ENCODER_ROUNDS = 12  # of a scale 10 % off: 1e-12 rad remain
-_BOUND = ("qpos", "qvel", "ctrl", "time", "xpos", "xmat", "cvel", "subtree_com", "site_xpos", "site_xmat", "geom_xpos")
+_BOUND = (
+    "qpos",
+    "qvel",
+    "ctrl",
+    "time",
+    "xpos",
+    "xmat",
+    "cvel",
+    "subtree_com",
+    "site_xpos",
+    "site_xmat",
+    "geom_xpos",
+)
 _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat")
 
 
@@ -45,8 +61,12 @@ class Snapshot:
 
     physics: np.ndarray  # (n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start
     judge: dict[str, np.ndarray]  # Name of each of the judge's counters → (n, …)
-    seeds: np.ndarray  # (n,) seeds of the reset draws, which determine friction and masses
-    memory: dict[str, np.ndarray]  # Name → (n, …): requested targets, and the memory of effects
+    seeds: (
+        np.ndarray
+    )  # (n,) seeds of the reset draws, which determine friction and masses
+    memory: dict[
+        str, np.ndarray
+    ]  # Name → (n, …): requested targets, and the memory of effects
     scene: np.ndarray
     """(n,) ``scene_digest`` of the scenes: only simulations of the same task, difficulty, twin and randomisation accept the
     snapshot."""
@@ -57,7 +77,9 @@ class Snapshot:
 
         def join(values: list[Any]) -> Any:
             if isinstance(values[0], dict):
-                return {name: join([value[name] for value in values]) for name in values[0]}
+                return {
+                    name: join([value[name] for value in values]) for name in values[0]
+                }
             return np.concatenate(values)
 
         return cls(**join([vars(part) for part in parts]))
@@ -89,11 +111,17 @@ class Simulation(SeenScene):
         physics: str = "c",
     ) -> None:
         if num_sims < 1 or num_threads < 0:
-            raise TaccorlError(f"simulation: num_sims {num_sims} and num_threads {num_threads} must be ≥ 1 and ≥ 0")
+            raise TaccorlError(
+                f"simulation: num_sims {num_sims} and num_threads {num_threads} must be ≥ 1 and ≥ 0"
+            )
         if not (isinstance(scale, int | float) and 0 <= scale <= 1):
-            raise TaccorlError(f"randomization: {scale!r} is no share of the ranges; give 0 (nominal) … 1 (full)")
+            raise TaccorlError(
+                f"randomization: {scale!r} is no share of the ranges; give 0 (nominal) … 1 (full)"
+            )
         if not (config is None or isinstance(config, TwinConfig)):
-            raise TaccorlError(f"twin: found {config!r}; give a TwinConfig, or the path of a twin.yaml, or None")
+            raise TaccorlError(
+                f"twin: found {config!r}; give a TwinConfig, or the path of a twin.yaml, or None"
+            )
         self.task, self.config, self.num_sims = task, config or TwinConfig(), num_sims
         self.randomization_scale = scale
         self.scene = scene_digest(task, self.config, scale)
@@ -105,9 +133,13 @@ class Simulation(SeenScene):
         self.arrays = {name: self.batch.bind(name) for name in _BOUND}
         self.judge = Judge(task, num_sims, CONTROL_HZ)
         self.sensor = self.config.sensor.build(ROBOT.pads)
-        layout = replace(ROBOT.pad, rows=self.sensor.spec.rows, columns=self.sensor.spec.columns)
+        layout = replace(
+            ROBOT.pad, rows=self.sensor.spec.rows, columns=self.sensor.spec.columns
+        )
         self.pads = PadArray(self.model, ROBOT.pads, layout)
-        self.effects = AddedEffects(self.config.effects, self.arrays["time"], self.batch, layout.shape)
+        self.effects = AddedEffects(
+            self.config.effects, self.arrays["time"], self.batch, layout.shape
+        )
         self.sensor.transforms.append(self.effects)
         self.seeds = np.full(num_sims, -1, dtype=np.int64)
         self.draws: list[dict[str, np.ndarray]] = [{} for _ in range(num_sims)]
@@ -135,40 +167,71 @@ class Simulation(SeenScene):
 
     def _index(self) -> None:
         m = self.model
-        self.action_actuators = np.array([m.actuator(name).id for name in ROBOT.action_names])
+        self.action_actuators = np.array(
+            [m.actuator(name).id for name in ROBOT.action_names]
+        )
         self._effort = MotorEffort(self.batch, self.action_actuators)
-        self._encoders = np.array([m.sensor(f"{name}_pos").adr[0] for name in ROBOT.action_names])
+        self._encoders = np.array(
+            [m.sensor(f"{name}_pos").adr[0] for name in ROBOT.action_names]
+        )
         self._joint_qpos = {
-            arm: np.array([m.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]) for arm in ROBOT.arms
+            arm: np.array([m.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints])
+            for arm in ROBOT.arms
         }
         self._fingers = {
-            arm: np.array([m.joint(f"{arm}_finger_{f}").qposadr[0] for f in ROBOT.fingers]) for arm in ROBOT.arms
+            arm: np.array(
+                [m.joint(f"{arm}_finger_{f}").qposadr[0] for f in ROBOT.fingers]
+            )
+            for arm in ROBOT.arms
         }
         self._free = {part: m.joint(part) for part in self.task.parts}
-        self._bodies = {name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)}
+        self._bodies = {
+            name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)
+        }
         self._tcp_sites = {arm: m.site(f"{arm}_tcp").id for arm in ROBOT.arms}
         owner = m.geom_bodyid
-        self._part_geoms = np.flatnonzero(np.isin(owner, list(self._bodies.values())) & (m.geom_contype > 0))
+        self._part_geoms = np.flatnonzero(
+            np.isin(owner, list(self._bodies.values())) & (m.geom_contype > 0)
+        )
         self._friction = self.batch.expand("geom_friction")
-        self._mass = {name: (m.body_mass[i], m.body_inertia[i].copy()) for name, i in self._bodies.items()}
-        self._body_mass, self._body_inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
-        touching = [[m.sensor(f"{pad}_on_{part}").adr[0] for pad in ROBOT.pads] for part in self.task.parts]
-        self._touching = {part: np.array(row) for part, row in zip(self.task.parts, touching, strict=True)}
+        self._mass = {
+            name: (m.body_mass[i], m.body_inertia[i].copy())
+            for name, i in self._bodies.items()
+        }
+        self._body_mass, self._body_inertia = (
+            self.batch.expand("body_mass"),
+            self.batch.expand("body_inertia"),
+        )
+        touching = [
+            [m.sensor(f"{pad}_on_{part}").adr[0] for pad in ROBOT.pads]
+            for part in self.task.parts
+        ]
+        self._touching = {
+            part: np.array(row)
+            for part, row in zip(self.task.parts, touching, strict=True)
+        }
         self._mating = {
-            pair: (m.sensor("{}_on_{}".format(*pair)).adr[0], m.sensor("{}_on_{}_force".format(*pair)).adr[0])
+            pair: (
+                m.sensor("{}_on_{}".format(*pair)).adr[0],
+                m.sensor("{}_on_{}_force".format(*pair)).adr[0],
+            )
             for pair in self.task.mating
         }
 
     # reset -----------------------------------------------------------------------------------------------------------
 
-    def reset(self, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
+    def reset(
+        self, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None
+    ) -> None:
         """Draw new scenes, one for each of ``seeds`` (n,). The same seed gives the same scene, bit for bit. ``ids``: (n,)
         simulations that get them, in the order of the seeds; None: all. Raises TaccorlError: the number of seeds differs
         from that of ``ids``, or one is no whole number in 0 … 2⁶³ − 1."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         seeds = checked_seeds(seeds)
         if seeds.shape != ids.shape:
-            raise TaccorlError(f"reset: {seeds.size} seeds for {ids.size} simulations; give one seed per simulation")
+            raise TaccorlError(
+                f"reset: {seeds.size} seeds for {ids.size} simulations; give one seed per simulation"
+            )
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         for i, seed in zip(ids, seeds, strict=True):
             self._place(int(i), int(seed))
@@ -188,7 +251,9 @@ class Simulation(SeenScene):
     def _place(self, i: int, seed: int) -> None:
         """Write the scene of ``seed`` into simulation ``i``: its model's random fields and its state."""
         self.seeds[i] = seed
-        self.draws[i] = draw(self.task.rows, np.random.default_rng(seed), self.randomization_scale)
+        self.draws[i] = draw(
+            self.task.rows, np.random.default_rng(seed), self.randomization_scale
+        )
         scene = self.task.reset(self.draws[i])
         self._write_model(i, scene)
         qpos = self.arrays["qpos"]
@@ -196,14 +261,20 @@ class Simulation(SeenScene):
             qpos[i, joint.qposadr[0] : joint.qposadr[0] + 7] = scene.poses[part]
         for body in self.task.clamped:
             slot = self.model.body(body).mocapid[0]
-            self.arrays["mocap_pos"][i, slot], self.arrays["mocap_quat"][i, slot] = np.split(scene.poses[body], [3])
+            self.arrays["mocap_pos"][i, slot], self.arrays["mocap_quat"][i, slot] = (
+                np.split(scene.poses[body], [3])
+            )
         for arm in ROBOT.arms:
             home = np.array(self.task.home_rad[arm])
             qpos[i, self._joint_qpos[arm]] = home
             # The arm rests T_ref / K_p away from its target, so that it stands still where it stands.
             controller = self.config.controller_of(arm)
-            rest = np.array(controller.torque_ff_nm) / np.array(controller.kp_nm_per_rad)
-            self.arrays["ctrl"][i, [self.model.actuator(f"{arm}_{j}").id for j in ROBOT.joints]] = home - rest
+            rest = np.array(controller.torque_ff_nm) / np.array(
+                controller.kp_nm_per_rad
+            )
+            self.arrays["ctrl"][
+                i, [self.model.actuator(f"{arm}_{j}").id for j in ROBOT.joints]
+            ] = home - rest
             opening_m = ROBOT.action_high[ROBOT.gripper_index(arm)]
             self.arrays["ctrl"][i, self.model.actuator(f"{arm}_gripper").id] = opening_m
             qpos[i, self._fingers[arm]] = ROBOT.finger_stroke_m
@@ -231,11 +302,18 @@ class Simulation(SeenScene):
         for name, (mass, inertia) in self._mass.items():
             body, change = self._bodies[name], scene.mass_change_kg.get(name, 0.0)
             self._body_mass[i, body] = mass + change
-            self._body_inertia[i, body] = inertia * ((mass + change) / mass) if mass > 0 else inertia
+            self._body_inertia[i, body] = (
+                inertia * ((mass + change) / mass) if mass > 0 else inertia
+            )
 
     # stepping --------------------------------------------------------------------------------------------------------
 
-    def step(self, action: np.ndarray, ids: np.ndarray | None = None, watch: Watch | None = None) -> None:
+    def step(
+        self,
+        action: np.ndarray,
+        ids: np.ndarray | None = None,
+        watch: Watch | None = None,
+    ) -> None:
         """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], linearly interpolated over the step.
 
         Simulations outside ``ids`` (all by default) are frozen, with their targets and outcomes; their rows are not used.
@@ -245,36 +323,61 @@ class Simulation(SeenScene):
         line = np.arange(1, SUB_COMMANDS + 1)[:, None, None] / SUB_COMMANDS
         commands = now + (goal - now) * line
         commands[-1] = goal  # exactly, not to rounding
-        self.advance(commands, self.config.physics.steps_per_control_step // SUB_COMMANDS, ids, watch)
+        self.advance(
+            commands,
+            self.config.physics.steps_per_control_step // SUB_COMMANDS,
+            ids,
+            watch,
+        )
         self.judge.update(self, ids)
 
     def advance(
-        self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None = None, watch: Watch | None = None
+        self,
+        commands: np.ndarray,
+        num_steps: int,
+        ids: np.ndarray | None = None,
+        watch: Watch | None = None,
     ) -> None:
         """Physics only: ``commands`` (S, N, A) [rad, m] are S targets, each held for ``num_steps`` physics steps. For replay and
         recording.
 
         ``ids`` and ``watch``: as ``step``; steps are counted over all S targets."""
-        stepped = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
+        stepped = (
+            np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
+        )
         watched = set(watch.at) if watch else set()
         total = len(commands) * num_steps
         arrive = self._send(commands, num_steps, ids)
         done = 0
         step_by_step = 1 if self.effects.rewrites else num_steps
         scans = self._scan_steps(stepped, total) if self.effects.remember_touch else {}
-        for end in sorted({*range(step_by_step, total + 1, step_by_step), *watched, *scans}):
-            self.arrays["ctrl"][stepped[:, None], self.action_actuators] = arrive[done // num_steps][stepped]
+        for end in sorted(
+            {*range(step_by_step, total + 1, step_by_step), *watched, *scans}
+        ):
+            self.arrays["ctrl"][stepped[:, None], self.action_actuators] = arrive[
+                done // num_steps
+            ][stepped]
             stages = mujoco.mjtStage
             all_of_it = end == total or self.effects.rewrites
             is_seen = end in watched or end in scans
-            stage = stages.mjSTAGE_ACC if all_of_it else stages.mjSTAGE_VEL if is_seen else stages.mjSTAGE_NONE
+            stage = (
+                stages.mjSTAGE_ACC
+                if all_of_it
+                else stages.mjSTAGE_VEL
+                if is_seen
+                else stages.mjSTAGE_NONE
+            )
             self.batch.step(ids, nstep=end - done, stage=stage)
             done = end
             ids = self._sound(ids, at_end=all_of_it)
             if self.effects.rewrites:
-                self.effects.feel(stepped if ids is None else ids, self.config.physics.timestep_s)
+                self.effects.feel(
+                    stepped if ids is None else ids, self.config.physics.timestep_s
+                )
             if end in scans:
-                self._scan(scans[end] if ids is None else np.intersect1d(scans[end], ids))
+                self._scan(
+                    scans[end] if ids is None else np.intersect1d(scans[end], ids)
+                )
             if watch and end in watched:
                 watch.see(end)
         if self.effects.past:
@@ -287,21 +390,33 @@ class Simulation(SeenScene):
         step_s = self.config.physics.timestep_s
         done = np.rint(self.arrays["time"][ids] / step_s)
         per_step = self.sensor.spec.rate_hz * step_s
-        scans = [np.floor((done + step) * per_step + 1e-6) for step in range(num_steps + 1)]
-        due = {step: ids[scans[step] > scans[step - 1]] for step in range(1, num_steps + 1)}
+        scans = [
+            np.floor((done + step) * per_step + 1e-6) for step in range(num_steps + 1)
+        ]
+        due = {
+            step: ids[scans[step] > scans[step - 1]] for step in range(1, num_steps + 1)
+        }
         return {step: chosen for step, chosen in due.items() if chosen.size}
 
     def _scan(self, ids: np.ndarray) -> None:
         """The pads of ``ids`` are scanned, whether somebody looks or not."""
         if ids.size:
-            self.effects.scan(self.sensor.reading(*self.pads.touch(self.batch), None), ids)
+            self.effects.scan(
+                self.sensor.reading(*self.pads.touch(self.batch), None), ids
+            )
 
     def _sound(self, ids: np.ndarray | None, *, at_end: bool) -> np.ndarray | None:
         """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time.
 
         Before the end of a control step MuJoCo's own warnings are enough: it checks the state at the beginning of a step."""
-        qvel, qpos, warned = self.arrays["qvel"], self.arrays["qpos"], self.batch.warning[:, _UNSTABLE, 1]
-        if not warned.any() and not (at_end and not (np.isfinite(qvel).all() and np.isfinite(qpos).all())):
+        qvel, qpos, warned = (
+            self.arrays["qvel"],
+            self.arrays["qpos"],
+            self.batch.warning[:, _UNSTABLE, 1],
+        )
+        if not warned.any() and not (
+            at_end and not (np.isfinite(qvel).all() and np.isfinite(qpos).all())
+        ):
             return ids
         finite = np.isfinite(qvel).all(1) & np.isfinite(qpos).all(1)
         bad = ~finite | warned.any(1)
@@ -309,7 +424,9 @@ class Simulation(SeenScene):
         ids = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
         return ids[~bad[ids]]
 
-    def _send(self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None) -> list[np.ndarray]:
+    def _send(
+        self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None
+    ) -> list[np.ndarray]:
         """What of S targets (S, N, A), each held for ``num_steps`` physics steps, reaches the controllers."""
         held_s, sent = np.zeros(self.num_sims), slice(None) if ids is None else ids
         held_s[sent] = num_steps * self.config.physics.timestep_s
@@ -338,20 +455,31 @@ class Simulation(SeenScene):
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         memory = self.effects.snapshot(ids) | {"targets": self.targets[ids].copy()}
         scene = np.full(len(memory["targets"]), self.scene)
-        return Snapshot(self.batch.state[ids].copy(), self.judge.snapshot(ids), self.seeds[ids].copy(), memory, scene)
+        return Snapshot(
+            self.batch.state[ids].copy(),
+            self.judge.snapshot(ids),
+            self.seeds[ids].copy(),
+            memory,
+            scene,
+        )
 
     def check_snapshot(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
         """Check that ``restore`` accepts the snapshot for the simulations ``ids`` (n,) (all by default). Raises TaccorlError:
         as ``restore``."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         if not isinstance(snapshot, Snapshot):
-            raise TaccorlError(f"state: {snapshot!r} is not a Snapshot; give the result of sim.snapshot()")
+            raise TaccorlError(
+                f"state: {snapshot!r} is not a Snapshot; give the result of sim.snapshot()"
+            )
         if snapshot.physics.shape != (len(ids), self.batch.nstate):
             raise TaccorlError(
                 f"restore: states of shape {snapshot.physics.shape} do not fit {len(ids)} simulations of task {self.task.name} "
                 f"with {self.batch.nstate} numbers each; they are states of another task or twin"
             )
-        kept, own = ({key for key in memory if "/" in key} for memory in (snapshot.memory, self.effects.snapshot(ids)))
+        kept, own = (
+            {key for key in memory if "/" in key}
+            for memory in (snapshot.memory, self.effects.snapshot(ids))
+        )
         if kept != own:
             raise TaccorlError(
                 f"restore: the state contains the memory of {', '.join(sorted(kept)) or 'nothing'}, but this twin's effects "
@@ -359,12 +487,18 @@ class Simulation(SeenScene):
             )
         self._check_scene(snapshot.scene, snapshot.seeds, ids)
 
-    def _check_scene(self, scenes: np.ndarray, seeds: np.ndarray, ids: np.ndarray) -> None:
+    def _check_scene(
+        self, scenes: np.ndarray, seeds: np.ndarray, ids: np.ndarray
+    ) -> None:
         if scenes.shape != ids.shape or seeds.shape != ids.shape:
-            raise TaccorlError(f"restore: {len(seeds)} seeds of {len(scenes)} states for {len(ids)} simulations")
+            raise TaccorlError(
+                f"restore: {len(seeds)} seeds of {len(scenes)} states for {len(ids)} simulations"
+            )
         checked_seeds(seeds)
         if (scenes != self.scene).any():
-            effects = ", ".join(effect.name for effect in self.effects.present) or "none"
+            effects = (
+                ", ".join(effect.name for effect in self.effects.present) or "none"
+            )
             raise TaccorlError(
                 "restore: the state is of another task, difficulty, twin or randomisation than this simulation's: "
                 f"{self.task.name}, {self.task.difficulty}, effects {effects}, randomisation {self.randomization_scale:g}. "
@@ -383,7 +517,9 @@ class Simulation(SeenScene):
         self.batch.state[ids] = snapshot.physics
         self.effects.restore(snapshot.memory, ids)
         self.batch.forward(ids)
-        self.batch.state[ids] = snapshot.physics  # forward() has written its own warm start
+        self.batch.state[ids] = (
+            snapshot.physics
+        )  # forward() has written its own warm start
         self.targets[ids] = snapshot.memory["targets"]
         self.judge.restore(snapshot.judge, ids, self)
         self.diverged[ids] = self.clipped[ids] = False
@@ -400,10 +536,20 @@ class Simulation(SeenScene):
         Together with the seed, which determines friction and masses, a row restores the simulation bit-exactly except for the
         judge's counters."""
         snapshot = self.snapshot(ids)
-        memory = [snapshot.memory[name].reshape(len(snapshot.physics), -1) for name in sorted(snapshot.memory)]
-        return np.concatenate([snapshot.scene[:, None], snapshot.physics, *memory], axis=1)
+        memory = [
+            snapshot.memory[name].reshape(len(snapshot.physics), -1)
+            for name in sorted(snapshot.memory)
+        ]
+        return np.concatenate(
+            [snapshot.scene[:, None], snapshot.physics, *memory], axis=1
+        )
 
-    def restore_rows(self, rows: np.ndarray, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
+    def restore_rows(
+        self,
+        rows: np.ndarray,
+        seeds: Sequence[int] | np.ndarray,
+        ids: np.ndarray | None = None,
+    ) -> None:
         """Put the simulations ``ids`` (n,) (all by default) into the stored states ``rows`` (n, row_size), with the scene seeds
         ``seeds`` (n,); the outcome counters restart. Raises TaccorlError: the rows are of another task, difficulty, twin or
         randomisation. The simulation is then unchanged."""
@@ -417,7 +563,9 @@ class Simulation(SeenScene):
         seeds = checked_seeds(seeds).reshape(-1)
         judge = self.judge.snapshot(ids)
         scene, physics, _ = np.split(rows, [1, 1 + self.batch.nstate], axis=1)
-        self.restore(Snapshot(physics, judge, seeds, self.row_memory(rows), scene[:, 0]), ids)
+        self.restore(
+            Snapshot(physics, judge, seeds, self.row_memory(rows), scene[:, 0]), ids
+        )
         self.judge.reset(ids, self)
 
     def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -425,7 +573,11 @@ class Simulation(SeenScene):
         now, memory, at = self.snapshot(np.array([0])).memory, {}, 1 + self.batch.nstate
         for name in sorted(now):
             one = now[name][0]
-            memory[name] = rows[:, at : at + one.size].reshape(len(rows), *one.shape).astype(one.dtype)
+            memory[name] = (
+                rows[:, at : at + one.size]
+                .reshape(len(rows), *one.shape)
+                .astype(one.dtype)
+            )
             at += one.size
         return memory
 
@@ -433,6 +585,10 @@ class Simulation(SeenScene):
 def checked_seeds(seeds: int | Sequence[int] | np.ndarray) -> np.ndarray:
     """Scene seeds as int64, with the shape of ``seeds``. Raises TaccorlError: one is no whole number in 0 … 2⁶³ − 1."""
     for seed in np.asarray(seeds, dtype=object).reshape(-1):
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
+        if (
+            isinstance(seed, bool)
+            or not isinstance(seed, int | np.integer)
+            or not 0 <= seed < 2**63
+        ):
             raise TaccorlError(f"seed: {seed!r} is no whole number in 0 … 2^63 - 1")
     return np.asarray(seeds, dtype=np.int64)

@@ -29,10 +29,14 @@ def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
     if part_numbers is not None:
         spaces[PARTS_KEY] = Box(-np.inf, np.inf, (part_numbers,), np.float32)
     if images:
-        spaces |= {key: Box(0, 255, IMAGE_SHAPE, np.uint8) for key in IMAGE_KEYS.values()}
+        spaces |= {
+            key: Box(0, 255, IMAGE_SHAPE, np.uint8) for key in IMAGE_KEYS.values()
+        }
     return Dict(spaces)
 
 
 def action_space() -> Box:
     """Action space (14,) float32 of one environment: targets within the joint limits [rad] and the grippers' openings [m]."""
-    return Box(ROBOT.action_low.astype(np.float32), ROBOT.action_high.astype(np.float32))
+    return Box(
+        ROBOT.action_low.astype(np.float32), ROBOT.action_high.astype(np.float32)
+    )

@@ -126,7 +126,9 @@ class Task(ABC):
 
     def __init__(self, difficulty: str = "train") -> None:
         if difficulty not in CLEARANCES_M:
-            raise TaccorlError(f"task {self.name}: no difficulty {difficulty!r}; {nearest(difficulty, CLEARANCES_M)}")
+            raise TaccorlError(
+                f"task {self.name}: no difficulty {difficulty!r}; {nearest(difficulty, CLEARANCES_M)}"
+            )
         self.difficulty = difficulty
         self.clearance_m = CLEARANCES_M[difficulty]
 

@@ -21,7 +21,9 @@ from taccorl.sim.part_surface import NEAR_M, TOUCH_M
 from taccorl.sim.polyhedron import FLAT_M
 
 _FAR_M = 1e3  # in place of infinity, because infinity times 0 is NaN
-_TINY_M = 1e-12  # least divisor for distances, which are 0 on a shape's axis and on an edge
+_TINY_M = (
+    1e-12  # least divisor for distances, which are 0 on a shape's axis and on an edge
+)
 _ZERO, _TINY = np.float32(0), np.float32(_TINY_M)
 
 
@@ -66,7 +68,9 @@ class Fields(NamedTuple):
 @intrinsic
 def _fma(_typing: Any, a: Any, b: Any, c: Any) -> Any:
     """a b + c, rounded once."""
-    return a(a, b, c), lambda _context, builder, _signature, values: builder.fma(*values)
+    return a(a, b, c), lambda _context, builder, _signature, values: builder.fma(
+        *values
+    )
 
 
 @numba.njit(inline="always")
@@ -77,7 +81,11 @@ def _sum3(a0, b0, a1, b1, a2, b2):
 
 @numba.njit(inline="always")
 def _cross(a, b):
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 @numba.njit(inline="always")
@@ -118,7 +126,10 @@ def _difference(a, b):
 def _place(geoms, pads, fields, n, p, g, position, velocity):
     """Whether the boxes of pad p and geom g meet; then writes the pad's (3, 3) ``position`` and ``velocity`` in its frame."""
     geom, half = geoms.geom[g], pads.half_m
-    site_pos, site_mat = fields.site_xpos[n, pads.site[p]], fields.site_xmat[n, pads.site[p]]
+    site_pos, site_mat = (
+        fields.site_xpos[n, pads.site[p]],
+        fields.site_xmat[n, pads.site[p]],
+    )
     away = _difference(fields.geom_xpos[n, geom], site_pos)
     mat = fields.geom_xmat[n, geom]
     # The pad's axes as columns, and the pad's origin [m], both in the geom's frame.
@@ -130,11 +141,18 @@ def _place(geoms, pads, fields, n, p, g, position, velocity):
     centre = _difference(geoms.centre_m[g], origin)
     extent = geoms.extent_m[g]
     for j, axis in enumerate((x, y, z)):
-        reach = half[j] + _sum3(extent[0], abs(axis[0]), extent[1], abs(axis[1]), extent[2], abs(axis[2]))
-        if not abs(_sum3(centre[0], axis[0], centre[1], axis[1], centre[2], axis[2])) < reach:
+        reach = half[j] + _sum3(
+            extent[0], abs(axis[0]), extent[1], abs(axis[1]), extent[2], abs(axis[2])
+        )
+        if (
+            not abs(_sum3(centre[0], axis[0], centre[1], axis[1], centre[2], axis[2]))
+            < reach
+        ):
             return False
     for i in range(3):
-        reach = extent[i] + _sum3(abs(x[i]), half[0], abs(y[i]), half[1], abs(z[i]), half[2])
+        reach = extent[i] + _sum3(
+            abs(x[i]), half[0], abs(y[i]), half[1], abs(z[i]), half[2]
+        )
         if not abs(centre[i]) < reach:
             return False
     turn_1, shift_1 = _motion(fields, n, pads.finger[p], pads.root, site_pos)
@@ -158,7 +176,11 @@ def _in_round(shapes, g, position, velocity, grid, depth, rate):
     """A capsule or cylinder: the deeper of it and what is in ``depth`` and ``rate`` (K,)."""
     kind, radius, half = shapes.kind[g], shapes.radius_m[g], shapes.half_m[g]
     for k in range(grid.shape[1]):
-        x, y, z = _at(position[0], grid, k), _at(position[1], grid, k), _at(position[2], grid, k)
+        x, y, z = (
+            _at(position[0], grid, k),
+            _at(position[1], grid, k),
+            _at(position[2], grid, k),
+        )
         if kind == CAPSULE:
             z = z - min(max(z, -half), half)
             distance = np.sqrt(x * x + y * y + z * z)
@@ -168,7 +190,11 @@ def _in_round(shapes, g, position, velocity, grid, depth, rate):
             deep = min(radius - distance, half - abs(z))
         if deep > depth[k]:
             depth[k] = deep
-            vx, vy, vz = _at(velocity[0], grid, k), _at(velocity[1], grid, k), _at(velocity[2], grid, k)
+            vx, vy, vz = (
+                _at(velocity[0], grid, k),
+                _at(velocity[1], grid, k),
+                _at(velocity[2], grid, k),
+            )
             if kind == CAPSULE:
                 rate[k] = (x * vx + y * vy + z * vz) / -max(distance, _TINY)
             elif half - abs(z) < radius - distance:
@@ -178,13 +204,22 @@ def _in_round(shapes, g, position, velocity, grid, depth, rate):
 
 
 @numba.njit(nogil=True, cache=True)
-def _in_solid(shapes, g, position, velocity, grid, depth, rate, under, deepest, nearest):
+def _in_solid(
+    shapes, g, position, velocity, grid, depth, rate, under, deepest, nearest
+):
     """A convex solid: the deeper of it and what is in ``depth`` and ``rate`` (K,); the last three are work space."""
     first, end = shapes.faces[g, 0], shapes.faces[g, 1]
     for f in range(first, end):
         normal, row = shapes.normals[f], under[f - first]
         for j in range(3):
-            row[j] = -_sum3(normal[0], position[0, j], normal[1], position[1, j], normal[2], position[2, j])
+            row[j] = -_sum3(
+                normal[0],
+                position[0, j],
+                normal[1],
+                position[1, j],
+                normal[2],
+                position[2, j],
+            )
         row[2] += shapes.offsets_m[f]
         if f == first:
             for k in range(grid.shape[1]):
@@ -204,9 +239,30 @@ def _in_solid(shapes, g, position, velocity, grid, depth, rate, under, deepest, 
                 depth[k], rate[k] = deep, speed
         elif deepest[k] > depth[k]:
             normal = shapes.normals[first + nearest[k]]
-            a = -_sum3(normal[0], velocity[0, 0], normal[1], velocity[1, 0], normal[2], velocity[2, 0])
-            b = -_sum3(normal[0], velocity[0, 1], normal[1], velocity[1, 1], normal[2], velocity[2, 1])
-            c = -_sum3(normal[0], velocity[0, 2], normal[1], velocity[1, 2], normal[2], velocity[2, 2])
+            a = -_sum3(
+                normal[0],
+                velocity[0, 0],
+                normal[1],
+                velocity[1, 0],
+                normal[2],
+                velocity[2, 0],
+            )
+            b = -_sum3(
+                normal[0],
+                velocity[0, 1],
+                normal[1],
+                velocity[1, 1],
+                normal[2],
+                velocity[2, 1],
+            )
+            c = -_sum3(
+                normal[0],
+                velocity[0, 2],
+                normal[1],
+                velocity[1, 2],
+                normal[2],
+                velocity[2, 2],
+            )
             depth[k] = deepest[k]
             rate[k] = _sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k])
 
@@ -224,11 +280,35 @@ def _at_seam(shapes, g, position, grid, k, under, deepest):
         inside = True
         for side in range(2):
             axis = shapes.seam_axes[r, side]
-            a = _sum3(axis[0], position[0, 0], axis[1], position[1, 0], axis[2], position[2, 0])
-            b = _sum3(axis[0], position[0, 1], axis[1], position[1, 1], axis[2], position[2, 1])
-            c = _sum3(axis[0], position[0, 2], axis[1], position[1, 2], axis[2], position[2, 2])
+            a = _sum3(
+                axis[0],
+                position[0, 0],
+                axis[1],
+                position[1, 0],
+                axis[2],
+                position[2, 0],
+            )
+            b = _sum3(
+                axis[0],
+                position[0, 1],
+                axis[1],
+                position[1, 1],
+                axis[2],
+                position[2, 1],
+            )
+            c = _sum3(
+                axis[0],
+                position[0, 2],
+                axis[1],
+                position[1, 2],
+                axis[2],
+                position[2, 2],
+            )
             c -= shapes.seam_centres_m[r, side]
-            inside &= abs(_sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k])) < shapes.seam_halves_m[r, side]
+            inside &= (
+                abs(_sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k]))
+                < shapes.seam_halves_m[r, side]
+            )
         if inside:
             return True
     return False
@@ -257,9 +337,13 @@ def _in_part(shapes, g, position, velocity, grid, k):
     cell = 0
     for i in range(3):
         at = (point[i] - shapes.cell_origin_m[u, i]) / shapes.cell_size_m[u]
-        cell = cell * shapes.cell_counts[u, i] + int(min(max(at, 0.0), shapes.cell_counts[u, i] - 1.0))
+        cell = cell * shapes.cell_counts[u, i] + int(
+            min(max(at, 0.0), shapes.cell_counts[u, i] - 1.0)
+        )
     cell += shapes.first_cell[u]
-    pieces = shapes.piece_list[shapes.cell_pieces[cell, 0] : shapes.cell_pieces[cell, 1]]
+    pieces = shapes.piece_list[
+        shapes.cell_pieces[cell, 0] : shapes.cell_pieces[cell, 1]
+    ]
     edges = shapes.edge_list[shapes.cell_edges[cell, 0] : shapes.cell_edges[cell, 1]]
     depth, inward = _to_surface(shapes, point, pieces, edges)
     if depth > NEAR_M:
@@ -280,7 +364,9 @@ def _to_surface(shapes, point, pieces, edges):
         edge = shapes.edges[e]
         sx, sy, sz, ex, ey, ez = edge[0], edge[1], edge[2], edge[3], edge[4], edge[5]
         dx, dy, dz = x - sx, y - sy, z - sz
-        share = min(max((dx * ex + dy * ey + dz * ez) / (ex * ex + ey * ey + ez * ez), 0.0), 1.0)
+        share = min(
+            max((dx * ex + dy * ey + dz * ez) / (ex * ex + ey * ey + ez * ez), 0.0), 1.0
+        )
         ax, ay, az = dx - share * ex, dy - share * ey, dz - share * ez
         square = ax * ax + ay * ay + az * az
         if square < least:
@@ -301,7 +387,10 @@ def _to_surface(shapes, point, pieces, edges):
         over = True
         for e in range(shapes.side_offsets_m.shape[1]):
             side = shapes.side_normals[q, e]
-            over &= x * side[0] + y * side[1] + z * side[2] - shapes.side_offsets_m[q, e] < FLAT_M
+            over &= (
+                x * side[0] + y * side[1] + z * side[2] - shapes.side_offsets_m[q, e]
+                < FLAT_M
+            )
         if over:
             depth, inward = under, (-nx, -ny, -nz)
     return depth, inward
@@ -312,21 +401,34 @@ def _compressed(pads, fields, n, s, depth, rate):
     """Compression of the plate of sprung pad s and its rate, (K,); see ``PadArray.compression``."""
     p = pads.sprung[s]
     site, box = pads.site[p], pads.box[p]
-    site_pos, site_mat, box_mat = fields.site_xpos[n, site], fields.site_xmat[n, site], fields.geom_xmat[n, box]
+    site_pos, site_mat, box_mat = (
+        fields.site_xpos[n, site],
+        fields.site_xmat[n, site],
+        fields.geom_xmat[n, box],
+    )
     normal = _row_times(_times(box_mat, pads.plate_normal[s]), site_mat)
     off = _times(box_mat, pads.plate_point_m[s])
     centre = fields.geom_xpos[n, box]
-    plate = _difference((centre[0] + off[0], centre[1] + off[1], centre[2] + off[2]), site_pos)
+    plate = _difference(
+        (centre[0] + off[0], centre[1] + off[1], centre[2] + off[2]), site_pos
+    )
     point = _row_times(plate, site_mat)
     n_z = normal[2]
     along = normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2]
     d = (normal[0] / n_z, normal[1] / n_z, -along / n_z)
     turn_1, shift_1 = _motion(fields, n, pads.plate[p], pads.root, site_pos)
     turn_2, shift_2 = _motion(fields, n, pads.finger[p], pads.root, site_pos)
-    turn, shift = _row_times(_difference(turn_1, turn_2), site_mat), _row_times(_difference(shift_1, shift_2), site_mat)
+    turn, shift = (
+        _row_times(_difference(turn_1, turn_2), site_mat),
+        _row_times(_difference(shift_1, shift_2), site_mat),
+    )
     m = _cross(normal, turn)
     moving = normal[0] * shift[0] + normal[1] * shift[1] + normal[2] * shift[2]
-    v = ((m[2] * d[0] - m[0]) / n_z, (m[2] * d[1] - m[1]) / n_z, (m[2] * d[2] - moving) / n_z)
+    v = (
+        (m[2] * d[0] - m[0]) / n_z,
+        (m[2] * d[1] - m[1]) / n_z,
+        (m[2] * d[2] - moving) / n_z,
+    )
     d0, d1, d2 = np.float32(d[0]), np.float32(d[1]), np.float32(d[2])
     v0, v1, v2 = np.float32(v[0]), np.float32(v[1]), np.float32(v[2])
     grid = pads.grid
@@ -349,7 +451,10 @@ def take_off_sinking(depth, rate, plate_depth, plate_rate):
             furthest, beyond = k, depth[k] - plate_depth[k]
     sunk, sunk_rate = _ZERO, _ZERO
     if furthest >= 0 and depth[furthest] - plate_depth[furthest] > _ZERO:
-        sunk, sunk_rate = depth[furthest] - plate_depth[furthest], rate[furthest] - plate_rate[furthest]
+        sunk, sunk_rate = (
+            depth[furthest] - plate_depth[furthest],
+            rate[furthest] - plate_rate[furthest],
+        )
     for k in range(len(depth)):
         depth[k] -= sunk
         if depth[k] > _ZERO:
@@ -364,7 +469,11 @@ def _work_space(shapes, grid):
     most = 1
     for g in range(len(shapes.faces)):
         most = max(most, shapes.faces[g, 1] - shapes.faces[g, 0])
-    return np.empty((most, 3), grid.dtype), np.empty(grid.shape[1], grid.dtype), np.empty(grid.shape[1], np.int32)
+    return (
+        np.empty((most, 3), grid.dtype),
+        np.empty(grid.shape[1], grid.dtype),
+        np.empty(grid.shape[1], np.int32),
+    )
 
 
 @numba.njit(nogil=True, cache=True)
@@ -376,7 +485,10 @@ def penetration(geoms, shapes, pads, fields, off_sinking, depth, rate):
     grid = pads.grid
     position, velocity = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
     under, deepest, nearest = _work_space(shapes, grid)
-    plate_depth, plate_rate = np.empty(grid.shape[1], np.float32), np.empty(grid.shape[1], np.float32)
+    plate_depth, plate_rate = (
+        np.empty(grid.shape[1], np.float32),
+        np.empty(grid.shape[1], np.float32),
+    )
     # Most pairs end in the innermost lines: no views of arrays there, which cost more than the numbers.
     geom, feels, bound, half = geoms.geom, geoms.feels, geoms.bound_m, pads.half_m
     geom_pos, site_pos, site_mat = fields.geom_xpos, fields.site_xpos, fields.site_xmat
@@ -384,27 +496,67 @@ def penetration(geoms, shapes, pads, fields, off_sinking, depth, rate):
         for p in range(len(pads.site)):
             site, met = pads.site[p], False
             x, y, z = site_pos[n, site, 0], site_pos[n, site, 1], site_pos[n, site, 2]
-            xx, xy, xz = site_mat[n, site, 0], site_mat[n, site, 1], site_mat[n, site, 2]
-            yx, yy, yz = site_mat[n, site, 3], site_mat[n, site, 4], site_mat[n, site, 5]
-            zx, zy, zz = site_mat[n, site, 6], site_mat[n, site, 7], site_mat[n, site, 8]
+            xx, xy, xz = (
+                site_mat[n, site, 0],
+                site_mat[n, site, 1],
+                site_mat[n, site, 2],
+            )
+            yx, yy, yz = (
+                site_mat[n, site, 3],
+                site_mat[n, site, 4],
+                site_mat[n, site, 5],
+            )
+            zx, zy, zz = (
+                site_mat[n, site, 6],
+                site_mat[n, site, 7],
+                site_mat[n, site, 8],
+            )
             for g in range(len(geom)):
                 at = geom[g]
-                dx, dy, dz = geom_pos[n, at, 0] - x, geom_pos[n, at, 1] - y, geom_pos[n, at, 2] - z
-                is_near = feels[p, g] and abs(_sum3(dx, xx, dy, yx, dz, zx)) < bound[g] + half[0]
-                is_near = is_near and abs(_sum3(dx, xy, dy, yy, dz, zy)) < bound[g] + half[1]
-                is_near = is_near and abs(_sum3(dx, xz, dy, yz, dz, zz)) < bound[g] + half[2]
-                if not (is_near and _place(geoms, pads, fields, n, p, g, position, velocity)):
+                dx, dy, dz = (
+                    geom_pos[n, at, 0] - x,
+                    geom_pos[n, at, 1] - y,
+                    geom_pos[n, at, 2] - z,
+                )
+                is_near = (
+                    feels[p, g]
+                    and abs(_sum3(dx, xx, dy, yx, dz, zx)) < bound[g] + half[0]
+                )
+                is_near = (
+                    is_near and abs(_sum3(dx, xy, dy, yy, dz, zy)) < bound[g] + half[1]
+                )
+                is_near = (
+                    is_near and abs(_sum3(dx, xz, dy, yz, dz, zz)) < bound[g] + half[2]
+                )
+                if not (
+                    is_near and _place(geoms, pads, fields, n, p, g, position, velocity)
+                ):
                     continue
                 met = True
                 if shapes.kind[g] == SOLID:
-                    _in_solid(shapes, g, position, velocity, grid, depth[n, p], rate[n, p], under, deepest, nearest)
+                    _in_solid(
+                        shapes,
+                        g,
+                        position,
+                        velocity,
+                        grid,
+                        depth[n, p],
+                        rate[n, p],
+                        under,
+                        deepest,
+                        nearest,
+                    )
                 else:
-                    _in_round(shapes, g, position, velocity, grid, depth[n, p], rate[n, p])
+                    _in_round(
+                        shapes, g, position, velocity, grid, depth[n, p], rate[n, p]
+                    )
             if met and off_sinking:
                 for s in range(len(pads.sprung)):
                     if pads.sprung[s] == p:
                         _compressed(pads, fields, n, s, plate_depth, plate_rate)
-                        take_off_sinking(depth[n, p], rate[n, p], plate_depth, plate_rate)
+                        take_off_sinking(
+                            depth[n, p], rate[n, p], plate_depth, plate_rate
+                        )
 
 
 @numba.njit(nogil=True, cache=True)
@@ -428,7 +580,9 @@ def depth_in_body(
         grid: (3, K) rows x, y, 1 of the taxels.
     """
     depth, rate = np.zeros((2, len(position), grid.shape[1]), np.float32)
-    position, velocity, grid = (np.ascontiguousarray(array, np.float64) for array in (position, velocity, grid))
+    position, velocity, grid = (
+        np.ascontiguousarray(array, np.float64) for array in (position, velocity, grid)
+    )
     _in_body(shapes, position, velocity, grid, depth, rate)
     return depth, rate
 
@@ -446,8 +600,26 @@ def _in_body(shapes, position, velocity, grid, depth, rate):
                     if j == 2:
                         a, b, c = a - pose[0, 3], b - pose[1, 3], c - pose[2, 3]
                     at[i, j] = _sum3(pose[0, i], a, pose[1, i], b, pose[2, i], c)
-                    speed[i, j] = _sum3(pose[0, i], moving[0, j], pose[1, i], moving[1, j], pose[2, i], moving[2, j])
+                    speed[i, j] = _sum3(
+                        pose[0, i],
+                        moving[0, j],
+                        pose[1, i],
+                        moving[1, j],
+                        pose[2, i],
+                        moving[2, j],
+                    )
             if shapes.kind[g] == SOLID:
-                _in_solid(shapes, g, at, speed, grid, depth[n], rate[n], under, deepest, nearest)
+                _in_solid(
+                    shapes,
+                    g,
+                    at,
+                    speed,
+                    grid,
+                    depth[n],
+                    rate[n],
+                    under,
+                    deepest,
+                    nearest,
+                )
             else:
                 _in_round(shapes, g, at, speed, grid, depth[n], rate[n])

@@ -24,7 +24,9 @@ class Trajectory:
     reported: np.ndarray
     """(T, 14) joint angles [rad] and gripper openings [m] as the encoders report them, at exactly ``time_s``."""
     targets: np.ndarray  # (T, 14) commanded targets [rad, m]
-    reading: np.ndarray  # (T, 4, 32, 12) float32 readings of the pads before gain, noise and rounding
+    reading: (
+        np.ndarray
+    )  # (T, 4, 32, 12) float32 readings of the pads before gain, noise and rounding
     effort: np.ndarray
     """(T, 14) motor torque of joints [N·m] and closing force of the gripper's motor [N], in the physics step before the
     sample."""
@@ -40,7 +42,9 @@ class DenseRecorder:
     """Physics steps since the episode began."""
 
     def __post_init__(self) -> None:
-        self._every = self.sim.config.physics.steps_per_control_step * CONTROL_HZ // SAMPLE_HZ
+        self._every = (
+            self.sim.config.physics.steps_per_control_step * CONTROL_HZ // SAMPLE_HZ
+        )
         self._see(0)
 
     def watch(self, num_steps: int | None = None) -> Watch:
@@ -55,15 +59,23 @@ class DenseRecorder:
         arrays, actuators = self.sim.arrays, self.sim.action_actuators
         row = (
             *(arrays["qpos"][i], arrays["qvel"][i], self.sim.proprioception()[i]),
-            *(arrays["ctrl"][i, actuators], self.sim.reading()[i], self.sim.effort()[i]),
+            *(
+                arrays["ctrl"][i, actuators],
+                self.sim.reading()[i],
+                self.sim.effort()[i],
+            ),
         )
         self._rows.append(tuple(np.array(values) for values in row))
 
     def trajectory(self) -> Trajectory:
         """The trajectory recorded so far."""
-        qpos, qvel, reported, targets, reading, effort = (np.stack(column) for column in zip(*self._rows, strict=True))
+        qpos, qvel, reported, targets, reading, effort = (
+            np.stack(column) for column in zip(*self._rows, strict=True)
+        )
         # A sample is taken at the end of a command's stretch; the command in force from then on is the next sample's.
         targets = np.concatenate([targets[1:], targets[-1:]])
-        mocap = np.concatenate([self.sim.arrays["mocap_pos"][0], self.sim.arrays["mocap_quat"][0]], axis=1)
+        mocap = np.concatenate(
+            [self.sim.arrays["mocap_pos"][0], self.sim.arrays["mocap_quat"][0]], axis=1
+        )
         time_s = np.arange(len(qpos)) / SAMPLE_HZ
         return Trajectory(time_s, qpos, qvel, mocap, reported, targets, reading, effort)

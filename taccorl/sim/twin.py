@@ -33,7 +33,10 @@ class PhysicsConfig:
     """Stiffness of friction relative to the normal force: at 1 a gripped part creeps, at 50 a step costs twice as much."""
 
     def __post_init__(self) -> None:
-        if not 20 <= self.steps_per_control_step <= MOST_STEPS or self.steps_per_control_step % 20:
+        if (
+            not 20 <= self.steps_per_control_step <= MOST_STEPS
+            or self.steps_per_control_step % 20
+        ):
             raise TaccorlError(
                 f"physics.steps_per_control_step: {self.steps_per_control_step:.10g} is not a multiple of 20 from 20 to "
                 f"{MOST_STEPS}; 20 is a step of 1.67 ms, 40 of 0.83 ms"
@@ -63,7 +66,9 @@ class TwinConfig:
     def __post_init__(self) -> None:
         for arm in self.arm_controllers:
             if arm not in ROBOT.arms:
-                raise TaccorlError(f"arm_controllers: no arm {arm!r}; {nearest(arm, ROBOT.arms)}")
+                raise TaccorlError(
+                    f"arm_controllers: no arm {arm!r}; {nearest(arm, ROBOT.arms)}"
+                )
 
     def controller_of(self, arm: str) -> ControllerConfig:
         """Controller gains of one arm."""
@@ -81,7 +86,9 @@ def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.impratio = config.physics.impratio
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a diverged simulation must stay one
+    option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    )  # a diverged simulation must stay one
     spec.worldbody.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -145,14 +152,25 @@ def _add_contact_sensors(spec: mujoco.MjSpec, task: Task) -> None:
     body, geom = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM
     for part in task.parts:
         for pad in ROBOT.pads:
-            _contact_sensor(spec, f"{pad}_on_{part}", (geom, pad), part, _FOUND, _MIN_DIST)
+            _contact_sensor(
+                spec, f"{pad}_on_{part}", (geom, pad), part, _FOUND, _MIN_DIST
+            )
     for one, other in task.mating:
-        _contact_sensor(spec, f"{one}_on_{other}", (body, one), other, _FOUND | _DIST, _MIN_DIST)
-        _contact_sensor(spec, f"{one}_on_{other}_force", (body, one), other, _FORCE, _NET_FORCE)
+        _contact_sensor(
+            spec, f"{one}_on_{other}", (body, one), other, _FOUND | _DIST, _MIN_DIST
+        )
+        _contact_sensor(
+            spec, f"{one}_on_{other}_force", (body, one), other, _FORCE, _NET_FORCE
+        )
 
 
 def _contact_sensor(
-    spec: mujoco.MjSpec, name: str, obj: tuple[mujoco.mjtObj, str], body: str, data: int, reduce: int
+    spec: mujoco.MjSpec,
+    name: str,
+    obj: tuple[mujoco.mjtObj, str],
+    body: str,
+    data: int,
+    reduce: int,
 ) -> None:
     spec.add_sensor(
         name=name,

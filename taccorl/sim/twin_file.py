@@ -54,7 +54,9 @@ def load_twin(path: Path) -> TwinConfig:
         return TwinConfig()
     kind, line = kind_of(path)
     if kind is not None:
-        raise SpecError(f"{path}:{line}: is of kind {kind!r}, for compare and diagnose; give a twin.yaml of the PiPER")
+        raise SpecError(
+            f"{path}:{line}: is of kind {kind!r}, for compare and diagnose; give a twin.yaml of the PiPER"
+        )
     document = EffectsDocument(TwinConfig, path)
     try:
         present(document.value.effects)
@@ -93,9 +95,13 @@ def twin_text(config: TwinConfig) -> str:
     if config.cameras != nominal.cameras:
         content["cameras"] = _camera_differences(config.cameras, nominal.cameras)
     if config.sensor != nominal.sensor:
-        content["sensor"] = _plugin_differences("type", sensors, config.sensor, type(nominal.sensor))
+        content["sensor"] = _plugin_differences(
+            "type", sensors, config.sensor, type(nominal.sensor)
+        )
     content["effects"] = [effect_entry(effect) for effect in config.effects]
-    return _HEADER + yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    return _HEADER + yaml.safe_dump(
+        content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+    )
 
 
 def twin_digest(config: TwinConfig) -> str:
@@ -145,20 +151,34 @@ class EffectsDocument[T](Document[T]):
 
     def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
         values = self._values(cls, self._items(node, key), key)
-        missing = [f.name for f in dataclasses.fields(cls) if _is_required(f) and f.name not in values]
+        missing = [
+            f.name
+            for f in dataclasses.fields(cls)
+            if _is_required(f) and f.name not in values
+        ]
         if missing:
             raise self.error(key, f"key {missing[0]!r} is missing")
         return self._made(cls, values, key)
 
-    def _values(self, cls: type, items: list[tuple[str, yaml.Node]], key: str) -> dict[str, Any]:
+    def _values(
+        self, cls: type, items: list[tuple[str, yaml.Node]], key: str
+    ) -> dict[str, Any]:
         """Fields of ``cls`` that stand in the file."""
-        hints, known = typing.get_type_hints(cls), [f.name for f in dataclasses.fields(cls)]
+        hints, known = (
+            typing.get_type_hints(cls),
+            [f.name for f in dataclasses.fields(cls)],
+        )
         values = {}
         for name, child in items:
             path = f"{key}/{name}" if key else name
             if name not in known:
-                other = "; the file of a robot, axis or cells begins with its kind: `kind: robot`" * (cls is TwinConfig)
-                raise self.error(path, f"unknown key {name!r}; {nearest(name, known)}{other}")
+                other = (
+                    "; the file of a robot, axis or cells begins with its kind: `kind: robot`"
+                    * (cls is TwinConfig)
+                )
+                raise self.error(
+                    path, f"unknown key {name!r}; {nearest(name, known)}{other}"
+                )
             values[name] = self._build(hints[name], child, path)
         return values
 
@@ -172,18 +192,33 @@ class EffectsDocument[T](Document[T]):
             text = str(error)
             named = sorted((text.index(name), name) for name in values if name in text)
             place = f"{key}/{named[0][1]}".lstrip("/") if named else key
-            raise self.error(place, text.removeprefix(f"{place.rsplit('/', 1)[-1]}: ")) from error
+            raise self.error(
+                place, text.removeprefix(f"{place.rsplit('/', 1)[-1]}: ")
+            ) from error
 
-    def _plugin(self, tag: str, registry: Registry[Any], default: type | None, node: yaml.Node, key: str) -> Any:
+    def _plugin(
+        self,
+        tag: str,
+        registry: Registry[Any],
+        default: type | None,
+        node: yaml.Node,
+        key: str,
+    ) -> Any:
         """A plug-in named by the key ``tag``, with its settings."""
         items = dict(self._items(node, key))
         if tag not in items and default is None:
-            raise self.error(key, f"key {tag!r} is missing; its value is one of: {', '.join(registry)}")
+            raise self.error(
+                key,
+                f"key {tag!r} is missing; its value is one of: {', '.join(registry)}",
+            )
         cls: Any = default
         if tag in items:
             name = self._scalar(str, items.pop(tag), f"{key}/{tag}")
             if name not in registry:
-                raise self.error(f"{key}/{tag}", f"no {registry.kind} {name!r}; {nearest(name, registry)}")
+                raise self.error(
+                    f"{key}/{tag}",
+                    f"no {registry.kind} {name!r}; {nearest(name, registry)}",
+                )
             cls = registry.get(name)
         return self._made(cls, self._values(cls, list(items.items()), key), key)
 
@@ -193,19 +228,37 @@ class EffectsDocument[T](Document[T]):
             path = f"{key}/{name}"
             if isinstance(child, yaml.ScalarNode) and child.tag.endswith(":null"):
                 if cameras.pop(name, None) is None:
-                    raise self.error(path, f"there is no camera {name!r} to remove; {nearest(name, cameras)}")
+                    raise self.error(
+                        path,
+                        f"there is no camera {name!r} to remove; {nearest(name, cameras)}",
+                    )
                 continue
             values = self._values(CameraConfig, self._items(child, path), path)
             if values.get("name", name) != name:
-                raise self.error(f"{path}/name", f"the camera's name is its key, {name!r}; remove this key")
+                raise self.error(
+                    f"{path}/name",
+                    f"the camera's name is its key, {name!r}; remove this key",
+                )
             nominal = cameras.get(name)
-            old = {f.name: getattr(nominal, f.name) for f in dataclasses.fields(CameraConfig)} if nominal else {}
-            cameras[name] = self._made(CameraConfig, old | values | {"name": name}, path)
+            old = (
+                {
+                    f.name: getattr(nominal, f.name)
+                    for f in dataclasses.fields(CameraConfig)
+                }
+                if nominal
+                else {}
+            )
+            cameras[name] = self._made(
+                CameraConfig, old | values | {"name": name}, path
+            )
         return list(cameras.values())
 
 
 def _is_required(field: dataclasses.Field) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+    return (
+        field.default is dataclasses.MISSING
+        and field.default_factory is dataclasses.MISSING
+    )
 
 
 def _differences(value: Any, base: Any, skip: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -220,23 +273,34 @@ def _differences(value: Any, base: Any, skip: tuple[str, ...] = ()) -> dict[str,
     return found
 
 
-def _plugin_differences(tag: str, registry: Registry[Any], value: Any, default: type | None = None) -> dict[str, Any]:
+def _plugin_differences(
+    tag: str, registry: Registry[Any], value: Any, default: type | None = None
+) -> dict[str, Any]:
     """``{tag: name, …}`` with what is not as in the plug-in's class; without the tag for ``default``."""
     cls = type(value)
     if cls is default:
         return _differences(value, cls())
     names = [name for name in registry if registry.get(name) is cls]
     if not names:
-        raise TaccorlError(f"{cls.__name__} is not a registered {registry.kind}, so that a file cannot name it")
+        raise TaccorlError(
+            f"{cls.__name__} is not a registered {registry.kind}, so that a file cannot name it"
+        )
     return {tag: names[0]} | _differences(value, cls())
 
 
-def _camera_differences(cameras: list[CameraConfig], nominal: list[CameraConfig]) -> dict[str, Any]:
+def _camera_differences(
+    cameras: list[CameraConfig], nominal: list[CameraConfig]
+) -> dict[str, Any]:
     bases = {camera.name: camera for camera in nominal}
     mine = {camera.name: camera for camera in cameras}
-    order = [*(name for name in bases if name in mine), *(name for name in mine if name not in bases)]
+    order = [
+        *(name for name in bases if name in mine),
+        *(name for name in mine if name not in bases),
+    ]
     if list(mine) != order or len(mine) < len(cameras):
-        raise TaccorlError(f"cameras {[c.name for c in cameras]}: a file has each camera once, {list(bases)} first")
+        raise TaccorlError(
+            f"cameras {[c.name for c in cameras]}: a file has each camera once, {list(bases)} first"
+        )
     found: dict[str, Any] = {name: None for name in bases if name not in mine}
     for name, camera in mine.items():
         if name not in bases:
@@ -264,5 +328,9 @@ def _plain(value: Any, name: str) -> Any:
 def _plain_fields(value: Any) -> Iterator[tuple[str, Any]]:
     for field in dataclasses.fields(value):
         mine = getattr(value, field.name)
-        if _is_required(field) or field.default is dataclasses.MISSING or mine != field.default:
+        if (
+            _is_required(field)
+            or field.default is dataclasses.MISSING
+            or mine != field.default
+        ):
             yield field.name, _plain(mine, field.name)

@@ -55,7 +55,9 @@ def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
         n == w or (w is None and n) for n, w in zip(actions.shape, wanted, strict=True)
     ):
         shape = ", ".join("H" if w is None else str(w) for w in wanted)
-        raise TaccorlError(f"action: shape {actions.shape}, expected ({shape}): {', '.join(ROBOT.action_names)}")
+        raise TaccorlError(
+            f"action: shape {actions.shape}, expected ({shape}): {', '.join(ROBOT.action_names)}"
+        )
     return actions
 
 
@@ -64,10 +66,14 @@ class Chunk:
     """Result of a chunk of actions: observation, rewards, and which environments ended."""
 
     observation: Observation  # Observation after the chunk; of an episode that ended, the first one of the next episode
-    reward: np.ndarray  # (N,) sum of the rewards in the chunk: 1 where the task succeeded within it
+    reward: (
+        np.ndarray
+    )  # (N,) sum of the rewards in the chunk: 1 where the task succeeded within it
     terminated: np.ndarray  # (N,) bool: succeeded or failed within the chunk
     truncated: np.ndarray  # (N,) bool: ran out of time within the chunk
-    num_steps: np.ndarray  # (N,) number of executed actions; a finished episode executes none
+    num_steps: (
+        np.ndarray
+    )  # (N,) number of executed actions; a finished episode executes none
     tactile: np.ndarray
     """(N, H, 1536) int16 counts above baseline after every control step, for policies that read a history."""
     info: dict[str, Any]
@@ -124,7 +130,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             TaccorlError: unknown task, difficulty or setting; unreadable twin, or one without a requested camera.
         """
         _one_of("images", images, ("never", "always", "on_request"))
-        _one_of("autoreset", autoreset, (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED))
+        _one_of(
+            "autoreset", autoreset, (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+        )
         _one_of("render_mode", render_mode, (None, "rgb_array"))
         self.sim = Simulation(
             tasks.get(task)(difficulty),
@@ -134,31 +142,58 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             scale=randomization,
             physics=physics,
         )
-        self.sim.require_cameras(ROBOT.cameras if images != "never" else ROBOT.cameras[:1] if render_mode else [])
+        self.sim.require_cameras(
+            ROBOT.cameras
+            if images != "never"
+            else ROBOT.cameras[:1]
+            if render_mode
+            else []
+        )
         checked_seeds([] if seed is None else seed)
         if max_episode_steps is not None:
-            if not isinstance(max_episode_steps, int | np.integer) or max_episode_steps < 1:
-                raise TaccorlError(f"max_episode_steps: {max_episode_steps!r} is no whole number ≥ 1")
+            if (
+                not isinstance(max_episode_steps, int | np.integer)
+                or max_episode_steps < 1
+            ):
+                raise TaccorlError(
+                    f"max_episode_steps: {max_episode_steps!r} is no whole number ≥ 1"
+                )
             self.sim.judge.limit_steps = max_episode_steps
-        self.num_envs, self.task, self.task_description = num_envs, task, self.sim.task.instruction
+        self.num_envs, self.task, self.task_description = (
+            num_envs,
+            task,
+            self.sim.task.instruction,
+        )
         self.images, self.autoreset, self.render_mode = images, autoreset, render_mode
-        self.metadata = {"autoreset_mode": autoreset, "render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
+        self.metadata = {
+            "autoreset_mode": autoreset,
+            "render_modes": ["rgb_array"],
+            "render_fps": CONTROL_HZ,
+        }
         self.single_observation_space = observation_space(
-            images == "always", len(part_pose_names(self.sim.task)) if part_poses else None
+            images == "always",
+            len(part_pose_names(self.sim.task)) if part_poses else None,
         )
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeds = EpisodeSeeds(num_envs, seed)
         self._begun = False
-        self._over, self._clipped = np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool)
+        self._over, self._clipped = (
+            np.zeros(num_envs, dtype=bool),
+            np.zeros(num_envs, dtype=bool),
+        )
         self._state = np.zeros((num_envs, ROBOT.num_actions), dtype=np.float32)
         self._tactile = np.zeros((num_envs, ROBOT.num_taxels), dtype=np.int16)
         self._parts = (
-            np.zeros((num_envs, len(part_pose_names(self.sim.task))), dtype=np.float32) if part_poses else None
+            np.zeros((num_envs, len(part_pose_names(self.sim.task))), dtype=np.float32)
+            if part_poses
+            else None
         )
         self._pictures = {
-            name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8) for name in ROBOT.cameras if images != "never"
+            name: np.zeros((num_envs, *IMAGE_SHAPE), dtype=np.uint8)
+            for name in ROBOT.cameras
+            if images != "never"
         }
         self._reason = np.full(num_envs, "", dtype=object)
         self._unseen = np.zeros(num_envs, dtype=bool)
@@ -177,7 +212,10 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     # gymnasium's interface --------------------------------------------------------------------------------------------
 
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, *, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
         """Start new episodes in all environments, or in those of ``reset_mask``; returns the observation and ``info`` of all.
 
@@ -188,12 +226,22 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         """
         self._check_open("reset")
         checked_seeds([] if seed is None else seed)
-        options = {name: value for name, value in (options or {}).items() if name != _NOT_FOR_US}
+        options = {
+            name: value
+            for name, value in (options or {}).items()
+            if name != _NOT_FOR_US
+        }
         for name in options:
             _one_of("reset option", name, _OPTIONS)
-        ids = self._mask_ids(options["reset_mask"]) if "reset_mask" in options else self._all
+        ids = (
+            self._mask_ids(options["reset_mask"])
+            if "reset_mask" in options
+            else self._all
+        )
         if not self._begun and len(ids) < self.num_envs:
-            raise TaccorlError("reset: the first reset must be of all environments; remove reset_mask")
+            raise TaccorlError(
+                "reset: the first reset must be of all environments; remove reset_mask"
+            )
         state = options.get("state")
         if state is not None:
             self.sim.check_snapshot(state, ids)  # before any of it acts
@@ -202,15 +250,25 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             self._seeds.begin(seed, ids.tolist())
         self._begin(ids, state)
         self._begun = True
-        return self.observe(self.images == "always"), _masked(self.facts(), np.isin(self._all, ids))
+        return self.observe(self.images == "always"), _masked(
+            self.facts(), np.isin(self._all, ids)
+        )
 
-    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step (1/30 s) with the targets ``actions`` (N, 14) [rad, m].
 
         Returns observation, reward (N,), terminated (N,), truncated (N,) and ``info``, as gymnasium defines them. Raises
         TaccorlError: wrong shape."""
         chunk = self.step_chunk(shaped(actions, self.num_envs)[:, None])
-        return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
+        return (
+            chunk.observation,
+            chunk.reward,
+            chunk.terminated,
+            chunk.truncated,
+            chunk.info,
+        )
 
     def step_chunk(self, actions: np.ndarray) -> Chunk:
         """H control steps with the targets ``actions`` (N, H, 14) [rad, m], as a policy gives them. An episode that ends within
@@ -219,7 +277,10 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
             raise TaccorlError("step: call reset() first")
-        reward, num_steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
+        reward, num_steps = (
+            np.zeros(self.num_envs),
+            np.zeros(self.num_envs, dtype=np.int64),
+        )
         tactile = np.empty((*actions.shape[:2], ROBOT.num_taxels), dtype=np.int16)
         self._clipped = np.zeros(self.num_envs, dtype=bool)
         for k in range(actions.shape[1]):
@@ -273,14 +334,18 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def observe(self, images: bool = False) -> Observation:
         """Newest observation of all environments; ``images`` renders the pictures now (for ``images="on_request"``)."""
         if images and self.images == "never":
-            raise TaccorlError('observe: images are "never" rendered here; make the environment with "on_request"')
+            raise TaccorlError(
+                'observe: images are "never" rendered here; make the environment with "on_request"'
+            )
         self._check_open("observe")
         observation = {STATE_KEY: self._state.copy(), TACTILE_KEY: self._tactile.copy()}
         if self._parts is not None:
             observation[PARTS_KEY] = self._parts.copy()
         if images:
             self._look()
-            observation |= {IMAGE_KEYS[name]: pictures for name, pictures in self._pictures.items()}
+            observation |= {
+                IMAGE_KEYS[name]: pictures for name, pictures in self._pictures.items()
+            }
         return observation
 
     def _look(self) -> None:
@@ -308,7 +373,11 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self.sim.reset([self._seeds.draw(i) for i in ids.tolist()], ids)
         if state is not None:
             self.sim.restore(state, ids)
-        self._over[ids], self._clipped[ids], self._reason[ids] = self.sim.judge.outcome.over[ids], False, ""
+        self._over[ids], self._clipped[ids], self._reason[ids] = (
+            self.sim.judge.outcome.over[ids],
+            False,
+            "",
+        )
         self._take(np.isin(self._all, ids))
 
     def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -344,11 +413,15 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
         The pads' noise follows from scene seed and step alone, so that neither company nor a restored state changes it."""
         valid = rows & ~self.sim.diverged
-        self._state = np.where(valid[:, None], self.sim.proprioception(), self._state).astype(np.float32)
+        self._state = np.where(
+            valid[:, None], self.sim.proprioception(), self._state
+        ).astype(np.float32)
         if self._parts is not None:
             self._parts = np.where(valid[:, None], part_poses(self.sim), self._parts)
         tactile = self.sim.touch(ScanNoise(self.sim.seeds, self.sim.judge.steps))
-        self._tactile = tactile if valid.all() else np.where(valid[:, None], tactile, self._tactile)
+        self._tactile = (
+            tactile if valid.all() else np.where(valid[:, None], tactile, self._tactile)
+        )
         self._unseen |= valid
         facts = self._judged()
         self._facts = facts if rows.all() else _rows_from(self._facts, facts, rows)
@@ -366,7 +439,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             "steps": judge.steps.copy(),
             "clipped": self._clipped.copy(),
             "reason": self._reason.copy(),
-            "measures": {name: np.array(values) for name, values in verdict.measures.items()},
+            "measures": {
+                name: np.array(values) for name, values in verdict.measures.items()
+            },
         }
 
     def _end(self) -> tuple[Observation, dict[str, Any]]:
@@ -374,30 +449,48 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         images, ended, info = self.images == "always", self._over.copy(), {}
         if self.autoreset is AutoresetMode.SAME_STEP and ended.any():
             before, ids = self.observe(images), np.flatnonzero(ended)
-            info = {"final_obs": np.full(self.num_envs, None, dtype=object), "final_info": _masked(self.facts(), ended)}
+            info = {
+                "final_obs": np.full(self.num_envs, None, dtype=object),
+                "final_info": _masked(self.facts(), ended),
+            }
             for i in ids.tolist():
-                info["final_obs"][i] = {name: values[i].copy() for name, values in before.items()}
+                info["final_obs"][i] = {
+                    name: values[i].copy() for name, values in before.items()
+                }
             info |= {f"_{name}": ended.copy() for name in info}
             self._begin(ids)
-        return self.observe(images), info | _masked(self.facts(), np.ones(self.num_envs, dtype=bool))
+        return self.observe(images), info | _masked(
+            self.facts(), np.ones(self.num_envs, dtype=bool)
+        )
 
     def _mask_ids(self, mask: Any) -> np.ndarray:
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise TaccorlError(f"reset_mask: expected ({self.num_envs},) bool with at least one True, found {mask!r}")
+            raise TaccorlError(
+                f"reset_mask: expected ({self.num_envs},) bool with at least one True, found {mask!r}"
+            )
         return np.flatnonzero(mask)
 
 
 def _one_of(what: str, value: Any, known: Sequence[Any]) -> None:
     if value not in known:
-        raise TaccorlError(f"{what}: {value!r} does not exist; {nearest(str(value), map(str, known))}")
+        raise TaccorlError(
+            f"{what}: {value!r} does not exist; {nearest(str(value), map(str, known))}"
+        )
 
 
-def _each(facts: dict[str, Any], change: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
-    return {name: _each(v, change) if isinstance(v, dict) else change(v) for name, v in facts.items()}
+def _each(
+    facts: dict[str, Any], change: Callable[[np.ndarray], np.ndarray]
+) -> dict[str, Any]:
+    return {
+        name: _each(v, change) if isinstance(v, dict) else change(v)
+        for name, v in facts.items()
+    }
 
 
-def _rows_from(old: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+def _rows_from(
+    old: dict[str, Any], new: dict[str, Any], rows: np.ndarray
+) -> dict[str, Any]:
     """``old`` with ``rows`` (N,) bool of ``new``."""
     merged = {}
     for name, values in new.items():
@@ -411,5 +504,8 @@ def _rows_from(old: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> di
 
 def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """With gymnasium's ``_name`` (N,) bool beside each entry: whose it is."""
-    inner = {name: _masked(values, mask) if isinstance(values, dict) else values for name, values in info.items()}
+    inner = {
+        name: _masked(values, mask) if isinstance(values, dict) else values
+        for name, values in info.items()
+    }
     return inner | {f"_{name}": mask.copy() for name in info}

@@ -22,7 +22,14 @@ mjw: Any = OnUse("mujoco_warp")
 wp: Any = OnUse("warp")
 torch: Any = OnUse("torch")
 
-_INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active")
+_INPUTS = (
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "mocap_pos",
+    "mocap_quat",
+    "eq_active",
+)
 _STATE = ("qpos", "qvel", "act", "history", "qacc_warmstart", *_INPUTS)
 _NONE = mujoco.mjtStage.mjSTAGE_NONE.value
 _LARGEST = 1e10  # mjMAXVAL: beyond it MuJoCo C warns of a bad state
@@ -59,14 +66,20 @@ class WarpSettings:
             key, _, value = option.partition("=")
             names = [f.name for f in dataclasses.fields(cls)]
             if key not in names:
-                raise TaccorlError(f"physics={physics}: no setting {key!r}; {nearest(key, names)}")
+                raise TaccorlError(
+                    f"physics={physics}: no setting {key!r}; {nearest(key, names)}"
+                )
             if key != "device" and not (value.isdecimal() and int(value) > 0):
-                raise TaccorlError(f"physics={physics}: {key}={value!r} is no whole number ≥ 1")
+                raise TaccorlError(
+                    f"physics={physics}: {key}={value!r} is no whole number ≥ 1"
+                )
             values[key] = value if key == "device" else int(value)
         return cls(**values)
 
 
-def make_batch(model: mujoco.MjModel, num_sims: int, num_threads: int, physics: str = "c") -> Batch:
+def make_batch(
+    model: mujoco.MjModel, num_sims: int, num_threads: int, physics: str = "c"
+) -> Batch:
     """Physics of ``num_sims`` simulations of ``model``: ``c``, or ``warp`` with the settings of ``WarpSettings``.
 
     Raises:
@@ -89,8 +102,12 @@ def check_supported(model: mujoco.MjModel) -> None:
         with wp.ScopedDevice("cpu"):
             mjw.put_model(_for_warp(model))
     except (NotImplementedError, ValueError) as error:
-        what = ", ".join(sorted(set(re.findall(r"mj\w+", str(error))))) or error  # its lists name each actuator
-        raise Unsupported(f"physics=warp: MuJoCo Warp does not support {what}; {_WAY_OUT}") from error
+        what = (
+            ", ".join(sorted(set(re.findall(r"mj\w+", str(error))))) or error
+        )  # its lists name each actuator
+        raise Unsupported(
+            f"physics=warp: MuJoCo Warp does not support {what}; {_WAY_OUT}"
+        ) from error
 
 
 def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -99,10 +116,15 @@ def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
     a plane, without edges: of a cylinder 1 … 10 µm deep in so large a box MuJoCo Warp 4.0.0 finds no contact in 7 % of 20 000
     poses, and in 6 of them one 0.9 m deep, which throws the part off."""
     model, flags = copy.copy(model), mujoco.mjtDisableBit
-    model.opt.disableflags = model.opt.disableflags & ~int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_NATIVECCD)
+    model.opt.disableflags = model.opt.disableflags & ~int(
+        flags.mjDSBL_AUTORESET
+    ) | int(flags.mjDSBL_NATIVECCD)
     if (table := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, TABLE)) >= 0:
         model.geom_pos[table, 2] += model.geom_size[table, 2]
-        model.geom_type[table], model.geom_rbound[table] = mujoco.mjtGeom.mjGEOM_PLANE, 0.0
+        model.geom_type[table], model.geom_rbound[table] = (
+            mujoco.mjtGeom.mjGEOM_PLANE,
+            0.0,
+        )
     return model
 
 
@@ -114,14 +136,25 @@ class WarpBatch(Batch):
     diverges is a NaN for itself: its ``warning`` counts it, and from the next step on its place on the device computes a copy of
     a sound world. So does one in which MuJoCo Warp gave up a contact of two convex shapes."""
 
-    def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0, *, settings: WarpSettings) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nsim: int,
+        nthread: int = 0,
+        *,
+        settings: WarpSettings,
+    ) -> None:
         super().__init__(model, nsim, nthread)
         self.settings = settings
         open_device(settings.device)
         check_supported(model)
         if settings.constraints < model.nv:  # friction and limits alone
-            raise TaccorlError(f"physics=warp:constraints={settings.constraints}: at least {model.nv} here")
-        self._columns = {name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size}
+            raise TaccorlError(
+                f"physics=warp:constraints={settings.constraints}: at least {model.nv} here"
+            )
+        self._columns = {
+            name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size
+        }
         self._time_s = self.bind("time")
         self._world: _Worlds | None = None
         self._lost = np.ones(nsim, dtype=bool)
@@ -144,7 +177,9 @@ class WarpBatch(Batch):
     def bind(self, name: str) -> np.ndarray:
         """As ``Batch.bind``: (N, …). Raises TaccorlError: MuJoCo Warp does not compute the field."""
         if name not in mjw.Data.__dataclass_fields__:
-            raise TaccorlError(f"physics=warp: MuJoCo Warp has no field {name}; {_WAY_OUT}")
+            raise TaccorlError(
+                f"physics=warp: MuJoCo Warp has no field {name}; {_WAY_OUT}"
+            )
         return super().bind(name)
 
     def expand(self, name: str) -> np.ndarray:
@@ -179,7 +214,9 @@ class WarpBatch(Batch):
                 worlds are then as they were when they were last refreshed.
         """
         chosen = self._mask(ids)
-        sound = np.isfinite(self._columns["qpos"]).all(1) & np.isfinite(self._columns["qvel"]).all(1)
+        sound = np.isfinite(self._columns["qpos"]).all(1) & np.isfinite(
+            self._columns["qvel"]
+        ).all(1)
         run = chosen & sound
         if run.any():
             self._pull_state(self._behind & ~run)
@@ -240,16 +277,30 @@ class WarpBatch(Batch):
     def _worlds(self) -> "_Worlds":
         """The worlds on the device, made anew when another field of the model varies between them."""
         if self._varied is None:
-            of_model = {name: self.expanded(name) for name in MODEL_FIELDS if _varies(name)}
-            self._varied = {name: self._flat(values) for name, values in of_model.items() if values is not None}
+            of_model = {
+                name: self.expanded(name) for name in MODEL_FIELDS if _varies(name)
+            }
+            self._varied = {
+                name: self._flat(values)
+                for name, values in of_model.items()
+                if values is not None
+            }
         varied = self._varied
         if self._world is None or self._world.varied != varied.keys():
             self._pull_state(self._behind)
             self._world = None
-            self._world = self._fitting(lambda: _Worlds(_for_warp(self.model), self.nsim, self.settings, list(varied)))
+            self._world = self._fitting(
+                lambda: _Worlds(
+                    _for_warp(self.model), self.nsim, self.settings, list(varied)
+                )
+            )
             self._lost[:] = self._unsound[:] = True
-            of_state = {name: np.zeros_like(values) for name, values in self._columns.items()}
-            self._known = of_state | {name: np.full_like(values, np.nan) for name, values in varied.items()}
+            of_state = {
+                name: np.zeros_like(values) for name, values in self._columns.items()
+            }
+            self._known = of_state | {
+                name: np.full_like(values, np.nan) for name, values in varied.items()
+            }
         return self._world
 
     def _fitting[T](self, work: Callable[[], T]) -> T:
@@ -266,7 +317,12 @@ class WarpBatch(Batch):
         self._world, device = None, wp.get_device(self.settings.device)
         wp.synchronize_device(device)
         model, free_mb = _for_warp(self.model), device.free_memory / 2**20
-        peaks_mb = np.array([_peak_mb(lambda n=n: _Worlds(model, n, self.settings, []).run(1)) for n in _FEW])
+        peaks_mb = np.array(
+            [
+                _peak_mb(lambda n=n: _Worlds(model, n, self.settings, []).run(1))
+                for n in _FEW
+            ]
+        )
         each_mb = np.diff(peaks_mb)[0] / np.diff(_FEW)[0]
         raise TaccorlError(
             f"physics=warp: {self.nsim} worlds do not fit the memory of {self.settings.device} ({fault}): about "
@@ -277,15 +333,30 @@ class WarpBatch(Batch):
         lost, current = run & self._lost, run & ~self._behind
         for name, values in self._columns.items():
             may = run if name in _INPUTS else current
-            rows = may & (values != self._known[name]).any(1) | lost if may.any() else lost
+            rows = (
+                may & (values != self._known[name]).any(1) | lost if may.any() else lost
+            )
             self._write(worlds, worlds.tensor(name), name, rows, values)
         if current.any():
             for name, values in (self._varied or {}).items():
-                self._write(worlds, worlds.of_model[name], name, (values != self._known[name]).any(1), values)
+                self._write(
+                    worlds,
+                    worlds.of_model[name],
+                    name,
+                    (values != self._known[name]).any(1),
+                    values,
+                )
         worlds.write(worlds.tensor("time"), run, self._time_s)
         self._unsound &= ~run
 
-    def _write(self, worlds: "_Worlds", tensor: Any, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+    def _write(
+        self,
+        worlds: "_Worlds",
+        tensor: Any,
+        name: str,
+        rows: np.ndarray,
+        values: np.ndarray,
+    ) -> None:
         if rows.any():
             worlds.write(tensor, rows, values)
             self._known[name][rows] = values[rows]
@@ -316,25 +387,37 @@ class WarpBatch(Batch):
 class _Worlds:
     """Model and states on the device, Torch's views of them, and the captured graphs of steps."""
 
-    def __init__(self, model: mujoco.MjModel, num_worlds: int, settings: WarpSettings, varied: list[str]) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_worlds: int,
+        settings: WarpSettings,
+        varied: list[str],
+    ) -> None:
         self.varied = set(varied)
         self._settings, self._num = settings, num_worlds
         self._device = wp.get_device(settings.device)
         with wp.ScopedDevice(self._device):
-            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(varied, num_worlds))
+            self._model = mjw.put_model(
+                model, batch_sizes=dict.fromkeys(varied, num_worlds)
+            )
             self._model.opt.warn_overflow = False  # ``overflow`` reads it
             self._model.opt.contact_sensor_maxmatch = settings.contacts
             if self._device.is_cuda and not wp.is_conditional_graph_supported():
                 self._model.opt.graph_conditional = False  # a driver before CUDA 12.4
             self._data = self._allocate(model)
-        self.of_model = {name: wp.to_torch(getattr(self._model, name)) for name in varied}
+        self.of_model = {
+            name: wp.to_torch(getattr(self._model, name)) for name in varied
+        }
         self._index_of: tuple[bytes, Any] = (b"", None)
         self._tensors: dict[str, Any] = {}
         self._graphs: dict[tuple[int, bool], Any] = {}
 
     def _allocate(self, model: mujoco.MjModel) -> Any:
         rows = -(-self._settings.constraints // _ROWS) * _ROWS
-        return mjw.make_data(model, nworld=self._num, nconmax=self._settings.contacts, njmax=rows)
+        return mjw.make_data(
+            model, nworld=self._num, nconmax=self._settings.contacts, njmax=rows
+        )
 
     def tensor(self, name: str) -> Any:
         """Torch's view (N, …) of a field of the device's data."""
@@ -363,9 +446,15 @@ class _Worlds:
 
     def _captured(self, nstep: int, refresh: bool) -> Any:
         if not self._graphs:  # compile all kernels first, then put everything back
-            tensors = [self.tensor(name) for name in ("time", *_STATE) if getattr(self._data, name).size]
+            tensors = [
+                self.tensor(name)
+                for name in ("time", *_STATE)
+                if getattr(self._data, name).size
+            ]
             kept = [(tensor, tensor.clone()) for tensor in tensors]
-            torch.cuda.synchronize(self._settings.device)  # Torch and Warp have streams of their own
+            torch.cuda.synchronize(
+                self._settings.device
+            )  # Torch and Warp have streams of their own
             self._steps(1, True)
             wp.synchronize_device(self._device)
             for tensor, values in kept:
@@ -379,20 +468,35 @@ class _Worlds:
     def finite(self) -> np.ndarray:
         """(N,) bool: positions and velocities are numbers that MuJoCo C, too, would accept."""
         of_state = self.tensor("qpos"), self.tensor("qvel")
-        if not self._device.is_cuda:  # Torch's threads wait for each other on a busy machine
+        if (
+            not self._device.is_cuda
+        ):  # Torch's threads wait for each other on a busy machine
             of_state = of_state[0].numpy(), of_state[1].numpy()
         ok = [(abs(values) < _LARGEST).all(1) for values in of_state]
-        return np.asarray((ok[0] & ok[1]).cpu() if self._device.is_cuda else ok[0] & ok[1])
+        return np.asarray(
+            (ok[0] & ok[1]).cpu() if self._device.is_cuda else ok[0] & ok[1]
+        )
 
     def overflow(self, run: np.ndarray) -> tuple[str, np.ndarray]:
         """Text of which buffer was too small in one of the worlds ``run`` (N,) bool, if one was; and (N,) bool: those of them in
         which a contact of two convex shapes was not found, which no setting helps. The flags are cleared."""
         kinds, flags = mjw.OverflowType, self._data.overflow.numpy()
         unfound = run & ((flags & int(kinds.EPA_HORIZON)) != 0)
-        run, ignored = run & ~unfound, kinds.ITERATIONS | kinds.LS_ITERATIONS  # as in MuJoCo C
-        found = int(np.bitwise_or.reduce(flags[run])) & ~int(ignored) if run.any() else 0
-        contacts = max(int(self._data.nacon.numpy()[0]), int(self._data.ncollision.numpy()[0])) / self._num
-        needed = {"contacts": int(np.ceil(contacts)), "constraints": int(self._data.nefc.numpy()[run].max(initial=0))}
+        run, ignored = (
+            run & ~unfound,
+            kinds.ITERATIONS | kinds.LS_ITERATIONS,
+        )  # as in MuJoCo C
+        found = (
+            int(np.bitwise_or.reduce(flags[run])) & ~int(ignored) if run.any() else 0
+        )
+        contacts = (
+            max(int(self._data.nacon.numpy()[0]), int(self._data.ncollision.numpy()[0]))
+            / self._num
+        )
+        needed = {
+            "contacts": int(np.ceil(contacts)),
+            "constraints": int(self._data.nefc.numpy()[run].max(initial=0)),
+        }
         # ``forward`` sets no flag for the first two buffers.
         few = {"constraints": found & int(kinds.NEFC | kinds.NJMAX_NNZ)}
         few["contacts"] = found & ~few["constraints"]
@@ -410,7 +514,9 @@ class _Worlds:
 
     def write(self, tensor: Any, rows: np.ndarray, values: np.ndarray) -> None:
         """Write ``values`` (N, …) of ``rows`` (N,) bool into a device's tensor (N, …)."""
-        new = torch.from_numpy(values[rows].astype(np.float32)).to(tensor.device, tensor.dtype)
+        new = torch.from_numpy(values[rows].astype(np.float32)).to(
+            tensor.device, tensor.dtype
+        )
         tensor[self._index(rows)] = new.reshape(-1, *tensor.shape[1:])
 
     def copy_row(self, tensor: Any, source: int, rows: np.ndarray) -> None:
@@ -426,7 +532,9 @@ class _Worlds:
         if rows.all():
             return slice(None)
         if self._index_of[0] != rows.tobytes():
-            index = torch.from_numpy(np.flatnonzero(rows)).to(wp.device_to_torch(self._device))
+            index = torch.from_numpy(np.flatnonzero(rows)).to(
+                wp.device_to_torch(self._device)
+            )
             self._index_of = rows.tobytes(), index
         return self._index_of[1]
 

@@ -29,11 +29,17 @@ class Bodies(NamedTuple):
     turn: np.ndarray  # (6, 3, 3) rotation parent-from-link at joint angle 0
     origin: np.ndarray  # (6, 3) origin of each link in its parent's frame [m]
     mass: np.ndarray  # (6,) masses [kg]
-    moment: np.ndarray  # (6, 3) first moment: mass times centre of mass, in the link's frame [kg·m]
+    moment: (
+        np.ndarray
+    )  # (6, 3) first moment: mass times centre of mass, in the link's frame [kg·m]
     inertia: np.ndarray  # (6, 3, 3) inertia about the link's origin [kg·m²]
 
 
-def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, float, float, float], ...] = ()) -> Bodies:
+def bodies(
+    config: RobotConfig,
+    opening_m: float,
+    balls: tuple[tuple[float, float, float, float], ...] = (),
+) -> Bodies:
     """Rigid bodies of the arm of ``config`` with its gripper open by ``opening_m``. ``balls``: point masses fixed to link 6:
     mass [kg], x, y, z [m]."""
     inertias = INERTIAS[config.inertias]
@@ -44,23 +50,46 @@ def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, floa
         xx, yy, zz, xy, xz, yz = body.about_com_kgm2()
         about_com = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         inertia[k] = about_com + _of_point(body.mass_kg, np.array(body.com_link_m))
-    round_ones = [(m, np.array(at), [0.4 * m * _BALL_RADIUS_M**2] * 3) for m, *at in balls]
+    round_ones = [
+        (m, np.array(at), [0.4 * m * _BALL_RADIUS_M**2] * 3) for m, *at in balls
+    ]
     for at_kg, at_m, own in (*_hand(config, opening_m), *round_ones):
         mass[-1] += at_kg
         moment[-1] += at_kg * at_m
         inertia[-1] += np.diag(own) + _of_point(at_kg, at_m)
-    turn = np.array([Rotation.from_euler("xyz", link.rpy_parent_rad).as_matrix() for link in ROBOT.links])
-    return Bodies(turn, np.array([link.pos_parent_m for link in ROBOT.links], dtype=float), mass, moment, inertia)
+    turn = np.array(
+        [
+            Rotation.from_euler("xyz", link.rpy_parent_rad).as_matrix()
+            for link in ROBOT.links
+        ]
+    )
+    return Bodies(
+        turn,
+        np.array([link.pos_parent_m for link in ROBOT.links], dtype=float),
+        mass,
+        moment,
+        inertia,
+    )
 
 
-def _hand(config: RobotConfig, opening_m: float) -> list[tuple[float, np.ndarray, list[float]]]:
+def _hand(
+    config: RobotConfig, opening_m: float
+) -> list[tuple[float, np.ndarray, list[float]]]:
     """Fingers and pads: mass, place in link 6, own inertia; as ``taccorl.sim.robot`` states them."""
     parts = []
     for side in (1.0, -1.0):
-        finger = np.array([0.0, side * (0.01 + opening_m / 2), ROBOT.finger_from_hand_m + 0.02])
+        finger = np.array(
+            [0.0, side * (0.01 + opening_m / 2), ROBOT.finger_from_hand_m + 0.02]
+        )
         parts.append((FINGER_MASS_KG[config.inertias], finger, [2e-5, 2e-5, 5e-6]))
         if config.pads == "sprung":
-            pad = np.array([0.0, side * (ROBOT.pad_thickness_m + opening_m) / 2, ROBOT.tcp_from_hand_m])
+            pad = np.array(
+                [
+                    0.0,
+                    side * (ROBOT.pad_thickness_m + opening_m) / 2,
+                    ROBOT.tcp_from_hand_m,
+                ]
+            )
             parts.append((0.004, pad, [1.4e-6, 1.4e-6, 2e-7]))
     return parts
 
@@ -119,7 +148,9 @@ def torques(b: Bodies, q, v, a, gravity):
         inertia = b.inertia[i]
         for k in range(3):
             here[k] = inertia[k, 0] * w[0] + inertia[k, 1] * w[1] + inertia[k, 2] * w[2]
-            couple[i, k] = inertia[k, 0] * dw[0] + inertia[k, 1] * dw[1] + inertia[k, 2] * dw[2]
+            couple[i, k] = (
+                inertia[k, 0] * dw[0] + inertia[k, 1] * dw[1] + inertia[k, 2] * dw[2]
+            )
         couple[i, 0] += w[1] * here[2] - w[2] * here[1] + y * acc[2] - z * acc[1]
         couple[i, 1] += w[2] * here[0] - w[0] * here[2] + z * acc[0] - x * acc[2]
         couple[i, 2] += w[0] * here[1] - w[1] * here[0] + x * acc[1] - y * acc[0]
@@ -127,7 +158,9 @@ def torques(b: Bodies, q, v, a, gravity):
     for i in range(5, -1, -1):
         out[i] = couple[i, 2]
         if i > 0:
-            _to_parent(rot[i], b.origin[i], force[i], couple[i], force[i - 1], couple[i - 1])
+            _to_parent(
+                rot[i], b.origin[i], force[i], couple[i], force[i - 1], couple[i - 1]
+            )
     return out
 
 
@@ -159,9 +192,15 @@ def mass_matrix(b: Bodies, q):
     for i in range(5, 0, -1):
         r, p, m = rot[i], b.origin[i], mass[i]
         for k in range(3):
-            turned[k] = r[k, 0] * moment[i, 0] + r[k, 1] * moment[i, 1] + r[k, 2] * moment[i, 2]
+            turned[k] = (
+                r[k, 0] * moment[i, 0] + r[k, 1] * moment[i, 1] + r[k, 2] * moment[i, 2]
+            )
             for n in range(3):
-                half[k, n] = r[k, 0] * inertia[i, 0, n] + r[k, 1] * inertia[i, 1, n] + r[k, 2] * inertia[i, 2, n]
+                half[k, n] = (
+                    r[k, 0] * inertia[i, 0, n]
+                    + r[k, 1] * inertia[i, 1, n]
+                    + r[k, 2] * inertia[i, 2, n]
+                )
         # About the parent's origin: R I Rᵀ + (2 p·h + m p·p) 1 − (p hᵀ + h pᵀ + m p pᵀ), with h = R m c
         pp = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
         trace = 2.0 * (p[0] * turned[0] + p[1] * turned[1] + p[2] * turned[2]) + m * pp
@@ -187,7 +226,14 @@ def mass_matrix(b: Bodies, q):
         for i in range(j, -1, -1):
             out[i, j] = out[j, i] = couple[i, 2]
             if i > 0:
-                _to_parent(rot[i], b.origin[i], force[i], couple[i], force[i - 1], couple[i - 1])
+                _to_parent(
+                    rot[i],
+                    b.origin[i],
+                    force[i],
+                    couple[i],
+                    force[i - 1],
+                    couple[i - 1],
+                )
     return out
 
 

@@ -17,7 +17,15 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from taccorl.alignment.measurements.motions import CHIRP, JUDGED_ON, POSES, RATE_HZ, Motion, Room, joint_number
+from taccorl.alignment.measurements.motions import (
+    CHIRP,
+    JUDGED_ON,
+    POSES,
+    RATE_HZ,
+    Motion,
+    Room,
+    joint_number,
+)
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.controller import ControllerConfig
@@ -39,10 +47,26 @@ from taccorl.surrogate.hidden import (
     within_bounds,
 )
 from taccorl.surrogate.plant import STEP_S, Run
-from taccorl.surrogate.robot import NOISE_RAD, PAYLOAD_LINK6_M, PAYLOAD_OFF_M, Robot, free_inertia, inertia_and_weight
-from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable
+from taccorl.surrogate.robot import (
+    NOISE_RAD,
+    PAYLOAD_LINK6_M,
+    PAYLOAD_OFF_M,
+    Robot,
+    free_inertia,
+    inertia_and_weight,
+)
+from taccorl.surrogate.sampled_loop import (
+    FILTER_S,
+    PERIODS_STEPS,
+    SampledLoop,
+    draw_loop,
+    is_stable,
+)
 
-SEVERITY_FLOORS = (1.0, 30.0)  # Range from which the strength of a hidden effect is drawn [floors]
+SEVERITY_FLOORS = (
+    1.0,
+    30.0,
+)  # Range from which the strength of a hidden effect is drawn [floors]
 SEARCHES, CLOSE_ENOUGH = 6, 0.15
 """Most steps of the search for a severity, and accepted error of the result (logarithm of the ratio)."""
 OMEGA_RAD_PER_S, ZETA = (11.0, 24.0), (0.7, 1.5)
@@ -71,15 +95,21 @@ class Case:
     """Twin with which the user starts: without the hidden effects, and with wrong gains if they are unknown."""
     gains_known: bool  # True: K_p and K_d are stated in the recordings, and the drive really has them
     room: Room  # Range of motion of the joint under test
-    pose: tuple[float, ...]  # (6,) pose of the arm under test [rad], with its joint in the middle
+    pose: tuple[
+        float, ...
+    ]  # (6,) pose of the arm under test [rad], with its joint in the middle
     floor_rad: float  # Expected noise floor [rad]: from the sensor, and from disturbances through the drive
     left_floors: float = 0.0  # Error that the hidden effects cause after a refit of K_p, K_d and T_ref [floors]
     design: str = "pack"  # Motions of the fit recordings: ``chirp`` or ``pack``
-    loop: SampledLoop | None = None  # Timing of the sampled loop; None: the velocity loop is continuous
+    loop: SampledLoop | None = (
+        None  # Timing of the sampled loop; None: the velocity loop is continuous
+    )
     loop_floors: float = 0.0  # Error that the loop's sampling alone causes after a refit of the gains [floors]
     payload_kg: float = 0.0
     """Known mass that is held in every recording [kg]; a design may have further recordings with a payload."""
-    payload_m: tuple[float, float, float] = PAYLOAD_LINK6_M  # True position of held masses in link 6's frame [m]
+    payload_m: tuple[float, float, float] = (
+        PAYLOAD_LINK6_M  # True position of held masses in link 6's frame [m]
+    )
     colour_s: float = 0.0  # Time constant of the encoder's noise [s]; 0: white noise
 
     @property
@@ -94,7 +124,13 @@ class Case:
             "seed": self.seed,
             "signal": self.signal,
             "hidden": [dataclasses.asdict(h) for h in self.hidden],
-            "gains": dict(zip(("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"), self.gains, strict=True)),
+            "gains": dict(
+                zip(
+                    ("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"),
+                    self.gains,
+                    strict=True,
+                )
+            ),
             "gains_known": self.gains_known,
             "floor_rad": self.floor_rad,
             "left_floors": self.left_floors,
@@ -111,18 +147,31 @@ class Case:
     def values(self) -> dict[str, float]:
         """Name of a number, such as ``kp``, ``kd``, ``coulomb_friction.torque_nm`` → its true value. K_d is that of the drive,
         which is larger than the equivalent continuous controller's because of the loop's timing."""
-        numbers = {"kp": self.gains[0], "kd": self.robot.drive.kd, "torque_ff": self.gains[2]}
-        return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
+        numbers = {
+            "kp": self.gains[0],
+            "kd": self.robot.drive.kd,
+            "torque_ff": self.gains[2],
+        }
+        return numbers | {
+            f"{h.name}.{name}": value
+            for h in self.hidden
+            for name, value in h.values.items()
+        }
 
     def ratios(self) -> dict[str, float]:
         """Number → true value, for the numbers that angles alone identify: torques, stiffnesses, dampings, inertias and masses
         divided by K_p (``coulomb_friction.torque_nm/kp``); others unchanged."""
         own = {n: v for n, v in self.values().items() if n != "kp"}
-        return {f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v for n, v in own.items()}
+        return {
+            f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v
+            for n, v in own.items()
+        }
 
     def motion(self, motion: Motion) -> Motion:
         """``motion`` with the payload of this robot added."""
-        return dataclasses.replace(motion, payload_kg=motion.payload_kg + self.payload_kg)
+        return dataclasses.replace(
+            motion, payload_kg=motion.payload_kg + self.payload_kg
+        )
 
     @cached_property
     def robot(self) -> Robot:
@@ -131,14 +180,23 @@ class Case:
 
     def robot_with(self, changes: Sequence[Change]) -> Robot:
         """The simulated robot with these changes in place of the hidden effects."""
-        return Robot(self.signal, self.gains, changes, self.pose, loop=self.loop, payload_m=self.payload_m)
+        return Robot(
+            self.signal,
+            self.gains,
+            changes,
+            self.pose,
+            loop=self.loop,
+            payload_m=self.payload_m,
+        )
 
 
 def _is_torque(name: str) -> bool:
     """By its unit, which is in its name."""
     if name in ("kd", "torque_ff"):
         return True
-    return "per_nm" not in name and bool({"nm", "nms", "nms2", "kg", "kgm2"} & set(name.split("_")))
+    return "per_nm" not in name and bool(
+        {"nm", "nms", "nms2", "kg", "kgm2"} & set(name.split("_"))
+    )
 
 
 def draw_case(
@@ -170,21 +228,33 @@ def draw_case(
         raise TaccorlError(f"no design {design!r}; {nearest(design, JUDGED_ON)}")
     rng = np.random.default_rng([seed, zlib.crc32("+".join(effect_names).encode())])
     kinds = [kind(name) for name in effect_names]
-    possible = [j for j in range(1, ROBOT.num_joints + 1) if all(j in k.joints for k in kinds)]
+    possible = [
+        j for j in range(1, ROBOT.num_joints + 1) if all(j in k.joints for k in kinds)
+    ]
     drawn = f"{rng.choice(ROBOT.arms)}_joint{rng.choice(possible or [1])}"
     signal = drawn if signal is None else signal
     joints = [name for name in ROBOT.action_names if not name.endswith("gripper")]
     if signal not in joints:
-        raise TaccorlError(f"{signal!r} is not a joint of the arms; {nearest(signal, joints)}")
+        raise TaccorlError(
+            f"{signal!r} is not a joint of the arms; {nearest(signal, joints)}"
+        )
     joint = joint_number(signal)
-    for name in (name for name, k in zip(effect_names, kinds, strict=True) if joint not in k.joints):
+    for name in (
+        name
+        for name, k in zip(effect_names, kinds, strict=True)
+        if joint not in k.joints
+    ):
         seen_on = ", ".join(f"joint{j}" for j in kind(name).joints)
-        raise TaccorlError(f"{name} cannot be seen on {signal}; choose one of {seen_on}")
+        raise TaccorlError(
+            f"{name} cannot be seen on {signal}; choose one of {seen_on}"
+        )
     pose = list(POSES[joint - 1])
     pose[joint - 1] += rng.uniform(-0.1, 0.1)
     inertia, weight = inertia_and_weight(np.array(pose), joint)
     gains = _draw_gains(rng, joint, inertia, stiff=all(k.stiff for k in kinds))
-    dice = np.random.default_rng([seed, zlib.crc32(b"conditions")])  # apart, so that they change nothing else
+    dice = np.random.default_rng(
+        [seed, zlib.crc32(b"conditions")]
+    )  # apart, so that they change nothing else
     case = Case(
         seed=seed,
         signal=signal,
@@ -202,25 +272,45 @@ def draw_case(
     )
     case, quiet = _quiet(case)
     if sampled:
-        case, quiet = _with_sampled_loop(case, quiet, dice, geared=any(n in _GEARED for n in effect_names))
+        case, quiet = _with_sampled_loop(
+            case, quiet, dice, geared=any(n in _GEARED for n in effect_names)
+        )
     plain = case.robot
     scale = Scale(
         kp=case.gains[0],
         kd=case.gains[1],
         inertia=inertia,
-        torque=max(float(np.abs(run.effort[:, joint - 1] + plain.carried_nm(run)).max()) for run in quiet),
+        torque=max(
+            float(np.abs(run.effort[:, joint - 1] + plain.carried_nm(run)).max())
+            for run in quiet
+        ),
         speed=float(np.abs(np.diff(CHIRP.target(case.room))).max() * RATE_HZ),
         centre=case.room.middle_rad,
         sweep=case.room.sweep_rad,
-        reach=max(float(np.abs(m.target(case.room) - case.room.middle_rad).max()) for m in JUDGED_ON[design]),
+        reach=max(
+            float(np.abs(m.target(case.room) - case.room.middle_rad).max())
+            for m in JUDGED_ON[design]
+        ),
     )
     case = dataclasses.replace(case, twin=_twin(rng, joint, case.gains, gains_known))
     refit = _Refit(case, plain, quiet)
     hidden = []
     for name, k in zip(effect_names, kinds, strict=True):
-        wanted = math.exp(rng.uniform(*np.log(SEVERITY_FLOORS))) if strength is None else strength
+        wanted = (
+            math.exp(rng.uniform(*np.log(SEVERITY_FLOORS)))
+            if strength is None
+            else strength
+        )
         if name in NOT_FITTED:  # as often as it happens, whatever that leaves
-            hidden.append(_hidden(name, signal, math.exp(rng.uniform(*np.log(k.severity(scale)))), scale, {}))
+            hidden.append(
+                _hidden(
+                    name,
+                    signal,
+                    math.exp(rng.uniform(*np.log(k.severity(scale)))),
+                    scale,
+                    {},
+                )
+            )
             continue
         hidden.append(_as_strong_as(wanted, refit, name, k, scale, k.shape(rng, scale)))
     left = refit.left_floors([h.change for h in hidden])
@@ -234,23 +324,41 @@ def case_of(config: TwinConfig, signal: str, seed: int, design: str = "pack") ->
     arm, joint = signal.partition("_")[0], joint_number(signal) - 1
     own = config.controller_of(arm)
     gains = own.kp_nm_per_rad[joint], own.kd_nms_per_rad[joint], own.torque_ff_nm[joint]
-    twin = TwinConfig(controller=config.controller, arm_controllers=config.arm_controllers)
-    case = dataclasses.replace(plain, gains=gains, twin=twin, hidden=hidden_in(config, (signal, arm), REGISTERED))
+    twin = TwinConfig(
+        controller=config.controller, arm_controllers=config.arm_controllers
+    )
+    case = dataclasses.replace(
+        plain,
+        gains=gains,
+        twin=twin,
+        hidden=hidden_in(config, (signal, arm), REGISTERED),
+    )
     return _quiet(case)[0]
 
 
-def _about(middle_m: tuple[float, float, float], rng: np.random.Generator) -> tuple[float, float, float]:
-    x, y, z = (float(m + PAYLOAD_OFF_M * n) for m, n in zip(middle_m, rng.standard_normal(3), strict=True))
+def _about(
+    middle_m: tuple[float, float, float], rng: np.random.Generator
+) -> tuple[float, float, float]:
+    x, y, z = (
+        float(m + PAYLOAD_OFF_M * n)
+        for m, n in zip(middle_m, rng.standard_normal(3), strict=True)
+    )
     return x, y, z
 
 
 def _quiet(case: Case) -> tuple[Case, list[Run]]:
     """The case with its noise floor, and its undisturbed runs without what is hidden."""
     plain = case.robot
-    quiet = [plain.run(case.motion(motion), case.room) for motion in JUDGED_ON[case.design]]
-    noisy = plain.run(case.motion(CHIRP), case.room, np.random.default_rng([case.seed, 1]))
+    quiet = [
+        plain.run(case.motion(motion), case.room) for motion in JUDGED_ON[case.design]
+    ]
+    noisy = plain.run(
+        case.motion(CHIRP), case.room, np.random.default_rng([case.seed, 1])
+    )
     moved = (plain.reported(noisy) - plain.reported(quiet[0]))[:, plain.joint]
-    return dataclasses.replace(case, floor_rad=math.hypot(NOISE_RAD, float(np.sqrt(np.mean(moved**2))))), quiet
+    return dataclasses.replace(
+        case, floor_rad=math.hypot(NOISE_RAD, float(np.sqrt(np.mean(moved**2))))
+    ), quiet
 
 
 def _with_sampled_loop(
@@ -262,7 +370,11 @@ def _with_sampled_loop(
     as_drawn = case, quiet
     joint = joint_number(case.signal)
     inertia, _ = inertia_and_weight(np.array(case.pose), joint)
-    inertias = [inertia, free_inertia(np.array(case.pose), joint), *([RobotConfig().armature_kgm2] if geared else [])]
+    inertias = [
+        inertia,
+        free_inertia(np.array(case.pose), joint),
+        *([RobotConfig().armature_kgm2] if geared else []),
+    ]
     for _ in range(GAIN_DRAWS):
         refit, most_late_s = _Refit(case, case.robot, quiet), SLOWEST_S
         for _ in range(LOOP_DRAWS):
@@ -274,26 +386,40 @@ def _with_sampled_loop(
             left = refit.left_of(sampled.robot)
             if left <= LOOP_FLOORS:
                 return _quiet(dataclasses.replace(sampled, loop_floors=left))
-        case, quiet = _quiet(dataclasses.replace(case, gains=_draw_gains(rng, joint, inertia, stiff=False)))
+        case, quiet = _quiet(
+            dataclasses.replace(
+                case, gains=_draw_gains(rng, joint, inertia, stiff=False)
+            )
+        )
     if geared:
         return as_drawn
     of = f"{case.signal}, seed {case.seed}"
-    raise TaccorlError(f"no sampled loop of {of}, is stable and has little effect; choose another seed")
+    raise TaccorlError(
+        f"no sampled loop of {of}, is stable and has little effect; choose another seed"
+    )
 
 
-def _draw_gains(rng: np.random.Generator, joint: int, inertia: float, *, stiff: bool) -> tuple[float, float, float]:
+def _draw_gains(
+    rng: np.random.Generator, joint: int, inertia: float, *, stiff: bool
+) -> tuple[float, float, float]:
     """From a soft drive to, one time in four, something between that and the paper's."""
     omega, zeta = rng.uniform(*OMEGA_RAD_PER_S), rng.uniform(*ZETA)
     share = rng.uniform(0.0, 1.0) * (rng.random() < 0.25) * stiff
     kp = (inertia * omega**2) ** (1 - share) * ROBOT.kp_nm_per_rad[joint - 1] ** share
-    kd = (2 * zeta * omega * inertia) ** (1 - share) * ROBOT.kd_nms_per_rad[joint - 1] ** share
+    kd = (2 * zeta * omega * inertia) ** (1 - share) * ROBOT.kd_nms_per_rad[
+        joint - 1
+    ] ** share
     return float(kp), float(kd), float(kp * rng.uniform(-0.02, 0.02))
 
 
-def _twin(rng: np.random.Generator, joint: int, gains: tuple[float, float, float], known: bool) -> TwinConfig:
+def _twin(
+    rng: np.random.Generator, joint: int, gains: tuple[float, float, float], known: bool
+) -> TwinConfig:
     """The paper's gains on the other joints, which are right; wrong ones on this."""
     control = ControllerConfig()
-    wrong = np.exp(rng.uniform(-math.log(2), math.log(2), 2)) if not known else np.ones(2)
+    wrong = (
+        np.exp(rng.uniform(-math.log(2), math.log(2), 2)) if not known else np.ones(2)
+    )
     control.kp_nm_per_rad[joint - 1] = gains[0] * float(wrong[0])
     control.kd_nms_per_rad[joint - 1] = gains[1] * float(wrong[1])
     control.torque_ff_nm[joint - 1] = 0.0
@@ -309,10 +435,14 @@ class _Refit:
     def __init__(self, case: Case, plain: Robot, quiet: Sequence[Run]) -> None:
         self.case, self.motions = case, [case.motion(m) for m in JUDGED_ON[case.design]]
         pose, joint = np.array(case.pose), plain.joint + 1
-        self._inertias = [inertia_and_weight(pose, joint, m.payload_kg)[0] for m in self.motions]
+        self._inertias = [
+            inertia_and_weight(pose, joint, m.payload_kg)[0] for m in self.motions
+        ]
         self._plain = self._reports(plain, quiet)
         self._linear = self._swung(0.0, 0.0)
-        self._softness = np.concatenate([np.full(len(m.target(case.room)), 1 / m.gain) for m in self.motions])
+        self._softness = np.concatenate(
+            [np.full(len(m.target(case.room)), 1 / m.gain) for m in self.motions]
+        )
 
     def _reports(self, robot: Robot, runs: Sequence[Run]) -> np.ndarray:
         """Reports of the joint under test, motion after motion."""
@@ -323,10 +453,18 @@ class _Refit:
         kp, kd, _ = self.case.gains
         out = []
         for motion, inertia in zip(self.motions, self._inertias, strict=True):
-            stiffness, damping = (f * motion.gain / inertia for f in (kp * math.exp(log_kp), kd * math.exp(log_kd)))
-            discrete: Any = cont2discrete(([stiffness], [1.0, damping, stiffness]), 1 / RATE_HZ)
+            stiffness, damping = (
+                f * motion.gain / inertia
+                for f in (kp * math.exp(log_kp), kd * math.exp(log_kd))
+            )
+            discrete: Any = cont2discrete(
+                ([stiffness], [1.0, damping, stiffness]), 1 / RATE_HZ
+            )
             target = motion.target(self.case.room)
-            out.append(target[0] + lfilter(np.ravel(discrete[0]), discrete[1], target - target[0]))
+            out.append(
+                target[0]
+                + lfilter(np.ravel(discrete[0]), discrete[1], target - target[0])
+            )
         return np.concatenate(out)
 
     def left_floors(self, changes: Sequence[Change]) -> float:
@@ -335,47 +473,80 @@ class _Refit:
 
     def left_of(self, robot: Robot) -> float:
         """The same of a robot in the place of this case's; a loop that runs away leaves more than anything."""
-        error = self._reports(robot, [robot.run(m, self.case.room) for m in self.motions]) - self._plain
+        error = (
+            self._reports(robot, [robot.run(m, self.case.room) for m in self.motions])
+            - self._plain
+        )
         scale = self.case.floor_rad * math.sqrt(len(error))
         if not np.abs(error).max() < _RUNAWAY_RAD:  # nor is NaN
             return math.inf
 
         def rest(x: np.ndarray) -> np.ndarray:
             log_kp, log_kd = (0.0, 0.0) if self.case.gains_known else x[1:]
-            return (error - x[0] * self._softness - (self._swung(log_kp, log_kd) - self._linear)) / scale
+            return (
+                error
+                - x[0] * self._softness
+                - (self._swung(log_kp, log_kd) - self._linear)
+            ) / scale
 
         start = np.zeros(1 if self.case.gains_known else 3)
-        found = least_squares(rest, start, x_scale=np.array([0.01, 0.1, 0.1])[: len(start)], max_nfev=20)
+        found = least_squares(
+            rest, start, x_scale=np.array([0.01, 0.1, 0.1])[: len(start)], max_nfev=20
+        )
         return math.sqrt(2 * found.cost)
 
 
-def _hidden(name: str, signal: str, severity: float, scale: Scale, shape: Values) -> Hidden:
+def _hidden(
+    name: str, signal: str, severity: float, scale: Scale, shape: Values
+) -> Hidden:
     """The effect of this severity and shape at ``signal``, within the bounds of the registry."""
     k, where = kind(name), selectors(name, signal)
     values = within_bounds(name, k.values(severity, scale, shape))
-    return Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where)
+    return Hidden(
+        name=name,
+        values=values,
+        severity=severity,
+        registered=k.registered,
+        selectors=where,
+    )
 
 
-def _as_strong_as(wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale, shape: Values) -> Hidden:
+def _as_strong_as(
+    wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale, shape: Values
+) -> Hidden:
     """The effect at the severity, of those that a robot could have, that leaves ``wanted`` floors, or is nearest to it."""
 
     def of(severity: float) -> Hidden:
         return _hidden(name, refit.case.signal, severity, scale, shape)
 
-    return of(find_severity(wanted, k.severity(scale), lambda severity: refit.left_floors([of(severity).change])))
+    return of(
+        find_severity(
+            wanted,
+            k.severity(scale),
+            lambda severity: refit.left_floors([of(severity).change]),
+        )
+    )
 
 
-def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[float], float]) -> float:
+def find_severity(
+    wanted: float, ends: tuple[float, float], left: Callable[[float], float]
+) -> float:
     """Severity within ``ends`` (low, high) at which the error is ``wanted`` [floors], or nearest to it, to 15 %. ``left``:
     function from severity to error [floors], which must increase."""
     low, high = np.log(ends)
-    found: list[tuple[float, float]] = []  # log severity, log of what is left over what is wanted
+    found: list[
+        tuple[float, float]
+    ] = []  # log severity, log of what is left over what is wanted
     at = 0.5 * (low + high)
     for _ in range(SEARCHES):
         found.append((at, math.log(min(max(left(math.exp(at)), 1e-6), 1e6) / wanted)))
         below = max((f for f in found if f[1] < 0), default=None)
         above = min((f for f in found if f[1] >= 0), default=None)
-        if abs(found[-1][1]) < CLOSE_ENOUGH or (below is None and at <= low) or (above is None and at >= high):
+        if (
+            abs(found[-1][1]) < CLOSE_ENOUGH
+            or (below is None and at <= low)
+            or (above is None and at >= high)
+        ):
             break
         if below and above and below[0] < above[0]:
             at = below[0] - below[1] * (above[0] - below[0]) / (above[1] - below[1])
@@ -396,5 +567,9 @@ def draw_secret(seed: int) -> tuple[str, ...]:
     drawn = [str(name) for name in rng.permutation(REGISTERED)]
     if fate < 0.75:
         return (drawn[0],)
-    fitting = (name for name in drawn[1:] if set(KINDS[name].joints) & set(KINDS[drawn[0]].joints))
+    fitting = (
+        name
+        for name in drawn[1:]
+        if set(KINDS[name].joints) & set(KINDS[drawn[0]].joints)
+    )
     return drawn[0], next(fitting)

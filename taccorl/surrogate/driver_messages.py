@@ -8,7 +8,9 @@ from typing import Any
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
-from mcap_ros2._dynamic import serialize_dynamic  # its public Writer cannot mix encodings in one file
+from mcap_ros2._dynamic import (
+    serialize_dynamic,
+)  # its public Writer cannot mix encodings in one file
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -45,16 +47,21 @@ _TRANSFORM = {
 }
 ROS2_DEFINITIONS = {
     JOINT_STATE: _definition(
-        "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort", _HEADER
+        "std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort",
+        _HEADER,
     ),
-    COMPRESSED_IMAGE: _definition("std_msgs/Header header, string format, uint8[] data", _HEADER),
+    COMPRESSED_IMAGE: _definition(
+        "std_msgs/Header header, string format, uint8[] data", _HEADER
+    ),
     UINT8_ARRAY: _definition("std_msgs/MultiArrayLayout layout, uint8[] data", _LAYOUT),
     STRING: "string data",
     ARM_STATUS: _definition(
         "uint8 ctrl_mode, uint8 arm_status, uint8 mode_feedback, uint8 teach_status, uint8 motion_status, "
         "uint8 trajectory_num, int64 err_code"
     ),
-    TF: _definition("geometry_msgs/TransformStamped[] transforms", _TRANSFORM | _HEADER),
+    TF: _definition(
+        "geometry_msgs/TransformStamped[] transforms", _TRANSFORM | _HEADER
+    ),
     # rosbag2 stores the three parts of a service type like this; no .msg parser accepts the separators
     SERVICE_EVENT: "bool enable_request\n---\nbool enable_response\n---\n",
 }
@@ -71,19 +78,30 @@ class MessageWriter:
         self._channels: dict[str, tuple[int, Callable[[Message], bytes]]] = {}
         self._types = functools.cache(self._register)
 
-    def write(self, topic: str, ros_type: str, message: Message | bytes, log_ns: int) -> None:
+    def write(
+        self, topic: str, ros_type: str, message: Message | bytes, log_ns: int
+    ) -> None:
         """Write one message; a message given as bytes is written unchanged. ``ros_type``: name of the ROS type, such as
         ``JOINT_STATE``. ``log_ns``: log time [ns]."""
         if topic not in self._channels:
             schema_id, encode = self._types(ros_type)
-            self._channels[topic] = self.writer.register_channel(topic, MessageEncoding.CDR, schema_id), encode
+            self._channels[topic] = (
+                self.writer.register_channel(topic, MessageEncoding.CDR, schema_id),
+                encode,
+            )
         channel_id, encode = self._channels[topic]
         self._counts[topic] += 1
         data = message if isinstance(message, bytes) else encode(message)
-        self.writer.add_message(channel_id, log_ns, data, publish_time=log_ns, sequence=self._counts[topic])
+        self.writer.add_message(
+            channel_id, log_ns, data, publish_time=log_ns, sequence=self._counts[topic]
+        )
 
     def _register(self, ros_type: str) -> tuple[int, Callable[[Message], bytes]]:
         """Write the schema of a type; returns its id and the encoder of its messages."""
         text = ROS2_DEFINITIONS[ros_type]
-        schema_id = self.writer.register_schema(ros_type, SchemaEncoding.ROS2, text.encode())
-        return schema_id, bytes if ros_type == SERVICE_EVENT else serialize_dynamic(ros_type, text)[ros_type]
+        schema_id = self.writer.register_schema(
+            ros_type, SchemaEncoding.ROS2, text.encode()
+        )
+        return schema_id, bytes if ros_type == SERVICE_EVENT else serialize_dynamic(
+            ros_type, text
+        )[ros_type]

@@ -29,7 +29,9 @@ class Scale:
     kp: float  # K_p [N·m/rad]
     kd: float  # K_d [N·m·s/rad]
     inertia: float  # Inertia, rotor included [kg·m²]
-    torque: float  # Largest torque of the drive in the recordings, weight included [N·m]
+    torque: (
+        float  # Largest torque of the drive in the recordings, weight included [N·m]
+    )
     speed: float  # Highest speed of the chirp's target [rad/s]
     centre: float  # Angle about which the joint is moved [rad]
     sweep: float = 0.35  # Amplitude of the chirp [rad]
@@ -45,7 +47,9 @@ class Kind:
     severity."""
     values: Callable[[float, Scale, Values], Values]
     """Function (severity, scale, shape) → parameters, with the registry's names if it has the effect."""
-    plant: Callable[[Values], Change]  # Function from these parameters to the change of the plant
+    plant: Callable[
+        [Values], Change
+    ]  # Function from these parameters to the change of the plant
     shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
     """Function that draws parameters which determine the effect's form, not its strength."""
     joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
@@ -55,7 +59,9 @@ class Kind:
     near: tuple[str, ...] = ()
     """For kinds outside the registry: effects of the registry with nearly the same consequences, which a diagnosis may name
     instead."""
-    whole_arm: bool = False  # True: the effect acts on every joint of the arm under test
+    whole_arm: bool = (
+        False  # True: the effect acts on every joint of the arm under test
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +84,9 @@ class Hidden:
     def effect(self) -> Effect:
         """The hidden effect as an effect of the registry. Raises TaccorlError: it lies outside the registry."""
         if not self.registered:
-            raise TaccorlError(f"{self.name} is not in the registry of effects, so that it cannot be made")
+            raise TaccorlError(
+                f"{self.name} is not in the registry of effects, so that it cannot be made"
+            )
         return make_effect(self.name, **self.selectors, **self.values)
 
 
@@ -98,18 +106,36 @@ def selectors(name: str, signal: str) -> dict[str, Any]:
     return {"arm": arm} if KINDS[name].whole_arm else {"arm": arm, "joints": [joint]}
 
 
-def hidden_in(config: TwinConfig, places: Sequence[str], known: Sequence[str]) -> tuple[Hidden, ...]:
+def hidden_in(
+    config: TwinConfig, places: Sequence[str], known: Sequence[str]
+) -> tuple[Hidden, ...]:
     """Effects of a twin at these joints, arms or pads, to be hidden in a surrogate with their parameters. ``known``: names that
     can be. Raises TaccorlError: another effect acts there, or the arm's bodies are not the nominal ones."""
     if config.robot != RobotConfig():
-        raise TaccorlError("robot: a surrogate has the nominal arm; hide effects instead, such as payload or armature")
+        raise TaccorlError(
+            "robot: a surrogate has the nominal arm; hide effects instead, such as payload or armature"
+        )
     found = []
     for effect in (e for e in config.effects if {*places} & {*e.acts_on()}):
         if effect.name not in known:
-            raise TaccorlError(f"{effect.name} of {places[0]}: no surrogate has it; {nearest(effect.name, known)}")
+            raise TaccorlError(
+                f"{effect.name} of {places[0]}: no surrogate has it; {nearest(effect.name, known)}"
+            )
         values = {p.name: float(getattr(effect, p.name)) for p in effect.parameters()}
-        at = {key: getattr(effect, key) for key in ("arm", "joints", "pads") if hasattr(effect, key)}
-        found.append(Hidden(name=effect.name, values=values, severity=0.0, registered=True, selectors=at))
+        at = {
+            key: getattr(effect, key)
+            for key in ("arm", "joints", "pads")
+            if hasattr(effect, key)
+        }
+        found.append(
+            Hidden(
+                name=effect.name,
+                values=values,
+                severity=0.0,
+                registered=True,
+                selectors=at,
+            )
+        )
     return tuple(found)
 
 
@@ -118,19 +144,30 @@ def within_bounds(name: str, values: Values) -> Values:
     if name not in effects:
         return values
     known = {p.name: p for p in effects.get(name).parameters()}
-    return {key: min(max(value, known[key].low), known[key].high) for key, value in values.items()}
+    return {
+        key: min(max(value, known[key].low), known[key].high)
+        for key, value in values.items()
+    }
 
 
 def _range(low: float, high: float) -> Callable[[Scale], tuple[float, float]]:
     return lambda scale: (low, high)
 
 
-def _uniform(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Scale], Values]:
-    return lambda rng, scale: {name: float(rng.uniform(*ends)) for name, ends in ranges.items()}
+def _uniform(
+    **ranges: tuple[float, float],
+) -> Callable[[np.random.Generator, Scale], Values]:
+    return lambda rng, scale: {
+        name: float(rng.uniform(*ends)) for name, ends in ranges.items()
+    }
 
 
-def _signed(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Scale], Values]:
-    return lambda rng, scale: {"sign": float(rng.choice([-1.0, 1.0]))} | _uniform(**ranges)(rng, scale)
+def _signed(
+    **ranges: tuple[float, float],
+) -> Callable[[np.random.Generator, Scale], Values]:
+    return lambda rng, scale: (
+        {"sign": float(rng.choice([-1.0, 1.0]))} | _uniform(**ranges)(rng, scale)
+    )
 
 
 _SLIP = _range(2e-4, 0.1)  # rad by which a torque turns the joint against its K_p
@@ -139,7 +176,10 @@ _KP = attrgetter("kp")
 
 
 def _wave(least: int, most: int) -> Callable[[np.random.Generator, Scale], Values]:
-    return lambda rng, scale: {"periods": float(rng.integers(least, most + 1))} | _uniform(phase_rad=_PHASE)(rng, scale)
+    return lambda rng, scale: (
+        {"periods": float(rng.integers(least, most + 1))}
+        | _uniform(phase_rad=_PHASE)(rng, scale)
+    )
 
 
 def _drive(**fields: float) -> Change:
@@ -163,7 +203,14 @@ def _kind(
     )
 
 
-def _either_way(parameter: str, field: str, low: float, high: float, absent: float = 0.0, **rest: Any) -> Kind:
+def _either_way(
+    parameter: str,
+    field: str,
+    low: float,
+    high: float,
+    absent: float = 0.0,
+    **rest: Any,
+) -> Kind:
     """The kind with one parameter, which lies above or below its absent value by its severity."""
     return Kind(
         severity=_range(low, high),
@@ -176,20 +223,36 @@ def _either_way(parameter: str, field: str, low: float, high: float, absent: flo
 
 _OUTSIDE: dict[str, Any] = {"registered": False}
 _SOFT_OUTSIDE: dict[str, Any] = {"registered": False, "stiff": False}
-_WAVE = {"amplitude_rad": "encoder_wave", "periods": "encoder_waves", "phase_rad": "encoder_phase"}
+_WAVE = {
+    "amplitude_rad": "encoder_wave",
+    "periods": "encoder_waves",
+    "phase_rad": "encoder_phase",
+}
 
 KINDS: dict[str, Kind] = {
     # friction
-    "viscous_friction": _kind({"damping_nms_per_rad": "viscous"}, _range(0.02, 1.0), lambda c: c.kd),
+    "viscous_friction": _kind(
+        {"damping_nms_per_rad": "viscous"}, _range(0.02, 1.0), lambda c: c.kd
+    ),
     "coulomb_friction": Kind(
         severity=_SLIP,
         values=lambda s, c, shape: {"torque_nm": s * c.kp},
-        plant=lambda v: _drive(coulomb=v["torque_nm"], **({"presliding": x} if (x := v.get("presliding_rad")) else {})),
+        plant=lambda v: _drive(
+            coulomb=v["torque_nm"],
+            **({"presliding": x} if (x := v.get("presliding_rad")) else {}),
+        ),
     ),
     "stribeck_friction": Kind(
         severity=_SLIP,
-        shape=_uniform(stiction_share=(1.0, 3.0), stribeck_rad_per_s=(0.05, 0.25), presliding_rad=(2e-4, 1e-3)),
-        values=lambda s, c, shape: {"torque_nm": s * c.kp / (1.0 + shape["stiction_share"]), **shape},
+        shape=_uniform(
+            stiction_share=(1.0, 3.0),
+            stribeck_rad_per_s=(0.05, 0.25),
+            presliding_rad=(2e-4, 1e-3),
+        ),
+        values=lambda s, c, shape: {
+            "torque_nm": s * c.kp / (1.0 + shape["stiction_share"]),
+            **shape,
+        },
         plant=lambda v: _drive(
             coulomb=v["torque_nm"],
             stribeck=v["torque_nm"] * v["stiction_share"],
@@ -200,11 +263,16 @@ KINDS: dict[str, Kind] = {
     "asymmetric_friction": Kind(
         severity=_SLIP,
         shape=_signed(asymmetry=(0.3, 0.7)),
-        values=lambda s, c, shape: {"torque_nm": s * c.kp, "asymmetry": shape["sign"] * shape["asymmetry"]},
+        values=lambda s, c, shape: {
+            "torque_nm": s * c.kp,
+            "asymmetry": shape["sign"] * shape["asymmetry"],
+        },
         plant=lambda v: _drive(coulomb=v["torque_nm"], asymmetry=v["asymmetry"]),
     ),
     "load_friction": _kind({"share": "load_share"}, _range(0.005, 0.5)),
-    "quadratic_drag": _kind({"drag_nms2_per_rad2": "quadratic"}, _range(0.01, 1.0), lambda c: c.kd / c.speed),
+    "quadratic_drag": _kind(
+        {"drag_nms2_per_rad2": "quadratic"}, _range(0.01, 1.0), lambda c: c.kd / c.speed
+    ),
     "position_dependent_friction": Kind(
         severity=_SLIP,
         shape=_uniform(place=(-0.6, 0.6), width_rad=(0.05, 0.3)),
@@ -213,19 +281,31 @@ KINDS: dict[str, Kind] = {
             "angle_rad": c.centre + shape["place"] * c.sweep,
             "width_rad": shape["width_rad"],
         },
-        plant=lambda v: _drive(spot=v["torque_nm"], spot_angle=v["angle_rad"], spot_width=v["width_rad"]),
+        plant=lambda v: _drive(
+            spot=v["torque_nm"], spot_angle=v["angle_rad"], spot_width=v["width_rad"]
+        ),
     ),
     # bodies and torques that hang on the angle
     "end_stop": Kind(
-        severity=lambda c: (0.02, 1.0 - 0.5 * c.sweep / c.reach),  # test motions start 0.4 of the sweep from the middle
+        severity=lambda c: (
+            0.02,
+            1.0 - 0.5 * c.sweep / c.reach,
+        ),  # test motions start 0.4 of the sweep from the middle
         shape=_signed(stiffness=(3.0, 30.0)),
         values=lambda s, c, shape: {
             "angle_rad": c.centre + shape["sign"] * (1.0 - s) * c.reach,
             "stiffness_nm_per_rad": shape["stiffness"] * c.kp,
         },
-        plant=lambda v: _drive(stop=v["stiffness_nm_per_rad"], stop_angle=v["angle_rad"]),
+        plant=lambda v: _drive(
+            stop=v["stiffness_nm_per_rad"], stop_angle=v["angle_rad"]
+        ),
     ),
-    "armature": _kind({"added_kgm2": "motor_inertia"}, _range(0.02, 3.0), lambda c: c.inertia, stiff=False),
+    "armature": _kind(
+        {"added_kgm2": "motor_inertia"},
+        _range(0.02, 3.0),
+        lambda c: c.inertia,
+        stiff=False,
+    ),
     "gravity_mismatch": Kind(
         severity=_range(0.005, 1.0),
         shape=_signed(),
@@ -249,10 +329,16 @@ KINDS: dict[str, Kind] = {
             "stiffness_nm_per_rad": s * c.kp,
             "rest_rad": c.centre + shape["sign"] * shape["off"],
         },
-        plant=lambda v: _drive(spring=v["stiffness_nm_per_rad"], spring_rest=v["rest_rad"]),
+        plant=lambda v: _drive(
+            spring=v["stiffness_nm_per_rad"], spring_rest=v["rest_rad"]
+        ),
     ),
     "cogging": _kind(
-        {"torque_nm": "cogging", "periods": "cogging_periods", "phase_rad": "cogging_phase"},
+        {
+            "torque_nm": "cogging",
+            "periods": "cogging_periods",
+            "phase_rad": "cogging_phase",
+        },
         _SLIP,
         _KP,
         shape=_wave(8, 32),
@@ -275,9 +361,15 @@ KINDS: dict[str, Kind] = {
     "error_deadband": _kind({"width_rad": "deadband"}, _range(2e-4, 0.05)),
     "integral_action": _kind({"rate_per_s": "integral"}, _range(0.02, 5.0)),
     # From K_d / K_p on it would oscillate.
-    "torque_lag": _kind({"time_constant_s": "torque_lag"}, lambda c: (2e-4, 0.5 * c.kd / c.kp), stiff=False),
+    "torque_lag": _kind(
+        {"time_constant_s": "torque_lag"},
+        lambda c: (2e-4, 0.5 * c.kd / c.kp),
+        stiff=False,
+    ),
     # Without weight it is a factor of all gains.
-    "torque_scale": _either_way("factor", "torque_scale", 0.02, 0.5, absent=1.0, joints=(2, 3, 5)),
+    "torque_scale": _either_way(
+        "factor", "torque_scale", 0.02, 0.5, absent=1.0, joints=(2, 3, 5)
+    ),
     "torque_saturation": Kind(
         severity=_range(0.02, 0.7),
         values=lambda s, c, shape: {"torque_max_nm": (1.0 - s) * c.torque},
@@ -287,7 +379,10 @@ KINDS: dict[str, Kind] = {
     "torque_speed_limit": Kind(
         severity=_range(0.3, 1.6),
         shape=_uniform(stall=(1.0, 1.5)),
-        values=lambda s, c, shape: {"stall_nm": shape["stall"] * c.torque, "no_load_rad_per_s": c.speed / s},
+        values=lambda s, c, shape: {
+            "stall_nm": shape["stall"] * c.torque,
+            "no_load_rad_per_s": c.speed / s,
+        },
         plant=lambda v: _drive(stall=v["stall_nm"], no_load=v["no_load_rad_per_s"]),
         stiff=False,
     ),
@@ -298,12 +393,16 @@ KINDS: dict[str, Kind] = {
     ),
     # the gear
     # Behind it there must be more than the rotor.
-    "backlash": _kind({"play_rad": "play"}, _range(3e-4, 0.03), joints=(1, 2, 3), stiff=False),
+    "backlash": _kind(
+        {"play_rad": "play"}, _range(3e-4, 0.03), joints=(1, 2, 3), stiff=False
+    ),
     "joint_compliance": Kind(
         severity=_range(0.005, 2.0),
         shape=_uniform(damping_s=(0.001, 0.004)),
         values=lambda s, c, shape: {"compliance_rad_per_nm": s / c.kp, **shape},
-        plant=lambda v: _drive(compliance=v["compliance_rad_per_nm"], compliance_damping=v["damping_s"]),
+        plant=lambda v: _drive(
+            compliance=v["compliance_rad_per_nm"], compliance_damping=v["damping_s"]
+        ),
         joints=(1, 2, 3),
         stiff=False,
     ),
@@ -314,7 +413,11 @@ KINDS: dict[str, Kind] = {
         severity=_range(5e-4, 0.05),
         shape=_uniform(phase_rad=_PHASE),
         values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=lambda v: _drive(encoder_wave=v["amplitude_rad"], encoder_waves=1.0, encoder_phase=v["phase_rad"]),
+        plant=lambda v: _drive(
+            encoder_wave=v["amplitude_rad"],
+            encoder_waves=1.0,
+            encoder_phase=v["phase_rad"],
+        ),
     ),
     "sensor_delay": Kind(
         severity=_range(5e-4, 0.1),
@@ -323,7 +426,10 @@ KINDS: dict[str, Kind] = {
     ),
     # outside the registry
     "loop_delay": _kind(  # from about J / K_d on it would oscillate
-        {"delay_s": "loop_delay"}, lambda c: (1e-4, 0.5 * c.inertia / c.kd), near=("torque_lag",), **_SOFT_OUTSIDE
+        {"delay_s": "loop_delay"},
+        lambda c: (1e-4, 0.5 * c.inertia / c.kd),
+        near=("torque_lag",),
+        **_SOFT_OUTSIDE,
     ),
     "angle_friction": _kind(
         {"torque_nm": "coulomb", "share": "angle_share", "phase_rad": "angle_phase"},
@@ -334,14 +440,21 @@ KINDS: dict[str, Kind] = {
         **_OUTSIDE,
     ),
     "gear_error": _kind(
-        _WAVE, _range(5e-4, 0.05), shape=_wave(5, 11), near=("encoder_eccentricity", "cogging"), **_OUTSIDE
+        _WAVE,
+        _range(5e-4, 0.05),
+        shape=_wave(5, 11),
+        near=("encoder_eccentricity", "cogging"),
+        **_OUTSIDE,
     ),
     "magnetic_hysteresis": _kind(
         {"torque_nm": "hysteresis", "width_rad": "hysteresis_width"},
         _SLIP,
         _KP,
         shape=_uniform(width_rad=(0.04, 0.2)),
-        near=("coulomb_friction", "stribeck_friction"),  # which slide only after some travel, too
+        near=(
+            "coulomb_friction",
+            "stribeck_friction",
+        ),  # which slide only after some travel, too
         **_OUTSIDE,
     ),
     "warming_friction": _kind(
@@ -356,7 +469,10 @@ KINDS: dict[str, Kind] = {
         severity=lambda c: (1e-3, 2.0 * c.inertia / c.kd),
         values=lambda s, c, shape: {"time_constant_s": s},
         plant=lambda v: _drive(loop_steps=8, velocity_filter=v["time_constant_s"]),
-        near=("torque_lag", "armature"),  # at low frequencies it is an inertia of −K_d τ
+        near=(
+            "torque_lag",
+            "armature",
+        ),  # at low frequencies it is an inertia of −K_d τ
         **_SOFT_OUTSIDE,
     ),
     "hung_mass": Kind(  # a tool or cable that swings on the link
@@ -364,7 +480,9 @@ KINDS: dict[str, Kind] = {
         shape=_uniform(hz=(3.0, 9.0), damping=(0.02, 0.1)),
         values=lambda s, c, shape: {"inertia_kgm2": s * c.inertia, **shape},
         plant=lambda v: _drive(
-            hung_inertia=v["inertia_kgm2"], hung_rad_per_s=2 * math.pi * v["hz"], hung_damping=v["damping"]
+            hung_inertia=v["inertia_kgm2"],
+            hung_rad_per_s=2 * math.pi * v["hz"],
+            hung_damping=v["damping"],
         ),
         near=("armature", "payload", "joint_compliance"),
         **_SOFT_OUTSIDE,
@@ -378,14 +496,24 @@ KINDS: dict[str, Kind] = {
         **_SOFT_OUTSIDE,
     ),
     "encoder_interpolation": _kind(  # between the lines of its disc
-        _WAVE, _range(1e-4, 5e-3), shape=_wave(40, 120), near=("encoder_eccentricity", "cogging"), **_OUTSIDE
+        _WAVE,
+        _range(1e-4, 5e-3),
+        shape=_wave(40, 120),
+        near=("encoder_eccentricity", "cogging"),
+        **_OUTSIDE,
     ),
-    "one_way_gains": _either_way("share", "one_way", 0.01, 0.5, near=("asymmetric_friction",), **_SOFT_OUTSIDE),
+    "one_way_gains": _either_way(
+        "share", "one_way", 0.01, 0.5, near=("asymmetric_friction",), **_SOFT_OUTSIDE
+    ),
 }
 """Name → kind of hidden effect."""
 NOT_FITTED = ("dropped_commands",)
 """Effects that differ between recordings of one motion: no fit can find them, but the checks of recordings can."""
-REGISTERED = tuple(name for name, k in KINDS.items() if k.registered and name not in NOT_FITTED)
+REGISTERED = tuple(
+    name for name, k in KINDS.items() if k.registered and name not in NOT_FITTED
+)
 """Names of the kinds that a search can find."""
-OUTSIDE = tuple(name for name, k in KINDS.items() if not k.registered and name not in NOT_FITTED)
+OUTSIDE = tuple(
+    name for name, k in KINDS.items() if not k.registered and name not in NOT_FITTED
+)
 """Names of the kinds outside the registry."""

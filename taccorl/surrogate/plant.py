@@ -24,7 +24,15 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from taccorl.surrogate.arm import GRAVITY, NUM_JOINTS, Bodies, factor, mass_matrix, solve, torques
+from taccorl.surrogate.arm import (
+    GRAVITY,
+    NUM_JOINTS,
+    Bodies,
+    factor,
+    mass_matrix,
+    solve,
+    torques,
+)
 
 SUBSTEPS = 8  # Number of integration steps per millisecond
 STEP_S = 1e-3 / SUBSTEPS  # Integration step [s]
@@ -45,7 +53,9 @@ class Drive(NamedTuple):
     asymmetry: float = 0.0  # a in the factor 1 ± a on the dry friction, + upwards
     stribeck: float = 0.0  # Torque that stiction adds to ``coulomb`` [N·m]
     stribeck_speed: float = 0.05  # Speed at which stiction has fallen to 1/e [rad/s]
-    presliding: float = 3e-5  # Deflection of the bristles at the break-away torque [rad]
+    presliding: float = (
+        3e-5  # Deflection of the bristles at the break-away torque [rad]
+    )
     load_share: float = 0.0  # Dry friction per torque through the joint
     angle_share: float = 0.0
     """Relative variation of the friction torque with the angle, with two periods per turn (not in the registry)."""
@@ -62,10 +72,16 @@ class Drive(NamedTuple):
     spring: float = 0.0  # Stiffness of a spring at the joint [N·m/rad]
     spring_rest: float = 0.0  # Angle at which that spring is relaxed [rad]
     hysteresis: float = 0.0  # Largest torque of a magnetic hysteresis (Bouc–Wen) [N·m] (not in the registry)
-    hysteresis_width: float = 0.05  # Travel after which the hysteresis torque is reached [rad]
+    hysteresis_width: float = (
+        0.05  # Travel after which the hysteresis torque is reached [rad]
+    )
     hung_inertia: float = 0.0  # Inertia that is coupled to the link by a spring [kg·m²] (not in the registry)
-    hung_rad_per_s: float = 30.0  # Natural frequency of the inertia ``hung_inertia`` on its spring [rad/s]
-    hung_damping: float = 0.05  # Damping ratio of the inertia ``hung_inertia`` on its spring
+    hung_rad_per_s: float = (
+        30.0  # Natural frequency of the inertia ``hung_inertia`` on its spring [rad/s]
+    )
+    hung_damping: float = (
+        0.05  # Damping ratio of the inertia ``hung_inertia`` on its spring
+    )
     # setpoint
     delay: float = 0.0  # Delay of commands [s]
     lag: float = 0.0  # Time constant of a low-pass on commands [s]
@@ -76,9 +92,13 @@ class Drive(NamedTuple):
     integral: float = 0.0  # r in K_p r ∫ e dt [1/s]
     loop_steps: int = 0
     """Number of integration steps between two samples of a sampled loop; 0: the velocity loop is continuous."""
-    velocity_filter: float = 0.0  # Time constant of the low-pass of the velocity in a sampled loop [s]
+    velocity_filter: float = (
+        0.0  # Time constant of the low-pass of the velocity in a sampled loop [s]
+    )
     loop_delay: float = 0.0  # Delay from the encoder to the torque, for position and velocity [s] (not in the registry)
-    torque_lag: float = 0.0  # Time constant with which the motor's torque follows the controller's [s]
+    torque_lag: float = (
+        0.0  # Time constant with which the motor's torque follows the controller's [s]
+    )
     torque_max: float = math.inf  # Largest torque of the motor [N·m]
     stall: float = math.inf
     """Torque of the motor at rest [N·m]; when it drives, the torque falls linearly with the speed to 0 at ``no_load``."""
@@ -94,7 +114,9 @@ class Drive(NamedTuple):
     motor_inertia: float = 0.01  # Inertia of the rotor at the joint [kg·m²]
     play: float = 0.0  # Width of the whole play of the gear [rad]
     compliance: float = 0.0  # Deflection of the gear per torque [rad/(N·m)]; 0: stiff
-    compliance_damping: float = 0.002  # Damping of the gear divided by its stiffness [s]
+    compliance_damping: float = (
+        0.002  # Damping of the gear divided by its stiffness [s]
+    )
     # encoder in the loop
     encoder_scale: float = 1.0  # Factor of the reported angle
     encoder_bias: float = 0.0  # Offset of the reported angle [rad]
@@ -111,7 +133,9 @@ class Change:
     drive: Values = field(default_factory=dict)
     """Changes of fields of ``Drive``. Torques, inertias and delays are added, ``torque_scale`` is multiplied, others are
     replaced."""
-    carried: float = 1.0  # Factor on the share of the weight that the controller compensates
+    carried: float = (
+        1.0  # Factor on the share of the weight that the controller compensates
+    )
     ball: tuple[float, float, float, float] | None = None
     """Point mass fixed to the arm's last link: mass [kg], then its position x, y, z in the frame of link 6 [m]. None: no mass is
     added."""
@@ -120,7 +144,17 @@ class Change:
     """Probability that a command is lost, 0 … 1. The lost commands are drawn anew for each recording."""
 
 
-_ADD = "viscous", "quadratic", "coulomb", "stribeck", "motor_inertia", "cogging", "delay", "integral", "encoder_bias"
+_ADD = (
+    "viscous",
+    "quadratic",
+    "coulomb",
+    "stribeck",
+    "motor_inertia",
+    "cogging",
+    "delay",
+    "integral",
+    "encoder_bias",
+)
 
 
 def changed(drive: Drive, changes: list[Change]) -> Drive:
@@ -143,7 +177,9 @@ class Arm(NamedTuple):
     believed: Bodies  # Rigid bodies with which the controller computes the gravity compensation
     carried: float  # Share of the weight computed from ``believed`` that the controller compensates, 0 … 1
     armature: np.ndarray  # (6,) rotor inertias [kg·m²]
-    kp: np.ndarray  # (6,) K_p of the drives [N·m/rad]; that of the joint under test is not used
+    kp: (
+        np.ndarray
+    )  # (6,) K_p of the drives [N·m/rad]; that of the joint under test is not used
     kd: np.ndarray  # (6,) K_d of the drives [N·m·s/rad]; as for ``kp``
     torque_ff: np.ndarray  # (6,) T_ref of the drives [N·m]; as for ``kp``
 
@@ -151,16 +187,24 @@ class Arm(NamedTuple):
 class Run(NamedTuple):
     """State of the arm at every millisecond, before the controller acts."""
 
-    angle: np.ndarray  # (M, 6) true angles of the motors, on the motor's side of the gear [rad]
+    angle: (
+        np.ndarray
+    )  # (M, 6) true angles of the motors, on the motor's side of the gear [rad]
     velocity: np.ndarray  # (M, 6) velocities of the motors [rad/s]
-    effort: np.ndarray  # (M, 6) motor torques without gravity compensation, half a millisecond old [N·m]
+    effort: (
+        np.ndarray
+    )  # (M, 6) motor torques without gravity compensation, half a millisecond old [N·m]
 
 
 @numba.njit(cache=True)
 def encoder(d: Drive, angle):
     """Reading [rad] of the tested joint's encoder at ``angle`` [rad], a number or an array of any shape: scale, bias and a
     sinusoidal error; not quantised."""
-    return d.encoder_scale * angle + d.encoder_bias + d.encoder_wave * np.sin(d.encoder_waves * angle + d.encoder_phase)
+    return (
+        d.encoder_scale * angle
+        + d.encoder_bias
+        + d.encoder_wave * np.sin(d.encoder_waves * angle + d.encoder_phase)
+    )
 
 
 @numba.njit(cache=True, inline="always")
@@ -175,7 +219,9 @@ def _arrived(target, joint, ms, delay_ms, window_ms):
 
 
 @numba.njit(cache=True)
-def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter, lead_ms: int) -> Run:
+def simulate(
+    arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter, lead_ms: int
+) -> Run:
     """Simulate the arm with targets ``target`` (T, 6) [rad] at 200 Hz, after ``lead_ms`` in which it comes to rest at the first
     target.
 
@@ -189,7 +235,11 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     h = STEP_S
     total = lead_ms + COMMAND_MS * target.shape[0]
     num = total - lead_ms
-    angle, velocity, effort = np.empty((num, NUM_JOINTS)), np.empty((num, NUM_JOINTS)), np.empty((num, NUM_JOINTS))
+    angle, velocity, effort = (
+        np.empty((num, NUM_JOINTS)),
+        np.empty((num, NUM_JOINTS)),
+        np.empty((num, NUM_JOINTS)),
+    )
     zero = np.zeros(NUM_JOINTS)
     q, v = start.copy(), np.zeros(NUM_JOINTS)
     qm, vm = q[joint], 0.0
@@ -197,7 +247,10 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     kp, kd = arm.kp.copy(), arm.kd.copy()
     kp[joint], kd[joint] = d.kp, 0.0
     given = np.zeros(NUM_JOINTS)
-    held, carried = np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS)  # of the controllers; damping comes on top
+    held, carried = (
+        np.zeros(NUM_JOINTS),
+        np.zeros(NUM_JOINTS),
+    )  # of the controllers; damping comes on top
     weight = torques(arm.bodies, q, zero, zero, GRAVITY)[joint]
     carry = arm.carried * torques(arm.believed, q, zero, zero, GRAVITY)[joint]
     # Integral action has done its work long ago.
@@ -226,7 +279,9 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
     sampled = d.loop_steps > 0
     loop_s = d.loop_steps * h
     window_ms = max(1.0, loop_s * 1e3)
-    filter_share = 1.0 - math.exp(-loop_s / d.velocity_filter) if d.velocity_filter > 0.0 else 1.0
+    filter_share = (
+        1.0 - math.exp(-loop_s / d.velocity_filter) if d.velocity_filter > 0.0 else 1.0
+    )
     seen, seen_rate, rate = encoder(d, q[joint]), 0.0, 0.0
     stop_side = math.copysign(1.0, d.stop_angle - q[joint])
     hung, hung_v, power = q[joint], 0.0, 0.0
@@ -240,11 +295,21 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             a = mass_matrix(arm.bodies, ahead)
             bias = torques(arm.bodies, ahead, v, zero, GRAVITY)
             for i in range(NUM_JOINTS):
-                a[i, i] += (d.motor_inertia * (1.0 - two) if i == joint else arm.armature[i]) + h * kd[i]
+                a[i, i] += (
+                    d.motor_inertia * (1.0 - two) if i == joint else arm.armature[i]
+                ) + h * kd[i]
             if two and stiffness == 0.0:
                 reduced = 1.0 / (1.0 / d.motor_inertia + 1.0 / a[joint, joint])
-                stiffness = 1.0 / d.compliance if d.compliance > 0.0 else min(2e4, (0.4 / h) ** 2 * reduced)
-                rub = d.compliance_damping * stiffness if d.compliance > 0.0 else 0.6 * math.sqrt(stiffness * reduced)
+                stiffness = (
+                    1.0 / d.compliance
+                    if d.compliance > 0.0
+                    else min(2e4, (0.4 / h) ** 2 * reduced)
+                )
+                rub = (
+                    d.compliance_damping * stiffness
+                    if d.compliance > 0.0
+                    else 0.6 * math.sqrt(stiffness * reduced)
+                )
             factor(a)
             inverse[:] = 0.0
             inverse[joint] = 1.0
@@ -262,14 +327,18 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         if s == next_tick:  # the controller
             ms = tick - lead_ms
             own = qm if two else q[joint]
-            load = torques(arm.believed, q, zero, zero, GRAVITY)  # the pose is known well enough for that
+            load = torques(
+                arm.believed, q, zero, zero, GRAVITY
+            )  # the pose is known well enough for that
             for i in range(NUM_JOINTS):
                 carried[i] = arm.carried * load[i]
                 if i != joint:
                     goal = _arrived(target, i, ms, 0.0, 1.0)
                     held[i] = kp[i] * (goal - q[i]) + arm.torque_ff[i]
             goal = _arrived(target, joint, ms, d.delay * 1e3, window_ms)
-            if tick % COMMAND_MS == 0:  # the driver limits what it sends, from one command to the next
+            if (
+                tick % COMMAND_MS == 0
+            ):  # the driver limits what it sends, from one command to the next
                 most_step = d.slew * COMMAND_MS * 1e-3
             step = (goal - setpoint) * command_share
             step = min(max(step, -most_step), most_step)
@@ -282,7 +351,9 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
                 error = math.copysign(max(abs(error) - d.deadband, 0.0), error)
                 if ms > -lead_ms // 2:
                     integral += d.kp * d.integral * error * 1e-3
-                held[joint] = d.kp * error + integral + d.kd * d.feedforward * rate + d.torque_ff
+                held[joint] = (
+                    d.kp * error + integral + d.kd * d.feedforward * rate + d.torque_ff
+                )
             tick += 1
             if tick < total:
                 next_tick = tick * SUBSTEPS + int(jitter[tick])
@@ -294,11 +365,18 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
             error = math.copysign(max(abs(error) - d.deadband, 0.0), error)
             if s > lead_ms * SUBSTEPS // 2:
                 integral += d.kp * d.integral * error * loop_s
-            held[joint] = d.kp * error + integral + d.kd * (d.feedforward * rate - seen_rate) + d.torque_ff
+            held[joint] = (
+                d.kp * error
+                + integral
+                + d.kd * (d.feedforward * rate - seen_rate)
+                + d.torque_ff
+            )
         ms = s // SUBSTEPS
         time_s = max(0.0, s * h - lead_ms * 1e-3)
         for i in range(NUM_JOINTS):
-            kick[i] = h * (held[i] + carried[i] - kd[i] * v[i] - bias[i] + disturbance[ms, i])
+            kick[i] = h * (
+                held[i] + carried[i] - kd[i] * v[i] - bias[i] + disturbance[ms, i]
+            )
         kick[joint] = h * (disturbance[ms, joint] - bias[joint])
         if d.hung_inertia > 0.0:
             back = hung_k * (hung - q[joint]) + hung_c * (hung_v - v[joint])
@@ -311,7 +389,11 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         free = v[joint] + kick[joint]
         motor_v = vm if two else v[joint]
         motor_q = qm if two else q[joint]
-        turning = d.encoder_waves * d.encoder_wave * math.cos(d.encoder_waves * motor_q + d.encoder_phase)
+        turning = (
+            d.encoder_waves
+            * d.encoder_wave
+            * math.cos(d.encoder_waves * motor_q + d.encoder_phase)
+        )
         ask, damp = held[joint], 0.0 if sampled else d.kd * (d.encoder_scale + turning)
         if late > 0:
             ring[at] = ask - damp * motor_v
@@ -322,15 +404,23 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         if d.one_way != 0.0:
             gain *= 1.0 + d.one_way * math.copysign(1.0, torque + carried[joint])
         if d.sag > 0.0:
-            power += h / d.sag_time * (max(0.0, (torque + carried[joint]) * motor_v) - power)
+            power += (
+                h / d.sag_time * (max(0.0, (torque + carried[joint]) * motor_v) - power)
+            )
             gain /= 1.0 + d.sag * power
         lift = gain * carried[joint]
-        other = d.cogging * math.sin(d.cogging_periods * motor_q + d.cogging_phase) if d.cogging != 0.0 else 0.0
+        other = (
+            d.cogging * math.sin(d.cogging_periods * motor_q + d.cogging_phase)
+            if d.cogging != 0.0
+            else 0.0
+        )
         other -= d.spring * (motor_q - d.spring_rest)
         if d.stop > 0.0:
             deep = stop_side * (motor_q - d.stop_angle)
             if deep > 0.0:  # 5 ms of damping
-                other -= stop_side * max(0.0, d.stop * (deep + 0.005 * stop_side * motor_v))
+                other -= stop_side * max(
+                    0.0, d.stop * (deep + 0.005 * stop_side * motor_v)
+                )
         if d.hysteresis > 0.0:
             turn = h * motor_v / d.hysteresis_width
             wound = (wound + turn) / (1.0 + abs(turn))
@@ -339,7 +429,9 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
         if d.stribeck > 0.0:
             limit += d.stribeck * math.exp(-((motor_v / d.stribeck_speed) ** 2))
         if d.spot > 0.0:
-            limit += d.spot * math.exp(-(((motor_q - d.spot_angle) / d.spot_width) ** 2))
+            limit += d.spot * math.exp(
+                -(((motor_q - d.spot_angle) / d.spot_width) ** 2)
+            )
         if d.load_share > 0.0:
             limit += d.load_share * abs(torque + lift + bias[joint])
         if d.asymmetry != 0.0:
@@ -365,13 +457,17 @@ def simulate(arm: Arm, joint: int, d: Drive, target, start, disturbance, jitter,
                 through = 0.0
                 if gap != 0.0 or d.play == 0.0:
                     firm = stiffness * h + rub
-                    through = (stiffness * gap + firm * (push / brake - free)) / (1.0 + firm * (b / brake + mobility))
+                    through = (stiffness * gap + firm * (push / brake - free)) / (
+                        1.0 + firm * (b / brake + mobility)
+                    )
                     if d.play > 0.0 and through * gap < 0.0:
                         through = 0.0  # faces part, they do not pull
                 new = (push - b * through) / brake
                 passed = through
             else:
-                new = (free + mobility * (ask + lift + other - stick)) / (1.0 + mobility * (damp + drag))
+                new = (free + mobility * (ask + lift + other - stick)) / (
+                    1.0 + mobility * (damp + drag)
+                )
                 passed = (new - free) / mobility
             torque = ask - damp * new
             if attempt == 0:

@@ -15,7 +15,14 @@ import numpy as np
 
 from taccorl.surrogate.plant import STEP_S
 
-PERIODS_STEPS = (2, 4, 5, 8, 10, 16)  # Numbers of integration steps between two samples: 4, 2, 1.6, 1, 0.8 and 0.5 kHz
+PERIODS_STEPS = (
+    2,
+    4,
+    5,
+    8,
+    10,
+    16,
+)  # Numbers of integration steps between two samples: 4, 2, 1.6, 1, 0.8 and 0.5 kHz
 FILTER_S = (3e-4, 3e-3)  # Range of the low-pass's time constant τ [s]: 530 to 53 Hz
 MARGIN = 3.2
 """Factor on K_p and K_d at which the loop must still be stable: recordings at twice the gains, and 1.6 for hidden effects."""
@@ -41,13 +48,20 @@ class SampledLoop:
 
 def draw_loop(rng: np.random.Generator, most_late_s: float = math.inf) -> SampledLoop:
     """Draw a loop with any rate and low-pass whose total delay is at most this. Stability with a drive is not checked."""
-    periods = [steps for steps in PERIODS_STEPS if steps * STEP_S + FILTER_S[0] <= most_late_s] or [PERIODS_STEPS[0]]
+    periods = [
+        steps for steps in PERIODS_STEPS if steps * STEP_S + FILTER_S[0] <= most_late_s
+    ] or [PERIODS_STEPS[0]]
     steps = int(rng.choice(periods))
     longest_s = max(FILTER_S[0], min(FILTER_S[1], most_late_s - steps * STEP_S))
-    return SampledLoop(steps=steps, filter_s=float(np.exp(rng.uniform(*np.log((FILTER_S[0], longest_s))))))
+    return SampledLoop(
+        steps=steps,
+        filter_s=float(np.exp(rng.uniform(*np.log((FILTER_S[0], longest_s))))),
+    )
 
 
-def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float) -> float:
+def spectral_radius(
+    loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float
+) -> float:
     """Largest modulus of the eigenvalues of the closed loop from one sample to the next; below 1 it is stable.
 
     State: angle, velocity, last reading, filtered velocity. Between samples the torque u is constant: q ← q + T v + T² u / 2J, v
@@ -56,14 +70,22 @@ def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float
     a = 1.0 - math.exp(-t / loop.filter_s) if loop.filter_s > 0.0 else 1.0
     rate = np.array([a / t, 0.0, -a / t, 1.0 - a])
     torque = -kd * rate - np.array([kp, 0.0, 0.0, 0.0])
-    step = np.array([[1.0, t, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], rate])
+    step = np.array(
+        [[1.0, t, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], rate]
+    )
     step[0] += 0.5 * t**2 / j * torque
     step[1] += t / j * torque
     return float(np.abs(np.linalg.eigvals(step)).max())
 
 
-def is_stable(loop: SampledLoop, kp: float, kd: float, inertias_kgm2: Sequence[float]) -> bool:
+def is_stable(
+    loop: SampledLoop, kp: float, kd: float, inertias_kgm2: Sequence[float]
+) -> bool:
     """True if the loop is stable at every gain up to ``MARGIN`` times these, for each inertia (in the play of a gear the motor
     moves alone). ``kp``, ``kd``: K_p [N·m/rad] and K_d [N·m·s/rad]."""
     gains = (1.0, 2.0, MARGIN)
-    return all(spectral_radius(loop, f * kp, f * kd, inertia) < 1.0 for f in gains for inertia in inertias_kgm2)
+    return all(
+        spectral_radius(loop, f * kp, f * kd, inertia) < 1.0
+        for f in gains
+        for inertia in inertias_kgm2
+    )

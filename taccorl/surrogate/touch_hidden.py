@@ -20,7 +20,9 @@ MILLISECOND = 1e-3  # [s]
 class TouchKind:
     """One kind of hidden effect of pads: its range of strength, its parameters for a strength, and where it acts."""
 
-    severity: tuple[float, float]  # Range of the severity, from hardly visible to the largest realistic one
+    severity: tuple[
+        float, float
+    ]  # Range of the severity, from hardly visible to the largest realistic one
     values: Callable[[float, np.random.Generator], Values]
     """Function (severity, a board's random generator) → parameters with the registry's names. The same generator state gives the
     same form."""
@@ -33,7 +35,9 @@ class TouchKind:
 def touch_kind(name: str) -> TouchKind:
     """The kind of hidden effect of that name. Raises TaccorlError: there is no hidden effect of that name."""
     if name not in TOUCH_KINDS:
-        raise TaccorlError(f"surrogate pads: no hidden effect {name!r}; {nearest(name, TOUCH_KINDS)}")
+        raise TaccorlError(
+            f"surrogate pads: no hidden effect {name!r}; {nearest(name, TOUCH_KINDS)}"
+        )
     return TOUCH_KINDS[name]
 
 
@@ -47,7 +51,10 @@ def _signed(parameter: str) -> Callable[[float, np.random.Generator], Values]:
 
 def _creep(s: float, rng: np.random.Generator) -> Values:
     share = max(float(rng.choice([-1.0, 1.0])) * s, -0.8)
-    return {"share": share, "time_constant_s": float(np.exp(rng.uniform(np.log(0.3), np.log(4.0))))}
+    return {
+        "share": share,
+        "time_constant_s": float(np.exp(rng.uniform(np.log(0.3), np.log(4.0)))),
+    }
 
 
 def _power(s: float, rng: np.random.Generator) -> Values:
@@ -60,52 +67,97 @@ def _shift(s: float, rng: np.random.Generator) -> Values:
 
 
 TOUCH_KINDS: dict[str, TouchKind] = {
-    "depth_offset": TouchKind(severity=(5e-6, 6e-4), values=_signed("offset_m"), stage="place"),
+    "depth_offset": TouchKind(
+        severity=(5e-6, 6e-4), values=_signed("offset_m"), stage="place"
+    ),
     "pad_shift": TouchKind(severity=(3e-5, 4e-3), values=_shift, stage="place"),
     "taxel_power_law": TouchKind(severity=(0.02, 1.5), values=_power, stage="material"),
-    "taxel_saturation": TouchKind(severity=(0.01, 3.0), values=lambda s, rng: {"limit": 1.0 / s}, stage="material"),
-    "taxel_threshold": TouchKind(severity=(0.01, 0.6), values=_one("threshold"), stage="material"),
-    "taxel_hysteresis": TouchKind(severity=(0.01, 0.45), values=_one("half_width"), stage="material"),
+    "taxel_saturation": TouchKind(
+        severity=(0.01, 3.0), values=lambda s, rng: {"limit": 1.0 / s}, stage="material"
+    ),
+    "taxel_threshold": TouchKind(
+        severity=(0.01, 0.6), values=_one("threshold"), stage="material"
+    ),
+    "taxel_hysteresis": TouchKind(
+        severity=(0.01, 0.45), values=_one("half_width"), stage="material"
+    ),
     "taxel_creep": TouchKind(severity=(0.02, 1.0), values=_creep, stage="material"),
-    "touch_delay": TouchKind(severity=(1e-3, 0.15), values=_one("delay_s"), stage="material"),
-    "touch_lag": TouchKind(severity=(1e-3, 0.3), values=_one("time_constant_s"), stage="material"),
-    "taxel_crosstalk": TouchKind(severity=(0.01, 0.7), values=_one("share"), stage="spread"),
-    "taxel_ghosting": TouchKind(severity=(1e-3, 0.15), values=_one("share"), stage="spread"),
-    "taxel_gain_spread": TouchKind(severity=(0.02, 0.6), values=_one("log_std"), stage="board"),
+    "touch_delay": TouchKind(
+        severity=(1e-3, 0.15), values=_one("delay_s"), stage="material"
+    ),
+    "touch_lag": TouchKind(
+        severity=(1e-3, 0.3), values=_one("time_constant_s"), stage="material"
+    ),
+    "taxel_crosstalk": TouchKind(
+        severity=(0.01, 0.7), values=_one("share"), stage="spread"
+    ),
+    "taxel_ghosting": TouchKind(
+        severity=(1e-3, 0.15), values=_one("share"), stage="spread"
+    ),
+    "taxel_gain_spread": TouchKind(
+        severity=(0.02, 0.6), values=_one("log_std"), stage="board"
+    ),
     "dead_taxels": TouchKind(severity=(0.02, 0.4), values=_one("share"), stage="board"),
-    "baseline_drift": TouchKind(severity=(0.01, 2.0), values=_signed("rate_per_min"), stage="baseline"),
+    "baseline_drift": TouchKind(
+        severity=(0.01, 2.0), values=_signed("rate_per_min"), stage="baseline"
+    ),
     # outside the registry: a film that softens with speed, and gains that fall as the board warms up
-    "rate_softening": TouchKind(severity=(1.0, 400.0), values=_one("per_mps"), stage="material", registered=False),
-    "warming_gain": TouchKind(severity=(0.05, 3.0), values=_one("fall_per_min"), stage="baseline", registered=False),
+    "rate_softening": TouchKind(
+        severity=(1.0, 400.0),
+        values=_one("per_mps"),
+        stage="material",
+        registered=False,
+    ),
+    "warming_gain": TouchKind(
+        severity=(0.05, 3.0),
+        values=_one("fall_per_min"),
+        stage="baseline",
+        registered=False,
+    ),
 }
 """Name → kind."""
-REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)  # Names of the kinds in the registry
+REGISTERED_TOUCH = tuple(
+    name for name, k in TOUCH_KINDS.items() if k.registered
+)  # Names of the kinds in the registry
 _DRAWN = [name for name, k in TOUCH_KINDS.items() if k.stage in ("board", "baseline")]
-EXACT_TOUCH = tuple(name for name in REGISTERED_TOUCH if name not in (*_DRAWN, "taxel_power_law"))
+EXACT_TOUCH = tuple(
+    name for name in REGISTERED_TOUCH if name not in (*_DRAWN, "taxel_power_law")
+)
 """Those that all parameters of the registry determine; single taxels' gains and drifts are drawn."""
 OUTSIDE_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if not k.registered)
 """Names of the kinds outside the registry."""
 
 
-def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray) -> np.ndarray:
+def material(
+    name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray
+) -> np.ndarray:
     """Readings (M, K) after an effect of the pad's material or driver, taxel by taxel; rows are milliseconds. ``reading``: (M, K)
     readings before it. ``rate_mps``: (M, K) depth rates [m/s]."""
     match name:
         case "taxel_power_law":
-            return np.exp(values["exponent"] * np.log(np.maximum(reading, 1e-12))) * (reading > 0)
+            return np.exp(values["exponent"] * np.log(np.maximum(reading, 1e-12))) * (
+                reading > 0
+            )
         case "taxel_saturation":  # supply voltage over two resistors in a row, of which one falls with pressure
             fixed, pressed = 1.0, values["limit"] / np.maximum(reading, 1e-9)
             return values["limit"] * fixed / (fixed + pressed) * (reading > 0)
         case "taxel_threshold":
-            return np.where(reading > values["threshold"], reading - values["threshold"], 0.0)
+            return np.where(
+                reading > values["threshold"], reading - values["threshold"], 0.0
+            )
         case "taxel_hysteresis":
-            return _bouc_wen(reading, np.log1p(-values["half_width"]), np.log1p(values["half_width"]))
+            return _bouc_wen(
+                reading, np.log1p(-values["half_width"]), np.log1p(values["half_width"])
+            )
         case "taxel_creep":
             return _chain(reading, values["share"], values["time_constant_s"])
         case "touch_delay":
             at = np.arange(len(reading)) - values["delay_s"] / MILLISECOND
             before = np.clip(np.floor(at).astype(int), 0, len(reading) - 1)
-            after, share = np.minimum(before + 1, len(reading) - 1), np.clip(at - before, 0.0, 1.0)[:, None]
+            after, share = (
+                np.minimum(before + 1, len(reading) - 1),
+                np.clip(at - before, 0.0, 1.0)[:, None],
+            )
             return reading[before] * (1 - share) + reading[after] * share
         case "touch_lag":
             rate = MILLISECOND / values["time_constant_s"]
@@ -154,18 +206,27 @@ def _low_pass(reading: np.ndarray, rate: float) -> np.ndarray:
 def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:
     """``frames`` (T, R, C) of one pad after crosstalk in wires and cover; returns (T, R, C)."""
     match name:
-        case "taxel_crosstalk":  # along rows, then along columns: corners get a little as well
+        case (
+            "taxel_crosstalk"
+        ):  # along rows, then along columns: corners get a little as well
             for axis in (1, 2):
                 flow = np.diff(frames, axis=axis)  # none over the edges
-                frames = frames + 0.25 * values["share"] * np.diff(flow, axis=axis, prepend=0.0, append=0.0)
+                frames = frames + 0.25 * values["share"] * np.diff(
+                    flow, axis=axis, prepend=0.0, append=0.0
+                )
             return frames
         case "taxel_ghosting":
-            wires = np.einsum("trc->tr", frames)[:, :, None] + np.einsum("trc->tc", frames)[:, None, :]
+            wires = (
+                np.einsum("trc->tr", frames)[:, :, None]
+                + np.einsum("trc->tc", frames)[:, None, :]
+            )
             return (1.0 - 2.0 * values["share"]) * frames + values["share"] * wires
     raise AssertionError(name)
 
 
-def board(name: str, values: Values, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+def board(
+    name: str, values: Values, rng: np.random.Generator, shape: tuple[int, ...]
+) -> np.ndarray:
     """(R, C) gains of one pad's taxels for a hidden effect of the board. ``name``: ``taxel_gain_spread`` or ``dead_taxels``.
     ``shape``: (R, C)."""
     match name:

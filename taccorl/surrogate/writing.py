@@ -50,7 +50,10 @@ class _Rows(drivers.TrueSignals):
         self.plans: list[drivers.Marks] = []
         self.duration_s = measurement.num_rows / measurement.rate_hz
         self._rows = {"state": measurement.measured, "command": measurement.target}
-        self._rows |= {name: np.nan_to_num(getattr(measurement, name)) for name in ("velocity", "effort")}
+        self._rows |= {
+            name: np.nan_to_num(getattr(measurement, name))
+            for name in ("velocity", "effort")
+        }
 
     def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
         row = np.rint(np.asarray(time_s) * self.measurement.rate_hz).astype(int)
@@ -74,27 +77,54 @@ class _Sweep(drivers.Streams):
             yield from super()._pad(topic, pad)
             return
         shape, k = (-1, len(drivers.PADS), *ROBOT.pad.shape), drivers.PADS.index(pad)
-        wire = (self._touch.counts + self._touch.baseline).reshape(shape)[:, k].swapaxes(1, 2).astype(np.uint8)
+        wire = (
+            (self._touch.counts + self._touch.baseline)
+            .reshape(shape)[:, k]
+            .swapaxes(1, 2)
+            .astype(np.uint8)
+        )
         for stamp, frame in zip(self._touch.time_s[:, k].tolist(), wire, strict=True):
-            yield drivers.Event(stamp, stamp - drivers.SCAN_S / 2, topic, UINT8_ARRAY, drivers.pad_message(frame))
+            yield drivers.Event(
+                stamp,
+                stamp - drivers.SCAN_S / 2,
+                topic,
+                UINT8_ARRAY,
+                drivers.pad_message(frame),
+            )
 
     def all(self) -> list[Iterator[drivers.Event]]:
         """One stream per topic, each in order of log time."""
         return [
-            *(self._joints(drivers.STATE_TOPICS[arm], arm, command=False) for arm in ROBOT.arms),
-            *(self._joints(drivers.COMMAND_TOPICS[arm], arm, command=True) for arm in ROBOT.arms),
+            *(
+                self._joints(drivers.STATE_TOPICS[arm], arm, command=False)
+                for arm in ROBOT.arms
+            ),
+            *(
+                self._joints(drivers.COMMAND_TOPICS[arm], arm, command=True)
+                for arm in ROBOT.arms
+            ),
             *(self._pad(drivers.PAD_TOPICS[pad], pad) for pad in drivers.PAD_TOPICS),
         ]
 
 
-def _write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
+def _write_recording(
+    path: Path, measurement: Measurement, seed: int, repeat_of: str | None
+) -> None:
     """Write one recording in the format of the robot's drivers; an existing file is replaced. ``repeat_of``: name of the
     recording that it repeats; None if it is no repeat."""
     story = _Rows(measurement)
     told = measurement.instruction
-    config = drivers.DriverConfig(duration_s=story.duration_s, seed=seed, instruction=told, pad_gain_spread=0.0)
-    label = labelled(measurement.origin) | {"instruction": told, "repeat_of": repeat_of or ""}
-    label |= {key: json.dumps(getattr(measurement, key)) for key in ("kp", "kd", "gain_scale", "payload_kg")}
+    config = drivers.DriverConfig(
+        duration_s=story.duration_s, seed=seed, instruction=told, pad_gain_spread=0.0
+    )
+    label = labelled(measurement.origin) | {
+        "instruction": told,
+        "repeat_of": repeat_of or "",
+    }
+    label |= {
+        key: json.dumps(getattr(measurement, key))
+        for key in ("kp", "kd", "gain_scale", "payload_kg")
+    }
     drivers.publish(path, _Sweep(config, story), label)
 
 
@@ -102,21 +132,29 @@ Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a recording, the number of recordings written, and of all."""
 
 
-def write_recordings(cases: Sequence[Case], folder: Path, progress: Progress | None = None) -> int:
+def write_recordings(
+    cases: Sequence[Case], folder: Path, progress: Progress | None = None
+) -> int:
     """Write a robot's joints, of one twin, as files into ``folder``; returns the number of recordings. Raises TaccorlError: the
     folder holds other files."""
     uses = _uses(robot_recordings(cases))
-    truth: dict[str, object] = {"joints": [c.truth() for c in cases]} if len(cases) > 1 else cases[0].truth()
+    truth: dict[str, object] = (
+        {"joints": [c.truth() for c in cases]} if len(cases) > 1 else cases[0].truth()
+    )
     with _beside(Path(folder)) as part:
         _fill(part, truth, cases[0].twin, uses, {}, progress)
     return len(uses)
 
 
 def _uses(made: Measurements) -> list[tuple[str, Measurement]]:
-    return [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
+    return [
+        (use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)
+    ]
 
 
-def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress | None = None) -> Measurements:
+def write_touch_recordings(
+    case: TouchCase, folder: Path, progress: Progress | None = None
+) -> Measurements:
     """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording. Raises TaccorlError:
     the folder holds other files."""
     made = touch_recordings(case)
@@ -131,7 +169,9 @@ def _beside(folder: Path) -> Iterator[Path]:
     """A folder beside ``folder`` to write into, which then takes its place: half a robot never stands there. Raises
     TaccorlError: the folder holds something that is no surrogate's, or there is no room."""
     if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
-        raise TaccorlError(f"{folder}: it contains files that are not of a surrogate robot; give another --out=")
+        raise TaccorlError(
+            f"{folder}: it contains files that are not of a surrogate robot; give another --out="
+        )
     part = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
     try:
@@ -164,7 +204,12 @@ def _fill(
     for k, (_, m) in enumerate(uses):
         if progress is not None:
             progress(files[m.name], k, len(uses))
-        _write_recording(recordings / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
+        _write_recording(
+            recordings / files[m.name],
+            m,
+            k,
+            files[m.repeat_of] if m.repeat_of else None,
+        )
     notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
     for name, of in pressed.items():
         notes[files[name]]["pressed"] = of
@@ -190,15 +235,31 @@ def write_tables(
         own, path = table(m), folder / kind / f"{m.name}.csv"
         header = origin_lines(m.origin) + ",".join(own)
         values = np.column_stack([*own.values()])
-        np.savetxt(path, values, fmt="%.8g", delimiter=",", header=header, comments="", encoding="utf-8")
-        notes[path.name] = {"use": use} | ({"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {})
+        np.savetxt(
+            path,
+            values,
+            fmt="%.8g",
+            delimiter=",",
+            header=header,
+            comments="",
+            encoding="utf-8",
+        )
+        notes[path.name] = {"use": use} | (
+            {"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {}
+        )
     _write_yaml(folder / kind / "columns.yaml", columns)
     _write_yaml(folder / kind / INDEX, {"columns": "columns.yaml", "recordings": notes})
     seal(folder, truth)
 
 
 def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    text = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+    text = yaml.safe_dump(
+        dict(content),
+        sort_keys=False,
+        default_flow_style=None,
+        allow_unicode=True,
+        width=120,
+    )
     path.write_text(text, encoding="utf-8")
 
 
@@ -224,7 +285,9 @@ def draw_touch_secret(seed: int) -> tuple[str, ...]:
 def seal(folder: Path, truth: dict[str, object]) -> None:
     """Write the true values into a file in encoded form, so that nobody reads them by mistake."""
     text = base64.b64encode(json.dumps(truth, ensure_ascii=False).encode()).decode()
-    (folder / TRUTH).write_text(json.dumps({"note": _NOTE, "sealed": text}, indent=1), encoding="utf-8")
+    (folder / TRUTH).write_text(
+        json.dumps({"note": _NOTE, "sealed": text}, indent=1), encoding="utf-8"
+    )
 
 
 def reveal(folder: Path) -> dict[str, object]:
@@ -232,8 +295,14 @@ def reveal(folder: Path) -> dict[str, object]:
     TaccorlError: there is no sealed truth, or it is damaged."""
     path = Path(folder) / TRUTH
     if not path.is_file():
-        raise TaccorlError(f"{path}: no such file; give the folder that `taccorl surrogate --out=` wrote")
+        raise TaccorlError(
+            f"{path}: no such file; give the folder that `taccorl surrogate --out=` wrote"
+        )
     try:
-        return json.loads(base64.b64decode(json.loads(path.read_text(encoding="utf-8"))["sealed"]))
+        return json.loads(
+            base64.b64decode(json.loads(path.read_text(encoding="utf-8"))["sealed"])
+        )
     except (ValueError, KeyError, TypeError) as error:
-        raise TaccorlError(f"{path}: its truth cannot be read ({error}); make the robot again") from error
+        raise TaccorlError(
+            f"{path}: its truth cannot be read ({error}); make the robot again"
+        ) from error

@@ -24,7 +24,12 @@ from taccorl.data.dataset import (
     write_records,
 )
 from taccorl.data.joining import require_videos
-from taccorl.data.lerobot_format import change_features, copy_pictures, merge, write_exact_statistics
+from taccorl.data.lerobot_format import (
+    change_features,
+    copy_pictures,
+    merge,
+    write_exact_statistics,
+)
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.errors import DatasetError, InTheWayError
@@ -34,7 +39,13 @@ from taccorl.lineage.store import Store
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.sim.part_poses import PARTS_KEY
 
-IS_SIM_FEATURE = {"dtype": "float32", "shape": (1,), "names": None, "unit": "1", "range": [0, 1]}
+IS_SIM_FEATURE = {
+    "dtype": "float32",
+    "shape": (1,),
+    "names": None,
+    "unit": "1",
+    "range": [0, 1],
+}
 """Entry of the feature ``observation.is_sim`` in LeRobot's features: 1 for a simulated row, 0 for a real one."""
 RECORD = PROVENANCE / "cotrain.json"
 """File in the merged dataset that lists its parts."""
@@ -86,20 +97,30 @@ def publish(
 
     def build(_: Any, inputs: list[Path], folder: Path) -> None:
         folder.rmdir()  # LeRobot wants to make it
-        merge_domains(inputs[: len(real)], inputs[len(real) :], folder, progress, videos=videos)
+        merge_domains(
+            inputs[: len(real)], inputs[len(real) :], folder, progress, videos=videos
+        )
 
     stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
-    config: dict[str, Any] = {"real": len(real), "sim": len(sim)}  # which they are, their content says
+    config: dict[str, Any] = {
+        "real": len(real),
+        "sim": len(sim),
+    }  # which they are, their content says
     config |= {} if videos else {"pictures": "cache"}
     datasets: dict[str, Artefact] = {}
     for root in (*real, *sim):
         dataset = store.dataset(root)
         if same := datasets.get(dataset.digest):
-            raise DatasetError(f"{root} has the same content as {same.path}: give each dataset once")
+            raise DatasetError(
+                f"{root} has the same content as {same.path}: give each dataset once"
+            )
         datasets[dataset.digest] = dataset
     store.run(stage, config, [*datasets.values()], destination=out)
     told = json.loads((out / RECORD).read_text(encoding="utf-8"))
-    return [Part(**{**part, "origins": tuple(map(Origin.read, part["origins"]))}) for part in told]
+    return [
+        Part(**{**part, "origins": tuple(map(Origin.read, part["origins"]))})
+        for part in told
+    ]
 
 
 def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
@@ -107,7 +128,9 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     Raises DatasetError: as ``merge_domains``."""
     datasets = [Dataset(root) for root in (*real, *sim)]
     if not datasets:
-        raise DatasetError("no dataset given: --real=FOLDER, --sim=FOLDER; repeat them for several")
+        raise DatasetError(
+            "no dataset given: --real=FOLDER, --sim=FOLDER; repeat them for several"
+        )
     for d in datasets:
         if IS_SIM in d.info["features"]:
             raise DatasetError(
@@ -121,8 +144,12 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
                 "collect with --domain=surrogate"
             )
     for d in datasets[len(real) :]:
-        if other := [origin for origin in origins_of(d) if origin.domain in ("real", "surrogate")]:
-            raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: give --real={d.root}")
+        if other := [
+            origin for origin in origins_of(d) if origin.domain in ("real", "surrogate")
+        ]:
+            raise DatasetError(
+                f"--sim={d.root}: its episodes are {other[0]}: give --real={d.root}"
+            )
     _check_pictures(datasets)
     return _shared_features(datasets, datasets[len(real) :])
 
@@ -155,13 +182,29 @@ def merge_domains(
         InTheWayError: something is at ``out``.
     """
     if not is_free(out):
-        raise InTheWayError(f"{out} exists already; nothing was changed: give another folder")
+        raise InTheWayError(
+            f"{out} exists already; nothing was changed: give another folder"
+        )
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]
-    poses = next((d.info["features"][PARTS_KEY] for d in datasets[len(real) :] if PARTS_KEY in shared), None)
-    cameras = {key for d in datasets for key, f in d.info["features"].items() if f["dtype"] == "video"}
+    poses = next(
+        (
+            d.info["features"][PARTS_KEY]
+            for d in datasets[len(real) :]
+            if PARTS_KEY in shared
+        ),
+        None,
+    )
+    cameras = {
+        key
+        for d in datasets
+        for key, f in d.info["features"].items()
+        if f["dtype"] == "video"
+    }
     num_steps = len(datasets) + 2
-    with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:
+    with tempfile.TemporaryDirectory(
+        prefix=f"{out.name}.parts_", dir=out.resolve().parent
+    ) as name:
         copies = []
         for k, d in enumerate(datasets):
             progress(f"copying {d.root.name}", k, num_steps)
@@ -169,8 +212,12 @@ def merge_domains(
             if poses is not None and PARTS_KEY not in d.info["features"]:
                 added[PARTS_KEY] = (np.nan, poses)
             copies.append(Path(name) / f"part_{k}")
-            change_features(d.root, copies[-1], shared if videos else shared - cameras, added)
-            state_domains(copies[-1], [])  # LeRobot merges only what has the same metadata
+            change_features(
+                d.root, copies[-1], shared if videos else shared - cameras, added
+            )
+            state_domains(
+                copies[-1], []
+            )  # LeRobot merges only what has the same metadata
         progress("joining", len(datasets), num_steps)
         merge(copies, out)
     progress("statistics", len(datasets) + 1, num_steps)
@@ -178,14 +225,31 @@ def merge_domains(
     if not videos:
         copy_pictures(datasets[0].root, out)
     parts = [
-        Part(str(d.root), k >= len(real), d.num_episodes, int(d.info["total_frames"]), origins_of(d))
+        Part(
+            str(d.root),
+            k >= len(real),
+            d.num_episodes,
+            int(d.info["total_frames"]),
+            origins_of(d),
+        )
         for k, d in enumerate(datasets)
     ]
-    _dump(out / RECORD, [asdict(part) | {"origins": [o.record() for o in part.origins]} for part in parts])
+    _dump(
+        out / RECORD,
+        [
+            asdict(part) | {"origins": [o.record() for o in part.origins]}
+            for part in parts
+        ],
+    )
     write_records(out, [record for d in datasets for record in _records(d, shared)])
-    described = [d for d in datasets if (d.root / PROVENANCE / "dataset_spec.json").is_file()]
+    described = [
+        d for d in datasets if (d.root / PROVENANCE / "dataset_spec.json").is_file()
+    ]
     if described:
-        _dump(out / PROVENANCE / "dataset_spec.json", dataset_spec_to_json(_spec(described[0], described[1:], shared)))
+        _dump(
+            out / PROVENANCE / "dataset_spec.json",
+            dataset_spec_to_json(_spec(described[0], described[1:], shared)),
+        )
     return parts
 
 
@@ -194,14 +258,19 @@ def _shared_features(datasets: Sequence[Dataset], sims: Sequence[Dataset]) -> se
     simulator's own nor optional."""
     first = datasets[0]
     everything = {key for d in datasets for key in d.info["features"]}
-    shared = {key for key in everything if all(key in d.info["features"] for d in datasets)}
+    shared = {
+        key for key in everything if all(key in d.info["features"] for d in datasets)
+    }
     for key in sorted(everything - shared):
         optional = all(
-            key not in d.unstored and (key not in d.spec.features or d.spec.features[key].optional) for d in datasets
+            key not in d.unstored
+            and (key not in d.spec.features or d.spec.features[key].optional)
+            for d in datasets
         )
         if not key.startswith("sim.") and not optional:
             has, lacks = (
-                [d.root.name for d in datasets if (key in d.info["features"]) is there] for there in (True, False)
+                [d.root.name for d in datasets if (key in d.info["features"]) is there]
+                for there in (True, False)
             )
             raise DatasetError(
                 f"co-training: {', '.join(has)} has {key}, but {', '.join(lacks)} does not: ingest or collect them with the "
@@ -224,7 +293,10 @@ def _check_pictures(datasets: Sequence[Dataset]) -> None:
     first = datasets[0]
     for d in datasets[1:]:
         for key, f in d.info["features"].items():
-            there, here = list(f["shape"]), list(first.info["features"].get(key, f)["shape"])
+            there, here = (
+                list(f["shape"]),
+                list(first.info["features"].get(key, f)["shape"]),
+            )
             if f["dtype"] == "video" and there != here:
                 raise DatasetError(
                     f"co-training: {key} is {there} in {d.root.name}, {here} in {first.root.name}: ingest them with the same "
@@ -236,7 +308,9 @@ def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
     """What ingest or the twin wrote down of each episode, its origin above all; of other people's datasets what there is."""
     path = dataset.root / PROVENANCE / "episodes.json"
     if not path.is_file():
-        return [episode_record(dataset.episode(k), "") for k in range(dataset.num_episodes)]
+        return [
+            episode_record(dataset.episode(k), "") for k in range(dataset.num_episodes)
+        ]
     records = json.loads(path.read_text(encoding="utf-8"))
     return [
         {
@@ -250,7 +324,10 @@ def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
 
 def _spec(dataset: Dataset, others: Sequence[Dataset], shared: set[str]) -> DatasetSpec:
     """Data spec of the merged dataset: that of ``dataset``, with the parts' poses of another one if it has none."""
-    read = [dataset_spec_from_json(d.root / PROVENANCE / "dataset_spec.json") for d in (dataset, *others)]
+    read = [
+        dataset_spec_from_json(d.root / PROVENANCE / "dataset_spec.json")
+        for d in (dataset, *others)
+    ]
     spec, told = read[0], IS_SIM_FEATURE
     features = {key: f for key, f in spec.features.items() if key in shared}
     posed = [one.features[PARTS_KEY] for one in read if PARTS_KEY in one.features]
@@ -270,9 +347,16 @@ def _spec(dataset: Dataset, others: Sequence[Dataset], shared: set[str]) -> Data
 
 def _dump(path: Path, value: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
 
 
 def origins_of(dataset: Dataset) -> tuple[Origin, ...]:
     """Origins of the episodes, each once, in the order of their labels."""
-    return tuple(sorted({dataset.episode_facts(k)["origin"] for k in range(dataset.num_episodes)}, key=str))
+    return tuple(
+        sorted(
+            {dataset.episode_facts(k)["origin"] for k in range(dataset.num_episodes)},
+            key=str,
+        )
+    )

@@ -64,7 +64,9 @@ class CacheRequest:
     def __post_init__(self) -> None:
         """Raises TaccorlError: the place is not one of gpu, host, disk."""
         if self.place not in PLACES:
-            raise TaccorlError(f"--dataset.cache={self.place}: {nearest(self.place, PLACES)}")
+            raise TaccorlError(
+                f"--dataset.cache={self.place}: {nearest(self.place, PLACES)}"
+            )
 
 
 def cache_request(cfg: Any) -> CacheRequest | None:
@@ -132,12 +134,19 @@ class FrameIndex:
     def of_rows(self) -> np.ndarray:
         """(N,) int64 frame of each row: that of the last row with a picture that is not after it."""
         lengths_E = self.lengths_E
-        step_N = np.arange(lengths_E.sum()) - np.repeat(np.cumsum(lengths_E) - lengths_E, lengths_E)
-        return np.repeat(self.first_frames_E, lengths_E) + step_N // self.rows_per_picture
+        step_N = np.arange(lengths_E.sum()) - np.repeat(
+            np.cumsum(lengths_E) - lengths_E, lengths_E
+        )
+        return (
+            np.repeat(self.first_frames_E, lengths_E) + step_N // self.rows_per_picture
+        )
 
 
 def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
-    meta, k = LeRobotDatasetMetadata("local/dataset", root=inputs[0]), Dataset(inputs[0]).rows_per_picture
+    meta, k = (
+        LeRobotDatasetMetadata("local/dataset", root=inputs[0]),
+        Dataset(inputs[0]).rows_per_picture,
+    )
     if k > 1:
         raise DatasetError(
             f"{inputs[0]}: states {k} rows for each picture and has videos, which have a frame for every row: remove "
@@ -146,15 +155,24 @@ def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> No
     files: dict[tuple[str, Path], list[int]] = {}
     for key in meta.video_keys:
         for episode in range(meta.total_episodes):
-            files.setdefault((key, inputs[0] / meta.get_video_file_path(episode, key)), []).append(episode)
+            files.setdefault(
+                (key, inputs[0] / meta.get_video_file_path(episode, key)), []
+            ).append(episode)
     out_dir.mkdir(parents=True, exist_ok=True)
     arrays = {
-        key: empty_frames(out_dir, key, meta.total_frames, config.resolution or tuple(meta.features[key]["shape"][:2]))
+        key: empty_frames(
+            out_dir,
+            key,
+            meta.total_frames,
+            config.resolution or tuple(meta.features[key]["shape"][:2]),
+        )
         for key in meta.video_keys
     }
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs = [
-            pool.submit(_decode, arrays[key], path, meta, key, episodes, config.resolution)
+            pool.submit(
+                _decode, arrays[key], path, meta, key, episodes, config.resolution
+            )
             for (key, path), episodes in files.items()
         ]
         for job in jobs:
@@ -172,7 +190,9 @@ def frames_file(folder: Path, key: str) -> Path:
     return folder / f"{key}.npy"
 
 
-def empty_frames(folder: Path, key: str, num_frames: int, resolution: tuple[int, int]) -> np.memmap:
+def empty_frames(
+    folder: Path, key: str, num_frames: int, resolution: tuple[int, int]
+) -> np.memmap:
     """Create a camera's file of frames, filled with zeros, as a writable memory map (num_frames, 3, rows, columns) uint8.
     Raises OSError: the disk is too full for it. Space is reserved first: writing to a map without space kills the process
     (SIGBUS)."""
@@ -204,7 +224,10 @@ def _decode(
     rows, times_s = [], []
     for k in episodes:
         episode: Any = meta.episodes[k]  # pyright: ignore[reportOptionalSubscript]
-        first, last = int(episode["dataset_from_index"]), int(episode["dataset_to_index"])
+        first, last = (
+            int(episode["dataset_from_index"]),
+            int(episode["dataset_to_index"]),
+        )
         begin_s = float(episode[f"videos/{key}/from_timestamp"])
         rows += range(first, last)
         times_s += [begin_s + t / meta.fps for t in range(last - first)]
@@ -219,11 +242,16 @@ def _decode(
             for frame in container.decode(stream):
                 if done + len(waiting) == len(rows) or frame.pts is None:
                     continue
-                if abs(frame.pts * step_s - times_s[done + len(waiting)]) > 0.5 / meta.fps:
+                if (
+                    abs(frame.pts * step_s - times_s[done + len(waiting)])
+                    > 0.5 / meta.fps
+                ):
                     continue  # of an episode that the dataset no longer has
                 waiting.append(frame.to_ndarray(format="rgb24"))
                 if len(waiting) == AT_ONCE:
-                    out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
+                    out[rows[done : done + len(waiting)]] = resized(
+                        np.stack(waiting), resolution
+                    )
                     done, waiting = done + len(waiting), []
     except (FFmpegError, OSError, IndexError) as error:
         raise DatasetError(
@@ -250,10 +278,17 @@ def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndar
     if pictures.shape[1:3] == (2 * resolution[0], 2 * resolution[1]):
         # Means of four values: twenty times faster in whole numbers.
         size = resolution[1], resolution[0]
-        halved = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
+        halved = [
+            cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            for picture in pictures
+        ]
         return np.stack(halved).transpose(0, 3, 1, 2)
-    small = resize_with_pad_torch(torch.from_numpy(pictures).to(torch.float32) / 255, *resolution)
-    return (small * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 3, 1, 2).numpy()
+    small = resize_with_pad_torch(
+        torch.from_numpy(pictures).to(torch.float32) / 255, *resolution
+    )
+    return (
+        (small * 255).round().clamp(0, 255).to(torch.uint8).permute(0, 3, 1, 2).numpy()
+    )
 
 
 class Frames:
@@ -266,7 +301,13 @@ class Frames:
     Frames that do not fit on the GPU are held in main memory, and on disk if they do not fit there; the log states it.
     """
 
-    def __init__(self, arrays: dict[str, np.ndarray], place: Place, device: str, numbers_bytes: int = 0) -> None:
+    def __init__(
+        self,
+        arrays: dict[str, np.ndarray],
+        place: Place,
+        device: str,
+        numbers_bytes: int = 0,
+    ) -> None:
         needed = sum(array.nbytes for array in arrays.values()) + numbers_bytes
         self.place = _fitting(place, needed, device)
         self.device = torch.device(device if self.place == "gpu" else "cpu")
@@ -277,7 +318,9 @@ class Frames:
                 continue
             held = torch.empty(array.shape, dtype=torch.uint8, device=self.device)
             for first in range(0, len(array), 4096):  # never twice as much in memory
-                held[first : first + 4096] = torch.from_numpy(np.array(array[first : first + 4096]))
+                held[first : first + 4096] = torch.from_numpy(
+                    np.array(array[first : first + 4096])
+                )
             self.tensors[key] = held
 
     def at(self, frames_B: Tensor) -> dict[str, Tensor]:
@@ -285,11 +328,16 @@ class Frames:
         return {key: frames[frames_B] for key, frames in self.tensors.items()}
 
 
-def require_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> None:
+def require_frames(
+    root: Path, resolution: tuple[int, int] | None, store: Store
+) -> None:
     """Check, without decoding, that the frames of the dataset at ``root`` are in the store or can be decoded. Raises
     DatasetError: the dataset has no videos, and the store has no frames of it at this resolution."""
     found = Dataset(root)
-    if found.unstored and store.find(FRAMES, FramesConfig(resolution), [store.dataset(root)]) is None:
+    if (
+        found.unstored
+        and store.find(FRAMES, FramesConfig(resolution), [store.dataset(root)]) is None
+    ):
         raise DatasetError(
             f"{root}: has no videos of {', '.join(found.unstored)}, and {store.root} has no frames of it at "
             f"{_size(resolution)}: {_command(root, found)}{_option(resolution)} --store={store.root} makes them; "
@@ -306,11 +354,18 @@ def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) 
         require_frames(root, resolution, store)
         info = Dataset(root).info
         cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
-        _log.info("decoding %d frames of %s into %s, once", int(info["total_frames"]) * len(cameras), root, store.root)
+        _log.info(
+            "decoding %d frames of %s into %s, once",
+            int(info["total_frames"]) * len(cameras),
+            root,
+            store.root,
+        )
     return store.run(FRAMES, config, [dataset]).path
 
 
-def require_joinable(parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> None:
+def require_joinable(
+    parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store
+) -> None:
     """Check, before anything is written, that ``join_frames`` can join the frames of the datasets ``parts``. Raises
     DatasetError: as ``require_frames``, or the datasets have pictures of different shares of their rows."""
     every = {part: Dataset(part).rows_per_picture for part in parts}
@@ -324,7 +379,9 @@ def require_joinable(parts: Sequence[Path], resolution: tuple[int, int] | None, 
         require_frames(part, resolution, store)
 
 
-def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> Path:
+def join_frames(
+    root: Path, parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store
+) -> Path:
     """Store the frames of the merged dataset at ``root``: those of ``parts`` one after the other. Returns the folder.
     ``parts``: the datasets whose rows it holds, in this order; frames of those with videos are decoded. Raises DatasetError:
     as ``stored_frames``."""
@@ -337,7 +394,12 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
             for folder in folders:
                 frames = np.load(frames_file(folder, key), mmap_mode="r")
                 if joined is None:
-                    joined = empty_frames(out_dir, key, FrameIndex.of_dataset(dataset).num_frames, frames.shape[2:])
+                    joined = empty_frames(
+                        out_dir,
+                        key,
+                        FrameIndex.of_dataset(dataset).num_frames,
+                        frames.shape[2:],
+                    )
                 for begin in range(0, len(frames), 4096):
                     piece = frames[begin : begin + 4096]
                     joined[first + begin :][: len(piece)] = piece
@@ -345,11 +407,17 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
             assert joined is not None and first == len(joined), "a frame for each row"
             joined.flush()
 
-    return store.run(FRAMES.bound(write), FramesConfig(resolution), [store.dataset(root)]).path
+    return store.run(
+        FRAMES.bound(write), FramesConfig(resolution), [store.dataset(root)]
+    ).path
 
 
 def open_frames(
-    request: CacheRequest, root: Path, cameras: Sequence[str], index: FrameIndex, numbers_bytes: int
+    request: CacheRequest,
+    root: Path,
+    cameras: Sequence[str],
+    index: FrameIndex,
+    numbers_bytes: int,
 ) -> Frames:
     """Open the frames of the dataset at ``root``; they are decoded if they are not in the store.
 
@@ -380,22 +448,33 @@ def _command(root: Path, dataset: Dataset) -> str:
     if "observation.is_sim" in dataset.info["features"]:
         words = "merge --real=… --sim=…"
     else:
-        words = DATASET_STAGES.get(read_manifest(root).get("stage", ""), "collect") + " …"
+        words = (
+            DATASET_STAGES.get(read_manifest(root).get("stage", ""), "collect") + " …"
+        )
     return f"taccorl {words} --out={root} --pictures=cache"
 
 
 def _size(resolution: tuple[int, int] | None) -> str:
-    return "the size that the dataset states" if resolution is None else f"{resolution[0]}×{resolution[1]} pixels"
+    return (
+        "the size that the dataset states"
+        if resolution is None
+        else f"{resolution[0]}×{resolution[1]} pixels"
+    )
 
 
 def _option(resolution: tuple[int, int] | None) -> str:
-    return "" if resolution is None else f" --resolution={resolution[0]}x{resolution[1]}"
+    return (
+        "" if resolution is None else f" --resolution={resolution[0]}x{resolution[1]}"
+    )
 
 
 def _fitting(place: Place, needed: int, device: str) -> Place:
     """``place``, or the next one with room for ``needed`` bytes."""
     if place == "gpu" and not device.startswith("cuda"):
-        _log.warning("--dataset.cache=gpu: --policy.device=%s is not a GPU; frames are kept in main memory", device)
+        _log.warning(
+            "--dataset.cache=gpu: --policy.device=%s is not a GPU; frames are kept in main memory",
+            device,
+        )
         place = "host"
     if place == "gpu":
         free = torch.cuda.mem_get_info(device)[0]
@@ -419,7 +498,11 @@ def _too_large(place: str, needed: int, free: int, instead: str) -> str:
 
 
 def _free_memory_bytes() -> int:
-    for line in Path("/proc/meminfo").read_text().splitlines() if Path("/proc/meminfo").exists() else []:
+    for line in (
+        Path("/proc/meminfo").read_text().splitlines()
+        if Path("/proc/meminfo").exists()
+        else []
+    ):
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")

@@ -35,12 +35,24 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from taccorl.data.dataset import Dataset
 from taccorl.data.finding import recompute_statistics
 from taccorl.errors import DatasetError
-from taccorl.lineage.manifest import CHECKPOINT, MANIFEST_PLACES, is_verified, read_manifest, seal_checkpoint
+from taccorl.lineage.manifest import (
+    CHECKPOINT,
+    MANIFEST_PLACES,
+    is_verified,
+    read_manifest,
+    seal_checkpoint,
+)
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.policies.tactile_pi05.weights import ADAPTER, WEIGHTS
-from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, cache_request, open_frames
+from taccorl.training.frame_cache import (
+    CacheRequest,
+    FrameIndex,
+    Frames,
+    cache_request,
+    open_frames,
+)
 from taccorl.training.video_backend import OPEN_VIDEOS, default_video_backend
 
 COMPARED_VERSION = "0.6.1"
@@ -79,12 +91,16 @@ def install() -> bool:
         module.get_safe_default_video_backend = default_video_backend  # pyright: ignore[reportAttributeAccessIssue]
     if lerobot_dataset.DatasetReader is not FastReader:
         lerobot_dataset.DatasetReader = FastReader
-        factory.resolve_delta_timestamps = with_windows(factory.resolve_delta_timestamps)
+        factory.resolve_delta_timestamps = with_windows(
+            factory.resolve_delta_timestamps
+        )
         factory.StreamingLeRobotDataset = streamed(factory.StreamingLeRobotDataset)
         factory.make_dataset = with_cache(factory.make_dataset)
         lerobot_dataset.LeRobotDataset.__getitems__ = whole_batch  # pyright: ignore[reportAttributeAccessIssue]
         default_collate_fn_map[WholeBatch] = lambda batch, **_: batch[0]
-        DataProcessorPipeline._save_pretrained = with_digests(DataProcessorPipeline._save_pretrained)
+        DataProcessorPipeline._save_pretrained = with_digests(
+            DataProcessorPipeline._save_pretrained
+        )
     add_cache_options()
     return True
 
@@ -94,7 +110,10 @@ def with_digests(save: Callable[..., None]) -> Callable[..., None]:
 
     def save_with_digests(self: Any, save_directory: Path, **kwargs: Any) -> None:
         save(self, save_directory, **kwargs)
-        if read_manifest(save_directory).get("stage") == CHECKPOINT or (save_directory / ADAPTER).is_file():
+        if (
+            read_manifest(save_directory).get("stage") == CHECKPOINT
+            or (save_directory / ADAPTER).is_file()
+        ):
             seal_checkpoint(save_directory, keep=[WEIGHTS])
 
     return save_with_digests
@@ -106,11 +125,22 @@ def add_cache_options() -> None:
     if "cache" in {f.name for f in dataclasses.fields(DatasetConfig)}:
         return
     # none, disk, host or gpu: decode every frame once, at the policy's resolution, and gather whole batches.
-    for f in dataclasses.fields(DatasetConfig):  # once made, a dataclass has lost its default factories
+    for f in dataclasses.fields(
+        DatasetConfig
+    ):  # once made, a dataclass has lost its default factories
         if f.default_factory is not dataclasses.MISSING:
-            default = default_video_backend if f.name == "video_backend" else f.default_factory
+            default = (
+                default_video_backend
+                if f.name == "video_backend"
+                else f.default_factory
+            )
             setattr(DatasetConfig, f.name, dataclasses.field(default_factory=default))
-    for name in ("__init__", "__repr__", "__eq__", "__match_args__"):  # nor does it make again what it has made
+    for name in (
+        "__init__",
+        "__repr__",
+        "__eq__",
+        "__match_args__",
+    ):  # nor does it make again what it has made
         delattr(DatasetConfig, name)
     DatasetConfig.__annotations__ |= {"cache": str, "cache_store": str}
     DatasetConfig.cache, DatasetConfig.cache_store = "none", "outputs/store"  # pyright: ignore[reportAttributeAccessIssue]
@@ -135,7 +165,10 @@ def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
         _requested = cache_request(cfg)
         _reads_pictures = getattr(cfg.trainable_config, "pictures", True)
         if _requested is not None and cfg.num_workers:
-            _log.info("--dataset.cache=%s: batches are gathered by the training's own process", _requested.place)
+            _log.info(
+                "--dataset.cache=%s: batches are gathered by the training's own process",
+                _requested.place,
+            )
             cfg.num_workers = 0
         dataset, policy = make_dataset(cfg), cfg.trainable_config
         if isinstance(policy, TactilePI05Config) and policy.pretrained_path:
@@ -150,7 +183,11 @@ class WholeBatch(dict):
 
     def pin_memory(self) -> "WholeBatch":
         """Pin the tensors that are on the CPU."""
-        pinned = {k: v.pin_memory() for k, v in self.items() if isinstance(v, Tensor) and v.device.type == "cpu"}
+        pinned = {
+            k: v.pin_memory()
+            for k, v in self.items()
+            if isinstance(v, Tensor) and v.device.type == "cpu"
+        }
         return WholeBatch({**self, **pinned})
 
 
@@ -158,11 +195,15 @@ def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
     """Replacement for ``LeRobotDataset.__getitems__``: a list with one ``WholeBatch`` if frames are cached, else a list with the
     item of each of ``rows`` (indices in the dataset)."""
     dataset.hf_dataset  # loads it  # noqa: B018
-    batch = dataset.reader.batch(rows) if isinstance(dataset.reader, FastReader) else None
+    batch = (
+        dataset.reader.batch(rows) if isinstance(dataset.reader, FastReader) else None
+    )
     return [dataset[row] for row in rows] if batch is None else [batch]
 
 
-def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Callable[[Any, Any], dict[str, list] | None]:
+def with_windows(
+    resolve: Callable[[Any, Any], dict[str, list] | None],
+) -> Callable[[Any, Any], dict[str, list] | None]:
     """Return ``resolve``, LeRobot's ``resolve_delta_timestamps``, extended by a policy's ``window_delta_indices`` (feature →
     offsets of rows)."""
 
@@ -170,9 +211,16 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
         deltas = Deltas(resolve(cfg, ds_meta) or {})
         if getattr(cfg, "use_relative_actions", False):
             action = ds_meta.features[ACTION]
-            names = [str(name).lower() for name in action["names"] or [""] * action["shape"][0]]
-            absolute = [str(word).lower() for word in cfg.relative_exclude_joints if word]
-            deltas.relative_actions = [not any(word in name for word in absolute) for name in names]
+            names = [
+                str(name).lower()
+                for name in action["names"] or [""] * action["shape"][0]
+            ]
+            absolute = [
+                str(word).lower() for word in cfg.relative_exclude_joints if word
+            ]
+            deltas.relative_actions = [
+                not any(word in name for word in absolute) for name in names
+            ]
         if isinstance(cfg, TactilePI05Config):
             for key, indices in cfg.window_delta_indices(ds_meta.features).items():
                 deltas[key] = [index / ds_meta.fps for index in indices]
@@ -186,7 +234,11 @@ def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
     its statistics of relative actions."""
 
     def make_streamed(*args: Any, **kwargs: Any) -> Any:
-        windows = (v for v in (*args, *kwargs.values()) if isinstance(v, Deltas) and v.relative_actions)
+        windows = (
+            v
+            for v in (*args, *kwargs.values())
+            if isinstance(v, Deltas) and v.relative_actions
+        )
         if deltas := next(windows, None):
             root, repo_id = kwargs.get("root"), kwargs.get("repo_id") or args[0]
             words = RELATIVE, f"--operation.chunk_size={len(deltas[ACTION])}"
@@ -195,7 +247,9 @@ def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
                 "written with, as LeRobot does it. Those of taccorl's commands are of absolute actions, several times wider: "
                 "leave streaming out%s",
                 root or repo_id,
-                f", or run `{recompute_statistics(Path(root).resolve(), *words)}` first" if root else "",
+                f", or run `{recompute_statistics(Path(root).resolve(), *words)}` first"
+                if root
+                else "",
             )
         return make(*args, **kwargs)
 
@@ -218,12 +272,17 @@ class Column:
         self.shape: tuple[int, ...] = ()
         if pa.types.is_fixed_size_list(kind):
             self.shape, kind = (kind.list_size,), kind.value_type
-        elif isinstance(kind, pa.ExtensionType) and hasattr(kind, "shape"):  # of the datasets library: lists in lists
+        elif isinstance(kind, pa.ExtensionType) and hasattr(
+            kind, "shape"
+        ):  # of the datasets library: lists in lists
             self.shape, kind = tuple(kind.shape), kind.storage_type
             for _ in self.shape:
                 kind = kind.value_type
         size = math.prod(self.shape)
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or column.null_count:
+        if (
+            not (pa.types.is_integer(kind) or pa.types.is_floating(kind))
+            or column.null_count
+        ):
             raise TypeError(f"a column of {column.type}")
         self._pieces, self._starts, start = [], [], 0
         for chunk in column.chunks:
@@ -232,8 +291,12 @@ class Column:
                 for _ in self.shape:
                     numbers = numbers.flatten()
                 if len(numbers) != len(chunk) * size:
-                    raise TypeError(f"a column of {column.type} whose rows differ in size")
-                self._pieces.append(numbers.to_numpy(zero_copy_only=True).reshape(len(chunk), size))
+                    raise TypeError(
+                        f"a column of {column.type} whose rows differ in size"
+                    )
+                self._pieces.append(
+                    numbers.to_numpy(zero_copy_only=True).reshape(len(chunk), size)
+                )
                 self._starts.append(start)
                 start += len(chunk)
         # As LeRobot's own way through Python's numbers makes them.
@@ -253,7 +316,9 @@ class Column:
         for row in rows:
             piece = bisect.bisect_right(self._starts, row) - 1
             found.append(self._pieces[piece][row - self._starts[piece]])
-        return torch.from_numpy(np.stack(found).astype(self._dtype)).reshape(len(rows), *self.shape)
+        return torch.from_numpy(np.stack(found).astype(self._dtype)).reshape(
+            len(rows), *self.shape
+        )
 
 
 _warned: set[Path] = set()
@@ -261,10 +326,18 @@ _warned: set[Path] = set()
 
 def _warn_unverified(root: Path) -> None:
     """Say once that nobody has compared a dataset of taccorl with its manifest."""
-    if root in _warned or not any((root / place).is_file() for place in MANIFEST_PLACES[1:]) or is_verified(root):
+    if (
+        root in _warned
+        or not any((root / place).is_file() for place in MANIFEST_PLACES[1:])
+        or is_verified(root)
+    ):
         return
     _warned.add(root)
-    _log.warning("%s: its files have not been compared with its manifest here: taccorl check %s", root, root)
+    _log.warning(
+        "%s: its files have not been compared with its manifest here: taccorl check %s",
+        root,
+        root,
+    )
 
 
 class FastReader(DatasetReader):
@@ -282,15 +355,22 @@ class FastReader(DatasetReader):
         """Cameras whose pictures are read."""
         cameras = self._meta.video_keys
         if self._meta.episodes is None:
-            raise DatasetError(f"{self.root}: holds no episode; if its recording failed, remove it and record again")
-        self._has_videos = all(f"videos/{key}/file_index" in self._meta.episodes.column_names for key in cameras)  # pyright: ignore
+            raise DatasetError(
+                f"{self.root}: holds no episode; if its recording failed, remove it and record again"
+            )
+        self._has_videos = all(
+            f"videos/{key}/file_index" in self._meta.episodes.column_names
+            for key in cameras
+        )  # pyright: ignore
         if not self._has_videos:
             if self._cache is None and self.cameras:
                 raise DatasetError(
                     f"{self.root}: has no videos of {', '.join(cameras)}; its frames are only in the frame cache of training: "
                     "give --dataset.cache=gpu (host, disk), or make a dataset with videos by taccorl collect --pictures=video"
                 )
-            assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
+            assert self._meta.stats is not None, (
+                "LeRobot writes statistics with every dataset"
+            )
             for key in cameras:  # LeRobot puts ImageNet's there
                 self._meta.stats.setdefault(key, {})
         given = [v for v in (*args, *kwargs.values()) if isinstance(v, Deltas)]
@@ -305,8 +385,12 @@ class FastReader(DatasetReader):
         if self._has_videos:
             return super()._check_cached_episodes_sufficient()
         table: Any = self.hf_dataset
-        wanted = range(self._meta.total_episodes) if self.episodes is None else self.episodes
-        return set(wanted) <= {int(episode) for episode in table.unique("episode_index")}
+        wanted = (
+            range(self._meta.total_episodes) if self.episodes is None else self.episodes
+        )
+        return set(wanted) <= {
+            int(episode) for episode in table.unique("episode_index")
+        }
 
     def _build_index_mapping(self) -> None:
         super()._build_index_mapping()
@@ -314,21 +398,31 @@ class FastReader(DatasetReader):
         if self.hf_dataset is not None and IS_SIM in self.hf_dataset.column_names:
             # Which rows the share p of the loss's weights counts: those that are trained on. LeRobot's editing of a dataset
             # loses the statistics of what it does not know.
-            share = np.asarray(self.hf_dataset.data.column(IS_SIM).to_numpy(), dtype=np.float64).mean()
-            assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
+            share = np.asarray(
+                self.hf_dataset.data.column(IS_SIM).to_numpy(), dtype=np.float64
+            ).mean()
+            assert self._meta.stats is not None, (
+                "LeRobot writes statistics with every dataset"
+            )
             self._meta.stats.setdefault(IS_SIM, {})["mean"] = np.array([share])
         if self.hf_dataset is not None and self._relative_actions is not None:
             # LeRobot normalises what is relative by the range of what is absolute unless lerobot-edit-dataset has overwritten it.
             assert self._meta.stats is not None and self.delta_indices is not None
-            self._meta.stats[ACTION] = self._relative_statistics(np.array(self._relative_actions))
+            self._meta.stats[ACTION] = self._relative_statistics(
+                np.array(self._relative_actions)
+            )
 
     def _relative_statistics(self, relative_A: np.ndarray) -> dict[str, np.ndarray]:
         """Exact statistics of actions as a policy with relative ones meets them: each step of each row's chunk, up to the end of
         the episode, less the row's state where that is wanted. (A,) each, and (H, A) for ``STEP_STATISTICS``."""
         table: Any = self.hf_dataset
-        episode, state, action = (Column(table.data.column(k)) for k in ("episode_index", OBS_STATE, ACTION))
+        episode, state, action = (
+            Column(table.data.column(k)) for k in ("episode_index", OBS_STATE, ACTION)
+        )
         episode_T = episode.stored().reshape(-1).numpy()
-        state_TA, action_TA = (column.stored().numpy().astype(np.float64) for column in (state, action))
+        state_TA, action_TA = (
+            column.stored().numpy().astype(np.float64) for column in (state, action)
+        )
         state_TA = state_TA[:, : len(relative_A)] * relative_A
 
         def of_action(a: int) -> dict[str, Any]:
@@ -338,17 +432,32 @@ class FastReader(DatasetReader):
                 rows = rows[episode_T[rows] == episode_T[rows + step]]
                 parts.append(action_TA[rows + step, a] - state_TA[rows, a])
             values = np.concatenate(parts)
-            found = {"min": values.min(), "max": values.max(), "mean": values.mean(), "std": values.std()}
+            found = {
+                "min": values.min(),
+                "max": values.max(),
+                "mean": values.mean(),
+                "std": values.std(),
+            }
             percent = (1, 10, 50, 90, 99)
-            found |= {f"q{q:02d}": x for q, x in zip(percent, np.percentile(values, percent), strict=True)}
-            found |= {"step_mean": [part.mean() for part in parts], "step_std": [part.std() for part in parts]}
+            found |= {
+                f"q{q:02d}": x
+                for q, x in zip(percent, np.percentile(values, percent), strict=True)
+            }
+            found |= {
+                "step_mean": [part.mean() for part in parts],
+                "step_std": [part.std() for part in parts],
+            }
             return found | {"count": len(values)}
 
         with ThreadPoolExecutor(4) as pool:  # NumPy partitions outside of Python's lock
             each = list(pool.map(of_action, range(len(relative_A))))
         told = {name: [of_one[name] for of_one in each] for name in each[0]}
-        statistics = {name: np.array(v if name != "count" else v[:1]) for name, v in told.items()}
-        return statistics | {name: np.ascontiguousarray(statistics[name].T) for name in STEP_STATISTICS}
+        statistics = {
+            name: np.array(v if name != "count" else v[:1]) for name, v in told.items()
+        }
+        return statistics | {
+            name: np.ascontiguousarray(statistics[name].T) for name in STEP_STATISTICS
+        }
 
     def columns(self) -> dict[str, Column]:
         """Feature → its column; empty for a dataset that LeRobot reads."""
@@ -356,10 +465,19 @@ class FastReader(DatasetReader):
             dataset, features = self.hf_dataset, self._meta.features
             assert dataset is not None, "LeRobot loads the table before it reads rows"
             self._columns = {}
-            plain = dataset._indices is None and not self._meta.depth_keys and not self._meta.image_keys
-            if plain and set(dataset.column_names) == set(features) - set(self._meta.video_keys):
+            plain = (
+                dataset._indices is None
+                and not self._meta.depth_keys
+                and not self._meta.image_keys
+            )
+            if plain and set(dataset.column_names) == set(features) - set(
+                self._meta.video_keys
+            ):
                 with contextlib.suppress(TypeError, pa.ArrowInvalid):
-                    self._columns = {key: Column(dataset.data.column(key)) for key in dataset.column_names}
+                    self._columns = {
+                        key: Column(dataset.data.column(key))
+                        for key in dataset.column_names
+                    }
         return self._columns
 
     def batch(self, rows: list[int]) -> "WholeBatch | None":
@@ -390,17 +508,28 @@ class FastReader(DatasetReader):
         row = int(idx) + len(self.hf_dataset) * (idx < 0)  # pyright: ignore[reportArgumentType]
         if not 0 <= row < len(self.hf_dataset):  # pyright: ignore[reportArgumentType]
             return super().get_item(idx)
-        episode, index = int(columns["episode_index"].rows([row])), int(columns["index"].rows([row]))
+        episode, index = (
+            int(columns["episode_index"].rows([row])),
+            int(columns["index"].rows([row])),
+        )
         windows: dict[str, list[int]] = {}
         padding: dict[str, Tensor] = {}
         if self.delta_indices is not None:
             windows, padding = self._get_query_indices(index, episode)
-        item: dict[str, Any] = {k: column.rows([row])[0] for k, column in columns.items() if k not in windows}
+        item: dict[str, Any] = {
+            k: column.rows([row])[0]
+            for k, column in columns.items()
+            if k not in windows
+        }
         item |= padding | self._query_hf_dataset(windows)
         if self.cameras and not self._has_videos:
             gathered: Any = self.batch([row])
             for key in self.cameras:
-                item[key] = gathered[key][0] if self._return_uint8 else gathered[key][0].to(torch.float32) / 255
+                item[key] = (
+                    gathered[key][0]
+                    if self._return_uint8
+                    else gathered[key][0].to(torch.float32) / 255
+                )
         elif self.cameras:
             times_s = self._get_query_timestamps(item["timestamp"].item(), windows)
             item = self._query_videos(times_s, episode) | item
@@ -417,50 +546,80 @@ class FastReader(DatasetReader):
             return super()._query_hf_dataset(query_indices)
         relative = self._absolute_to_relative_idx
         return {
-            key: columns[key].rows(rows if relative is None else [relative[row] for row in rows])
+            key: columns[key].rows(
+                rows if relative is None else [relative[row] for row in rows]
+            )
             for key, rows in query_indices.items()
             if key in columns
         }
 
-    def _query_videos(self, query_timestamps: dict[str, list[float]], ep_idx: int) -> dict[str, Tensor]:
+    def _query_videos(
+        self, query_timestamps: dict[str, list[float]], ep_idx: int
+    ) -> dict[str, Tensor]:
         single = all(len(times_s) == 1 for times_s in query_timestamps.values())
         if self._video_backend != "pyav" or not single or self._meta.depth_keys:
             return super()._query_videos(query_timestamps, ep_idx)
-        assert self._meta.episodes is not None, "LeRobot loads episodes with the metadata"
+        assert self._meta.episodes is not None, (
+            "LeRobot loads episodes with the metadata"
+        )
         episode, pictures = self._meta.episodes[ep_idx], {}
         for key, (time_s,) in query_timestamps.items():
             path = self.root / self._meta.get_video_file_path(ep_idx, key)
-            picture = OPEN_VIDEOS.picture(path, episode[f"videos/{key}/from_timestamp"] + time_s, self._tolerance_s)
+            picture = OPEN_VIDEOS.picture(
+                path,
+                episode[f"videos/{key}/from_timestamp"] + time_s,
+                self._tolerance_s,
+            )
             if picture is None:  # LeRobot says what is wrong
                 return super()._query_videos(query_timestamps, ep_idx)
-            pictures[key] = picture if self._return_uint8 else picture.to(torch.float32) / 255
+            pictures[key] = (
+                picture if self._return_uint8 else picture.to(torch.float32) / 255
+            )
         return pictures
 
 
 class Gathered:
     """A dataset's numbers as tensors beside its cached frames: a batch is a few gather operations on one device."""
 
-    def __init__(self, reader: FastReader, columns: dict[str, Column], request: CacheRequest) -> None:
+    def __init__(
+        self, reader: FastReader, columns: dict[str, Column], request: CacheRequest
+    ) -> None:
         """Raises DatasetError: as ``open_frames``."""
         meta: Any = reader._meta
-        assert reader.hf_dataset is not None and meta.tasks is not None, "LeRobot loads table and tasks first"
-        numbers = {key: column.stored() for key, column in columns.items() if not key.startswith(SIMULATOR)}
-        index = FrameIndex(np.array(meta.episodes["length"], dtype=np.int64), Dataset(reader.root).rows_per_picture)
+        assert reader.hf_dataset is not None and meta.tasks is not None, (
+            "LeRobot loads table and tasks first"
+        )
+        numbers = {
+            key: column.stored()
+            for key, column in columns.items()
+            if not key.startswith(SIMULATOR)
+        }
+        index = FrameIndex(
+            np.array(meta.episodes["length"], dtype=np.int64),
+            Dataset(reader.root).rows_per_picture,
+        )
         needed = sum(x.nbytes for x in numbers.values())
-        self.frames: Frames = open_frames(request, reader.root, reader.cameras, index, needed)
+        self.frames: Frames = open_frames(
+            request, reader.root, reader.cameras, index, needed
+        )
         device = self.frames.device
         self.rows_per_picture = index.rows_per_picture if reader.cameras else 1
         self.frame_N = torch.from_numpy(index.of_rows()).to(device)
         self.numbers = {key: x.to(device) for key, x in numbers.items()}
         self.kinds = {key: column.kind for key, column in columns.items()}
-        self.offsets = {key: torch.tensor(d, device=device) for key, d in (reader.delta_indices or {}).items()}
+        self.offsets = {
+            key: torch.tensor(d, device=device)
+            for key, d in (reader.delta_indices or {}).items()
+        }
         episode = numbers["episode_index"].reshape(-1)
         begins = torch.ones(len(episode), dtype=torch.bool)
         begins[1:] = episode[1:] != episode[:-1]
         place = begins.cumsum(0) - 1
         firsts = torch.nonzero(begins).reshape(-1)
         self.first = firsts[place].to(device)
-        self.last = (torch.cat([firsts[1:], torch.tensor([len(episode)])]) - 1)[place].to(device)
+        self.last = (torch.cat([firsts[1:], torch.tensor([len(episode)])]) - 1)[
+            place
+        ].to(device)
         self.tasks = [str(meta.tasks.iloc[k].name) for k in range(len(meta.tasks))]
         self.task_index = numbers["task_index"].reshape(-1).tolist()
 

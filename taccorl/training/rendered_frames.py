@@ -32,7 +32,14 @@ from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.seen_scene import DRAWN_TOGETHER
 from taccorl.sim.simulation import Simulation
-from taccorl.training.frame_cache import FRAMES, FrameIndex, FramesConfig, empty_frames, frames_file, resized
+from taccorl.training.frame_cache import (
+    FRAMES,
+    FrameIndex,
+    FramesConfig,
+    empty_frames,
+    frames_file,
+    resized,
+)
 
 
 def render_frames(
@@ -63,22 +70,36 @@ def render_frames(
             return
         for key in cameras:
             shape = tuple(dataset.info["features"][key]["shape"][:2])
-            empty_frames(out_dir, key, index.num_frames, config.resolution or shape).flush()
-        first_frames, num_frames = index.first_frames_E.tolist(), index.frames_E.tolist()
+            empty_frames(
+                out_dir, key, index.num_frames, config.resolution or shape
+            ).flush()
+        first_frames, num_frames = (
+            index.first_frames_E.tolist(),
+            index.frames_E.tolist(),
+        )
         rendered = _rendered_before(store, config)
         made_of = _attempts(inputs[0]) or [""] * dataset.num_episodes
         found = engine.map(
             functools.partial(_fill_episode, inputs[0], out_dir, config.resolution),
             [
-                _Item(i, first_frames[i], num_frames[i], rendered.get((key, index.rows_per_picture)))
+                _Item(
+                    i,
+                    first_frames[i],
+                    num_frames[i],
+                    rendered.get((key, index.rows_per_picture)),
+                )
                 for i, key in enumerate(made_of)
             ],
-            on_done=lambda item, _: progress(f"{item} of {dataset.num_episodes}: {item.done}"),
+            on_done=lambda item, _: progress(
+                f"{item} of {dataset.num_episodes}: {item.done}"
+            ),
             name=str,
         )
         seconds.extend(found)
 
-    artefact = store.run(FRAMES.bound(render), FramesConfig(resolution), [store.dataset(root)])
+    artefact = store.run(
+        FRAMES.bound(render), FramesConfig(resolution), [store.dataset(root)]
+    )
     return artefact, mean_seconds(seconds)
 
 
@@ -86,7 +107,12 @@ class DrawnFrames:
     """Frames of a dataset that is being collected, drawn as its episodes become known: ``collect.Pictures``."""
 
     def __init__(
-        self, spec: DatasetSpec, rows_per_picture: int, resolution: tuple[int, int] | None, store: Store, folder: Path
+        self,
+        spec: DatasetSpec,
+        rows_per_picture: int,
+        resolution: tuple[int, int] | None,
+        store: Store,
+        folder: Path,
     ) -> None:
         """
         Args:
@@ -96,25 +122,40 @@ class DrawnFrames:
         """
         self._every, self._folder = rows_per_picture, folder
         shapes = {key: spec.features[key].shape for key in spec.keys("video")}
-        self._frames = {key: resolution or (shape[0], shape[1]) for key, shape in shapes.items()}
-        self._size, self._resolution = next((shape[0], shape[1]) for shape in shapes.values()), resolution
+        self._frames = {
+            key: resolution or (shape[0], shape[1]) for key, shape in shapes.items()
+        }
+        self._size, self._resolution = (
+            next((shape[0], shape[1]) for shape in shapes.values()),
+            resolution,
+        )
         self._known = _rendered_before(store, FramesConfig(resolution))
         self._items: list[_Item] = []
         self._made_of: list[str] = []
 
     def add(self, demonstration: Artefact, rows: int) -> "_Piece":
         """Reserve the frames of the next episode, whose attempt is ``demonstration``. Returns the function that renders them."""
-        first = self._items[-1].first_frame + self._items[-1].num_frames if self._items else 0
+        first = (
+            self._items[-1].first_frame + self._items[-1].num_frames
+            if self._items
+            else 0
+        )
         known = self._known.get((demonstration.digest, self._every))
         item = _Item(len(self._items), first, -(-rows // self._every), known)
         self._items.append(item)
         self._made_of.append(demonstration.digest)
-        return _Piece(item, self._folder, self._frames, self._size, self._resolution, self._every)
+        return _Piece(
+            item, self._folder, self._frames, self._size, self._resolution, self._every
+        )
 
     def are_of(self, root: Path, index: FrameIndex) -> bool:
         """Whether these are the frames of the dataset at ``root``, all of them, in its order."""
         frames = [item.num_frames for item in self._items]
-        return self._made_of == _attempts(root) and frames == index.frames_E.tolist() and bool(frames)
+        return (
+            self._made_of == _attempts(root)
+            and frames == index.frames_E.tolist()
+            and bool(frames)
+        )
 
     def move(self, out_dir: Path, progress: Callable[[str], None]) -> None:
         """Move the files into ``out_dir``, where they are as those of ``empty_frames``."""
@@ -122,7 +163,11 @@ class DrawnFrames:
         for key, size in self._frames.items():
             path = frames_file(self._folder, key)
             with path.open("r+b") as file:
-                shape = {"descr": "|u1", "fortran_order": False, "shape": (num_frames, 3, *size)}
+                shape = {
+                    "descr": "|u1",
+                    "fortran_order": False,
+                    "shape": (num_frames, 3, *size),
+                }
                 np.lib.format.write_array_header_1_0(file, shape)
                 assert file.tell() == _HEADER_BYTES
             path.rename(frames_file(out_dir, key))
@@ -150,13 +195,22 @@ class _Piece:
     def __call__(self, sim: Simulation, states: np.ndarray) -> None:
         arrays = {key: self._opened(key) for key in self.frames}
         if self.item.known is None:
-            _draw(sim, states[:: self.rows_per_picture], self.size, self.resolution, arrays)
+            _draw(
+                sim,
+                states[:: self.rows_per_picture],
+                self.size,
+                self.resolution,
+                arrays,
+            )
         else:
             _copy(self.item.known, arrays)
 
     def _opened(self, key: str) -> np.memmap:
         """The episode's part of a camera's file. Space is reserved first, as by ``empty_frames``."""
-        path, shape = frames_file(self.folder, key), (self.item.num_frames, 3, *self.frames[key])
+        path, shape = (
+            frames_file(self.folder, key),
+            (self.item.num_frames, 3, *self.frames[key]),
+        )
         size = math.prod(shape)
         begin = _HEADER_BYTES + size // self.item.num_frames * self.item.first_frame
         with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+b") as file:
@@ -194,31 +248,55 @@ class _Item:
 def _attempts(root: Path) -> list[str]:
     """Digest of the attempt that each episode of the dataset was made of; empty if the dataset does not say so."""
     manifest = read_manifest(root)
-    inputs = manifest["inputs"] if manifest and manifest["stage"] in DATASET_STAGES else []
+    inputs = (
+        manifest["inputs"] if manifest and manifest["stage"] in DATASET_STAGES else []
+    )
     return [entry["digest"] for entry in inputs]
 
 
-def _rendered_before(store: Store, config: FramesConfig) -> dict[tuple[str, int], _Place]:
+def _rendered_before(
+    store: Store, config: FramesConfig
+) -> dict[tuple[str, int], _Place]:
     """(digest of an attempt, rows per picture) → its frames at this resolution. Only of datasets that are still there, as they
     were."""
     found: dict[tuple[str, int], _Place] = {}
-    now = {name: version for name, version in software().items() if name in ("mujoco", "taccorl")}
+    now = {
+        name: version
+        for name, version in software().items()
+        if name in ("mujoco", "taccorl")
+    }
     for folder in store.artefacts():
         manifest = read_manifest(folder) if folder.parent.name == FRAMES.name else {}
-        if not manifest or (manifest["config"], manifest["stage_version"]) != (canonical(config), FRAMES.version):
+        if not manifest or (manifest["config"], manifest["stage_version"]) != (
+            canonical(config),
+            FRAMES.version,
+        ):
             continue
-        if any(manifest["software"].get(name) != version for name, version in now.items()):
+        if any(
+            manifest["software"].get(name) != version for name, version in now.items()
+        ):
             continue  # it may have drawn other pictures
         root = Path(manifest["inputs"][0]["path"])
         made_of = _attempts(root) if root.is_dir() else []
-        if made_of and store.source(root).digest == manifest["inputs"][0]["digest"] and not store.damaged(folder):
+        if (
+            made_of
+            and store.source(root).digest == manifest["inputs"][0]["digest"]
+            and not store.damaged(folder)
+        ):
             dataset = Dataset(root)
-            first, every = FrameIndex.of_dataset(dataset).first_frames_E.tolist(), dataset.rows_per_picture
-            found |= {(key, every): _Place(folder, first[i]) for i, key in enumerate(made_of)}
+            first, every = (
+                FrameIndex.of_dataset(dataset).first_frames_E.tolist(),
+                dataset.rows_per_picture,
+            )
+            found |= {
+                (key, every): _Place(folder, first[i]) for i, key in enumerate(made_of)
+            }
     return found
 
 
-def _fill_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None, item: _Item) -> dict[str, float]:
+def _fill_episode(
+    root: Path, out_dir: Path, resolution: tuple[int, int] | None, item: _Item
+) -> dict[str, float]:
     """Write every frame of an episode; returns the seconds of rendering and of resizing and writing, none if copied."""
     arrays = {}
     for path in out_dir.glob("*.npy"):
@@ -228,7 +306,9 @@ def _fill_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None,
         _copy(item.known, arrays)
         return {}
     dataset, sim = _opened(root)
-    states = dataset.values(item.index, ["sim.state"])["sim.state"][:: dataset.rows_per_picture]
+    states = dataset.values(item.index, ["sim.state"])["sim.state"][
+        :: dataset.rows_per_picture
+    ]
     shape = dataset.info["features"][_cameras(dataset)[0]]["shape"]
     return _draw(sim, states, (shape[0], shape[1]), resolution, arrays)
 
@@ -253,10 +333,14 @@ def _draw(
     for first in range(0, len(states), DRAWN_TOGETHER):
         began_s = time.perf_counter()
         part = states[first : first + DRAWN_TOGETHER]
-        shown = sim.draw_states(part, [key.removeprefix(PICTURE) for key in arrays], size)
+        shown = sim.draw_states(
+            part, [key.removeprefix(PICTURE) for key in arrays], size
+        )
         rendered_s = time.perf_counter()
         for key, frames in arrays.items():
-            frames[first : first + len(part)] = resized(shown[key.removeprefix(PICTURE)], resolution)
+            frames[first : first + len(part)] = resized(
+                shown[key.removeprefix(PICTURE)], resolution
+            )
         spent["rendering"] += rendered_s - began_s
         spent["resizing and writing"] += time.perf_counter() - rendered_s
     return spent
@@ -284,6 +368,8 @@ def _opened(root: Path) -> tuple[Dataset, Simulation]:
         dataset = Dataset(root)
         told: Any = dataset.episode_facts(0).get("provenance", {}).get("simulation")
         if not isinstance(told, dict) or "twin" not in told:
-            raise DatasetError(f"{root}: does not state in which twin it was made; make it with taccorl collect")
+            raise DatasetError(
+                f"{root}: does not state in which twin it was made; make it with taccorl collect"
+            )
         _open[root] = dataset, make_simulation(told)
     return _open[root]

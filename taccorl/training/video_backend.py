@@ -51,26 +51,43 @@ class OpenVideos(threading.local):
                 break
         if nearest is None:
             return None
-        return torch.from_numpy(nearest.to_ndarray(format="rgb24")).permute(2, 0, 1).contiguous()
+        return (
+            torch.from_numpy(nearest.to_ndarray(format="rgb24"))
+            .permute(2, 0, 1)
+            .contiguous()
+        )
 
-    def _frames(self, path: Path, time_s: float) -> Iterator[tuple[av.VideoFrame, float]]:
+    def _frames(
+        self, path: Path, time_s: float
+    ) -> Iterator[tuple[av.VideoFrame, float]]:
         """From the last keyframe that is not after ``time_s`` on."""
         container = self._container(path)
         stream = container.streams.video[0]
         assert stream.time_base is not None, "LeRobot's videos have a time base"
-        container.seek(round(time_s / stream.time_base) - 1, backward=True, any_frame=False, stream=stream)
+        container.seek(
+            round(time_s / stream.time_base) - 1,
+            backward=True,
+            any_frame=False,
+            stream=stream,
+        )
         for frame in container.decode(stream):
             if frame.pts is not None:
                 yield frame, float(frame.pts * stream.time_base)
 
     def _container(self, path: Path) -> InputContainer:
-        if self._process != os.getpid():  # a fork shares its parent's place in each file
+        if (
+            self._process != os.getpid()
+        ):  # a fork shares its parent's place in each file
             self.__init__()
         if path in self._open:
             self._open.move_to_end(path)
             return self._open[path]
         container = self._open[path] = av.open(str(path))
-        container.streams.video[0].thread_type = "NONE"  # frame threads read ahead, for one frame that is in vain
+        container.streams.video[
+            0
+        ].thread_type = (
+            "NONE"  # frame threads read ahead, for one frame that is in vain
+        )
         if len(self._open) > MOST_OPEN:
             self._open.popitem(last=False)[1].close()
         return container

@@ -29,7 +29,11 @@ from taccorl.views.contact_sheet import draw_sheet
 PICTURE = ".card/episode_0.jpg"
 SHEET_WIDTH_PX = 1200
 """Largest width of the card's picture [pixels]."""
-DOMAIN_TAGS: dict[Domain | None, str] = {"real": "real", "surrogate": "surrogate", "twin": "simulated"}
+DOMAIN_TAGS: dict[Domain | None, str] = {
+    "real": "real",
+    "surrogate": "surrogate",
+    "twin": "simulated",
+}
 """Domain → tag of the card."""
 MOST_INSTRUCTIONS = 8
 """Most instructions that a card lists."""
@@ -62,8 +66,12 @@ def write_card(root: Path) -> Path | None:
 
 def card_text(dataset: Dataset) -> str:
     """Text of the dataset card: Markdown, below the YAML front matter that the Hugging Face Hub reads."""
-    origins = Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
-    front = yaml.safe_dump(_front_matter(dataset, origins), sort_keys=False, allow_unicode=True)
+    origins = Counter(
+        dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes)
+    )
+    front = yaml.safe_dump(
+        _front_matter(dataset, origins), sort_keys=False, allow_unicode=True
+    )
     said = "; ".join(str(origin) for origin in origins)
     shown = f"![Episode 0: pictures and pads at six instants, grippers and touch over time]({PICTURE})"
     body = markdown(
@@ -78,8 +86,16 @@ def card_text(dataset: Dataset) -> str:
 
 def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
     """As LeRobot's own card, without a licence: its owner adds that."""
-    kinds = dict.fromkeys(DOMAIN_TAGS[origin.domain] for origin in origins if origin.domain)
-    tags = ["LeRobot", "taccorl", *["tactile"] * bool(dataset.spec.keys("tactile")), *kinds, dataset.spec.robot_type]
+    kinds = dict.fromkeys(
+        DOMAIN_TAGS[origin.domain] for origin in origins if origin.domain
+    )
+    tags = [
+        "LeRobot",
+        "taccorl",
+        *["tactile"] * bool(dataset.spec.keys("tactile")),
+        *kinds,
+        dataset.spec.robot_type,
+    ]
     return {
         "task_categories": ["robotics"],
         "tags": [tag for tag in dict.fromkeys(tags) if tag],
@@ -88,12 +104,23 @@ def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
 
 
 def _summary(dataset: Dataset) -> list[str]:
-    spec, rows = dataset.spec, sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
-    outcomes = Counter(dataset.episode_facts(i).get("success") for i in range(dataset.num_episodes))
+    spec, rows = (
+        dataset.spec,
+        sum(dataset.num_rows(i) for i in range(dataset.num_episodes)),
+    )
+    outcomes = Counter(
+        dataset.episode_facts(i).get("success") for i in range(dataset.num_episodes)
+    )
     words = {True: "success", False: "failure", None: "not stated"}
-    said = ", ".join(f"{num} {words[outcome]}" for outcome, num in outcomes.most_common())
+    said = ", ".join(
+        f"{num} {words[outcome]}" for outcome, num in outcomes.most_common()
+    )
     texts, seconds = [f"*{text}*" for text in dataset.instructions], rows / spec.fps
-    duration = f"{seconds / 3600:.2f} hours" if seconds >= 360 else f"{seconds / 60:.1f} minutes"
+    duration = (
+        f"{seconds / 3600:.2f} hours"
+        if seconds >= 360
+        else f"{seconds / 60:.1f} minutes"
+    )
     size = f"{_count(dataset.num_episodes, 'episode')}, {rows} rows at {spec.fps} a second, {duration}"
     return [
         f"{size}; outcomes: {said}",
@@ -112,12 +139,26 @@ def _features(dataset: Dataset) -> Section:
     for key, told in dataset.info["features"].items():
         if key not in BOOKKEEPING:
             feature = dataset.spec.features.get(key)
-            content = _unit_and_content(dataset, key, feature) if feature else ("", dataset.skipped.get(key, ""))
-            rows.append([Cell(key, "code"), f"{told['dtype']} [{' × '.join(map(str, told['shape']))}]", *content])
-    return Section(title="Features", heads=("feature", "type", "unit", "what"), rows=rows)
+            content = (
+                _unit_and_content(dataset, key, feature)
+                if feature
+                else ("", dataset.skipped.get(key, ""))
+            )
+            rows.append(
+                [
+                    Cell(key, "code"),
+                    f"{told['dtype']} [{' × '.join(map(str, told['shape']))}]",
+                    *content,
+                ]
+            )
+    return Section(
+        title="Features", heads=("feature", "type", "unit", "what"), rows=rows
+    )
 
 
-def _unit_and_content(dataset: Dataset, key: str, feature: FeatureSpec) -> tuple[str, str]:
+def _unit_and_content(
+    dataset: Dataset, key: str, feature: FeatureSpec
+) -> tuple[str, str]:
     if feature.dtype == "video":
         codec = (dataset.info["features"][key].get("info") or {}).get("video.codec", "")
         return "", f"RGB {codec}".rstrip()
@@ -140,16 +181,32 @@ def _origin(dataset: Dataset, origins: Counter[Origin]) -> Section:
         kind = "simulated" if part["is_sim"] else "given as real"
         rows.append([f"{kind}: {Path(part['dataset']).name}", str(part["episodes"])])
     if any(origin.domain is None for origin in origins):
-        notes.append("Where the domain is not stated, nothing here says whether a robot or a simulator made the data.")
+        notes.append(
+            "Where the domain is not stated, nothing here says whether a robot or a simulator made the data."
+        )
     if manifest := dataset.provenance:
-        software = ", ".join(f"{name} {v}" for name, v in manifest["software"].items() if name in _SHAPED_BY)
+        software = ", ".join(
+            f"{name} {v}"
+            for name, v in manifest["software"].items()
+            if name in _SHAPED_BY
+        )
         sources = len(manifest.get("sources", []))
-        made_of = _count(sources, "file") if sources else f"{_count(len(manifest['inputs']), 'result')} of other stages"
+        made_of = (
+            _count(sources, "file")
+            if sources
+            else f"{_count(len(manifest['inputs']), 'result')} of other stages"
+        )
         notes.append(
             f"Made by stage `{manifest['stage']}` from {made_of}, with {software}. "
             f"`taccorl lineage explain {_quoted(dataset)}` shows what it was made from, down to the raw files."
         )
-    return Section(title="Origin", heads=("domain: origin", "episodes"), rows=rows, right=(1,), notes=notes)
+    return Section(
+        title="Origin",
+        heads=("domain: origin", "episodes"),
+        rows=rows,
+        right=(1,),
+        notes=notes,
+    )
 
 
 _SHAPED_BY = ("taccorl", "lerobot", "mujoco")
@@ -158,22 +215,38 @@ _SHAPED_BY = ("taccorl", "lerobot", "mujoco")
 def _checks(dataset: Dataset) -> list[str]:
     lines = []
     if report := _read(dataset, "ingest_report.json", None):
-        outcomes = ", ".join(f"{num} {outcome}" for outcome, num in report["outcomes"].items())
-        lines.append(f"recordings: {outcomes}; {report['episodes_quarantined']} episodes quarantined")
+        outcomes = ", ".join(
+            f"{num} {outcome}" for outcome, num in report["outcomes"].items()
+        )
+        lines.append(
+            f"recordings: {outcomes}; {report['episodes_quarantined']} episodes quarantined"
+        )
         found = Counter((f["severity"], f["check"]) for f in _findings(report))
-        named = [f"{severity} `{check}` ({num})" for (severity, check), num in sorted(found.items())]
+        named = [
+            f"{severity} `{check}` ({num})"
+            for (severity, check), num in sorted(found.items())
+        ]
         lines.append(f"findings in its episodes: {', '.join(named) or 'none'}")
     if report := _read(dataset, "collect_report.json", None):
         if "attempts" in report and "outcomes" in report:
-            outcomes = ", ".join(f"{num} {outcome}" for outcome, num in report["outcomes"].items())
+            outcomes = ", ".join(
+                f"{num} {outcome}" for outcome, num in report["outcomes"].items()
+            )
             lines.append(f"{_count(report['attempts'], 'attempt')}: {outcomes}")
         if report.get("dropped"):
-            dropped = ", ".join(f"{num} {outcome}" for outcome, num in report["dropped"].items())
-            lines.append(f"left out, because they did not succeed when they were executed: {dropped}")
+            dropped = ", ".join(
+                f"{num} {outcome}" for outcome, num in report["dropped"].items()
+            )
+            lines.append(
+                f"left out, because they did not succeed when they were executed: {dropped}"
+            )
     if dataset.spec.keys("video"):
         lines.append("every row had a video frame of its own when it was written")
     command = f"`taccorl check {_quoted(dataset)}`"
-    return [*lines, f"{command} compares all files with their digests and looks at timing, joints, pictures and touch"]
+    return [
+        *lines,
+        f"{command} compares all files with their digests and looks at timing, joints, pictures and touch",
+    ]
 
 
 def _findings(report: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -38,4 +38,6 @@ def heat(share: np.ndarray) -> np.ndarray:
 @functools.cache
 def _heat_table() -> np.ndarray:
     """(256, 3): OpenCV starts its threads for every call, 12 ms for the 384 taxels of a pad."""
-    return cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    return cv2.applyColorMap(
+        np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO
+    )[:, 0, ::-1]

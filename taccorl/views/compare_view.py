@@ -18,7 +18,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace, origin_words, shown, shown_unit
+from taccorl.diagnosis.comparison.result import (
+    Comparison,
+    TouchTrace,
+    Trace,
+    origin_words,
+    shown,
+    shown_unit,
+)
 from taccorl.report.compared import how_far
 from taccorl.report.markdown import markdown
 from taccorl.report.section import Section
@@ -40,32 +47,60 @@ MOST_ROWS = 5
 """Most recordings in one tab."""
 
 
-def save_comparison(comparison: Comparison, rrd: Path, after: Comparison | None = None) -> None:
+def save_comparison(
+    comparison: Comparison, rrd: Path, after: Comparison | None = None
+) -> None:
     """Write all compared signals and the layout of their views as one .rrd file. ``after``: comparison of a second twin on the
     same recordings. Raises OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full."""
     check_free(rrd)
-    with replacing(rrd) as part, recording_to(part, comparison_blueprint(comparison)) as rec:
+    with (
+        replacing(rrd) as part,
+        recording_to(part, comparison_blueprint(comparison)) as rec,
+    ):
         rec.send_recording_name(f"{comparison.twin} beside measurements")
-        rec.log("provenance", rr.TextDocument(_page(comparison, after), media_type=rr.MediaType.MARKDOWN), static=True)
+        rec.log(
+            "provenance",
+            rr.TextDocument(_page(comparison, after), media_type=rr.MediaType.MARKDOWN),
+            static=True,
+        )
         for trace in comparison.traces:
-            others = after.of(trace.signal, trace.kind, trace.use) if after is not None else ()
-            _log_trace(rec, trace, next((o for o in others if o.recording == trace.recording), None))
+            others = (
+                after.of(trace.signal, trace.kind, trace.use)
+                if after is not None
+                else ()
+            )
+            _log_trace(
+                rec,
+                trace,
+                next((o for o in others if o.recording == trace.recording), None),
+            )
         for touch in comparison.touches:
             others = after.touches if after is not None else ()
-            _log_touch(rec, touch, next((o for o in others if o.recording == touch.recording), None))
+            _log_touch(
+                rec,
+                touch,
+                next((o for o in others if o.recording == touch.recording), None),
+            )
 
 
 def comparison_blueprint(comparison: Comparison) -> rrb.Blueprint:
     """Layout with one tab per signal; touch and provenance are last."""
     tabs: list[rrb.Container | rrb.View] = []
     for signal, kind in comparison.signals:
-        traces = sorted(comparison.of(signal, kind), key=lambda t: FIRST_USES.index(t.use))
+        traces = sorted(
+            comparison.of(signal, kind), key=lambda t: FIRST_USES.index(t.use)
+        )
         for k, some in enumerate(itertools.batched(traces, MOST_ROWS)):
             name = f"{signal} {kind}" + (f", from {k * MOST_ROWS + 1}" if k else "")
             tabs.append(rrb.Vertical(*[_row(t) for t in some], name=name))
-    tabs += [_touch_view(t) for t in sorted(comparison.touches, key=lambda t: FIRST_USES.index(t.use))]
+    tabs += [
+        _touch_view(t)
+        for t in sorted(comparison.touches, key=lambda t: FIRST_USES.index(t.use))
+    ]
     tabs.append(rrb.TextDocumentView(origin="/provenance", name="provenance"))
-    return arranged(rrb.Tabs(*tabs, active_tab=0), rrb.TimePanel(state="collapsed", timeline="time"))
+    return arranged(
+        rrb.Tabs(*tabs, active_tab=0), rrb.TimePanel(state="collapsed", timeline="time")
+    )
 
 
 def _row(trace: Trace) -> rrb.Container:
@@ -106,17 +141,51 @@ def _word(name: str) -> str:
 
 def _log_trace(rec: rr.RecordingStream, trace: Trace, after: Trace | None) -> None:
     path, factor = _path(trace), shown_unit(trace.unit)[0]
-    twins = [(TWIN_NAMES[0], trace, TWIN_COLORS[0])] + ([(TWIN_NAMES[1], after, TWIN_COLORS[1])] if after else [])
+    twins = [(TWIN_NAMES[0], trace, TWIN_COLORS[0])] + (
+        [(TWIN_NAMES[1], after, TWIN_COLORS[1])] if after else []
+    )
     if trace.kind == "position":
-        _line(rec, f"{path}/command", "command", trace.time_s, trace.target, COMMAND_COLOR, 1.0)
-    _line(rec, f"{path}/measured", "measured", trace.time_s, trace.measured, MEASURED_COLOR, 2.5)
+        _line(
+            rec,
+            f"{path}/command",
+            "command",
+            trace.time_s,
+            trace.target,
+            COMMAND_COLOR,
+            1.0,
+        )
+    _line(
+        rec,
+        f"{path}/measured",
+        "measured",
+        trace.time_s,
+        trace.measured,
+        MEASURED_COLOR,
+        2.5,
+    )
     for name, one, color in twins:
         _line(rec, f"{path}/{name}", name, one.time_s, one.replayed, color, 1.5)
-        _line(rec, f"{path}/residual/{name}", name, one.time_s, one.residual * factor, color, 1.5)
+        _line(
+            rec,
+            f"{path}/residual/{name}",
+            name,
+            one.time_s,
+            one.residual * factor,
+            color,
+            1.5,
+        )
     ends = trace.time_s[[0, -1]]
     for name, sign in (("floor_high", 1.0), ("floor_low", -1.0)):
         level = np.full(2, sign * 2 * trace.floor.value * factor)
-        _line(rec, f"{path}/residual/{name}", "± 2 noise floors", ends, level, NOISE_COLOR, 1.0)
+        _line(
+            rec,
+            f"{path}/residual/{name}",
+            "± 2 noise floors",
+            ends,
+            level,
+            NOISE_COLOR,
+            1.0,
+        )
 
 
 def _line(
@@ -131,14 +200,23 @@ def _line(
     """A curve; rows without a number are left out."""
     rec.log(path, rr.SeriesLines(colors=color, names=name, widths=width), static=True)
     known = np.isfinite(values)
-    rr.send_columns(path, [_times(time_s[known])], rr.Scalars.columns(scalars=values[known]), recording=rec)
+    rr.send_columns(
+        path,
+        [_times(time_s[known])],
+        rr.Scalars.columns(scalars=values[known]),
+        recording=rec,
+    )
 
 
 def _times(time_s: np.ndarray) -> rr.TimeColumn:
-    return rr.TimeColumn("time", duration=np.round(1e9 * time_s).astype("timedelta64[ns]"))
+    return rr.TimeColumn(
+        "time", duration=np.round(1e9 * time_s).astype("timedelta64[ns]")
+    )
 
 
-def _log_touch(rec: rr.RecordingStream, touch: TouchTrace, after: TouchTrace | None) -> None:
+def _log_touch(
+    rec: rr.RecordingStream, touch: TouchTrace, after: TouchTrace | None
+) -> None:
     """Pads side by side; one row of pads each for measured and replayed."""
     rows = [("measured", touch.measured), (TWIN_NAMES[0], touch.replayed)]
     rows += [(TWIN_NAMES[1], after.replayed)] if after is not None else []
@@ -147,13 +225,22 @@ def _log_touch(rec: rr.RecordingStream, touch: TouchTrace, after: TouchTrace | N
         image = _side_by_side(np.clip(np.round(values), 0, 65535).astype(np.uint16))
         path = f"/{_word(touch.recording)}/touch/{name}"
         height, width = image.shape[1:]
-        rec.log(path, rr.Transform3D(translation=(0.0, k * (height + 6.0), 0.0)), static=True)
+        rec.log(
+            path,
+            rr.Transform3D(translation=(0.0, k * (height + 6.0), 0.0)),
+            static=True,
+        )
         rec.log(path, depth_style(height, width, np.uint16, (0.0, top)), static=True)
         label = rr.Points2D(
-            [(width / 2, -2.5)], labels=[f"{name}, {', '.join(touch.pads)}"], radii=0.001, show_labels=True
+            [(width / 2, -2.5)],
+            labels=[f"{name}, {', '.join(touch.pads)}"],
+            radii=0.001,
+            show_labels=True,
         )
         rec.log(f"{path}/name", label, static=True)
-        buffers = rr.DepthImage.columns(buffer=image.reshape(len(image), -1).view(np.uint8))
+        buffers = rr.DepthImage.columns(
+            buffer=image.reshape(len(image), -1).view(np.uint8)
+        )
         rr.send_columns(path, [_times(touch.time_s[:, 0])], buffers, recording=rec)
 
 

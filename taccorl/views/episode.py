@@ -26,7 +26,13 @@ import rerun as rr
 from taccorl.data.episode import Episode
 from taccorl.data.sensor_spec import SensorSpec
 from taccorl.views.blueprint import PAD_GAP_TAXELS, episode_blueprint, heatmap_places
-from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLOR, PAD_COLORS
+from taccorl.views.colors import (
+    CONTACT_COLOR,
+    HEATMAP,
+    LINE_COLORS,
+    NOISE_COLOR,
+    PAD_COLORS,
+)
 from taccorl.views.figure import log_figure
 from taccorl.views.groups import groups_of, short_name, vector_keys
 from taccorl.views.outputs import check_free, replacing
@@ -60,11 +66,20 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None) -> None:
     log_figure(log, pads)
 
 
-def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, progress: Progress = no_progress) -> None:
+def save_episode(
+    episode: Episode,
+    rrd: Path,
+    *,
+    at_s: float | None = None,
+    progress: Progress = no_progress,
+) -> None:
     """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``. Raises OutputError: ``rrd``
     exists and was not written by taccorl, or the disk is full."""
     check_free(rrd)
-    with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
+    with (
+        replacing(rrd) as part,
+        recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec,
+    ):
         rec.send_recording_name(episode.name)
         log_episode(EpisodeLog(rec, episode, progress=progress), at_s=at_s)
 
@@ -73,29 +88,44 @@ def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
     """The one row of an episode that a screenshot at ``at_s`` [s] shows: the last row that is not later, or the first row if all
     are. It keeps its time."""
     fps = log.episode.spec.fps
-    row = min(max(math.floor((at_s - log.begins_s) * fps + 1e-6), 0), log.episode.num_rows - 1)
+    row = min(
+        max(math.floor((at_s - log.begins_s) * fps + 1e-6), 0), log.episode.num_rows - 1
+    )
     part = part_of(log.episode, row / fps, (row + 1) / fps)
     return dataclasses.replace(log, episode=part, begins_s=log.begins_s + row / fps)
 
 
 def log_page(log: EpisodeLog) -> None:
-    log.static("provenance", rr.TextDocument(provenance(log.episode), media_type=rr.MediaType.MARKDOWN))
+    log.static(
+        "provenance",
+        rr.TextDocument(provenance(log.episode), media_type=rr.MediaType.MARKDOWN),
+    )
 
 
 def log_pictures(log: EpisodeLog) -> None:
     """Log the pictures of all cameras; errors as ``log_episode``."""
     keys = log.episode.picture_keys
-    for batch in itertools.batched(enumerate(log.episode.pictures()) if keys else (), PICTURES_AT_ONCE):
+    for batch in itertools.batched(
+        enumerate(log.episode.pictures()) if keys else (), PICTURES_AT_ONCE
+    ):
         for key in keys:
             blobs = [_jpeg(pictures[key]) for _, pictures in batch]
-            columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
-            log.send(f"observation/images/{short_name(key)}", columns, [row for row, _ in batch])
+            columns = rr.EncodedImage.columns(
+                blob=blobs, media_type=["image/jpeg"] * len(blobs)
+            )
+            log.send(
+                f"observation/images/{short_name(key)}",
+                columns,
+                [row for row, _ in batch],
+            )
         log.progress(log.episode.name, batch[-1][0] + 1, log.episode.num_rows)
 
 
 def _jpeg(rgb: np.ndarray) -> bytes:
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[
+        1
+    ].tobytes()
 
 
 def _log_vector(log: EpisodeLog, key: str) -> None:
@@ -105,11 +135,17 @@ def _log_vector(log: EpisodeLog, key: str) -> None:
         colors = [LINE_COLORS[i % len(LINE_COLORS)] for i in range(len(group.columns))]
         # same names: the legend lists a joint once
         log.static(path, curve_style(key, colors, group.labels))
-        log.send(path, rr.Scalars.columns(scalars=log.episode.arrays[key][:, list(group.columns)]))
+        log.send(
+            path,
+            rr.Scalars.columns(scalars=log.episode.arrays[key][:, list(group.columns)]),
+        )
 
 
 def curve_style(
-    key: str, colors: Sequence[tuple[int, int, int]], names: Sequence[str], width: float = 2.0
+    key: str,
+    colors: Sequence[tuple[int, int, int]],
+    names: Sequence[str],
+    width: float = 2.0,
 ) -> rr.SeriesLines:
     """Style of the curves of feature ``key``: those of the action are thin and pale."""
     is_action = key == "action"
@@ -120,7 +156,9 @@ def curve_style(
     )
 
 
-def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tuple[int, int, int]]) -> None:
+def log_heatmaps(
+    log: EpisodeLog, places: dict[str, float], colors: Sequence[tuple[int, int, int]]
+) -> None:
     """The pads side by side, each with its name. Negative counts are drawn as 0; the dataset is not changed. ``places``:
     positions from ``heatmap_places``. ``colors``: colours of the names, in turn."""
     for i, pad in enumerate(pads_of(log.episode)):
@@ -130,8 +168,18 @@ def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tup
         path = f"observation/tactile/{pad.name}"
         place(log, path, places[pad.name])
         log.static(path, _heatmap_style(pad.sensor, image[0]))
-        log.send(path, rr.DepthImage.columns(buffer=image.reshape(len(image), -1).view(np.uint8)))
-        write(log, f"{path}/name", pad.sensor.columns / 2, -3.5, pad.name, colors[i % len(colors)])
+        log.send(
+            path,
+            rr.DepthImage.columns(buffer=image.reshape(len(image), -1).view(np.uint8)),
+        )
+        write(
+            log,
+            f"{path}/name",
+            pad.sensor.columns / 2,
+            -3.5,
+            pad.name,
+            colors[i % len(colors)],
+        )
 
 
 def log_other_touch(log: EpisodeLog, touch: Sequence[OtherTouch]) -> None:
@@ -142,15 +190,34 @@ def log_other_touch(log: EpisodeLog, touch: Sequence[OtherTouch]) -> None:
         for pad in range(num_pads):
             path = f"{shown.path}/{pad}"
             place(log, path, pad * (columns + PAD_GAP_TAXELS))
-            log.static(path, depth_style(rows, columns, np.float32, (whole.low, max(whole.high, whole.low + 1e-6))))
+            log.static(
+                path,
+                depth_style(
+                    rows,
+                    columns,
+                    np.float32,
+                    (whole.low, max(whole.high, whole.low + 1e-6)),
+                ),
+            )
             image = np.ascontiguousarray(shown.values[:, pad])
-            log.send(path, rr.DepthImage.columns(buffer=image.reshape(num_rows, -1).view(np.uint8)))
+            log.send(
+                path,
+                rr.DepthImage.columns(
+                    buffer=image.reshape(num_rows, -1).view(np.uint8)
+                ),
+            )
 
 
-def log_heat_scale(log: EpisodeLog, pads: list[Pad], x: float, height: float = 1.0) -> None:
+def log_heat_scale(
+    log: EpisodeLog, pads: list[Pad], x: float, height: float = 1.0
+) -> None:
     """Log the colour scale of the heatmaps at position ``x`` [taxels], ``height`` times as high as a pad."""
     sensor = max((pad.sensor for pad in pads), key=lambda s: s.max_count)
-    bar = np.repeat(np.linspace(sensor.max_count, 0, 4 * sensor.rows).astype(np.uint16)[:, None], 8, axis=1)
+    bar = np.repeat(
+        np.linspace(sensor.max_count, 0, 4 * sensor.rows).astype(np.uint16)[:, None],
+        8,
+        axis=1,
+    )
     path = "observation/tactile/scale"
     place(log, path, x, scale=0.25 * height)
     log.static(path, _heatmap_style(sensor, bar))
@@ -162,17 +229,38 @@ def log_heat_scale(log: EpisodeLog, pads: list[Pad], x: float, height: float = 1
         (sensor.max_count, f"{sensor.max_count}"),
     ):
         y = bar.shape[0] * (1 - count / sensor.max_count)
-        write(log, f"{path}/{text.split()[0]}", 12 + 2.0 * len(text), y - 5, text, NOISE_COLOR)
+        write(
+            log,
+            f"{path}/{text.split()[0]}",
+            12 + 2.0 * len(text),
+            y - 5,
+            text,
+            NOISE_COLOR,
+        )
 
 
-def place(log: EpisodeLog, path: str, x: float, y: float = 0.0, scale: float = 1.0) -> None:
+def place(
+    log: EpisodeLog, path: str, x: float, y: float = 0.0, scale: float = 1.0
+) -> None:
     """Place the entity at ``path`` in a 2-D view, at ``x`` and ``y`` [taxels, y down], enlarged by ``scale``."""
     log.static(path, rr.Transform3D(translation=(x, y, 0.0), scale=scale))
 
 
-def write(log: EpisodeLog, path: str, x: float, y: float, text: str, color: tuple[int, int, int]) -> None:
+def write(
+    log: EpisodeLog,
+    path: str,
+    x: float,
+    y: float,
+    text: str,
+    color: tuple[int, int, int],
+) -> None:
     """Write a text into a 2-D view, centred at ``x``, below ``y`` [taxels]."""
-    log.static(path, rr.Points2D([(x, y)], labels=[text], colors=[color], radii=0.001, show_labels=True))
+    log.static(
+        path,
+        rr.Points2D(
+            [(x, y)], labels=[text], colors=[color], radii=0.001, show_labels=True
+        ),
+    )
 
 
 def _heatmap_style(sensor: SensorSpec, image: np.ndarray) -> rr.DepthImage:
@@ -181,11 +269,15 @@ def _heatmap_style(sensor: SensorSpec, image: np.ndarray) -> rr.DepthImage:
     return depth_style(rows, columns, image.dtype, (0.0, float(sensor.max_count)))
 
 
-def depth_style(rows: int, columns: int, dtype: Any, value_range: tuple[float, float]) -> rr.DepthImage:
+def depth_style(
+    rows: int, columns: int, dtype: Any, value_range: tuple[float, float]
+) -> rr.DepthImage:
     """Everything of a heatmap but its values of ``dtype``; ``value_range``: of the colours."""
     kind = rr.ChannelDatatype.from_np_dtype(np.dtype(dtype))
     return rr.DepthImage.from_fields(
-        format=rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind),
+        format=rr.components.ImageFormat(
+            width=columns, height=rows, channel_datatype=kind
+        ),
         meter=1.0,
         colormap=HEATMAP,
         depth_range=value_range,
@@ -196,19 +288,34 @@ def depth_style(rows: int, columns: int, dtype: Any, value_range: tuple[float, f
 def _log_touch(log: EpisodeLog, pads: list[Pad]) -> None:
     for i, pad in enumerate(pads):
         log_touch_curves(log, pad, PAD_COLORS[i % len(PAD_COLORS)], pad.name)
-    for sensor, gate_count in {pad.sensor.name: (pad.sensor, pad.gate_count) for pad in pads}.values():
+    for sensor, gate_count in {
+        pad.sensor.name: (pad.sensor, pad.gate_count) for pad in pads
+    }.values():
         for name, count, color in (
             (f"noise floor {sensor.noise_count:g}", sensor.noise_count, NOISE_COLOR),
             (f"contact {gate_count:.3g}", gate_count, CONTACT_COLOR),
         ):
             path = f"touch/peak/{name.replace(' ', '_').replace('.', '_')}"
             log.static(path, rr.SeriesLines(colors=color, names=name, widths=1.0))
-            log.send(path, rr.Scalars.columns(scalars=np.full(len(pads[0].counts), float(count))))
+            log.send(
+                path,
+                rr.Scalars.columns(scalars=np.full(len(pads[0].counts), float(count))),
+            )
 
 
-def log_touch_curves(log: EpisodeLog, pad: Pad, color: tuple[int, int, int], name: str, width: float = 1.5) -> None:
+def log_touch_curves(
+    log: EpisodeLog,
+    pad: Pad,
+    color: tuple[int, int, int],
+    name: str,
+    width: float = 1.5,
+) -> None:
     """Log sum, peak and number of active taxels of one pad over time, as curves named ``name``."""
-    for kind, values in (("sum", pad.sum_count), ("peak", pad.peak_count), ("active", pad.num_active)):
+    for kind, values in (
+        ("sum", pad.sum_count),
+        ("peak", pad.peak_count),
+        ("active", pad.num_active),
+    ):
         path = f"touch/{kind}/{pad.name}"
         log.static(path, rr.SeriesLines(colors=color, names=name, widths=width))
         log.send(path, rr.Scalars.columns(scalars=values.astype(float)))
@@ -222,20 +329,42 @@ def log_events(log: EpisodeLog, pads: list[Pad]) -> None:
         gate = contact_gate(pads)
         rows = [0, *(np.flatnonzero(np.diff(gate)) + 1)]
         states = ["contact" if gate[row] else "no contact" for row in rows]
-        _log_lane(log, "contact gate", rows, states, {"contact": 0xDC2626FF, "no contact": 0x475569FF})
+        _log_lane(
+            log,
+            "contact gate",
+            rows,
+            states,
+            {"contact": 0xDC2626FF, "no contact": 0x475569FF},
+        )
     if episode.stages:
         names = [name for _, name in episode.stages]
-        colors = {name: EVENT_COLORS[i % len(EVENT_COLORS)] for i, name in enumerate(dict.fromkeys(names))}
+        colors = {
+            name: EVENT_COLORS[i % len(EVENT_COLORS)]
+            for i, name in enumerate(dict.fromkeys(names))
+        }
         _log_lane(log, "stage", [row for row, _ in episode.stages], names, colors)
     if episode.success is not None:
         word = "success" if episode.success else "failure"
-        _log_lane(log, "outcome", [0], [word], {"success": 0x16A34AFF, "failure": 0xB91C1CFF})
+        _log_lane(
+            log, "outcome", [0], [word], {"success": 0x16A34AFF, "failure": 0xB91C1CFF}
+        )
 
 
-def _log_lane(log: EpisodeLog, lane: str, rows: Sequence[int], states: list[str], colors: dict[str, int]) -> None:
+def _log_lane(
+    log: EpisodeLog,
+    lane: str,
+    rows: Sequence[int],
+    states: list[str],
+    colors: dict[str, int],
+) -> None:
     path = f"events/{lane.replace(' ', '_')}"
     names = list(colors)
     log.static(
-        path, rr.StateConfiguration(values=names, labels=names, colors=np.array(list(colors.values()), np.uint32))
+        path,
+        rr.StateConfiguration(
+            values=names,
+            labels=names,
+            colors=np.array(list(colors.values()), np.uint32),
+        ),
     )
     log.send(path, rr.StateChange.columns(state=states), rows)

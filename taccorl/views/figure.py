@@ -19,7 +19,15 @@ from taccorl.views.touch import Pad
 
 # Schematic from here on.
 BASE_POS_WORLD = {"left": (0.0, 0.3, 0.0), "right": (0.0, -0.3, 0.0)}
-BONE_RADIUS_M = (0.045, 0.0, 0.036, 0.032, 0.0, 0.028, 0.024)  # base, link 1 to 6; 0: no bone, its child sits on it
+BONE_RADIUS_M = (
+    0.045,
+    0.0,
+    0.036,
+    0.032,
+    0.0,
+    0.028,
+    0.024,
+)  # base, link 1 to 6; 0: no bone, its child sits on it
 # Radius, length, and place on the joint's own axis: frames 1 and 2, and 4 and 5, have one origin, their drums do not.
 JOINT_DRUMS_M = (
     (0.056, 0.030, -0.070),
@@ -45,9 +53,13 @@ def arms_of(episode: Episode) -> dict[str, np.ndarray]:
     index = {re.sub(r"\.pos$", "", name): i for i, name in enumerate(feature.names)}
     found = {}
     for side in BASE_POS_WORLD:
-        names = [f"{side}_joint_{i}" for i in range(1, ROBOT.num_joints + 1)] + [f"{side}_gripper"]
+        names = [f"{side}_joint_{i}" for i in range(1, ROBOT.num_joints + 1)] + [
+            f"{side}_gripper"
+        ]
         if all(name in index for name in names):
-            found[side] = episode.arrays["observation.state"][:, [index[name] for name in names]].astype(float)
+            found[side] = episode.arrays["observation.state"][
+                :, [index[name] for name in names]
+            ].astype(float)
     return found
 
 
@@ -56,7 +68,9 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
     from taccorl.sim import robot  # with MuJoCo, which only this needs
 
     poses = robot.link_poses(joints_rad)
-    return np.concatenate([np.broadcast_to(np.eye(4), (len(poses), 1, 4, 4)), poses], axis=1)
+    return np.concatenate(
+        [np.broadcast_to(np.eye(4), (len(poses), 1, 4, 4)), poses], axis=1
+    )
 
 
 def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
@@ -66,8 +80,13 @@ def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
     poses = np.repeat(link6_poses[:, None], 2, axis=1)
     for finger, sign in enumerate((1.0, -1.0)):
         offset = np.zeros((len(opening_m), 3))
-        offset[:, 1], offset[:, 2] = sign * opening_m / 2, ROBOT.finger_from_hand_m + ROBOT.pad.length_m / 2
-        poses[:, finger, :3, 3] += np.einsum("tij,tj->ti", link6_poses[:, :3, :3], offset)
+        offset[:, 1], offset[:, 2] = (
+            sign * opening_m / 2,
+            ROBOT.finger_from_hand_m + ROBOT.pad.length_m / 2,
+        )
+        poses[:, finger, :3, 3] += np.einsum(
+            "tij,tj->ti", link6_poses[:, :3, :3], offset
+        )
     return poses
 
 
@@ -101,11 +120,20 @@ def log_figure(log: EpisodeLog, pads: list[Pad]) -> None:
             _send_poses(log, f"{root}/finger_{name}", faces[:, finger])
             pad = by_name.get(f"{side}_{name}")
             if pad is None:
-                log.static(f"{root}/finger_{name}/pad", rr.Boxes3D.from_fields(colors=[PLATE_COLOR]))
+                log.static(
+                    f"{root}/finger_{name}/pad",
+                    rr.Boxes3D.from_fields(colors=[PLATE_COLOR]),
+                )
             else:  # never static as well: what is static hides what changes
-                log.send(f"{root}/finger_{name}/pad", rr.Boxes3D.columns(colors=pad_colors(pad)))
+                log.send(
+                    f"{root}/finger_{name}/pad",
+                    rr.Boxes3D.columns(colors=pad_colors(pad)),
+                )
         path = tool_paths(log.episode)[side] - BASE_POS_WORLD[side]
-        log.static(f"{root}/tool_path", rr.LineStrips3D([path], colors=[(*ARM_COLORS[side], 120)], radii=0.0015))
+        log.static(
+            f"{root}/tool_path",
+            rr.LineStrips3D([path], colors=[(*ARM_COLORS[side], 120)], radii=0.0015),
+        )
 
 
 def pad_colors(pad: Pad) -> np.ndarray:
@@ -125,7 +153,11 @@ def _log_still_parts(log: EpisodeLog, root: str, side: str, floor_z: float) -> N
     log.static(root, rr.Transform3D(translation=BASE_POS_WORLD[side]))
     height, top = 0.03 - floor_z, 0.03
     stand = rr.Cylinders3D(
-        lengths=[height], radii=[0.07], centers=[(0, 0, top - height / 2)], colors=[PLATE_COLOR], fill_mode="solid"
+        lengths=[height],
+        radii=[0.07],
+        centers=[(0, 0, top - height / 2)],
+        colors=[PLATE_COLOR],
+        fill_mode="solid",
     )
     log.static(f"{root}/stand", stand)
     label = rr.Points3D(
@@ -140,15 +172,24 @@ def _log_still_parts(log: EpisodeLog, root: str, side: str, floor_z: float) -> N
     for i, (radius, end) in enumerate(zip(BONE_RADIUS_M, ends, strict=True)):
         link = f"{root}/link_{i}" if i else root
         if radius:
-            log.static(f"{link}/bone", _capsule(np.array(end), radius, ARM_COLORS[side]))
+            log.static(
+                f"{link}/bone", _capsule(np.array(end), radius, ARM_COLORS[side])
+            )
         if i:
             radius, length, z = JOINT_DRUMS_M[i - 1]
             drum = rr.Cylinders3D(
-                lengths=[length], radii=[radius], centers=[(0, 0, z)], colors=[LINE_COLORS[i - 1]], fill_mode="solid"
+                lengths=[length],
+                radii=[radius],
+                centers=[(0, 0, z)],
+                colors=[LINE_COLORS[i - 1]],
+                fill_mode="solid",
             )
             log.static(f"{link}/joint", drum)
     rail = rr.Boxes3D(
-        half_sizes=[(0.018, 0.055, 0.016)], centers=[(0, 0, 0.116)], colors=[FINGER_COLOR], fill_mode="solid"
+        half_sizes=[(0.018, 0.055, 0.016)],
+        centers=[(0, 0, 0.116)],
+        colors=[FINGER_COLOR],
+        fill_mode="solid",
     )
     log.static(f"{root}/link_6/rail", rail)
     for name, sign in zip(ROBOT.fingers, (1.0, -1.0), strict=True):
@@ -158,11 +199,15 @@ def _log_still_parts(log: EpisodeLog, root: str, side: str, floor_z: float) -> N
             ("pad", PAD_THICKNESS_M, sign * PAD_THICKNESS_M / 2, None),
         ):
             half = (ROBOT.pad.width_m / 2, thickness / 2, ROBOT.pad.length_m / 2)
-            box = rr.Boxes3D(half_sizes=[half], centers=[(0, y, 0)], colors=color, fill_mode="solid")
+            box = rr.Boxes3D(
+                half_sizes=[half], centers=[(0, y, 0)], colors=color, fill_mode="solid"
+            )
             log.static(f"{root}/finger_{name}/{part}", box)
 
 
-def _capsule(end: np.ndarray, radius_m: float, color: tuple[int, int, int]) -> rr.Capsules3D:
+def _capsule(
+    end: np.ndarray, radius_m: float, color: tuple[int, int, int]
+) -> rr.Capsules3D:
     """From the link's origin to ``end``."""
     turn = Rotation.align_vectors([end], [(0.0, 0.0, 1.0)])[0]
     return rr.Capsules3D(

@@ -39,7 +39,11 @@ class Group:
 
 def short_name(key: str) -> str:
     """Last part of a feature's key: ``observation.images.front`` → ``front``."""
-    return key.removeprefix("observation.images.").removeprefix("observation.").replace(".", "_")
+    return (
+        key.removeprefix("observation.images.")
+        .removeprefix("observation.")
+        .replace(".", "_")
+    )
 
 
 def vector_keys(episode: Episode) -> list[str]:
@@ -69,7 +73,9 @@ def groups_of(feature: FeatureSpec) -> list[Group]:
                 name = f"{side} arm" if side in ROBOT.arms else side
                 groups.append(Group(name, unit, of_side, labels))
         else:
-            kind = "grippers" if all("gripper" in names[i] for i in columns) else "joints"
+            kind = (
+                "grippers" if all("gripper" in names[i] for i in columns) else "joints"
+            )
             labels = tuple(names[i].removesuffix("_gripper") for i in columns)
             groups.append(Group(kind, unit, tuple(columns), labels))
     return groups

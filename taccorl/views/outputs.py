@@ -27,9 +27,13 @@ def check_free(path: Path) -> None:
     """Check that ``path`` may be written: it does not exist, or taccorl wrote it. Raises OutputError: another file is there, or
     the folder does not exist."""
     if not path.parent.is_dir():
-        raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {shlex.quote(str(path.parent))}")
+        raise OutputError(
+            f"{path.parent}: no such folder; make it first: mkdir -p {shlex.quote(str(path.parent))}"
+        )
     if path.exists() and not _is_ours(path):
-        raise OutputError(f"{path}: exists and was not written by `{SOFTWARE}`; give another name, or remove it")
+        raise OutputError(
+            f"{path}: exists and was not written by `{SOFTWARE}`; give another name, or remove it"
+        )
 
 
 def _is_ours(path: Path) -> bool:
@@ -59,7 +63,9 @@ def replacing(path: Path) -> Iterator[Path]:
             raise
         place = path if error.filename in (None, str(part)) else error.filename
         kept = "; the earlier file is as it was" if path.exists() else ""
-        raise OutputError(f"{place}: not written: {error.strerror}{kept}. Make room, or give another place") from error
+        raise OutputError(
+            f"{place}: not written: {error.strerror}{kept}. Make room, or give another place"
+        ) from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -51,8 +51,14 @@ class Pair:
         self.episodes = (a, b)
         self.align = align
         self.pads = (pads_of(a), pads_of(b))
-        self.begins_s = (0.0, 0.0) if align == "start" else tuple(-_required_contact_s(e) for e in self.episodes)
-        self.curves = tuple(list(dict.fromkeys(c for c, _, _ in elements_of(e))) for e in self.episodes)
+        self.begins_s = (
+            (0.0, 0.0)
+            if align == "start"
+            else tuple(-_required_contact_s(e) for e in self.episodes)
+        )
+        self.curves = tuple(
+            list(dict.fromkeys(c for c, _, _ in elements_of(e))) for e in self.episodes
+        )
 
     @property
     def name(self) -> str:
@@ -62,7 +68,9 @@ class Pair:
     @property
     def origin(self) -> str:
         """Origins of both episodes."""
-        return "; ".join(f"{name}: {e.origin}" for name, e in zip(NAMES, self.episodes, strict=True))
+        return "; ".join(
+            f"{name}: {e.origin}" for name, e in zip(NAMES, self.episodes, strict=True)
+        )
 
     @property
     def num_rows(self) -> int:
@@ -72,7 +80,11 @@ class Pair:
     @property
     def best_time_s(self) -> float:
         """Time at which touch is strongest in A while B runs [s]; the middle of that time if A has no touch."""
-        rows = self.common_rows()[0] if len(self.common_rows()[0]) else np.arange(self.episodes[0].num_rows)
+        rows = (
+            self.common_rows()[0]
+            if len(self.common_rows()[0])
+            else np.arange(self.episodes[0].num_rows)
+        )
         touch = sum(pad.sum_count[rows] for pad in self.pads[0])
         row = rows[int(np.argmax(touch)) if np.any(touch) else len(rows) // 2]
         return self.begins_s[0] + float(self.episodes[0].time_s[row])
@@ -96,7 +108,10 @@ class Pair:
     def full_difference(self) -> float:
         """Difference of counts that gets the full colour: the largest difference, but at least the contact threshold."""
         rows_a, rows_b = self.common_rows()
-        found = [np.abs(b.counts[rows_b].astype(np.int32) - a.counts[rows_a]).max() for a, b in self.shared_pads()]
+        found = [
+            np.abs(b.counts[rows_b].astype(np.int32) - a.counts[rows_a]).max()
+            for a, b in self.shared_pads()
+        ]
         return float(max(*found, self.shared_pads()[0][0].gate_count))
 
 
@@ -105,8 +120,14 @@ def elements_of(episode: Episode) -> Iterator[tuple[Curve, str, int]]:
     for key in vector_keys(episode):
         feature = episode.spec.features[key]
         family = "joints" if key in ("observation.state", "action") else short_name(key)
-        for i, (name, unit) in enumerate(zip(element_names(feature), feature.units, strict=True)):
-            yield Curve(name if feature.names else f"element {name}", unit, family), key, i
+        for i, (name, unit) in enumerate(
+            zip(element_names(feature), feature.units, strict=True)
+        ):
+            yield (
+                Curve(name if feature.names else f"element {name}", unit, family),
+                key,
+                i,
+            )
 
 
 def cameras_of(episode: Episode) -> list[str]:
@@ -119,9 +140,15 @@ def page_of(pair: Pair) -> str:
     lines = []
     for name, color, e in zip(NAMES, COLOR_WORDS, pair.episodes, strict=True):
         facts = f"outcome {outcome(e)}; {e.num_rows / e.spec.fps:.2f} s at {e.spec.fps} fps; {_contact_words(e)}"
-        lines += [f"**{name} ({color}): {e.name}**  \ndata: **{e.origin}**  \n{facts}", ""]
+        lines += [
+            f"**{name} ({color}): {e.name}**  \ndata: **{e.origin}**  \n{facts}",
+            "",
+        ]
     aligned = "first contact" if pair.align == "contact" else "first row"
-    facts = [f"0 s is the {aligned} of each; curves: state thick, action thin", *_lacks(pair)]
+    facts = [
+        f"0 s is the {aligned} of each; curves: state thick, action thin",
+        *_lacks(pair),
+    ]
     if pair.shared_pads() and len(pair.common_rows()[0]):
         more = f"{COLOR_WORDS[1]} where B has more counts, {COLOR_WORDS[0]} where A has more"
         facts.append(f"B − A: {more}; full colour at ± {pair.full_difference:.0f}")
@@ -136,8 +163,16 @@ def _lacks(pair: Pair) -> list[str]:
     for k, other in ((0, 1), (1, 0)):
         for what, own, others in (
             ("cameras", cameras_of(pair.episodes[k]), cameras_of(pair.episodes[other])),
-            ("pads", [p.name for p in pair.pads[k]], [p.name for p in pair.pads[other]]),
-            ("curves", [c.name for c in pair.curves[k]], [c.name for c in pair.curves[other]]),
+            (
+                "pads",
+                [p.name for p in pair.pads[k]],
+                [p.name for p in pair.pads[other]],
+            ),
+            (
+                "curves",
+                [c.name for c in pair.curves[k]],
+                [c.name for c in pair.curves[other]],
+            ),
         ):
             names = [name for name in own if name not in others]
             if names:
@@ -167,7 +202,9 @@ def _contact_words(episode: Episode) -> str:
 def _required_contact_s(episode: Episode) -> float:
     pads = pads_of(episode)
     if not pads:
-        raise TaccorlError(f"--align=contact: {episode.name} has no touch; give --align=start")
+        raise TaccorlError(
+            f"--align=contact: {episode.name} has no touch; give --align=start"
+        )
     gate = contact_gate(pads)
     if not gate.any():
         raise TaccorlError(

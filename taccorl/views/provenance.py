@@ -21,7 +21,11 @@ def provenance(episode: Episode) -> str:
     """Return the provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and all
     other stored facts."""
     spec = episode.spec
-    facts = [(name.replace("_", " "), _short(v)) for name, v in episode.provenance.items() if v is not None]
+    facts = [
+        (name.replace("_", " "), _short(v))
+        for name, v in episode.provenance.items()
+        if v is not None
+    ]
     lines = [
         f"instruction: *{episode.instruction}*",
         f"outcome: {outcome(episode)}",
@@ -79,4 +83,6 @@ def _timing(timing: tuple[ChannelTiming, ...]) -> Section:
         notes += [f"{name.replace('_', ' ')}: {', '.join(odd)}"] * bool(odd)
     heads = ("channel", "align", "Hz", "gaps", "ms", "age", "oldest")
     title = [Section(notes=[f"**timing**: {TIMING_COLUMNS}"])]
-    return Section(parts=[*title, Section(heads=heads, rows=rows, right=range(2, 7), notes=notes)])
+    return Section(
+        parts=[*title, Section(heads=heads, rows=rows, right=range(2, 7), notes=notes)]
+    )

@@ -38,11 +38,20 @@ class EpisodeLog:
         """Log values that do not change over time, as the entity ``path``."""
         self.rec.log(f"{self.root}{path}", data, static=True)
 
-    def send(self, path: str, columns: rr.ComponentColumnList, rows: Sequence[int] | None = None) -> None:
+    def send(
+        self,
+        path: str,
+        columns: rr.ComponentColumnList,
+        rows: Sequence[int] | None = None,
+    ) -> None:
         """Log values that change, for all T rows or the given ones; ``columns`` have one entry per row."""
-        index = np.asarray(range(self.episode.num_rows) if rows is None else rows, dtype=np.int64)
+        index = np.asarray(
+            range(self.episode.num_rows) if rows is None else rows, dtype=np.int64
+        )
         # Rerun itself would round down.
-        time_ns = np.round(1e9 * (self.begins_s + self.episode.time_s[index])).astype("timedelta64[ns]")
+        time_ns = np.round(1e9 * (self.begins_s + self.episode.time_s[index])).astype(
+            "timedelta64[ns]"
+        )
         indexes = [rr.TimeColumn("time", duration=time_ns)]
         if not self.root:
             indexes.append(rr.TimeColumn("frame_index", sequence=index))
@@ -58,6 +67,8 @@ def recording_to(rrd: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingSt
         # active, too: as the default alone, the web viewer shows its own arrangement instead
         rec.send_blueprint(blueprint, make_active=True, make_default=True)
         yield rec
-        content = stream.read()  # once: each reading ends with a footer that counts from its own beginning
+        content = (
+            stream.read()
+        )  # once: each reading ends with a footer that counts from its own beginning
     assert content is not None  # not even the blueprint came
     rrd.write_bytes(content)

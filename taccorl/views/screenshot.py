@@ -16,7 +16,12 @@ from taccorl.views.viewer import PICTURE_TIMEOUT_S, ViewerError, picture_without
 WIDTH_PX, HEIGHT_PX = 1600, 1000
 
 
-def screenshot(shown: Episode | Pair, png: Path, *, progress: Callable[[str], None] = lambda text: None) -> None:
+def screenshot(
+    shown: Episode | Pair,
+    png: Path,
+    *,
+    progress: Callable[[str], None] = lambda text: None,
+) -> None:
     """Draw the Rerun view of an episode or a pair as a PNG, where touch is strongest. ``progress``: function that is called with
     a text: the next step and how long it may take. Raises ViewerError: the Rerun program cannot draw here; OutputError: it
     exists and was not written by taccorl."""
@@ -25,9 +30,13 @@ def screenshot(shown: Episode | Pair, png: Path, *, progress: Callable[[str], No
         progress(f"writing {shown.num_rows} rows for the viewer")
         save_shown(shown, rrd, at_s=best_time_s(shown))
         progress(f"drawing with the Rerun program, at most {PICTURE_TIMEOUT_S:.0f} s")
-        if (why_not := picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)) is not None:
+        if (
+            why_not := picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)
+        ) is not None:
             install = "apt-get install mesa-vulkan-drivers libvulkan1"
-            raise ViewerError(f"no screenshot: {why_not}. On Debian: {install}; --sheet=x.png needs nothing")
+            raise ViewerError(
+                f"no screenshot: {why_not}. On Debian: {install}; --sheet=x.png needs nothing"
+            )
         with Image.open(drawn) as image:
             save_png(image.convert("RGB"), png, shown.name, str(shown.origin))
 

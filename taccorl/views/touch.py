@@ -72,7 +72,12 @@ def pads_of(episode: Episode) -> list[Pad]:
 
 def contact_gate(pads: list[Pad]) -> np.ndarray:
     """(T,) bool, paper's c_t at history L = 1: I[Σ_k I(|f_k| > λ_f) ≥ m] over all pads; f = counts × gain."""
-    over = sum((np.abs(p.counts) * p.sensor.gain_per_count > CONTACT_THRESHOLD).sum(axis=(1, 2)) for p in pads)
+    over = sum(
+        (np.abs(p.counts) * p.sensor.gain_per_count > CONTACT_THRESHOLD).sum(
+            axis=(1, 2)
+        )
+        for p in pads
+    )
     return np.asarray(over) >= MIN_ACTIVE_TAXELS
 
 
@@ -113,13 +118,22 @@ def other_touch_of(episode: Episode) -> list[OtherTouch]:
     and vectors of more elements than are shown as curves, as a single row."""
     found = []
     for key in other_touch_keys(episode):
-        feature, values = episode.spec.features[key], episode.arrays[key].astype(np.float32)
+        feature, values = (
+            episode.spec.features[key],
+            episode.arrays[key].astype(np.float32),
+        )
         layout = feature.layout or (1, feature.size)
         if not feature.layout and feature.size <= MOST_NUMBERS:
             continue
         known = values[np.isfinite(values)]
-        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-        unit = feature.unit if isinstance(feature.unit, str) else ", ".join(dict.fromkeys(feature.unit))
+        low, high = (
+            (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+        )
+        unit = (
+            feature.unit
+            if isinstance(feature.unit, str)
+            else ", ".join(dict.fromkeys(feature.unit))
+        )
         pictures = values.reshape(len(values), -1, *layout[-2:])
         found.append(OtherTouch(key, pictures, low, high, unit))
     return found

@@ -27,33 +27,65 @@ class ViewerError(TaccorlError):
 
 def require_screen() -> None:
     """Check that there is a screen for a window. Raises ViewerError: there is no screen; the message names the alternatives."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError("there is no screen (no DISPLAY): use --serve=true, --save=… or --screenshot=…")
+    if sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise ViewerError(
+            "there is no screen (no DISPLAY): use --serve=true, --save=… or --screenshot=…"
+        )
 
 
 def open_window(rrd: Path) -> None:
     """Show ``rrd`` in a window, and return when it is closed. Raises ViewerError: the Rerun program could not open one."""
-    command = [_program(), str(rrd), "--bind", LOOPBACK, "--port", "auto", "--hide-welcome-screen"]
+    command = [
+        _program(),
+        str(rrd),
+        "--bind",
+        LOOPBACK,
+        "--port",
+        "auto",
+        "--hide-welcome-screen",
+    ]
     if subprocess.run(command, env=_environment(), check=False).returncode != 0:
-        raise ViewerError("the Rerun window did not open (see its message above): use --serve=true and a browser")
+        raise ViewerError(
+            "the Rerun window did not open (see its message above): use --serve=true and a browser"
+        )
 
 
-def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) -> str | None:
+def picture_without_window(
+    rrd: Path, png: Path, width_px: int, height_px: int
+) -> str | None:
     """Draw ``rrd`` into ``png`` without a window. Returns None, or the reason why that is not possible on this machine."""
-    command = [_program(), str(rrd), "--headless", "--screenshot-to", str(png), "--bind", LOOPBACK, "--port", "auto"]
+    command = [
+        _program(),
+        str(rrd),
+        "--headless",
+        "--screenshot-to",
+        str(png),
+        "--bind",
+        LOOPBACK,
+        "--port",
+        "auto",
+    ]
     command += ["--window-size", f"{width_px}x{height_px}"]
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         environment = _environment() | {"XDG_RUNTIME_DIR": folder}
         try:
             done = subprocess.run(
-                command, env=environment, check=False, capture_output=True, text=True, timeout=PICTURE_TIMEOUT_S
+                command,
+                env=environment,
+                check=False,
+                capture_output=True,
+                text=True,
+                timeout=PICTURE_TIMEOUT_S,
             )
         except subprocess.TimeoutExpired:
             return f"the Rerun program drew nothing within {PICTURE_TIMEOUT_S:.0f} s"
     if not png.is_file():
         said = [line for line in done.stderr.splitlines() if line.strip()]
         why = next(
-            (line for line in said if "panicked" in line), said[-1] if said else f"exit status {done.returncode}"
+            (line for line in said if "panicked" in line),
+            said[-1] if said else f"exit status {done.returncode}",
         )
         return f"the Rerun program drew nothing: {why.strip()}"
     return None
@@ -96,7 +128,9 @@ def _environment() -> dict[str, str]:
 
 def _free_ports(num: int) -> list[int]:
     with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(num)]
+        sockets = [
+            stack.enter_context(socket.create_server((LOOPBACK, 0))) for _ in range(num)
+        ]
         return [s.getsockname()[1] for s in sockets]
 
 
@@ -104,8 +138,12 @@ def _wait_for(page: str, process: subprocess.Popen) -> None:
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline_s:
         if process.poll() is not None:
-            raise ViewerError(f"the Rerun web viewer ended at once (exit status {process.returncode})")
+            raise ViewerError(
+                f"the Rerun web viewer ended at once (exit status {process.returncode})"
+            )
         with contextlib.suppress(OSError), urllib.request.urlopen(page, timeout=2):
             return
         time.sleep(0.1)
-    raise ViewerError(f"the Rerun web viewer did not answer at {page} within {START_TIMEOUT_S:.0f} s")
+    raise ViewerError(
+        f"the Rerun web viewer did not answer at {page} within {START_TIMEOUT_S:.0f} s"
+    )

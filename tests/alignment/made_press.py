@@ -33,17 +33,28 @@ def ball_at(x_m: float, z_m: float) -> PressedObject:
 
 def penetration_m(time_s: np.ndarray, seed: int) -> np.ndarray:
     """Five presses to three depths at two speeds, with holds; below 0 without contact. Quick ones last 0.1 s."""
-    depths = np.random.default_rng(seed).permutation([0.3e-3, 0.6e-3, 1.0e-3, 0.6e-3, 1.0e-3])
+    depths = np.random.default_rng(seed).permutation(
+        [0.3e-3, 0.6e-3, 1.0e-3, 0.6e-3, 1.0e-3]
+    )
     knots_s, knots_m, at = [0.0, 2.0], [-1e-3, -1e-3], 2.0
     for k, depth in enumerate(depths):
         rise, hold = (0.1, 0.6)[k % 2], (0.5, 1.6)[k % 3 == 0]
-        knots_s += [at + rise, at + rise + hold, at + 2 * rise + hold, at + 2 * rise + hold + 0.5]
+        knots_s += [
+            at + rise,
+            at + rise + hold,
+            at + 2 * rise + hold,
+            at + 2 * rise + hold + 0.5,
+        ]
         knots_m += [depth, depth, -1e-3, -1e-3]
         at += 2 * rise + hold + 0.5
     # Corners rounded as a finger of some inertia would: mean over 60 ms
     fine = np.arange(-0.1, at + 2.1, 1e-3)
     line = np.interp(fine, knots_s, knots_m)
-    return np.interp(time_s, fine, np.convolve(np.pad(line, 30, mode="edge"), np.ones(61) / 61, mode="valid"))
+    return np.interp(
+        time_s,
+        fine,
+        np.convolve(np.pad(line, 30, mode="edge"), np.ones(61) / 61, mode="valid"),
+    )
 
 
 def press(

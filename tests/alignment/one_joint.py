@@ -18,10 +18,29 @@ from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
 
-HOME = np.array([0.003, 1.732, -0.883, -0.528, 0.2, -0.4, 0.06, -0.003, 1.732, -0.883, 0.528, 0.2, 0.4, 0.06])
+HOME = np.array(
+    [
+        0.003,
+        1.732,
+        -0.883,
+        -0.528,
+        0.2,
+        -0.4,
+        0.06,
+        -0.003,
+        1.732,
+        -0.883,
+        0.528,
+        0.2,
+        0.4,
+        0.06,
+    ]
+)
 TWIN = TwinConfig()
 REFERENCE_TWIN = TwinConfig(
-    controller=ControllerConfig(kp_nm_per_rad=[500.0] * 6, kd_nms_per_rad=[50.0] * 6, torque_ff_nm=[0.0] * 6)
+    controller=ControllerConfig(
+        kp_nm_per_rad=[500.0] * 6, kd_nms_per_rad=[50.0] * 6, torque_ff_nm=[0.0] * 6
+    )
 )
 """The paper's reference simulator: knows nothing of the true gains."""
 
@@ -44,13 +63,20 @@ class AxisJoint(RigidJoint):
 
 
 def chirp(
-    signal: str, seconds: float = 10.0, *, amplitude: float = 0.25, high_hz: float = 2.0, rate_hz: float = 200.0
+    signal: str,
+    seconds: float = 10.0,
+    *,
+    amplitude: float = 0.25,
+    high_hz: float = 2.0,
+    rate_hz: float = 200.0,
 ) -> Measurement:
     """One joint's targets from 0.1 Hz to ``high_hz`` after half a second of rest; "measured" are its targets."""
     time_s = np.arange(round(seconds * rate_hz)) / rate_hz
     phase = 2 * np.pi * (0.1 * time_s + (high_hz - 0.1) * time_s**2 / (2 * seconds))
     target = np.tile(HOME, (len(time_s), 1))
-    target[:, ROBOT.action_names.index(signal)] += amplitude * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
+    target[:, ROBOT.action_names.index(signal)] += (
+        amplitude * np.clip((time_s - 0.5) / 0.5, 0, 1) * np.sin(phase)
+    )
     return Measurement(
         name=f"chirp to {high_hz:g} Hz",
         time_s=time_s,
@@ -62,7 +88,9 @@ def chirp(
 
 def at_rest(motion: JointMotion, gains: Gains) -> JointMotion:
     """``motion`` from where its joint stands still: T_ref / K_p off its target."""
-    return dataclasses.replace(motion, start=float(motion.target[0]) + gains.torque_ff / gains.kp)
+    return dataclasses.replace(
+        motion, start=float(motion.target[0]) + gains.torque_ff / gains.kp
+    )
 
 
 def recorded(
@@ -79,7 +107,9 @@ def recorded(
     of so many rows before them: a clock that is off."""
     m = chirp(signal, seconds, high_hz=high_hz)
     gains = JointModel(TWIN, signal).gains
-    done = in_mujoco(at_rest(joint_motion(m, TWIN, signal), gains), signal, gains, effects)
+    done = in_mujoco(
+        at_rest(joint_motion(m, TWIN, signal), gains), signal, gains, effects
+    )
     rng, j = np.random.default_rng(seed), m.column(signal)
     seen = done.reported + noise_rad * rng.normal(size=m.num_rows)
     m.measured[:, j] = seen
@@ -90,5 +120,8 @@ def recorded(
     return dataclasses.replace(
         m,
         **{name: getattr(m, name)[:keep] for name in ("time_s", "target")},
-        **{name: getattr(m, name)[rows_early:] for name in ("measured", "velocity", "effort")},
+        **{
+            name: getattr(m, name)[rows_early:]
+            for name in ("measured", "velocity", "effort")
+        },
     )

@@ -85,30 +85,65 @@ def test_the_machine_is_described_without_its_name() -> None:
     assert "cores" in machine() and platform.node() not in machine()
 
 
-def test_a_cost_is_told_in_steps_of_the_reference_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cost_is_told_in_steps_of_the_reference_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(module, "reference_step_s", lambda: 1e-5)
     row = module.against_reference("touch", [90e-6, 80e-6, 40e-6], "≤ 9")
-    assert (row.value, row.unit, row.n) == (pytest.approx(8.0), "reference steps", 3)  # median 80 µs of 10 µs each
+    assert (row.value, row.unit, row.n) == (
+        pytest.approx(8.0),
+        "reference steps",
+        3,
+    )  # median 80 µs of 10 µs each
     assert row.spread == pytest.approx(2.5)  # (9 − 4) / 2
-    assert (row.rival, row.rival_value) == ("one reference step, µs CPU", pytest.approx(10.0))
+    assert (row.rival, row.rival_value) == (
+        "one reference step, µs CPU",
+        pytest.approx(10.0),
+    )
 
 
 def test_no_goal_is_one_of_cpu_seconds_but_on_a_named_gpu() -> None:
     """The same code took 49 and 241 µs on two machines."""
-    absolute = ("CPU-s", "s", "ms", "µs", "µs/env", "ms CPU", "s (wall)", "env steps/CPU-s")
+    absolute = (
+        "CPU-s",
+        "s",
+        "ms",
+        "µs",
+        "µs/env",
+        "ms CPU",
+        "s (wall)",
+        "env steps/CPU-s",
+    )
     rows = json.loads(runner.JSON_PATH.read_text())
-    judged = [row["name"] for row in rows if row["unit"] in absolute and row["met"] is not None]
+    judged = [
+        row["name"]
+        for row in rows
+        if row["unit"] in absolute and row["met"] is not None
+    ]
     assert all("NVIDIA" in name for name in judged), judged
-    assert render(rows) == runner.PAGE_PATH.read_text(), "docs/benchmarks.md is what make bench writes"
+    assert render(rows) == runner.PAGE_PATH.read_text(), (
+        "docs/benchmarks.md is what make bench writes"
+    )
 
 
 # ---- a run ----
 
 
-def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_row_is_completed_stored_and_rendered(
+    only_mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     @benchmark("reading")
     def _() -> Iterator[Row]:
-        yield Row(name="rows", value=4.5, unit="×", goal="≥ 4", rival="default", rival_value=2.0, n=3, spread=0.25)
+        yield Row(
+            name="rows",
+            value=4.5,
+            unit="×",
+            goal="≥ 4",
+            rival="default",
+            rival_value=2.0,
+            n=3,
+            spread=0.25,
+        )
         yield Row(name="time", value=1.6, unit="CPU-s", goal="< 1.5", n=5, spread=0.1)
         yield Row.of([12345.678], name="size", unit="MB")
         yield Row.of([1.0], name="a: yield", unit="%", goal="≥ 2")
@@ -116,13 +151,20 @@ def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.
 
     rows = run()
     assert [r.met for r in rows] == [True, False, None, False, True]
-    assert list(stored(only_mine))[:3] == ["reading: rows", "reading: time", "reading: size"]
+    assert list(stored(only_mine))[:3] == [
+        "reading: rows",
+        "reading: time",
+        "reading: size",
+    ]
     first = stored(only_mine)["reading: rows"]
     assert first["date"] == datetime.date.today().isoformat()
     assert first["command"] == "make bench ONLY=reading"
     assert first == dataclasses.asdict(rows[0])
     page = (only_mine / "docs/benchmarks.md").read_text()
-    assert f"| **reading** | A, {first['date']} | | |\n| rows |" in page and f"\nA {machine()}.\n" in page
+    assert (
+        f"| **reading** | A, {first['date']} | | |\n| rows |" in page
+        and f"\nA {machine()}.\n" in page
+    )
     assert "| rows | 4.5 ± 0.25 × | ≥ 4 | 3 |" in page
     assert "| time | **1.6 ± 0.1** CPU-s | < 1.5 | 5 |" in page
     assert "| yield | a **1**, b 3 ± 1 % | ≥ 2 | 1 … 2 |" in page
@@ -131,7 +173,9 @@ def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.
     assert "NOT MET" in shown and "bench.json and docs/benchmarks.md written" in shown
 
 
-def test_a_partial_run_keeps_the_rows_of_the_others_and_replaces_its_own(only_mine: Path) -> None:
+def test_a_partial_run_keeps_the_rows_of_the_others_and_replaces_its_own(
+    only_mine: Path,
+) -> None:
     value = [1.0]
 
     @benchmark("b")
@@ -154,7 +198,9 @@ def test_a_partial_run_keeps_the_rows_of_the_others_and_replaces_its_own(only_mi
     assert "new name" in page and "old name" not in page
 
 
-def test_rows_of_another_machine_stay_beside_ones_own(only_mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_another_machine_stay_beside_ones_own(
+    only_mine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kind = ["2 cores"]
     monkeypatch.setattr(runner, "machine", lambda: kind[0])
 
@@ -166,10 +212,15 @@ def test_rows_of_another_machine_stay_beside_ones_own(only_mine: Path, monkeypat
     kind[0] = "a lent GPU"
     run()
     run()
-    assert list(stored(only_mine)) == ["pictures: drawn by 2 cores", "pictures: drawn by a lent GPU"]
+    assert list(stored(only_mine)) == [
+        "pictures: drawn by 2 cores",
+        "pictures: drawn by a lent GPU",
+    ]
 
 
-def test_a_benchmark_that_fails_does_not_cost_the_figures_of_the_others(only_mine: Path) -> None:
+def test_a_benchmark_that_fails_does_not_cost_the_figures_of_the_others(
+    only_mine: Path,
+) -> None:
     @benchmark("first")
     def _() -> Iterator[Row]:
         yield Row(name="x", value=1.0, unit="s", n=1, spread=0.0)
@@ -185,7 +236,15 @@ def test_a_benchmark_that_fails_does_not_cost_the_figures_of_the_others(only_min
 
 
 def test_cells_cannot_break_the_table() -> None:
-    row = Row(name="a: b | c", value=1.0, unit="s|h", n=1, spread=0.0, met=True, machine="2 cores")
+    row = Row(
+        name="a: b | c",
+        value=1.0,
+        unit="s|h",
+        n=1,
+        spread=0.0,
+        met=True,
+        machine="2 cores",
+    )
     line = render([dataclasses.asdict(row)]).splitlines()[-1]
     assert line.replace("\\|", "").count("|") == 5  # four cells
 
@@ -195,7 +254,9 @@ def test_an_unknown_name_is_told_with_the_nearest(only_mine: Path) -> None:
     def _() -> Iterator[Row]:
         yield Row(name="x", value=1.0, unit="s", n=1, spread=0.0)
 
-    with pytest.raises(TaccorlError, match="no benchmark 'ingst'; did you mean 'ingest'"):
+    with pytest.raises(
+        TaccorlError, match="no benchmark 'ingst'; did you mean 'ingest'"
+    ):
         run("ingst")
     assert not (only_mine / "bench.json").exists()
 
@@ -208,7 +269,11 @@ def test_a_bare_word_would_run_everything_and_is_refused() -> None:
 
 # ---- every benchmark of ``make bench`` runs to its end, at the smallest size that its module's constants allow ----
 
-MODULES = [m.name for m in pkgutil.iter_modules(pipelines.benchmarks.__path__) if not m.name.startswith("__")]
+MODULES = [
+    m.name
+    for m in pkgutil.iter_modules(pipelines.benchmarks.__path__)
+    if not m.name.startswith("__")
+]
 for _name in MODULES:
     importlib.import_module(f"pipelines.benchmarks.{_name}")
 ON_A_GPU = ("full_size", "full_adapters", "full_post_training", "physics_on_gpu")
@@ -236,7 +301,9 @@ TINY: dict[str, dict[str, Any]] = {  # module → its constants
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", BENCHMARKS)
-def test_a_benchmark_yields_figures_at_tiny_size(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_benchmark_yields_figures_at_tiny_size(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (suite := tmp_path / "test_suite.py").write_text(SUITE)
     words = {"CORRUPTION": (suite,), "DAMAGE": (suite,)}
     for of, constants in (TINY | {"recordings": TINY["recordings"] | words}).items():
@@ -246,5 +313,7 @@ def test_a_benchmark_yields_figures_at_tiny_size(name: str, tmp_path: Path, monk
     figures = list(BENCHMARKS[name]())
     assert figures or name in ON_A_GPU
     for row in figures:
-        assert row.n >= 1 and math.isfinite(row.value) and math.isfinite(row.spread), row
+        assert row.n >= 1 and math.isfinite(row.value) and math.isfinite(row.spread), (
+            row
+        )
         assert meets(row.value, row.goal) in ((True, False) if row.goal else (None,))

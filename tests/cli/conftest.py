@@ -30,6 +30,8 @@ def said(request, place, monkeypatch, capsys):
         shown = capsys.readouterr()
         assert "Traceback" not in shown.out + shown.err
         text = shown.out + shown.err
-        return code, " ".join(text.split()) if hasattr(request.module, "ONE_LINE") else text
+        return code, " ".join(text.split()) if hasattr(
+            request.module, "ONE_LINE"
+        ) else text
 
     return run

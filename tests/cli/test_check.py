@@ -19,7 +19,9 @@ SPEC = "--spec=piper_flexitac_mcap"
 
 def record(path: Path, **config: Any) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_mcap(path, StandInConfig(**({"duration_s": 2.5, "camera_size": (96, 128)} | config)))
+    write_mcap(
+        path, StandInConfig(**({"duration_s": 2.5, "camera_size": (96, 128)} | config))
+    )
     return path
 
 
@@ -35,7 +37,9 @@ def test_a_sound_recording_is_ok(good, said):
     code, text = said(good, SPEC)
     assert code == 0
     assert text.count("ok  ") == 2, "the recording and its one episode"
-    assert "70 rows, 'insert the test tube into the rack'" in text  # 2.3 s, both ends on a row
+    assert (
+        "70 rows, 'insert the test tube into the rack'" in text
+    )  # 2.3 s, both ends on a row
     assert "warning" not in text and "error" not in text
 
 
@@ -43,18 +47,27 @@ def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path, sai
     path = record(tmp_path / "frozen.mcap", duration_s=4.0, frozen_camera="front")
     code, text = said(path, SPEC)
     assert (code, "frozen_picture" in text) == (1, True)
-    assert "leave this recording out" in text and "lerobot-edit-dataset" not in text, "no dataset, no command on one"
+    assert "leave this recording out" in text and "lerobot-edit-dataset" not in text, (
+        "no dataset, no command on one"
+    )
     code, text = said(path, SPEC, "--pictures=false")
     assert (code, "frozen_picture" in text) == (0, False)
 
 
 def test_an_episode_that_the_operator_discarded_is_no_warning(tmp_path, said):
-    path = record(tmp_path / "two.mcap", duration_s=4.0, episodes=2, outcomes=("discard", "success"))
+    path = record(
+        tmp_path / "two.mcap",
+        duration_s=4.0,
+        episodes=2,
+        outcomes=("discard", "success"),
+    )
     code, text = said(path, SPEC, "--pictures=false")
     assert code == 0 and "discarded by the operator" in text
 
 
-def test_pictures_that_do_not_decode_are_named_and_the_rest_is_checked(good, tmp_path, said):
+def test_pictures_that_do_not_decode_are_named_and_the_rest_is_checked(
+    good, tmp_path, said
+):
     code, text = said(garbled(good, tmp_path / "broken.mcap", [36]), SPEC)
     assert code == 1
     assert "broken_picture: front: 1 pictures do not decode, first at 1.2" in text
@@ -75,17 +88,28 @@ def test_a_bad_file_in_a_folder_does_not_hide_the_others(good, tmp_path, said):
 def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset, said):
     code, text = said(dataset)
     assert "episode 0: " in text and "episode 1: " in text
-    assert "verified" in text and "files are as they were written" in " ".join(text.split())
+    assert "verified" in text and "files are as they were written" in " ".join(
+        text.split()
+    )
     assert code == int("warning" in text)
     assert "error" not in text
 
 
-def test_a_spec_of_another_format_for_a_dataset_is_refused_with_the_way_out(dataset, said):
+def test_a_spec_of_another_format_for_a_dataset_is_refused_with_the_way_out(
+    dataset, said
+):
     code, text = said(dataset, SPEC)
-    assert code == 2 and str(dataset) in text and SPEC in text and "Leave --spec out" in text
+    assert (
+        code == 2
+        and str(dataset) in text
+        and SPEC in text
+        and "Leave --spec out" in text
+    )
 
 
-def test_a_cut_video_is_an_error_and_the_other_episodes_are_still_checked(dataset, tmp_path, said):
+def test_a_cut_video_is_an_error_and_the_other_episodes_are_still_checked(
+    dataset, tmp_path, said
+):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     video = next(copy.rglob("videos/observation.images.front/**/*.mp4"))
     os.truncate(video, video.stat().st_size // 2)
@@ -112,13 +136,17 @@ def flip_bit(path: Path) -> None:
         "meta/taccorl/episodes.json",
     ],
 )
-def test_one_bit_that_flipped_is_an_error_that_names_the_file(pattern, dataset, tmp_path, said):
+def test_one_bit_that_flipped_is_an_error_that_names_the_file(
+    pattern, dataset, tmp_path, said
+):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     path = next(copy.glob(pattern))
     flip_bit(path)
     code, text = said(copy, "--pictures=false")
     assert code >= 1
-    assert "changed_file" in text and path.relative_to(copy).as_posix() in " ".join(text.split())
+    assert "changed_file" in text and path.relative_to(copy).as_posix() in " ".join(
+        text.split()
+    )
 
 
 def test_quick_reads_no_digest(dataset, tmp_path, said):
@@ -148,17 +176,25 @@ def test_a_damaged_manifest_is_an_error(how, dataset, tmp_path, said):
         manifest["files"][name] = manifest["files"][name][::-1]
         path.write_text(json.dumps(manifest))
     code, text = said(copy, "--pictures=false")
-    assert code >= 1 and "damaged_manifest" in text and "manifest.json" in " ".join(text.split())
+    assert (
+        code >= 1
+        and "damaged_manifest" in text
+        and "manifest.json" in " ".join(text.split())
+    )
 
 
-def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(dataset, tmp_path, said):
+def test_a_dataset_without_a_manifest_says_that_nothing_was_compared(
+    dataset, tmp_path, said
+):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     (copy / "meta" / "taccorl" / "manifest.json").unlink()
     code, text = said(copy, "--pictures=false")
     assert code == 1 and "no_manifest" in text and "changed_file" not in text
     shutil.rmtree(copy / "meta" / "taccorl")  # now it could be anybody's
     text = said(copy, "--pictures=false")[1]
-    assert "no manifest of taccorl" in " ".join(text.split()) and "no_manifest" not in text
+    assert (
+        "no manifest of taccorl" in " ".join(text.split()) and "no_manifest" not in text
+    )
 
 
 # ---- what is no recording ----
@@ -169,7 +205,13 @@ def test_a_name_that_is_not_in_a_large_folder_does_not_list_it_all(tmp_path, sai
         (tmp_path / f"{k:03d}.mcap").touch()
     (tmp_path / ".000.taccorl-lock").touch()
     code, text = said(tmp_path / "something_else")
-    assert code == 2 and "009.mcap" in text and "010.mcap" not in text and "490 more" in text and ".000" not in text
+    assert (
+        code == 2
+        and "009.mcap" in text
+        and "010.mcap" not in text
+        and "490 more" in text
+        and ".000" not in text
+    )
 
 
 def odd_things(folder: Path) -> dict[str, Path]:
@@ -178,16 +220,28 @@ def odd_things(folder: Path) -> dict[str, Path]:
     os.mkfifo(folder / "pipe.mcap")
     (folder / "dangling.mcap").symlink_to(folder / "nowhere.mcap")
     (folder / "text.txt").write_text("hello")
-    names = ["empty", "dir.mcap", "pipe.mcap", "dangling.mcap", "text.txt", "missing.mcap"]
+    names = [
+        "empty",
+        "dir.mcap",
+        "pipe.mcap",
+        "dangling.mcap",
+        "text.txt",
+        "missing.mcap",
+    ]
     return {name: folder / name for name in names}
 
 
-@pytest.mark.parametrize("name", ["empty", "dir.mcap", "pipe.mcap", "dangling.mcap", "text.txt", "missing.mcap"])
+@pytest.mark.parametrize(
+    "name",
+    ["empty", "dir.mcap", "pipe.mcap", "dangling.mcap", "text.txt", "missing.mcap"],
+)
 @pytest.mark.parametrize("with_spec", [True, False])
 def test_no_recording_is_one_clear_line_that_names_it(name, with_spec, tmp_path, said):
     path = odd_things(tmp_path)[name]
     if name == "text.txt" and with_spec:
-        code, text = said(path, SPEC)  # the spec names the reader, and the reader says what is wrong with the file
+        code, text = said(
+            path, SPEC
+        )  # the spec names the reader, and the reader says what is wrong with the file
         assert code == 1 and "is not an MCAP file" in text
         return
     code, text = said(path, *([SPEC] if with_spec else []))

@@ -34,7 +34,13 @@ TRUTH_NM = 0.0286331  # of this surrogate; `taccorl surrogate --reveal` prints i
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("diagnose") / "robot"
-    words = ["--secret=3", "--effects=[coulomb_friction]", f"--signal={SIGNAL}", "--strength=12", "--gains_known=true"]
+    words = [
+        "--secret=3",
+        "--effects=[coulomb_friction]",
+        f"--signal={SIGNAL}",
+        "--strength=12",
+        "--gains_known=true",
+    ]
     assert main(["surrogate", *words, "--design=chirp", f"--out={folder}"]) == 0
     return folder
 
@@ -42,11 +48,22 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three recordings of the same robot as tables, which are read faster: a chirp, the same again, one to judge on."""
-    case = draw_case(["coulomb_friction"], 3, signal=SIGNAL, strength=12.0, gains_known=True, design="chirp")
-    chirp, again, held = (record(case, motion) for motion in (CHIRP, AGAIN, VALIDATION[0]))
+    case = draw_case(
+        ["coulomb_friction"],
+        3,
+        signal=SIGNAL,
+        strength=12.0,
+        gains_known=True,
+        design="chirp",
+    )
+    chirp, again, held = (
+        record(case, motion) for motion in (CHIRP, AGAIN, VALIDATION[0])
+    )
     folder = tmp_path_factory.mktemp("sweeps")
     save_twin(case.twin, folder / "twin.yaml")
-    write_folder(folder / "sweeps", Measurements((chirp, again), (held,)), ROBOT.action_names[:7])
+    write_folder(
+        folder / "sweeps", Measurements((chirp, again), (held,)), ROBOT.action_names[:7]
+    )
     path = folder / "sweeps" / "measurements.yaml"
     index = yaml.safe_load(path.read_text())
     for note in index["recordings"].values():
@@ -64,7 +81,12 @@ def few(*kept: str) -> str:
 def mended(robot: Path) -> Path:
     """All effects, until the noise floor."""
     out = robot.parent / "whole"
-    words = [f"--twin={robot / 'twin.yaml'}", f"--measurements={robot / 'sweeps'}", f"--out={out}", "--workers=1"]
+    words = [
+        f"--twin={robot / 'twin.yaml'}",
+        f"--measurements={robot / 'sweeps'}",
+        f"--out={out}",
+        "--workers=1",
+    ]
     assert main(["diagnose", *words, "--until=noise_floor"]) == 0
     return out
 
@@ -76,20 +98,39 @@ def test_the_hidden_friction_is_found_among_all_effects(robot: Path, mended: Pat
     assert found["status"] == "at_floor"
     assert [e["effect"] for e in found["effects"]] == ["coulomb_friction"]
     assert found["effects"][0]["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
-    stage = min(("before", "fitted"), key=lambda stage: found["errors"][stage]["validation"])
-    assert f"test {found['errors'][stage]['test']:.2f} → " in found["effects"][0]["evidence"], "as in the verdict"
+    stage = min(
+        ("before", "fitted"), key=lambda stage: found["errors"][stage]["validation"]
+    )
+    assert (
+        f"test {found['errors'][stage]['test']:.2f} → "
+        in found["effects"][0]["evidence"]
+    ), "as in the verdict"
     # Forms of dry friction with one or two more parameters fit as well: ties. Friction over speed**0.05 counts as dry friction.
     (ties,), finding = found["rivals"].values(), report["verdicts"][SIGNAL]["finding"]
     forms = {f"{kind}_friction" for kind in ("asymmetric", "position_dependent")}
-    assert {"asymmetric_friction"} <= {*ties} <= forms and ties == found["rounds"][0]["ties"]
-    assert finding.startswith(f"{SIGNAL} lacks {' or '.join(['coulomb_friction', *ties])}: ")
+    assert {"asymmetric_friction"} <= {*ties} <= forms and ties == found["rounds"][0][
+        "ties"
+    ]
+    assert finding.startswith(
+        f"{SIGNAL} lacks {' or '.join(['coulomb_friction', *ties])}: "
+    )
     assert len(found["rounds"][0]["evidence"]) >= 4
     for use in ("fit", "validation", "test"):
-        assert found["errors"]["after"][use] < 1.5 < 6.0 < found["errors"]["fitted"][use]
+        assert (
+            found["errors"]["after"][use] < 1.5 < 6.0 < found["errors"]["fitted"][use]
+        )
     (data,) = report["data"]
-    assert data.startswith("surrogate: ") and data.endswith(f"not a robot; {SIGNAL} under test")
-    before, after = (next(s for s in report[k] if s["use"] == "test") for k in ("scores", "scores_after"))
-    assert after["ratio"] < 0.3 * before["ratio"] and (mended / "report.html").stat().st_size > 10_000
+    assert data.startswith("surrogate: ") and data.endswith(
+        f"not a robot; {SIGNAL} under test"
+    )
+    before, after = (
+        next(s for s in report[k] if s["use"] == "test")
+        for k in ("scores", "scores_after")
+    )
+    assert (
+        after["ratio"] < 0.3 * before["ratio"]
+        and (mended / "report.html").stat().st_size > 10_000
+    )
 
 
 @pytest.mark.slow
@@ -99,53 +140,121 @@ def test_the_mended_twin_holds_the_effect_and_only_there(robot: Path, mended: Pa
     assert effect.acts_on() == [SIGNAL]
     left, right = twin.controller_of("left"), twin.controller_of("right")
     assert right == start.controller
-    assert left.kp_nm_per_rad == start.controller.kp_nm_per_rad, "commanded gains are not touched"
-    assert left.torque_ff_nm[3] != 0.0 and left.torque_ff_nm[:3] == start.controller.torque_ff_nm[:3]
+    assert left.kp_nm_per_rad == start.controller.kp_nm_per_rad, (
+        "commanded gains are not touched"
+    )
+    assert (
+        left.torque_ff_nm[3] != 0.0
+        and left.torque_ff_nm[:3] == start.controller.torque_ff_nm[:3]
+    )
 
 
-def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, said: Any, tmp_path: Path):
+def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(
+    sweeps: Path, said: Any, tmp_path: Path
+):
     out = tmp_path / "found"
     keep = few("coulomb_friction", "asymmetric_friction", "encoder_bias")
-    code, text = said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep)
-    assert code == 0 and f"\n{SIGNAL}: coulomb_friction\n" in text and "noise floor 0.3" in text
+    code, text = said(
+        sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep
+    )
+    assert (
+        code == 0
+        and f"\n{SIGNAL}: coulomb_friction\n" in text
+        and "noise floor 0.3" in text
+    )
     assert "commanded gains; chosen by the error on held_chirp.csv (validation)" in text
-    lines = text.split(f"\n{SIGNAL}: coulomb_friction\n", 1)[1].partition("\nwrote ")[0].splitlines()
-    assert lines[0].startswith(f"  {SIGNAL} lacks coulomb_friction or asymmetric_friction: ") and len(lines) < 10
+    lines = (
+        text.split(f"\n{SIGNAL}: coulomb_friction\n", 1)[1]
+        .partition("\nwrote ")[0]
+        .splitlines()
+    )
+    assert (
+        lines[0].startswith(
+            f"  {SIGNAL} lacks coulomb_friction or asymmetric_friction: "
+        )
+        and len(lines) < 10
+    )
     assert "torque_nm F = 0.028" in lines[1] and "N·m (0.028" in lines[1]
-    assert lines[3].startswith("  Confidence moderate: ") and "no test recording" in lines[3]
+    assert (
+        lines[3].startswith("  Confidence moderate: ")
+        and "no test recording" in lines[3]
+    )
     assert lines[4].startswith("  Record next: ")
-    assert "coulomb_friction from asymmetric_friction" in lines[4], "which no motion separates without efforts"
+    assert "coulomb_friction from asymmetric_friction" in lines[4], (
+        "which no motion separates without efforts"
+    )
     assert "taccorl excite" not in text
-    page, found = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
-    assert "fixed by commanded gains" in page and "worst after the fit: " in page and "→ coulomb_friction" in page
+    page, found = (
+        (out / "report.html").read_text(),
+        json.loads((out / "report.json").read_text()),
+    )
+    assert (
+        "fixed by commanded gains" in page
+        and "worst after the fit: " in page
+        and "→ coulomb_friction" in page
+    )
     assert found["identified"][SIGNAL]["pinned_by"] == ["commanded gains"]
-    friction = {n["name"]: n for n in found["identified"][SIGNAL]["identifiable"]}["coulomb_friction.torque_nm"]
+    friction = {n["name"]: n for n in found["identified"][SIGNAL]["identifiable"]}[
+        "coulomb_friction.torque_nm"
+    ]
     assert friction["low"] <= TRUTH_NM <= friction["high"]
     assert "encoder_bias (looks like torque_ff, always fitted)" in page
-    assert found["diagnoses"][SIGNAL]["words"] == "at the noise floor" and "tied with coulomb_friction" in page
+    assert (
+        found["diagnoses"][SIGNAL]["words"] == "at the noise floor"
+        and "tied with coulomb_friction" in page
+    )
     command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
-    assert f"next: {command}\nasymmetric_friction does as well as coulomb_friction: see Record next" in text
-    assert {f"taccorl {end}" for line in text.splitlines() if (end := line.partition("taccorl ")[2])} == {command}
+    assert (
+        f"next: {command}\nasymmetric_friction does as well as coulomb_friction: see Record next"
+        in text
+    )
+    assert {
+        f"taccorl {end}"
+        for line in text.splitlines()
+        if (end := line.partition("taccorl ")[2])
+    } == {command}
     tied = f"{command}/report.json".replace("coulomb", "asymmetric")
     assert [main(shlex.split(words)[1:]) for words in (command, tied)] == [0, 0]
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
 
 
 @pytest.mark.slow
-def test_a_report_is_replaced_and_other_files_are_left_alone(sweeps: Path, said: Any, tmp_path: Path):
-    out, keep = tmp_path / "found", few("coulomb_friction", "asymmetric_friction", "encoder_bias")
-    assert said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep)[0] == 0
+def test_a_report_is_replaced_and_other_files_are_left_alone(
+    sweeps: Path, said: Any, tmp_path: Path
+):
+    out, keep = (
+        tmp_path / "found",
+        few("coulomb_friction", "asymmetric_friction", "encoder_bias"),
+    )
+    assert (
+        said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep)[0]
+        == 0
+    )
     (out / "notes.txt").write_text("mine")
-    code, text = said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep, "--joints=[J3]")
-    assert code == 0 and f"\n{SIGNAL}: coulomb_friction\n" in text, "the paper's name of the joint"
-    assert "replaced the report of" in text and (out / "notes.txt").read_text() == "mine"
+    code, text = said(
+        sweeps,
+        f"--twin={sweeps.parent / 'twin.yaml'}",
+        f"--out={out}",
+        keep,
+        "--joints=[J3]",
+    )
+    assert code == 0 and f"\n{SIGNAL}: coulomb_friction\n" in text, (
+        "the paper's name of the joint"
+    )
+    assert (
+        "replaced the report of" in text and (out / "notes.txt").read_text() == "mine"
+    )
     (out / "report.html").write_text("mine, too")
-    code, text = said(sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep)
+    code, text = said(
+        sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}", keep
+    )
     assert code == 2 and (out / "report.html").read_text() == "mine, too"
 
 
 @pytest.mark.slow
-def test_without_the_true_effect_something_else_remains(sweeps: Path, said: Any, tmp_path: Path):
+def test_without_the_true_effect_something_else_remains(
+    sweeps: Path, said: Any, tmp_path: Path
+):
     out = tmp_path / "found"
     words = [sweeps, f"--twin={sweeps.parent / 'twin.yaml'}", f"--out={out}"]
     code, text = said(*words, few("backlash", "cogging", "encoder_scale"))
@@ -158,7 +267,10 @@ def test_without_the_true_effect_something_else_remains(sweeps: Path, said: Any,
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--joints=[left_joint9]"], "left_joint9: no such joint is swept in these recordings; "),
+        (
+            ["--joints=[left_joint9]"],
+            "left_joint9: no such joint is swept in these recordings; ",
+        ),
         (["--joints=[right_joint4]"], "right_joint4: no such joint is swept"),
         (["--joints=[J4]"], "J4: no such joint is swept"),  # the paper's J4 is joint5
         (["--without=[coulomb_frictoin]"], "coulomb_friction"),
@@ -167,7 +279,9 @@ def test_without_the_true_effect_something_else_remains(sweeps: Path, said: Any,
         (["--out={tmp}/file"], "is a file; give a folder"),
     ],
 )
-def test_what_cannot_be_done_is_said(words: list[str], message: str, sweeps: Path, said: Any, tmp_path: Path):
+def test_what_cannot_be_done_is_said(
+    words: list[str], message: str, sweeps: Path, said: Any, tmp_path: Path
+):
     (tmp_path / "file").write_text("mine")
     words = [w.format(tmp=tmp_path) for w in words]
     code, text = said(sweeps, f"--out={tmp_path / 'out'}", *words)
@@ -185,8 +299,12 @@ def test_recordings_that_sweep_no_joint_are_refused(said: Any, tmp_path: Path):
     with (folder / "gripper.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["t", "left_gripper.q_target", "left_gripper.q"])
-        late = np.concatenate([target[:1].repeat(10), target[:-10]]) + 1e-5 * rng.standard_normal(600)
-        rows.writerows([f"{k / 200:.3f}", f"{target[k]:.7f}", f"{late[k]:.7f}"] for k in range(600))
+        late = np.concatenate(
+            [target[:1].repeat(10), target[:-10]]
+        ) + 1e-5 * rng.standard_normal(600)
+        rows.writerows(
+            [f"{k / 200:.3f}", f"{target[k]:.7f}", f"{late[k]:.7f}"] for k in range(600)
+        )
     code, text = said(folder, f"--out={tmp_path / 'out'}")
     assert code == 2 and "no fit recording moves a joint" in " ".join(text.split())
 
@@ -204,12 +322,17 @@ def stepped(folder: Path, late_rows: int) -> Path:
         target[200 * k :, 4] += level - (0.0, 0.0, 0.2, -0.1, 0.25)[k]
     reported = replay(sim, target, 200.0, sim.proprioception()[0].copy()).reported[:, 4]
     rows = np.clip(np.arange(len(reported)) - late_rows, 0, len(reported) - 1)
-    seen = reported[rows] + 2e-4 * np.random.default_rng(1).standard_normal(len(reported))
+    seen = reported[rows] + 2e-4 * np.random.default_rng(1).standard_normal(
+        len(reported)
+    )
     folder.mkdir()
     with (folder / "steps.csv").open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["t", "left_joint5.q_target", "left_joint5.q"])
-        table.writerows([f"{k / 200:.3f}", f"{target[k, 4]:.8f}", f"{seen[k]:.8f}"] for k in range(len(seen)))
+        table.writerows(
+            [f"{k / 200:.3f}", f"{target[k, 4]:.8f}", f"{seen[k]:.8f}"]
+            for k in range(len(seen))
+        )
     return folder
 
 
@@ -217,32 +340,56 @@ LATE = pytest.param(1, (0, 1), "a real delay", marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
-    ("late_rows", "codes", "words"), [(-1, (1,), "not diagnosed"), (0, (0,), "nothing is missing"), LATE]
+    ("late_rows", "codes", "words"),
+    [(-1, (1,), "not diagnosed"), (0, (0,), "nothing is missing"), LATE],
 )
-def test_positions_one_row_too_early_stop_it_before_an_effect_is_blamed(late_rows, codes, words, said, tmp_path: Path):
+def test_positions_one_row_too_early_stop_it_before_an_effect_is_blamed(
+    late_rows, codes, words, said, tmp_path: Path
+):
     """On one clock they are diagnosed; one row too late is a delay or a clock."""
     keep = few("command_delay", "sensor_delay", "coulomb_friction")
-    code, text = said(stepped(tmp_path / "made", late_rows), f"--out={tmp_path / 'out'}", keep)
+    code, text = said(
+        stepped(tmp_path / "made", late_rows), f"--out={tmp_path / 'out'}", keep
+    )
     assert code in codes and words in " ".join(text.split())
     assert (tmp_path / "out").exists() == (late_rows >= 0)
 
 
 @pytest.mark.slow
-def test_a_recording_s_stated_gains_are_needed_only_if_they_are_to_be_believed(said: Any, tmp_path: Path):
+def test_a_recording_s_stated_gains_are_needed_only_if_they_are_to_be_believed(
+    said: Any, tmp_path: Path
+):
     folder = stepped(tmp_path / "silent", 0)
-    code, text = said(folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash"))
-    assert code == 2 and "kp and kd into its measurements.yaml" in " ".join(text.split())
-    note = {"recordings": {"steps.csv": {"kp": {"left_joint5": 151.1}, "kd": {"left_joint5": 17.1}}}}
+    code, text = said(
+        folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash")
+    )
+    assert code == 2 and "kp and kd into its measurements.yaml" in " ".join(
+        text.split()
+    )
+    note = {
+        "recordings": {
+            "steps.csv": {"kp": {"left_joint5": 151.1}, "kd": {"left_joint5": 17.1}}
+        }
+    }
     (folder / "measurements.yaml").write_text(yaml.safe_dump(note))
-    code, text = said(folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash"))
-    assert code == 0 and "commanded gains; chosen by the error on the last rows of each" in text
+    code, text = said(
+        folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash")
+    )
+    assert (
+        code == 0
+        and "commanded gains; chosen by the error on the last rows of each" in text
+    )
 
 
 @pytest.fixture(scope="module")
 def bench(sweeps: Path, recordings: Path, dataset: Path) -> Path:
     """Folder with recordings, and a dataset without pictures."""
     (sweeps.parent / "recordings").symlink_to(recordings)
-    keys = [key for key, f in read_info(dataset)["features"].items() if f["dtype"] != "video"]
+    keys = [
+        key
+        for key, f in read_info(dataset)["features"].items()
+        if f["dtype"] != "video"
+    ]
     change_features(dataset, sweeps.parent / "dataset", keys, {})
     return sweeps.parent
 
@@ -264,18 +411,59 @@ with figures_once():
 def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: Path):
     commands: list[tuple[list[str], int, str]] = [
         (["effects", "coulomb_friction"], 0, "torque_nm [N·m]"),
-        (["surrogate", "--secret=3", "--signal=left_joint4", "--strength=0"], 2, "--strength=0"),
-        (["compare", "sweeps", "--twin=twin.yaml", "--out=report"], 0, "wrote report/report.html"),
-        (["diagnose", "sweeps", "--twin=twin.yaml", few("coulomb_friction", "backlash")], 0, "lacks coulomb_friction"),
-        (["check", "dataset", "--pictures=false"], 0, "whether LeRobot loads it not judged: needs lerobot"),
-        (["ingest", "inspect", "recordings"], 2, "needs cv2, which is not installed: pip install"),
+        (
+            ["surrogate", "--secret=3", "--signal=left_joint4", "--strength=0"],
+            2,
+            "--strength=0",
+        ),
+        (
+            ["compare", "sweeps", "--twin=twin.yaml", "--out=report"],
+            0,
+            "wrote report/report.html",
+        ),
+        (
+            [
+                "diagnose",
+                "sweeps",
+                "--twin=twin.yaml",
+                few("coulomb_friction", "backlash"),
+            ],
+            0,
+            "lacks coulomb_friction",
+        ),
+        (
+            ["check", "dataset", "--pictures=false"],
+            0,
+            "whether LeRobot loads it not judged: needs lerobot",
+        ),
+        (
+            ["ingest", "inspect", "recordings"],
+            2,
+            "needs cv2, which is not installed: pip install",
+        ),
         (["ingest", "recordings", "--out=new"], 2, "lerobot_policy_taccorl[lerobot]"),
-        (["collect", "--task=assembly_1", "--out=new"], 2, "lerobot_policy_taccorl[lerobot]"),
-        (["compare", "sweeps", "--twin=twin.yaml", "--rerun=x.rrd"], 2, "lerobot_policy_taccorl[lerobot]"),
-        (["evaluate", "--task=assembly_1", "--policy.path=x"], 2, "lerobot_policy_taccorl[train]"),
+        (
+            ["collect", "--task=assembly_1", "--out=new"],
+            2,
+            "lerobot_policy_taccorl[lerobot]",
+        ),
+        (
+            ["compare", "sweeps", "--twin=twin.yaml", "--rerun=x.rrd"],
+            2,
+            "lerobot_policy_taccorl[lerobot]",
+        ),
+        (
+            ["evaluate", "--task=assembly_1", "--policy.path=x"],
+            2,
+            "lerobot_policy_taccorl[train]",
+        ),
     ]
-    done = fresh_python("-c", LIGHT, json.dumps([words for words, _, _ in commands]), cwd=bench)
-    assert (done.returncode, "Traceback" in done.stdout) == (0, False), done.stdout + done.stderr
+    done = fresh_python(
+        "-c", LIGHT, json.dumps([words for words, _, _ in commands]), cwd=bench
+    )
+    assert (done.returncode, "Traceback" in done.stdout) == (0, False), (
+        done.stdout + done.stderr
+    )
     shown = done.stdout
     for words, status, printed in commands:
         own, end, shown = shown.partition(f"=== {words} === {status}\n")
@@ -283,9 +471,16 @@ def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: P
         assert printed in own, words
 
 
-def test_ctrl_c_ends_with_what_was_found(sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd):
+def test_ctrl_c_ends_with_what_was_found(
+    sweeps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
+):
     """After the first round has added the friction, Ctrl-C keeps it; before that nothing is written."""
-    words = ["diagnose", f"--measurements={sweeps}", f"--twin={sweeps.parent / 'twin.yaml'}", f"--joints=[{SIGNAL}]"]
+    words = [
+        "diagnose",
+        f"--measurements={sweeps}",
+        f"--twin={sweeps.parent / 'twin.yaml'}",
+        f"--joints=[{SIGNAL}]",
+    ]
     words += [few("coulomb_friction", "encoder_offset"), "--until=noise_floor"]
 
     def typed_at(begins: str, out: str) -> int:
@@ -298,9 +493,14 @@ def test_ctrl_c_ends_with_what_was_found(sweeps: Path, tmp_path: Path, monkeypat
         return main([*words, f"--out={tmp_path / out}"])
 
     plain, before = Steps.__call__, signal.getsignal(signal.SIGINT)
-    assert typed_at("no effect added", "nothing") == 130 and not (tmp_path / "nothing").exists()
+    assert (
+        typed_at("no effect added", "nothing") == 130
+        and not (tmp_path / "nothing").exists()
+    )
     assert typed_at("coulomb_friction", "found") in (0, 1)
     assert signal.getsignal(signal.SIGINT) is before
-    told = json.loads((tmp_path / "found" / "report.json").read_text())["diagnoses"][SIGNAL]
+    told = json.loads((tmp_path / "found" / "report.json").read_text())["diagnoses"][
+        SIGNAL
+    ]
     assert [e["effect"] for e in told["effects"]] == ["coulomb_friction"]
     assert "stopping with what was found" in capfd.readouterr().err

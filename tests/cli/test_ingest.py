@@ -33,7 +33,11 @@ def place(tmp_path: Path) -> Path:
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
 
 
 # ---- ingest ----
@@ -42,9 +46,14 @@ def tree(folder: Path) -> dict[str, bytes]:
 def test_the_command_of_the_readme_says_where_everything_is(good, said):
     before = good.read_bytes()
     code, text = said(good, SPEC, "--out=outputs/my dataset")
-    assert code == 0 and "recordings: 1 written, 0 split, 0 quarantined, 0 refused" in text
+    assert (
+        code == 0 and "recordings: 1 written, 0 split, 0 quarantined, 0 refused" in text
+    )
     assert "report:  outputs/my dataset.ingest_report.json" in text
-    assert "taccorl view 'outputs/my dataset' --episode=0" in text and "(1 episodes, 70 rows)" in text
+    assert (
+        "taccorl view 'outputs/my dataset' --episode=0" in text
+        and "(1 episodes, 70 rows)" in text
+    )
     report = json.loads(Path("outputs/my dataset.ingest_report.json").read_text())
     assert report["rows"] == 70
     assert (Path("outputs/my dataset") / "meta/info.json").is_file()
@@ -57,16 +66,27 @@ def test_the_command_of_the_readme_says_where_everything_is(good, said):
 def test_without_a_spec_the_one_that_fits_is_chosen_and_named(good, said, tmp_path):
     code, text = said(good, "--dry_run=true")
     assert (code, "piper_flexitac_mcap, whose topics these are" in text) == (0, True)
-    for verb, words in (("check", ["--pictures=false"]), ("view", [f"--save={tmp_path / 'x.rrd'}"])):
+    for verb, words in (
+        ("check", ["--pictures=false"]),
+        ("view", [f"--save={tmp_path / 'x.rrd'}"]),
+    ):
         assert main([verb, str(good), *words]) == 0, verb
 
 
-def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path, said, capsys):
-    path = write_hdf5(tmp_path / "own.hdf5", {"/qpos": np.zeros((40, 6)), "/command": np.zeros((40, 6))})
+def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(
+    tmp_path, said, capsys
+):
+    path = write_hdf5(
+        tmp_path / "own.hdf5",
+        {"/qpos": np.zeros((40, 6)), "/command": np.zeros((40, 6))},
+    )
     for verb in ("ingest", "check", "view"):
         assert main([verb, str(path)]) != 0
         error = capsys.readouterr().err
-        assert f"taccorl ingest inspect {path} --draft=" in error and f"taccorl compare {path}" in error, verb
+        assert (
+            f"taccorl ingest inspect {path} --draft=" in error
+            and f"taccorl compare {path}" in error
+        ), verb
         assert "Traceback" not in error
 
 
@@ -107,14 +127,18 @@ def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run, tmp_path, said):
         (("nowhere.mcap",), "nowhere.mcap: no such file or folder"),
     ],
 )
-def test_what_cannot_work_is_told_before_any_work(words, expected, good, said, monkeypatch):
+def test_what_cannot_work_is_told_before_any_work(
+    words, expected, good, said, monkeypatch
+):
     Path("file").write_text("x")
     Path("full").mkdir()
     Path("full/mine.txt").write_text("x")
     Path("in").mkdir()
     shutil.copy(good, "in/good.mcap")
     before = tree(Path.cwd())
-    monkeypatch.setattr("taccorl.data.ingest.ingest_one", lambda *_: pytest.fail("work was begun"))
+    monkeypatch.setattr(
+        "taccorl.data.ingest.ingest_one", lambda *_: pytest.fail("work was begun")
+    )
     spec = () if any(w.startswith("--spec") for w in words) else (SPEC,)
     code, text = said("in", *spec, *words)
     assert code == 2
@@ -137,7 +161,9 @@ def test_inspect_shows_channels_and_names_the_spec_that_fits(good, said):
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(good, tmp_path, said):
-    path = tmp_path / "[red]a[" / "bold].mcap"  # rich would read "[/bold]" as a closing tag
+    path = (
+        tmp_path / "[red]a[" / "bold].mcap"
+    )  # rich would read "[/bold]" as a closing tag
     path.parent.mkdir()
     shutil.copy(good, path)
     code, text = said("inspect", path)
@@ -176,7 +202,9 @@ def test_one_bad_entry_of_a_folder_does_not_hide_the_others(tmp_path, capsys):
     (tmp_path / "v21/meta/info.json").write_text('{"codebase_version": "v2.1"}')
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "zero.mcap").touch()
-    assert main(["ingest", "inspect", str(tmp_path / "missing.mcap"), str(tmp_path)]) == 1
+    assert (
+        main(["ingest", "inspect", str(tmp_path / "missing.mcap"), str(tmp_path)]) == 1
+    )
     printed = capsys.readouterr().out
     assert "missing.mcap: no such file" in printed
     assert "piper_flexitac_mcap" in printed
@@ -191,7 +219,9 @@ def test_times_that_the_reader_made_up_are_not_shown_as_measured(tmp_path, capsy
     assert main(["ingest", "inspect", str(tmp_path / "a.hdf5")]) == 0
     printed = capsys.readouterr().out
     assert "hdf5, – s" in printed
-    [row] = [line for line in printed.splitlines() if line.startswith("/observations/qpos")]
+    [row] = [
+        line for line in printed.splitlines() if line.startswith("/observations/qpos")
+    ]
     assert row.split() == ["/observations/qpos", "float32", "75", "–", "–", "–", "–"]
 
 
@@ -206,7 +236,9 @@ def test_what_is_wrong_comes_instead_of_a_spec_that_fits(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
-def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(share, tmp_path, capsys):
+def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(
+    share, tmp_path, capsys
+):
     path = tmp_path / "a.mcap"
     write_mcap(tmp_path / "known.mcap", StandInConfig(**SMALL))
     types = {CAMERA_TOPICS["front"]: "foxglove_msgs/msg/CompressedImage"}
@@ -215,6 +247,11 @@ def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(share, t
     path.write_bytes(path.read_bytes()[: round(share * path.stat().st_size)])
     code, printed = main(["ingest", "inspect", str(path)]), capsys.readouterr().out
     assert "no shipped spec fits" in printed and list(tmp_path.iterdir()) == [path]
-    drafts = "dataset: draft_dataset.yaml" in printed and "draft_dataset.yaml: what its dataset holds" in printed
+    drafts = (
+        "dataset: draft_dataset.yaml" in printed
+        and "draft_dataset.yaml: what its dataset holds" in printed
+    )
     is_named = f"to {path.stat().st_size:,}: the file ends without a footer" in printed
-    assert (code, drafts, is_named) == ((0, True, False) if share == 1 else (1, False, True))
+    assert (code, drafts, is_named) == (
+        (0, True, False) if share == 1 else (1, False, True)
+    )

@@ -49,17 +49,28 @@ def test_the_list_names_every_verb_and_needs_no_library():
         assert group in listing
         for verb, line in verbs.items():
             assert f"  {verb:16s}{line}" in listing
-            assert callable(importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}").main)
+            assert callable(
+                importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}").main
+            )
 
 
-@pytest.mark.parametrize(("stated", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
-def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(stated, threads):
+@pytest.mark.parametrize(
+    ("stated", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")]
+)
+def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(
+    stated, threads
+):
     code = (
         "import atexit, os; atexit.register(lambda: print(os.environ['OPENBLAS_NUM_THREADS']));"
         "from taccorl.cli.main import main; main()"
     )
     own = [name for name in os.environ if name.endswith("_NUM_THREADS")]
-    assert fresh_python("-c", code, "diagnose", "--help", without=own, **stated).stdout.splitlines()[-1] == threads
+    assert (
+        fresh_python(
+            "-c", code, "diagnose", "--help", without=own, **stated
+        ).stdout.splitlines()[-1]
+        == threads
+    )
 
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])
@@ -72,10 +83,15 @@ def test_the_version_is_the_packages(capsys):
     assert capsys.readouterr().out == f"taccorl {taccorl.__version__}\n"
 
 
-@pytest.mark.parametrize(("typo", "meant"), [("ingst", "ingest"), ("chekc", "check"), ("veiw", "view")])
+@pytest.mark.parametrize(
+    ("typo", "meant"), [("ingst", "ingest"), ("chekc", "check"), ("veiw", "view")]
+)
 def test_an_unknown_verb_names_the_nearest(typo, meant, capsys):
     assert main([typo, "x"]) == 2
-    assert capsys.readouterr().err == f"taccorl: no verb {typo!r}; did you mean {meant!r}?\n"
+    assert (
+        capsys.readouterr().err
+        == f"taccorl: no verb {typo!r}; did you mean {meant!r}?\n"
+    )
 
 
 def test_help_names_every_registered_task_but_the_empty_bench(capsys):
@@ -89,7 +105,9 @@ def test_help_names_every_registered_task_but_the_empty_bench(capsys):
 
 def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys):
     verbs = {verb for group in VERBS.values() for verb in group} - {"lineage", "task"}
-    assert verbs | {f"{v} {second}" for v, words in SECOND_WORDS.items() for second in words} == set(SHOWN)
+    assert verbs | {
+        f"{v} {second}" for v, words in SECOND_WORDS.items() for second in words
+    } == set(SHOWN)
     number = 0
     for verb, named in SHOWN.items():
         with pytest.raises(SystemExit):
@@ -105,8 +123,16 @@ def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys):
 def test_help_shows_what_options_with_choices_are(capsys):
     """draccus overlooks the docstrings of Literal fields, also of those in a config within a config."""
     for verb, option, text in (
-        ("diagnose", "--until {one,noise_floor}", "find the most likely missing effect of each joint"),
-        ("compare", "--pressed.shape {nothing,sphere,rod}", "Shape of the object. nothing: touch is not compared."),
+        (
+            "diagnose",
+            "--until {one,noise_floor}",
+            "find the most likely missing effect of each joint",
+        ),
+        (
+            "compare",
+            "--pressed.shape {nothing,sphere,rod}",
+            "Shape of the object. nothing: touch is not compared.",
+        ),
     ):
         with pytest.raises(SystemExit):
             main([verb, "--help=all"])
@@ -117,23 +143,44 @@ def test_help_shows_what_options_with_choices_are(capsys):
 @pytest.mark.parametrize(
     ("raised", "code", "words"),
     [
-        (TaccorlError("front: no such topic"), 2, "taccorl check: front: no such topic"),
-        (FileNotFoundError(2, "No such file or directory", "x.mcap"), 2, "No such file or directory (x.mcap)"),
+        (
+            TaccorlError("front: no such topic"),
+            2,
+            "taccorl check: front: no such topic",
+        ),
+        (
+            FileNotFoundError(2, "No such file or directory", "x.mcap"),
+            2,
+            "No such file or directory (x.mcap)",
+        ),
         (OSError("odd"), 2, "taccorl check: odd"),
-        (OSError(28, "No space left on device", "/out"), 2, "No space left on device (/out); make room"),
+        (
+            OSError(28, "No space left on device", "/out"),
+            2,
+            "No space left on device (/out); make room",
+        ),
         (
             shutil.Error(
-                [("a", "/out/a", "[Errno 28] No space left on device: '/out/a'"), ("b", "/out/b", "the same")]
+                [
+                    ("a", "/out/a", "[Errno 28] No space left on device: '/out/a'"),
+                    ("b", "/out/b", "the same"),
+                ]
             ),
             2,
             "taccorl check: No space left on device (/out/a); make room, then run the same command again\n",
         ),
         (shutil.Error([("a", "/out/a", "odd")]), 2, "taccorl check: odd (/out/a)"),
         (KeyboardInterrupt(), 130, "taccorl check: stopped\n"),
-        (KeyboardInterrupt(), 130, "taccorl ingest: stopped; what was finished is kept"),  # in its store
+        (
+            KeyboardInterrupt(),
+            130,
+            "taccorl ingest: stopped; what was finished is kept",
+        ),  # in its store
     ],
 )
-def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(raised, code, words, monkeypatch, capsys):
+def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
+    raised, code, words, monkeypatch, capsys
+):
     def fail(argv: Any) -> int:
         raise raised
 
@@ -159,7 +206,10 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(raised, code, word
         (("excite", "left_joint2", "--num=0"), "--num=0"),
         (("excite", "left_joint2", "--floor_rad=nan"), "--floor_rad=nan"),
         (("surrogate", "--secret=1", "--strength=0"), "--strength=0"),
-        (("check", "full", "--spec=piper_flexitac_mcpa"), "did you mean 'piper_flexitac_mcap'"),
+        (
+            ("check", "full", "--spec=piper_flexitac_mcpa"),
+            "did you mean 'piper_flexitac_mcap'",
+        ),
         (("ingest", "inspect", "nope"), "taccorl ingest inspect: nope"),
         (("lineage", "explain", "nope"), "taccorl lineage explain: "),
     ],
@@ -172,15 +222,21 @@ def test_a_refused_command_makes_no_store(words, named, tmp_path, said):
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["full", "notes.txt"]
 
 
-@pytest.mark.parametrize("words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")])
+@pytest.mark.parametrize(
+    "words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")]
+)
 def test_a_reader_that_goes_away_is_no_error_message(words, tmp_path):
     from tests.recordings.stand_in import StandInConfig, write_mcap
 
-    write_mcap(tmp_path / "a.mcap", StandInConfig(duration_s=2.0, camera_size=(96, 128)))
+    write_mcap(
+        tmp_path / "a.mcap", StandInConfig(duration_s=2.0, camera_size=(96, 128))
+    )
     read_end, write_end = os.pipe()
     os.close(read_end)  # as `taccorl … | head -0` does
     given = [w.format(recording=tmp_path / "a.mcap") for w in words]
-    done = subprocess.run([*TACCORL, *given], stdout=write_end, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [*TACCORL, *given], stdout=write_end, stderr=subprocess.PIPE, text=True
+    )
     os.close(write_end)
     assert (done.returncode, done.stderr) == (141, "")
 
@@ -188,7 +244,9 @@ def test_a_reader_that_goes_away_is_no_error_message(words, tmp_path):
 # ---- what verbs print while they work ----
 
 
-def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_left(monkeypatch, capsys) -> None:
+def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_left(
+    monkeypatch, capsys
+) -> None:
     now_s = 100.0
     monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
     with tables.Bars(2) as bars:
@@ -205,14 +263,19 @@ def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_l
     ]
 
 
-def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(monkeypatch, capsys) -> None:
+def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(
+    monkeypatch, capsys
+) -> None:
     now_s = 100.0
     monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
     steps = pickle.loads(pickle.dumps(tables.Steps()))
     for second in (1, 4, 6, 8, 12):
         now_s = 100.0 + second
         steps("elbow", f"step {second}")
-    assert capsys.readouterr().err.splitlines() == ["elbow: step 6 (6 s)", "elbow: step 12 (12 s)"]
+    assert capsys.readouterr().err.splitlines() == [
+        "elbow: step 6 (6 s)",
+        "elbow: step 12 (12 s)",
+    ]
 
 
 # ---- names of other people's topics and files never steer the terminal ----
@@ -227,13 +290,20 @@ def write(path: Path) -> Path:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        joints = writer.register_schema(f"sensor_msgs/msg/JointState{RED}", "jsonschema", b"{}")
+        joints = writer.register_schema(
+            f"sensor_msgs/msg/JointState{RED}", "jsonschema", b"{}"
+        )
         other = writer.register_schema("my_msgs/Unknown", "jsonschema", b"{}")
         message = {"name": [f"joint{RED}"], "position": [0.5]}
         for topic, schema in ((TOPIC, joints), (TEXTS, other)):
             channel = writer.register_channel(topic, "json", schema)
             for k in range(20):
-                writer.add_message(channel, 10**18 + k * 10**7, json.dumps(message).encode(), publish_time=0)
+                writer.add_message(
+                    channel,
+                    10**18 + k * 10**7,
+                    json.dumps(message).encode(),
+                    publish_time=0,
+                )
         writer.add_metadata(f"note{RED}", {"by": f"{RED}me"})
         writer.finish()
     return path
@@ -248,26 +318,41 @@ def test_printable_writes_out_what_a_terminal_would_obey():
 def test_what_inspect_prints_and_drafts_has_no_control_characters(tmp_path, capsys):
     path = write(tmp_path / f"a{RED}.mcap")
     assert main(["ingest", "inspect", str(path)]) == 0
-    assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
+    assert (
+        main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'mine.yaml'}"]) == 0
+    )
     printed = capsys.readouterr().out
-    assert not STEERS.search(printed) and r"/arm\x1b[31m/joint\x07_state\u202e\x9b2J\nrow: 2" in printed
+    assert (
+        not STEERS.search(printed)
+        and r"/arm\x1b[31m/joint\x07_state\u202e\x9b2J\nrow: 2" in printed
+    )
     for name in ("mine.yaml", "mine_dataset.yaml"):
         assert not STEERS.search((tmp_path / name).read_text())
         assert yaml.safe_load((tmp_path / name).read_text())
-    (channel,) = yaml.safe_load((tmp_path / "mine.yaml").read_text())["channels"].values()
+    (channel,) = yaml.safe_load((tmp_path / "mine.yaml").read_text())[
+        "channels"
+    ].values()
     assert channel["topic"] == TOPIC
     assert channel["pick"] == [f"joint{RED}"]
     assert r"# not used: /other\x1b[31m" in (tmp_path / "mine.yaml").read_text()
 
 
-def test_errors_reports_and_lists_of_what_is_not_read_have_none_either(tmp_path, capsys):
+def test_errors_reports_and_lists_of_what_is_not_read_have_none_either(
+    tmp_path, capsys
+):
     folder = tmp_path / "in"
     folder.mkdir()
     write(folder / f"a{RED}.mcap")
     (folder / f"b{RED}.txt").write_text("?")
     for words in (["ingest", "--dry_run=true"], ["check"]):
-        assert main([words[0], str(folder), "--spec=piper_flexitac_mcap", *words[1:]]) == 1
+        assert (
+            main([words[0], str(folder), "--spec=piper_flexitac_mcap", *words[1:]]) == 1
+        )
     assert main(["check", str(folder / f"c{RED}")]) == 2
     captured = capsys.readouterr()
     assert not STEERS.search(captured.out + captured.err)
-    assert r"a\x1b[31m.mcap" in captured.out and r"b\x1b[31m.txt" in captured.out and r"c\x1b[31m" in captured.err
+    assert (
+        r"a\x1b[31m.mcap" in captured.out
+        and r"b\x1b[31m.txt" in captured.out
+        and r"c\x1b[31m" in captured.err
+    )

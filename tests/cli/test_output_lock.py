@@ -45,7 +45,9 @@ def line(stream: Any) -> str:
 
 @pytest.mark.parametrize("out", ["made", "new/folder/made"])
 @pytest.mark.parametrize("ends", ["done", signal.SIGTERM, signal.SIGKILL])
-def test_a_second_process_waits_until_the_first_ends_however_it_does(out: str, ends: Any, tmp_path: Path):
+def test_a_second_process_waits_until_the_first_ends_however_it_does(
+    out: str, ends: Any, tmp_path: Path
+):
     first = start(tmp_path, "-c", HOLDER, out)
     assert line(first.stdout) == "has it"
     second = start(tmp_path, "-c", HOLDER, out)
@@ -59,14 +61,18 @@ def test_a_second_process_waits_until_the_first_ends_however_it_does(out: str, e
         first.communicate()
     assert line(second.stdout) == "has it"
     third = start(tmp_path, "-c", HOLDER, out)
-    assert f"held by process {second.pid}" in line(third.stderr), "the file that the first one removed is no other lock"
+    assert f"held by process {second.pid}" in line(third.stderr), (
+        "the file that the first one removed is no other lock"
+    )
     second.communicate("\n")
     assert line(third.stdout) == "has it"
     third.communicate("\n")
     assert [*tmp_path.rglob("*.lock")] == [] and [*tmp_path.iterdir()] == []
 
 
-def test_two_names_of_one_place_are_one_lock_and_others_are_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_two_names_of_one_place_are_one_lock_and_others_are_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     (tmp_path / "a").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "a")
     monkeypatch.chdir(tmp_path / "a")
@@ -99,10 +105,20 @@ def test_every_option_out_is_locked_where_it_is_parsed(tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", [["--out=made"], []], ids=["given", "not given"])
-def test_of_two_commands_into_one_place_one_writes_and_the_other_refuses(where: list[str], tmp_path: Path):
+def test_of_two_commands_into_one_place_one_writes_and_the_other_refuses(
+    where: list[str], tmp_path: Path
+):
     (tmp_path / "drive.yaml").write_text(AXIS)
     program = "import sys; from taccorl.cli.main import main; sys.exit(main())"
-    words = ["-c", program, "surrogate", "--twin=drive.yaml", "--secret=1", "--speed=0.5", *where]
+    words = [
+        "-c",
+        program,
+        "surrogate",
+        "--twin=drive.yaml",
+        "--secret=1",
+        "--speed=0.5",
+        *where,
+    ]
     both = [start(tmp_path, *words) for _ in range(2)]
     said = [process.communicate()[1] for process in both]
     assert sorted(process.returncode for process in both) == [0, 2], said

@@ -11,7 +11,9 @@ from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_recor
 from taccorl.data.episode import Episode
 from taccorl.data.lerobot_format import quiet_lerobot, write_episodes
 
-Row = Mapping[str, Any]  # Feature → array, picture (rows, columns, 3) or text; and ``task``
+Row = Mapping[
+    str, Any
+]  # Feature → array, picture (rows, columns, 3) or text; and ``task``
 
 
 def write_with_lerobot(
@@ -30,17 +32,35 @@ def write_with_lerobot(
             return {"dtype": "string", "shape": (1,), "names": None}
         if ".images." in key:
             dtype = "image" if key in images else "video"
-            return {"dtype": dtype, "shape": value.shape, "names": ["height", "width", "channels"]}
-        return {"dtype": str(value.dtype), "shape": np.shape(value), "names": (names or {}).get(key)}
+            return {
+                "dtype": dtype,
+                "shape": value.shape,
+                "names": ["height", "width", "channels"],
+            }
+        return {
+            "dtype": str(value.dtype),
+            "shape": np.shape(value),
+            "names": (names or {}).get(key),
+        }
 
     episodes = [list(rows) for rows in episodes]
     with quiet_lerobot():
         from lerobot.configs import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        features = {key: feature(key, value) for key, value in episodes[0][0].items() if key != "task"}
-        options = {"fps": 30, "rgb_encoder": RGBEncoderConfig(**encoder) if encoder else None, **options}
-        dataset = LeRobotDataset.create(f"local/{root.name}", root=root, features=features, **options)
+        features = {
+            key: feature(key, value)
+            for key, value in episodes[0][0].items()
+            if key != "task"
+        }
+        options = {
+            "fps": 30,
+            "rgb_encoder": RGBEncoderConfig(**encoder) if encoder else None,
+            **options,
+        }
+        dataset = LeRobotDataset.create(
+            f"local/{root.name}", root=root, features=features, **options
+        )
         for rows in episodes:
             for row in rows:
                 dataset.add_frame(dict(row))
@@ -53,6 +73,10 @@ def write_described(root: Path, episodes: Sequence[Episode]) -> Path:
     """Episodes of one spec by taccorl's writer, with the records and the spec that ``taccorl ingest`` writes beside them."""
     write_episodes(episodes, root)
     (root / PROVENANCE).mkdir()
-    (root / PROVENANCE / "episodes.json").write_text(json.dumps([episode_record(e, "") for e in episodes]))
-    (root / PROVENANCE / "dataset_spec.json").write_text(json.dumps(dataset_spec_to_json(episodes[0].spec)))
+    (root / PROVENANCE / "episodes.json").write_text(
+        json.dumps([episode_record(e, "") for e in episodes])
+    )
+    (root / PROVENANCE / "dataset_spec.json").write_text(
+        json.dumps(dataset_spec_to_json(episodes[0].spec))
+    )
     return root

@@ -49,8 +49,15 @@ def read_raw(path: Path) -> list[Raw]:
     """Every message, in the order of the file."""
     with path.open("rb") as file:
         return [
-            Raw(channel.topic, schema.name if schema else "", message.log_time, message.data)
-            for schema, channel, message in make_reader(file).iter_messages(log_time_order=False)
+            Raw(
+                channel.topic,
+                schema.name if schema else "",
+                message.log_time,
+                message.data,
+            )
+            for schema, channel, message in make_reader(file).iter_messages(
+                log_time_order=False
+            )
         ]
 
 
@@ -74,10 +81,16 @@ def rewrite(
         channels = {}
         for c in sorted(summary.channels.values(), key=lambda c: c.id):
             schema = summary.schemas[c.schema_id]
-            named = writer.register_schema((types or {}).get(c.topic, schema.name), schema.encoding, schema.data)
-            channels[c.topic] = writer.register_channel(c.topic, c.message_encoding, named)
+            named = writer.register_schema(
+                (types or {}).get(c.topic, schema.name), schema.encoding, schema.data
+            )
+            channels[c.topic] = writer.register_channel(
+                c.topic, c.message_encoding, named
+            )
         for raw in change(read_raw(source)):
-            writer.add_message(channels[raw.topic], raw.log_ns, raw.data, publish_time=raw.log_ns)
+            writer.add_message(
+                channels[raw.topic], raw.log_ns, raw.data, publish_time=raw.log_ns
+            )
         writer.finish()
     return path
 
@@ -89,7 +102,11 @@ def garbled(path: Path, new: Path, broken: Iterable[int]) -> Path:
         seen = itertools.count()
         for m in messages:
             is_broken = m.topic == CAMERA_TOPICS["front"] and next(seen) in broken
-            yield replace(m, data=m.data.replace(b"\xff\xd8\xff", b"\0\0\0")) if is_broken else m
+            yield (
+                replace(m, data=m.data.replace(b"\xff\xd8\xff", b"\0\0\0"))
+                if is_broken
+                else m
+            )
 
     return rewrite(path, new, garble)
 
@@ -98,16 +115,26 @@ def marker(at_s: float, text: str) -> Raw:
     """A std_msgs/String on the episode topic, as CDR: its length with the closing zero, its bytes."""
     data = text.encode() + b"\0"
     cdr = b"\x00\x01\x00\x00" + struct.pack("<I", len(data)) + data
-    return Raw(EPISODE_TOPIC, "std_msgs/msg/String", START_UNIX_NS + round(at_s * 1e9), cdr)
+    return Raw(
+        EPISODE_TOPIC, "std_msgs/msg/String", START_UNIX_NS + round(at_s * 1e9), cdr
+    )
 
 
-def with_markers(source: Path, path: Path, markers: Iterable[tuple[float, str]]) -> Path:
+def with_markers(
+    source: Path, path: Path, markers: Iterable[tuple[float, str]]
+) -> Path:
     """``source`` with other texts on its episode topic."""
     new = [marker(at_s, text) for at_s, text in markers]
-    return rewrite(source, path, lambda messages: [m for m in messages if m.topic != EPISODE_TOPIC] + new)
+    return rewrite(
+        source,
+        path,
+        lambda messages: [m for m in messages if m.topic != EPISODE_TOPIC] + new,
+    )
 
 
-def changed_specs(folder: Path, *changes: tuple[str, str], spec: str = "piper_flexitac_mcap") -> Path:
+def changed_specs(
+    folder: Path, *changes: tuple[str, str], spec: str = "piper_flexitac_mcap"
+) -> Path:
     """A copy of the shipped specs with texts replaced wherever they stand; each must stand somewhere. The spec's path."""
     shutil.copytree(data_specs_folder(), folder, dirs_exist_ok=True)
     unmet = set(changes)

@@ -27,7 +27,10 @@ PICTURE_PX = 56
 
 SPEC = bimanual_spec(PICTURE_PX)
 NAMES = SPEC.features[STATE].names
-GRIPPER = {"left": NAMES.index("left_gripper.pos"), "right": NAMES.index("right_gripper.pos")}
+GRIPPER = {
+    "left": NAMES.index("left_gripper.pos"),
+    "right": NAMES.index("right_gripper.pos"),
+}
 PADS = SPEC.features[TOUCH].pads
 
 
@@ -42,9 +45,13 @@ class Recipe:
     touch_clock_s: dict[str, float] = dataclasses.field(default_factory=dict)
     """Pad → how much later it feels everything."""
     state_clock_s: float = 0.0  # States appear this much later than they were
-    noise_count: float | None = None  # Standard deviation of a taxel; None: drawn from 1 to 2
+    noise_count: float | None = (
+        None  # Standard deviation of a taxel; None: drawn from 1 to 2
+    )
     drift_count_per_s: float = 0.0
-    part_m: dict[str, float] | None = None  # Arm → width of its part; None: drawn. 0: it closes on nothing
+    part_m: dict[str, float] | None = (
+        None  # Arm → width of its part; None: drawn. 0: it closes on nothing
+    )
     rest_s: tuple[float, float] = (0.0, 0.0)  # Stillness added before and after
 
 
@@ -62,7 +69,9 @@ class _Truth:
         self.duration_s, self.before_s = recipe.duration_s, recipe.rest_s[0]
         limits = SPEC.features[STATE].limits
         self.command = np.empty((len(self.time_s), 14))
-        self.part_m = recipe.part_m or {a: float(rng.uniform(0.010, 0.045)) for a in GRIPPER}
+        self.part_m = recipe.part_m or {
+            a: float(rng.uniform(0.010, 0.045)) for a in GRIPPER
+        }
         self.squeeze_m = {a: float(rng.uniform(0.006, 0.012)) for a in GRIPPER}
         close = {"left": rng.uniform(0.25, 0.30), "right": rng.uniform(0.38, 0.45)}
         release = {"left": rng.uniform(0.84, 0.88), "right": rng.uniform(0.70, 0.78)}
@@ -74,10 +83,14 @@ class _Truth:
                 self.command[:, i] = self._joint(limits[i], rng)
         keep = np.exp(-1 / (GRID_HZ * recipe.lead_s))
         first = self.command[0]
-        self.state = first + lfilter([1 - keep], [1, -keep], self.command - first, axis=0)
+        self.state = first + lfilter(
+            [1 - keep], [1, -keep], self.command - first, axis=0
+        )
         self.felt = {}
         for arm, i in GRIPPER.items():
-            self.felt[arm] = np.clip((self.part_m[arm] - self.state[:, i]) / self.squeeze_m[arm], 0, None)
+            self.felt[arm] = np.clip(
+                (self.part_m[arm] - self.state[:, i]) / self.squeeze_m[arm], 0, None
+            )
             self.state[:, i] = np.maximum(self.state[:, i], self.part_m[arm])
 
     def at(self, share: float) -> float:
@@ -87,16 +100,30 @@ class _Truth:
         middle, span = float(limit.mean()), float(limit[1] - limit[0])
         poses = middle + span * np.clip(rng.normal(0, 0.12, 5), -0.3, 0.3)
         x = np.full(len(self.time_s), poses[0])
-        for k, (a, b) in enumerate(((0.02, 0.22), (0.46, 0.56), (0.58, 0.68), (0.88, 0.98))):
+        for k, (a, b) in enumerate(
+            ((0.02, 0.22), (0.46, 0.56), (0.58, 0.68), (0.88, 0.98))
+        ):
             fastest = 3.0 / 1.875 * (b - a) * self.duration_s  # minimum jerk at 3 rad/s
-            poses[k + 1] = poses[k] + np.clip(poses[k + 1] - poses[k], -fastest, fastest)
+            poses[k + 1] = poses[k] + np.clip(
+                poses[k + 1] - poses[k], -fastest, fastest
+            )
             x += (poses[k + 1] - poses[k]) * _ramp(self.time_s, self.at(a), self.at(b))
-        working = _ramp(self.time_s, self.at(0.0), self.at(0.01)) - _ramp(self.time_s, self.at(0.99), self.at(1.0))
+        working = _ramp(self.time_s, self.at(0.0), self.at(0.01)) - _ramp(
+            self.time_s, self.at(0.99), self.at(1.0)
+        )
         for _ in range(3):
-            x += 0.002 * working * np.sin(2 * np.pi * (rng.uniform(0.3, 2.2) * self.time_s + rng.random()))
+            x += (
+                0.002
+                * working
+                * np.sin(
+                    2 * np.pi * (rng.uniform(0.3, 2.2) * self.time_s + rng.random())
+                )
+            )
         return x
 
-    def _gripper(self, arm: str, close: float, release: float, rng: np.random.Generator) -> np.ndarray:
+    def _gripper(
+        self, arm: str, close: float, release: float, rng: np.random.Generator
+    ) -> np.ndarray:
         opening, target = 0.065, max(self.part_m[arm] - self.squeeze_m[arm], 0.0)
         takes = rng.uniform(0.4, 0.8)
         down = _ramp(self.time_s, self.at(close), self.at(close) + takes)
@@ -104,7 +131,9 @@ class _Truth:
         return opening - (opening - target) * (down - up)
 
     def sample(self, grid: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(time_s, self.time_s, c) for c in np.atleast_2d(grid.T)], axis=1)
+        return np.stack(
+            [np.interp(time_s, self.time_s, c) for c in np.atleast_2d(grid.T)], axis=1
+        )
 
 
 def _footprint(rng: np.random.Generator) -> np.ndarray:
@@ -113,10 +142,16 @@ def _footprint(rng: np.random.Generator) -> np.ndarray:
     kind = rng.integers(3)
     if kind == 0:
         middle = rng.uniform(3, 8) + rng.uniform(-0.08, 0.08) * (row - 16)
-        return np.exp(-0.5 * ((column - middle) / rng.uniform(1.0, 2.0)) ** 2) / (1 + np.exp(rng.uniform(4, 12) - row))
+        return np.exp(-0.5 * ((column - middle) / rng.uniform(1.0, 2.0)) ** 2) / (
+            1 + np.exp(rng.uniform(4, 12) - row)
+        )
     if kind == 1:
         top, half = rng.uniform(10, 22), rng.uniform(2.5, 5)
-        return 1 / (1 + np.exp((top - row) / 0.7)) / (1 + np.exp((np.abs(column - 5.5) - half) / 0.6))
+        return (
+            1
+            / (1 + np.exp((top - row) / 0.7))
+            / (1 + np.exp((np.abs(column - 5.5) - half) / 0.6))
+        )
     r, c = rng.uniform(6, 26), rng.uniform(3, 8)
     return np.exp(-0.5 * (((row - r) / 2.0) ** 2 + ((column - c) / 1.8) ** 2))
 
@@ -127,12 +162,19 @@ def _touch(
     """(T, 1536) counts above baseline and (1536,) baseline."""
     pads, baselines = [], []
     noise = rng.uniform(1.0, 2.0) if recipe.noise_count is None else recipe.noise_count
-    push = 1 + 0.3 * np.sin(2 * np.pi * rng.uniform(0.1, 0.4, 2)[:, None] * time_s + rng.random((2, 1)))
+    push = 1 + 0.3 * np.sin(
+        2 * np.pi * rng.uniform(0.1, 0.4, 2)[:, None] * time_s + rng.random((2, 1))
+    )
     shape = {arm: _footprint(rng) for arm in GRIPPER}
     force = {arm: rng.uniform(60, 110) for arm in GRIPPER}
     for pad in PADS:
         arm = pad.split("_")[0]
-        felt_at = time_s - recipe.touch_delay_s - recipe.touch_clock_s.get(pad, 0.0) - rng.uniform(0, 0.01, len(time_s))
+        felt_at = (
+            time_s
+            - recipe.touch_delay_s
+            - recipe.touch_clock_s.get(pad, 0.0)
+            - rng.uniform(0, 0.01, len(time_s))
+        )
         grip = truth.sample(truth.felt[arm], felt_at)[:, 0]
         contact = grip**0.9 * push[list(GRIPPER).index(arm)]
         # the film gives back the rest within a second or two
@@ -141,10 +183,16 @@ def _touch(
         gain = np.clip(rng.normal(1, 0.12, (32, 12)), 0.6, 1.4)
         baseline = np.round(rng.uniform(10, 40, (32, 12)))
         counts = force[arm] * (contact + residue)[:, None, None] * image * gain
-        counts = counts + recipe.drift_count_per_s * time_s[:, None, None] + rng.normal(0, noise, counts.shape)
+        counts = (
+            counts
+            + recipe.drift_count_per_s * time_s[:, None, None]
+            + rng.normal(0, noise, counts.shape)
+        )
         pads.append(np.clip(np.round(counts + baseline), 0, 255) - baseline)
         baselines.append(baseline)
-    return np.stack(pads, axis=1).reshape(len(time_s), -1), np.stack(baselines).reshape(-1)
+    return np.stack(pads, axis=1).reshape(len(time_s), -1), np.stack(baselines).reshape(
+        -1
+    )
 
 
 def pictures_of(state: np.ndarray, seed: int) -> dict[str, np.ndarray]:
@@ -157,8 +205,12 @@ def pictures_of(state: np.ndarray, seed: int) -> dict[str, np.ndarray]:
         (FRONT.replace("front", "right_wrist"), [7, 8]),
     ):
         background = rng.integers(40, 160, (PICTURE_PX, PICTURE_PX, 3))
-        frames = np.repeat(background[None], len(state), axis=0) + rng.normal(0, 2, (len(state), *background.shape))
-        where = 20 + 12 * np.stack([state[:, joints].sum(axis=1), state[:, joints[::2]].sum(axis=1)], axis=1)
+        frames = np.repeat(background[None], len(state), axis=0) + rng.normal(
+            0, 2, (len(state), *background.shape)
+        )
+        where = 20 + 12 * np.stack(
+            [state[:, joints].sum(axis=1), state[:, joints[::2]].sum(axis=1)], axis=1
+        )
         for t, (r, c) in enumerate(np.clip(where, 0, PICTURE_PX - 14).astype(int)):
             frames[t, r : r + 14, c : c + 14] = 230
         out[key] = np.clip(frames, 0, 255).astype(np.uint8)
@@ -172,8 +224,12 @@ def make(recipe: Recipe | None = None, **changes: object) -> Episode:
     truth = _Truth(recipe, rng)
     num_rows = int((recipe.duration_s + sum(recipe.rest_s)) * SPEC.fps)
     time_s = np.arange(num_rows) / SPEC.fps
-    sampled = [time_s - rng.uniform(0, 0.005, num_rows) for _ in range(2)]  # 200 Hz, the last sample before the row
-    encoder_noise = np.where(np.isin(np.arange(14), list(GRIPPER.values())), 5e-5, 2e-4)  # m, rad
+    sampled = [
+        time_s - rng.uniform(0, 0.005, num_rows) for _ in range(2)
+    ]  # 200 Hz, the last sample before the row
+    encoder_noise = np.where(
+        np.isin(np.arange(14), list(GRIPPER.values())), 5e-5, 2e-4
+    )  # m, rad
     state = truth.sample(truth.state, sampled[0] - recipe.state_clock_s)
     state += encoder_noise * rng.normal(size=(num_rows, 14))
     touch, baseline = _touch(recipe, truth, time_s, rng)
@@ -216,14 +272,25 @@ def good_timing(key: str, **changes: object) -> ChannelTiming:
     """A channel that came at its rate."""
     rate_hz = SPEC.features[key].rate_hz
     period_s = 1 / rate_hz
-    timing = ChannelTiming(key.rsplit(".", 1)[-1], key, "asof", rate_hz, 1, 2 * period_s, period_s / 2, period_s)
+    timing = ChannelTiming(
+        key.rsplit(".", 1)[-1],
+        key,
+        "asof",
+        rate_hz,
+        1,
+        2 * period_s,
+        period_s / 2,
+        period_s,
+    )
     return dataclasses.replace(timing, **changes)  # type: ignore[arg-type]
 
 
 def with_arrays(episode: Episode, **arrays: np.ndarray) -> Episode:
     """The episode with other arrays: ``state``, ``action``, ``touch``."""
     keys = {"state": STATE, "action": ACTION, "touch": TOUCH}
-    return dataclasses.replace(episode, arrays=episode.arrays | {keys[k]: v for k, v in arrays.items()})
+    return dataclasses.replace(
+        episode, arrays=episode.arrays | {keys[k]: v for k, v in arrays.items()}
+    )
 
 
 def copies(episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

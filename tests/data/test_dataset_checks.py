@@ -46,10 +46,16 @@ def row(features: tuple[str, ...], time_s: float, k: int) -> dict[str, Any]:
 
 
 def build(
-    root: Path, features: tuple[str, ...] = FEATURES, tasks: tuple[str, ...] = ("put", "open"), fps: int = FPS
+    root: Path,
+    features: tuple[str, ...] = FEATURES,
+    tasks: tuple[str, ...] = ("put", "open"),
+    fps: int = FPS,
 ) -> Path:
     written = [
-        [row(features, e + k / fps, k) | {"task": tasks[e % len(tasks)]} for k in range(ROWS + e)]
+        [
+            row(features, e + k / fps, k) | {"task": tasks[e % len(tasks)]}
+            for k in range(ROWS + e)
+        ]
         for e in range(EPISODES)
     ]
     return write_with_lerobot(
@@ -68,7 +74,9 @@ def findings(root: Path) -> dict[str, str]:
     dataset = Dataset(root)
     found = [*check_bookkeeping(dataset), *check_statistics(dataset)]
     problems = dataset.video_problems()
-    return ({"video_count": problems[0]} if problems else {}) | {f.check: f.text for f in found if f.severity != "note"}
+    return ({"video_count": problems[0]} if problems else {}) | {
+        f.check: f.text for f in found if f.severity != "note"
+    }
 
 
 def edit_dataset(command: str) -> None:
@@ -117,15 +125,21 @@ def test_what_lerobots_own_tools_write_is_good(good, tmp_path, edit):
         elif edit == "split":
             tools.split_dataset(source, {"d": [0, 2]}, output_dir=tmp_path)
         else:
-            other = LeRobotDataset("local/other", root=build(tmp_path / "other", tasks=("close",)))
-            tools.merge_datasets([source, other], output_repo_id="local/d", output_dir=tmp_path / "d")
+            other = LeRobotDataset(
+                "local/other", root=build(tmp_path / "other", tasks=("close",))
+            )
+            tools.merge_datasets(
+                [source, other], output_repo_id="local/d", output_dir=tmp_path / "d"
+            )
     assert findings(tmp_path / "d") == {}
 
 
 # ---- planted faults ----
 
 
-def set_column(root: Path, kind: str, key: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+def set_column(
+    root: Path, kind: str, key: str, change: Callable[[np.ndarray], np.ndarray]
+) -> None:
     path = next((root / kind).rglob("*.parquet"))
     table = pq.read_table(path)
     field = table.schema.field(key)
@@ -148,11 +162,15 @@ def at(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def data(key: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+def data(
+    key: str, change: Callable[[np.ndarray], np.ndarray]
+) -> Callable[[Path], None]:
     return lambda root: set_column(root, "data", key, change)
 
 
-def episodes(key: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+def episodes(
+    key: str, change: Callable[[np.ndarray], np.ndarray]
+) -> Callable[[Path], None]:
     return lambda root: set_column(root, "meta/episodes", key, change)
 
 
@@ -174,38 +192,84 @@ def swap_rows(root: Path) -> None:
 
 TOTAL = 3 * ROWS + 3
 FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
-    "stamps run on over the episodes": (data("timestamp", lambda t: np.arange(len(t)) / FPS), "row_time"),
+    "stamps run on over the episodes": (
+        data("timestamp", lambda t: np.arange(len(t)) / FPS),
+        "row_time",
+    ),
     "stamps of half the rate": (data("timestamp", lambda t: t * 2), "row_time"),
-    "jitter of 1 ms": (data("timestamp", lambda t: t + np.linspace(0, 1e-3, len(t))), "row_time"),
+    "jitter of 1 ms": (
+        data("timestamp", lambda t: t + np.linspace(0, 1e-3, len(t))),
+        "row_time",
+    ),
     "one stamp is NaN": (data("timestamp", at(7, np.nan)), "row_time"),
     "stamps of 1970": (data("timestamp", lambda t: t + 1.76e9), "row_time"),
     "index restarts": (
-        data("index", lambda i: np.concatenate([np.arange(ROWS), np.arange(len(i) - ROWS)])),
+        data(
+            "index",
+            lambda i: np.concatenate([np.arange(ROWS), np.arange(len(i) - ROWS)]),
+        ),
         "row_index",
     ),
     "one index twice": (data("index", at(5, 4)), "row_index"),
     "frames exchanged": (swap_rows, "episode_rows"),
-    "frames of another episode": (data("episode_index", at(slice(10, 12), 1)), "episode_rows"),
-    "first rows shifted": (episodes("dataset_from_index", at(slice(1, None), lambda v: v + 1)), "dataset_index"),
-    "last rows shifted": (episodes("dataset_to_index", at(0, lambda v: v - 1)), "dataset_index"),
+    "frames of another episode": (
+        data("episode_index", at(slice(10, 12), 1)),
+        "episode_rows",
+    ),
+    "first rows shifted": (
+        episodes("dataset_from_index", at(slice(1, None), lambda v: v + 1)),
+        "dataset_index",
+    ),
+    "last rows shifted": (
+        episodes("dataset_to_index", at(0, lambda v: v - 1)),
+        "dataset_index",
+    ),
     "wrong number of rows": (info(total_frames=TOTAL + 1), "totals"),
     "wrong number of tasks": (info(total_tasks=7), "totals"),
     "unknown task": (data("task_index", at(2, 9)), "tasks"),
     "task of another episode": (data("task_index", at(slice(0, ROWS), 1)), "tasks"),
-    "statistics absent": (lambda root: (root / "meta" / "stats.json").unlink(), "statistics"),
-    "statistics of a feature absent": (stats(lambda s: s.pop("action")), "statistics"),
-    "standard deviation NaN": (stats(lambda s: s["action"].update(std=[float("nan")] * 2)), "statistics"),
-    "standard deviation negative": (stats(lambda s: s["action"].update(std=[0.5, -0.1])), "statistics"),
-    "mean of older data": (stats(lambda s: s["observation.state"].update(mean=[0.3, 0.2])), "statistics"),
-    "maximum in degrees": (stats(lambda s: s["action"].update(max=[57.0, 57.0])), "statistics"),
-    "statistics of too few elements": (stats(lambda s: s["action"].update(mean=[0.1])), "statistics"),
-    "pictures' statistics infinite": (
-        stats(lambda s: s["observation.images.top"].update(max=[[[1.0]], [[float("inf")]], [[1.0]]])),
+    "statistics absent": (
+        lambda root: (root / "meta" / "stats.json").unlink(),
         "statistics",
     ),
-    "video of another episode": (episodes("videos/observation.images.top/from_timestamp", at(1, 0.0)), "video_count"),
+    "statistics of a feature absent": (stats(lambda s: s.pop("action")), "statistics"),
+    "standard deviation NaN": (
+        stats(lambda s: s["action"].update(std=[float("nan")] * 2)),
+        "statistics",
+    ),
+    "standard deviation negative": (
+        stats(lambda s: s["action"].update(std=[0.5, -0.1])),
+        "statistics",
+    ),
+    "mean of older data": (
+        stats(lambda s: s["observation.state"].update(mean=[0.3, 0.2])),
+        "statistics",
+    ),
+    "maximum in degrees": (
+        stats(lambda s: s["action"].update(max=[57.0, 57.0])),
+        "statistics",
+    ),
+    "statistics of too few elements": (
+        stats(lambda s: s["action"].update(mean=[0.1])),
+        "statistics",
+    ),
+    "pictures' statistics infinite": (
+        stats(
+            lambda s: s["observation.images.top"].update(
+                max=[[[1.0]], [[float("inf")]], [[1.0]]]
+            )
+        ),
+        "statistics",
+    ),
+    "video of another episode": (
+        episodes("videos/observation.images.top/from_timestamp", at(1, 0.0)),
+        "video_count",
+    ),
     "video begins between frames": (
-        episodes("videos/observation.images.top/from_timestamp", at(1, lambda v: v + 0.4 / FPS)),
+        episodes(
+            "videos/observation.images.top/from_timestamp",
+            at(1, lambda v: v + 0.4 / FPS),
+        ),
         "video_count",
     ),
 }
@@ -222,7 +286,9 @@ def test_a_planted_fault_is_named(faulty, name):
     plant(faulty)
     found = findings(faulty)
     assert check in found, f"found {sorted(found)}"
-    assert set(found) <= {check, "statistics", "row_time", "row_index"}, "nothing that is right is accused"
+    assert set(found) <= {check, "statistics", "row_time", "row_index"}, (
+        "nothing that is right is accused"
+    )
 
 
 def more_rows(root: Path) -> None:
@@ -243,7 +309,9 @@ def more_rows(root: Path) -> None:
         ),
     ],
 )
-def test_what_is_too_much_is_said_in_a_line_before_it_is_read(faulty, plant, said, capsys):
+def test_what_is_too_much_is_said_in_a_line_before_it_is_read(
+    faulty, plant, said, capsys
+):
     plant(faulty)
     assert main(["check", str(faulty), "--pictures=false"]) == 1
     out = capsys.readouterr().out
@@ -260,64 +328,121 @@ def test_a_video_that_begins_at_no_time_is_named(faulty, from_s, capsys):
 @pytest.mark.parametrize("value", [np.nan, 1e30])
 def test_a_stamp_that_is_no_time_refuses_the_episode_that_has_it(faulty, value):
     data("timestamp", at(7, value))(faulty)
-    with pytest.raises(RecordingError, match=re.escape(f"`timestamp` of row 7 is {value:g}")):
-        list(readers.get("lerobot")(Source(faulty, (), "episode_000000"), None).messages(None))
+    with pytest.raises(
+        RecordingError, match=re.escape(f"`timestamp` of row 7 is {value:g}")
+    ):
+        list(
+            readers.get("lerobot")(Source(faulty, (), "episode_000000"), None).messages(
+                None
+            )
+        )
 
 
-@pytest.mark.parametrize("name", ["stamps run on over the episodes", "wrong number of tasks"])
+@pytest.mark.parametrize(
+    "name", ["stamps run on over the episodes", "wrong number of tasks"]
+)
 def test_lerobots_own_reading_is_part_of_the_check(faulty, name, capsys):
     FAULTS[name][0](faulty)
     assert main(["check", str(faulty), "--pictures=false"]) == 1
     out = capsys.readouterr().out
-    assert ("lerobot: LeRobot cannot read row" in out) == (name == "stamps run on over the episodes")
+    assert ("lerobot: LeRobot cannot read row" in out) == (
+        name == "stamps run on over the episodes"
+    )
     assert FAULTS[name][1] in out
 
 
 @pytest.mark.parametrize("from_within", [False, True])
-def test_the_episode_to_leave_out_is_named_by_its_own_number_and_folder(faulty, from_within, monkeypatch, capsys):
+def test_the_episode_to_leave_out_is_named_by_its_own_number_and_folder(
+    faulty, from_within, monkeypatch, capsys
+):
     swap_rows(faulty)  # episode 0 is not readable
     path = next((faulty / "data").rglob("*.parquet"))
     table = pq.read_table(path)
     state = table["observation.state"].to_pylist()
     state[2 * ROWS + 5] = [np.nan, 0.0]  # row 4 of episode 2
     column = pa.array(state, table.schema.field("observation.state").type)
-    pq.write_table(table.set_column(table.column_names.index("observation.state"), "observation.state", column), path)
-    stats(lambda s: s["observation.state"].update(mean=[np.nan, 0.0]))(faulty)  # as LeRobot computes it of these rows
+    pq.write_table(
+        table.set_column(
+            table.column_names.index("observation.state"), "observation.state", column
+        ),
+        path,
+    )
+    stats(lambda s: s["observation.state"].update(mean=[np.nan, 0.0]))(
+        faulty
+    )  # as LeRobot computes it of these rows
     monkeypatch.chdir(faulty if from_within else faulty.parent)
     assert main(["check", "." if from_within else faulty.name, "--quick=true"]) == 1
     out = capsys.readouterr().out
-    assert " statistics: " not in out and "install -D" not in out  # no repair of statistics helps, and there is no spec
-    assert "episode 1: 13 rows" in out and "episode 2: 14 rows" in out and "episode 0: 12 rows" not in out
+    assert (
+        " statistics: " not in out and "install -D" not in out
+    )  # no repair of statistics helps, and there is no spec
+    assert (
+        "episode 1: 13 rows" in out
+        and "episode 2: 14 rows" in out
+        and "episode 0: 12 rows" not in out
+    )
     assert re.findall(r"episode_indices=\[(\d)\]", out) == ["2"]
     assert f"--root={faulty} " in out and f"--new_root={faulty}_without_2 " in out
 
 
-REPAIRED = [name for name, (_, check) in FAULTS.items() if check not in ("episode_rows", "tasks", "video_count")]
+REPAIRED = [
+    name
+    for name, (_, check) in FAULTS.items()
+    if check not in ("episode_rows", "tasks", "video_count")
+]
 
 
 @pytest.mark.parametrize("name", REPAIRED)
 def test_a_repaired_copy_is_the_good_dataset_again(good, faulty, name, tmp_path):
     FAULTS[name][0](faulty)
     before = {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()}
-    assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}", "--pictures=false", "--quick=true"]) == 0
-    assert {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()} == before, "the dataset itself is untouched"
-    a, b = (pq.read_table(next((root / "data").rglob("*.parquet"))) for root in (good, tmp_path / "copy"))
+    assert (
+        main(
+            [
+                "check",
+                str(faulty),
+                f"--repair={tmp_path / 'copy'}",
+                "--pictures=false",
+                "--quick=true",
+            ]
+        )
+        == 0
+    )
+    assert {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()} == before, (
+        "the dataset itself is untouched"
+    )
+    a, b = (
+        pq.read_table(next((root / "data").rglob("*.parquet")))
+        for root in (good, tmp_path / "copy")
+    )
     assert a.equals(b)
-    of = [{p.relative_to(d): p.read_bytes() for p in d.glob("videos/**/*.mp4")} for d in (good, tmp_path / "copy")]
+    of = [
+        {p.relative_to(d): p.read_bytes() for p in d.glob("videos/**/*.mp4")}
+        for d in (good, tmp_path / "copy")
+    ]
     assert of[0] == of[1]
 
 
 # The check prints three different repair commands; each is run on one fault.
-@pytest.mark.parametrize("name", ["statistics absent", "mean of older data", "pictures' statistics infinite"])
-def test_the_printed_command_mends_wrong_statistics(good, name, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "name", ["statistics absent", "mean of older data", "pictures' statistics infinite"]
+)
+def test_the_printed_command_mends_wrong_statistics(
+    good, name, tmp_path, monkeypatch, capsys
+):
     root = shutil.copytree(good, tmp_path / "it's a set")
     FAULTS[name][0](root)
     monkeypatch.chdir(root)
     assert main(["check", ".", "--pictures=false"]) == 1
-    line = next(line for line in capsys.readouterr().out.splitlines() if " statistics: " in line)
+    line = next(
+        line for line in capsys.readouterr().out.splitlines() if " statistics: " in line
+    )
     command = re.findall("`([^`]*)`", line)[0]
     if command.startswith("taccorl "):
-        assert name in ("statistics absent", "pictures' statistics infinite")  # LeRobot's command leaves pictures' out
+        assert name in (
+            "statistics absent",
+            "pictures' statistics infinite",
+        )  # LeRobot's command leaves pictures' out
         root = tmp_path / "copy"
         assert main(shlex.split(command.replace("COPY", str(root)))[1:]) == 0
     else:
@@ -325,20 +450,33 @@ def test_the_printed_command_mends_wrong_statistics(good, name, tmp_path, monkey
     assert main(["check", str(root), "--pictures=false"]) == 0
 
 
-def test_statistics_computed_anew_in_place_are_no_changed_file(dataset, tmp_path, capsys):
+def test_statistics_computed_anew_in_place_are_no_changed_file(
+    dataset, tmp_path, capsys
+):
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
     edit_dataset(recompute_statistics(copy))
-    assert main(["check", str(copy), "--pictures=false"]) == 0 and "changed_statistics" in capsys.readouterr().out
+    assert (
+        main(["check", str(copy), "--pictures=false"]) == 0
+        and "changed_statistics" in capsys.readouterr().out
+    )
     stats = json.loads((copy / "meta/stats.json").read_text())
-    stats["observation.images.front"]["mean"][0][0][0] += 0.01  # which no number of a row gives
+    stats["observation.images.front"]["mean"][0][0][0] += (
+        0.01  # which no number of a row gives
+    )
     (copy / "meta/stats.json").write_text(json.dumps(stats))
-    assert main(["check", str(copy), "--pictures=false"]) == 1 and "changed_file" in capsys.readouterr().out
+    assert (
+        main(["check", str(copy), "--pictures=false"]) == 1
+        and "changed_file" in capsys.readouterr().out
+    )
 
 
 def test_exchanged_rows_are_not_repaired(faulty, tmp_path, capsys):
     swap_rows(faulty)
     assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}"]) != 0
-    assert "cannot be repaired" in capsys.readouterr().err and not (tmp_path / "copy").exists()
+    assert (
+        "cannot be repaired" in capsys.readouterr().err
+        and not (tmp_path / "copy").exists()
+    )
 
 
 def test_stamps_that_run_on_cost_no_row_in_ingest(faulty):
@@ -352,29 +490,47 @@ def test_stamps_that_run_on_cost_no_row_in_ingest(faulty):
 # ---- what taccorl writes ----
 
 
-def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(tmp_path, capsys):
+def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
+    tmp_path, capsys
+):
     for k, task in enumerate(("put the cup on the plate", "open the drawer")):
         folder = tmp_path / f"r{k}"
         for name in "ab":
-            write_mcap(folder / "in" / f"{name}{k}.mcap", messages(seconds=1.5 + k + (name == "b")))
+            write_mcap(
+                folder / "in" / f"{name}{k}.mcap",
+                messages(seconds=1.5 + k + (name == "b")),
+            )
         spec = write_spec(folder, ("put the cup on the plate", task))
-        words = [f"--spec={spec}", f"--out={folder / 'out'}", f"--store={tmp_path / 'store'}", "--domain=real"]
+        words = [
+            f"--spec={spec}",
+            f"--out={folder / 'out'}",
+            f"--store={tmp_path / 'store'}",
+            "--domain=real",
+        ]
         assert main(["ingest", str(folder / "in"), *words]) == 0
     merged = tmp_path / "merged"
     parts = [f"--real={tmp_path / name / 'out'}" for name in ("r0", "r1")]
-    assert main(["merge", *parts, f"--out={merged}", f"--store={tmp_path / 'store'}"]) == 0
+    assert (
+        main(["merge", *parts, f"--out={merged}", f"--store={tmp_path / 'store'}"]) == 0
+    )
     out = capsys.readouterr().out
     assert "--policy.type=act" in out, "the data has no touch"
     for root in (tmp_path / "r0" / "out", merged):
-        table = pa.concat_tables(pq.read_table(p) for p in sorted((root / "data").rglob("*.parquet")))
+        table = pa.concat_tables(
+            pq.read_table(p) for p in sorted((root / "data").rglob("*.parquet"))
+        )
         stats = json.loads((root / "meta" / "stats.json").read_text())
         for key in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
             rows = table[key].to_numpy().astype(float)
-            expected = {name: getattr(rows, name)() for name in ("min", "max", "mean", "std")}
+            expected = {
+                name: getattr(rows, name)() for name in ("min", "max", "mean", "std")
+            }
             found = {name: stats[key][name][0] for name in expected}
             assert found == pytest.approx(expected), key
         assert [f.text for f in check_statistics(Dataset(root))] == []
-    assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
+    assert json.loads((merged / "meta/stats.json").read_text())["task_index"][
+        "max"
+    ] == [1]
 
 
 def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(dataset, tmp_path, capsys):

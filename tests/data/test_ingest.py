@@ -28,7 +28,9 @@ from taccorl.surrogate.drivers import CAMERA_TOPICS
 from tests.recordings.pictures import read_frame_id
 from tests.recordings.stand_in import StandInConfig, write_mcap
 
-pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")  # its other threads only wait
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:This process .* is multi-threaded"
+)  # its other threads only wait
 GAP = (CAMERA_TOPICS["left_wrist"], 1.8, 2.3)
 
 
@@ -40,7 +42,9 @@ def spec(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def record(path: Path, **config: Any) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_mcap(path, StandInConfig(**({"duration_s": 2.5, "camera_size": SIZE} | config)))
+    write_mcap(
+        path, StandInConfig(**({"duration_s": 2.5, "camera_size": SIZE} | config))
+    )
     return path
 
 
@@ -56,9 +60,15 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Ingests:
     """The real command in this process, on one store, with a note of every recording that was really written."""
 
-    def __init__(self, folder: Path, spec: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(
+        self, folder: Path, spec: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         self.folder, self.spec = folder, spec
-        self.out, self.store, self.log = folder / "out", folder / "store", folder / "written.log"
+        self.out, self.store, self.log = (
+            folder / "out",
+            folder / "store",
+            folder / "written.log",
+        )
         original = lerobot_format.write_episodes
 
         def noted(episodes: Sequence[Any], root: Path, **options: Any) -> None:
@@ -70,13 +80,19 @@ class Ingests:
 
     def words(self, *paths: Path | str, **options: Any) -> list[str]:
         given = {"spec": self.spec, "out": self.out, "store": self.store} | options
-        return ["ingest", *map(str, paths), *(f"--{k.replace('__', '.')}={v}" for k, v in given.items())]
+        return [
+            "ingest",
+            *map(str, paths),
+            *(f"--{k.replace('__', '.')}={v}" for k, v in given.items()),
+        ]
 
     def run(self, *paths: Path | str, **options: Any) -> int:
         return main(self.words(*paths, **options))
 
     def report(self) -> dict[str, Any]:
-        return json.loads(self.out.with_name(f"{self.out.name}.ingest_report.json").read_text())
+        return json.loads(
+            self.out.with_name(f"{self.out.name}.ingest_report.json").read_text()
+        )
 
     def written(self) -> int:
         """Recordings written since last asked."""
@@ -117,41 +133,91 @@ def in_fork(work: Callable[[], int]) -> int:
 def mixed(tmp_path_factory: pytest.TempPathFactory, spec: Path) -> dict[str, Any]:
     """Four recordings of four outcomes in one command."""
     folder = tmp_path_factory.mktemp("mixed")
-    record(folder / "in/1_good.mcap", duration_s=5.0, episodes=2, outcomes=("success", "failure"), seed=3)
+    record(
+        folder / "in/1_good.mcap",
+        duration_s=5.0,
+        episodes=2,
+        outcomes=("success", "failure"),
+        seed=3,
+    )
     record(folder / "in/2_gap.mcap", duration_s=4.0, gap=GAP, seed=4)
     record(folder / "in/3_degrees.mcap", duration_s=3.0, joints_in_degrees=True)
     (folder / "in/4_empty.mcap").touch()
-    words = ["ingest", str(folder / "in"), f"--spec={spec}", f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
+    words = [
+        "ingest",
+        str(folder / "in"),
+        f"--spec={spec}",
+        f"--out={folder / 'out'}",
+        f"--store={folder / 'store'}",
+    ]
     code = main(words)
     report = json.loads((folder / "out.ingest_report.json").read_text())
-    return {"folder": folder, "code": code, "report": report, "dataset": Dataset(folder / "out")}
+    return {
+        "folder": folder,
+        "code": code,
+        "report": report,
+        "dataset": Dataset(folder / "out"),
+    }
 
 
 def test_every_recording_has_exactly_one_outcome(mixed):
     report = mixed["report"]
     assert mixed["code"] == 1
-    assert [(Path(r["recording"]).stem, r["outcome"]) for r in report["recordings"]] == [
+    assert [
+        (Path(r["recording"]).stem, r["outcome"]) for r in report["recordings"]
+    ] == [
         ("1_good", "written"),
         ("2_gap", "split"),
         ("3_degrees", "quarantined"),
         ("4_empty", "refused"),
     ]
-    assert report["outcomes"] == {"written": 1, "split": 1, "quarantined": 1, "refused": 1}
+    assert report["outcomes"] == {
+        "written": 1,
+        "split": 1,
+        "quarantined": 1,
+        "refused": 1,
+    }
     for r in report["recordings"]:
         assert (
-            r["reason"] == ("1 marked as failure (success: false)" if r["outcome"] == "written" else r["reason"]) != ""
+            r["reason"]
+            == (
+                "1 marked as failure (success: false)"
+                if r["outcome"] == "written"
+                else r["reason"]
+            )
+            != ""
         )
-        assert {"spec", "spec_digest", "part", "command", "episodes", "losses", "damage", "findings"} <= set(r)
+        assert {
+            "spec",
+            "spec_digest",
+            "part",
+            "command",
+            "episodes",
+            "losses",
+            "damage",
+            "findings",
+        } <= set(r)
         assert "traceback" not in r and "artefact" not in r
 
 
 def test_counts_in_the_report_are_those_of_the_dataset(mixed):
     report, dataset = mixed["report"], mixed["dataset"]
-    episodes = [e for r in report["recordings"] for e in r["episodes"] if e["outcome"] == "written"]
+    episodes = [
+        e
+        for r in report["recordings"]
+        for e in r["episodes"]
+        if e["outcome"] == "written"
+    ]
     assert [e["index_in_dataset"] for e in episodes] == list(range(4))
     assert report["episodes"] == dataset.num_episodes == 4
-    assert report["rows"] == sum(e["rows"] for e in episodes) == dataset.info["total_frames"]
-    assert [dataset.num_rows(e["index_in_dataset"]) for e in episodes] == [e["rows"] for e in episodes]
+    assert (
+        report["rows"]
+        == sum(e["rows"] for e in episodes)
+        == dataset.info["total_frames"]
+    )
+    assert [dataset.num_rows(e["index_in_dataset"]) for e in episodes] == [
+        e["rows"] for e in episodes
+    ]
     assert [e["success"] for e in episodes] == [True, False, None, True]
     assert all("index_in_dataset" not in e for e in report["recordings"][2]["episodes"])
     messages = report["recordings"][0]["messages"]
@@ -177,17 +243,33 @@ def test_the_dataset_holds_what_cutting_gives(mixed, spec):
                 stored = dataset.episode(index)
                 for key, values in episode.arrays.items():
                     np.testing.assert_array_equal(stored.arrays[key], values)
-                ids = [read_frame_id(shown["observation.images.front"]) for shown in episode.pictures()]
-                assert [read_frame_id(f) for f in dataset.frames(index, "observation.images.front")] == ids
-                assert (stored.instruction, stored.success) == (episode.instruction, episode.success)
+                ids = [
+                    read_frame_id(shown["observation.images.front"])
+                    for shown in episode.pictures()
+                ]
+                assert [
+                    read_frame_id(f)
+                    for f in dataset.frames(index, "observation.images.front")
+                ] == ids
+                assert (stored.instruction, stored.success) == (
+                    episode.instruction,
+                    episode.success,
+                )
                 assert stored.start_ns == episode.start_ns
                 index += 1
     assert index == dataset.num_episodes and dataset.video_problems() == []
 
 
 def test_the_named_commands_show_what_is_wrong(mixed, capsys):
-    commands = {Path(r["recording"]).stem: shlex.split(r["command"]) for r in mixed["report"]["recordings"]}
-    for name, words in (("4_empty", "is empty (0 bytes)"), ("3_degrees", "degrees?"), ("2_gap", "no fresh sample of")):
+    commands = {
+        Path(r["recording"]).stem: shlex.split(r["command"])
+        for r in mixed["report"]["recordings"]
+    }
+    for name, words in (
+        ("4_empty", "is empty (0 bytes)"),
+        ("3_degrees", "degrees?"),
+        ("2_gap", "no fresh sample of"),
+    ):
         assert main(commands[name][1:]) == 1
         assert words in " ".join(capsys.readouterr().out.split())
 
@@ -195,7 +277,11 @@ def test_the_named_commands_show_what_is_wrong(mixed, capsys):
 def test_an_unfit_recording_without_episodes_is_quarantined(ingests, tmp_path):
     record(tmp_path / "in.mcap", gap=("/left_robot_left_finger", 0.2, 9.0))
     job = ingest_module.find_jobs(
-        [tmp_path / "in.mcap"], load_recording_spec(ingests.spec), "spec", tmp_path / "store", True
+        [tmp_path / "in.mcap"],
+        load_recording_spec(ingests.spec),
+        "spec",
+        tmp_path / "store",
+        True,
     )
     [entry] = ingest_module.ingest(job, tmp_path / "out", None)["recordings"]
     assert (entry["outcome"], entry["episodes"]) == ("quarantined", [])
@@ -205,16 +291,24 @@ def test_an_unfit_recording_without_episodes_is_quarantined(ingests, tmp_path):
 # ---- pictures, watched while they are written ----
 
 
-def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_is_kept(ingests, tmp_path):
+def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_is_kept(
+    ingests, tmp_path
+):
     # frozen after a third of 6 s; two episodes of 3 s: of the first 1 s is frozen, all of the second
-    record(tmp_path / "in.mcap", duration_s=6.0, episodes=2, frozen_camera="right_wrist", seed=2)
+    record(
+        tmp_path / "in.mcap",
+        duration_s=6.0,
+        episodes=2,
+        frozen_camera="right_wrist",
+        seed=2,
+    )
     assert ingests.run(tmp_path / "in.mcap") == 1
     [entry] = ingests.report()["recordings"]
     assert [e["outcome"] for e in entry["episodes"]] == ["written", "quarantined"]
     assert entry["outcome"] == "split" and ingests.report()["episodes_quarantined"] == 1
-    assert "1 of 2 episodes quarantined" in entry["reason"] and "right_wrist" in json.dumps(
-        entry["episodes"][1]["findings"]
-    )
+    assert "1 of 2 episodes quarantined" in entry[
+        "reason"
+    ] and "right_wrist" in json.dumps(entry["episodes"][1]["findings"])
     assert Dataset(ingests.out).num_episodes == 1
 
 
@@ -224,23 +318,36 @@ def test_pictures_that_do_not_decode_cost_only_themselves(ingests, tmp_path):
     [entry] = ingests.report()["recordings"]
     assert entry["outcome"] == "split"
     assert "2 of front" in entry["reason"]
-    assert entry["broken_pictures_s"]["front"] == [pytest.approx(1.03, abs=0.06), pytest.approx(1.36, abs=0.06)]
+    assert entry["broken_pictures_s"]["front"] == [
+        pytest.approx(1.03, abs=0.06),
+        pytest.approx(1.36, abs=0.06),
+    ]
     assert entry["losses"] == [], "each row has an older picture of under 80 ms"
-    ids = [read_frame_id(f) for f in Dataset(ingests.out).frames(0, "observation.images.front")]
+    ids = [
+        read_frame_id(f)
+        for f in Dataset(ingests.out).frames(0, "observation.images.front")
+    ]
     assert not {30, 40} & set(ids)
     assert {29, 31, 39, 41} <= set(ids)
 
 
-def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(ingests, good, monkeypatch, capsys):
+def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(
+    ingests, good, monkeypatch, capsys
+):
     original = Cutter.cut
 
     def faulty(self: Cutter) -> Any:
-        return 1 // 0 if self.recording.source.name.endswith("a.mcap") else original(self)
+        return (
+            1 // 0 if self.recording.source.name.endswith("a.mcap") else original(self)
+        )
 
     monkeypatch.setattr(Cutter, "cut", faulty)
     assert ingests.run(good) == 1
     bad, other = ingests.report()["recordings"]
-    assert bad["outcome"] == "refused" and "a fault in taccorl, please report it: ZeroDivisionError" in bad["reason"]
+    assert (
+        bad["outcome"] == "refused"
+        and "a fault in taccorl, please report it: ZeroDivisionError" in bad["reason"]
+    )
     assert "in faulty" in bad["traceback"]
     assert other["outcome"] == "written", "its neighbour does not suffer"
     shown = capsys.readouterr()
@@ -250,11 +357,15 @@ def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(ingests, good
 # ---- a second run ----
 
 
-def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_written(ingests, good, tmp_path):
+def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_written(
+    ingests, good, tmp_path
+):
     inputs = Path(shutil.copytree(good, tmp_path / "in"))
     assert ingests.run(inputs) == 0
     assert ingests.written() == 2
-    files = [p for p in (*ingests.store.rglob("*"), *ingests.out.rglob("*")) if p.is_file()]
+    files = [
+        p for p in (*ingests.store.rglob("*"), *ingests.out.rglob("*")) if p.is_file()
+    ]
     # Digests of files that were new when they were read are found, and remembered, once more.
     before = {p: p.stat().st_mtime_ns for p in files if ".digests" not in p.parts}
     report = ingests.report()
@@ -270,7 +381,9 @@ def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_wri
     assert Dataset(ingests.out).num_episodes == 3
     assert Dataset(tmp_path / "out.old-1").num_episodes == 2
     assert ingests.run(inputs, replace="true") == 0
-    assert not (tmp_path / "out.old-2").exists(), "a dataset that is replaced by itself stays where it is"
+    assert not (tmp_path / "out.old-2").exists(), (
+        "a dataset that is replaced by itself stays where it is"
+    )
 
 
 @pytest.mark.slow
@@ -290,13 +403,24 @@ def test_a_changed_spec_writes_all_again(ingests, good, tmp_path, spec):
 def test_one_file_by_several_names_is_one_input(ingests, good, tmp_path, monkeypatch):
     monkeypatch.chdir(good)
     (tmp_path / "link.mcap").symlink_to(good / "a.mcap")
-    assert ingests.run("a.mcap", good / "a.mcap", "./a.mcap", f"../{good.name}/a.mcap", tmp_path / "link.mcap") == 0
+    assert (
+        ingests.run(
+            "a.mcap",
+            good / "a.mcap",
+            "./a.mcap",
+            f"../{good.name}/a.mcap",
+            tmp_path / "link.mcap",
+        )
+        == 0
+    )
     assert [r["recording"] for r in ingests.report()["recordings"]] == ["a.mcap"]
     assert Dataset(ingests.out).num_episodes == 1
 
 
 @pytest.mark.slow
-def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(ingests, good, tmp_path, monkeypatch, capsys):
+def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(
+    ingests, good, tmp_path, monkeypatch, capsys
+):
     names = ["2024-01-01.mcap", "[bold]it's #1 [].mcap", "über 測試 😀.mcap"]
     folder = tmp_path / "a: b [/c] 'd'"
     folder.mkdir(parents=True)
@@ -316,7 +440,9 @@ def test_names_with_spaces_and_foreign_letters_are_names_like_any_other(ingests,
 # ---- what is in the way ----
 
 
-def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(ingests, good, capsys):
+def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(
+    ingests, good, capsys
+):
     ingests.out.mkdir()
     (ingests.out / "thesis.txt").write_text("do not touch")
     assert ingests.run(good) == 2
@@ -329,23 +455,35 @@ def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(ingests, goo
     assert content(aside) == {"thesis.txt": b"do not touch"}
 
 
-def test_another_dataset_is_left_alone_and_the_same_content_of_another_name_is_known(ingests, good, tmp_path, capsys):
+def test_another_dataset_is_left_alone_and_the_same_content_of_another_name_is_known(
+    ingests, good, tmp_path, capsys
+):
     assert ingests.run(good / "a.mcap") == 0
     assert ingests.written() == 1
     before = content(ingests.out)
     assert ingests.run(good / "b.mcap") == 2
     said = capsys.readouterr().err
-    assert "holds another dataset (1 recordings are new, 1 are missing)" in said and "--replace=true" in said
+    assert (
+        "holds another dataset (1 recordings are new, 1 are missing)" in said
+        and "--replace=true" in said
+    )
     assert content(ingests.out) == before
     shutil.copy(good / "a.mcap", tmp_path / "renamed.mcap")
     assert ingests.run(tmp_path / "renamed.mcap", out=tmp_path / "out2") == 0
     assert ingests.written() == 0
-    assert Path(Dataset(tmp_path / "out2").episode_facts(0)["provenance"]["recording"]).name == "renamed.mcap"
+    assert (
+        Path(
+            Dataset(tmp_path / "out2").episode_facts(0)["provenance"]["recording"]
+        ).name
+        == "renamed.mcap"
+    )
     assert content(tmp_path / "out2/data") == content(ingests.out / "data")
 
 
 @pytest.mark.slow
-def test_a_replacement_that_fails_puts_back_what_was_there(ingests, good, monkeypatch, capsys):
+def test_a_replacement_that_fails_puts_back_what_was_there(
+    ingests, good, monkeypatch, capsys
+):
     assert ingests.run(good / "a.mcap") == 0
     before = content(ingests.out)
 
@@ -356,10 +494,9 @@ def test_a_replacement_that_fails_puts_back_what_was_there(ingests, good, monkey
     assert ingests.run(good / "b.mcap", replace="true") == 2
     assert "3 problems after merging" in capsys.readouterr().err
     assert content(ingests.out) == before
-    assert sorted(p.name for p in ingests.folder.iterdir() if p.name.startswith("out")) == [
-        "out",
-        "out.ingest_report.json",
-    ]
+    assert sorted(
+        p.name for p in ingests.folder.iterdir() if p.name.startswith("out")
+    ) == ["out", "out.ingest_report.json"]
 
 
 # ---- dry runs ----
@@ -372,7 +509,17 @@ def test_a_dry_run_writes_nothing_at_all(ingests, mixed, monkeypatch, capsys):
     scratch.mkdir()
     monkeypatch.chdir(place)
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
-    assert main(["ingest", str(mixed["folder"] / "in"), f"--spec={ingests.spec}", "--dry_run=true"]) == 1
+    assert (
+        main(
+            [
+                "ingest",
+                str(mixed["folder"] / "in"),
+                f"--spec={ingests.spec}",
+                "--dry_run=true",
+            ]
+        )
+        == 1
+    )
     assert list(place.iterdir()) == list(scratch.iterdir()) == []
     shown = capsys.readouterr().out
     assert "1 written, 1 split, 1 quarantined, 1 refused" in shown
@@ -380,17 +527,26 @@ def test_a_dry_run_writes_nothing_at_all(ingests, mixed, monkeypatch, capsys):
 
 
 def outcomes(report: dict[str, Any]) -> list[tuple[str, str, str]]:
-    return [(Path(r["recording"]).name, r["outcome"], r["reason"]) for r in report["recordings"]]
+    return [
+        (Path(r["recording"]).name, r["outcome"], r["reason"])
+        for r in report["recordings"]
+    ]
 
 
-@pytest.mark.parametrize("feature", ["observation.images/front", "observation.images.front"])
+@pytest.mark.parametrize(
+    "feature", ["observation.images/front", "observation.images.front"]
+)
 def test_a_dry_run_promises_what_the_run_then_does(ingests, good, feature, monkeypatch):
     folder = Path(shutil.copytree(good, ingests.folder / "in"))
     shutil.copy(folder / "b.mcap", folder / "c.mcap")
     spec = load_recording_spec(ingests.spec)
     front = "observation.images.front"
-    features = {feature if key == front else key: f for key, f in spec.target.features.items()}
-    contract = dataclasses.replace(spec.target, features=features)  # past the spec's own check of names
+    features = {
+        feature if key == front else key: f for key, f in spec.target.features.items()
+    }
+    contract = dataclasses.replace(
+        spec.target, features=features
+    )  # past the spec's own check of names
     mapped = {feature if key == front else key: m for key, m in spec.features.items()}
     spec = dataclasses.replace(spec, contract=contract, features=mapped)
     reports = []
@@ -402,8 +558,12 @@ def test_a_dry_run_promises_what_the_run_then_does(ingests, good, feature, monke
     # LeRobot refuses a `/` in a feature's name; without it the third recording is the second once more.
     expected = ["refused"] * 3 if "/" in feature else ["written", "written", "refused"]
     assert [outcome for _, outcome, _ in outcomes(reports[0])] == expected
-    assert ("the same content as" in reports[0]["recordings"][2]["reason"]) == (expected[0] == "written")
-    assert ("/" in feature) == ("should not contain '/'" in reports[0]["recordings"][0]["reason"])
+    assert ("the same content as" in reports[0]["recordings"][2]["reason"]) == (
+        expected[0] == "written"
+    )
+    assert ("/" in feature) == (
+        "should not contain '/'" in reports[0]["recordings"][0]["reason"]
+    )
 
 
 # ---- the machine fails ----
@@ -411,13 +571,17 @@ def test_a_dry_run_promises_what_the_run_then_does(ingests, good, feature, monke
 
 def _no_damage(ingests: Ingests) -> None:
     assert not ingests.out.exists()
-    assert not [p for p in ingests.folder.rglob(".*") if p.is_dir() and "taccorl" in p.name]
+    assert not [
+        p for p in ingests.folder.rglob(".*") if p.is_dir() and "taccorl" in p.name
+    ]
     assert not list(ingests.store.glob("recording/.*")), "half an artefact"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit_bytes", [20_000, 120_000])
-def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(ingests, good, limit_bytes, capfd):
+def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(
+    ingests, good, limit_bytes, capfd
+):
     """As a full disk would: some write fails, in LeRobot's encoder threads or elsewhere."""
     import lerobot.datasets.lerobot_dataset  # noqa: F401  (before the limit: importing writes files, too)
 
@@ -429,13 +593,18 @@ def test_a_file_that_may_not_grow_stops_the_run_with_one_clear_line(ingests, goo
     shown = capfd.readouterr()
     assert "Traceback" not in shown.out + shown.err
     last = shown.err.strip().splitlines()[-1]
-    assert last.startswith("taccorl ingest: ") and "larger than this user may write" in last
+    assert (
+        last.startswith("taccorl ingest: ")
+        and "larger than this user may write" in last
+    )
     assert "run the same command again" in last
     _no_damage(ingests)
     assert ingests.run(good) == 0, "with room again, it goes on"
 
 
-def test_a_store_that_is_read_only_is_told_at_once(tmp_path, spec, good, monkeypatch, capsys):
+def test_a_store_that_is_read_only_is_told_at_once(
+    tmp_path, spec, good, monkeypatch, capsys
+):
     ingests = Ingests(tmp_path, spec, monkeypatch)
     assert ingests.run(good / "a.mcap", out="/proc/nothing/out") == 2
     assert ingests.run(good / "a.mcap", store="/proc/nothing/store") == 2

@@ -43,22 +43,42 @@ def spec(tmp_path_factory: pytest.TempPathFactory) -> DatasetSpec:
 TOP = "observation.images.top"
 
 
-def episode(spec: DatasetSpec, seed: int, rows: int, instruction: str, cameras: tuple[str, ...] = ()) -> Episode:
+def episode(
+    spec: DatasetSpec,
+    seed: int,
+    rows: int,
+    instruction: str,
+    cameras: tuple[str, ...] = (),
+) -> Episode:
     """Numbers at random; row k of a picture is grey of brightness 4 k + 20 seed."""
     rng = np.random.default_rng(seed)
-    arrays = {key: rng.normal(size=(rows, 2)).astype(np.float32) for key in spec.features if key != TOP}
-    shown = [dict.fromkeys(cameras, np.full((32, 48, 3), (4 * k + 20 * seed) % 256, np.uint8)) for k in range(rows)]
+    arrays = {
+        key: rng.normal(size=(rows, 2)).astype(np.float32)
+        for key in spec.features
+        if key != TOP
+    }
+    shown = [
+        dict.fromkeys(
+            cameras, np.full((32, 48, 3), (4 * k + 20 * seed) % 256, np.uint8)
+        )
+        for k in range(rows)
+    ]
     return Episode(
         name=f"made up {seed}", spec=spec, start_ns=0, arrays=arrays, picture_keys=cameras, pictures=lambda: iter(shown),
         instruction=instruction, origin=Origin(text="made up"),
     )  # fmt: skip
 
 
-def written(spec: DatasetSpec, folder: Path, cameras: tuple[str, ...] = ()) -> list[Path]:
+def written(
+    spec: DatasetSpec, folder: Path, cameras: tuple[str, ...] = ()
+) -> list[Path]:
     """Tasks are numbered otherwise in each: push 0 and pull 1; pull 0; lift 0 and push 1."""
     told = {"x": ["push", "pull", "push"], "y": ["pull"], "z": ["lift", "push"]}
     for k, (name, instructions) in enumerate(told.items()):
-        episodes = [episode(spec, 10 * k + i, 7 + 3 * i + k, text, cameras) for i, text in enumerate(instructions)]
+        episodes = [
+            episode(spec, 10 * k + i, 7 + 3 * i + k, text, cameras)
+            for i, text in enumerate(instructions)
+        ]
         write_episodes(episodes, folder / name)
     return [folder / name for name in told]
 
@@ -74,7 +94,10 @@ def filmed(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[
 
 
 def table(root: Path, kind: str) -> pd.DataFrame:
-    pieces = [pq.read_table(path) for path in sorted((root / kind).glob("chunk-*/file-*.parquet"))]
+    pieces = [
+        pq.read_table(path)
+        for path in sorted((root / kind).glob("chunk-*/file-*.parquet"))
+    ]
     return pa.concat_tables(pieces).to_pandas()
 
 
@@ -83,32 +106,52 @@ def test_it_is_what_lerobot_makes_of_them(of, tmp_path, request):
     parts = request.getfixturevalue(of)
     _join(parts, tmp_path / "ours")
     names = [f"local/{root.name}" for root in parts]
-    aggregate_datasets(names, "local/theirs", parts, tmp_path / "theirs", concatenate_videos=False)
+    aggregate_datasets(
+        names, "local/theirs", parts, tmp_path / "theirs", concatenate_videos=False
+    )
     for kind in ("data", "meta/episodes"):
-        pd.testing.assert_frame_equal(table(tmp_path / "ours", kind), table(tmp_path / "theirs", kind))
-    ours, theirs = (pd.read_parquet(tmp_path / name / "meta/tasks.parquet") for name in ("ours", "theirs"))
+        pd.testing.assert_frame_equal(
+            table(tmp_path / "ours", kind), table(tmp_path / "theirs", kind)
+        )
+    ours, theirs = (
+        pd.read_parquet(tmp_path / name / "meta/tasks.parquet")
+        for name in ("ours", "theirs")
+    )
     pd.testing.assert_frame_equal(ours, theirs)
     for name in ("info", "stats"):
-        found, wanted = (json.loads((tmp_path / of / f"meta/{name}.json").read_text()) for of in ("ours", "theirs"))
+        found, wanted = (
+            json.loads((tmp_path / of / f"meta/{name}.json").read_text())
+            for of in ("ours", "theirs")
+        )
         if of == "parts":
             wanted.pop("video_path", None)  # LeRobot forgets where videos would be
         assert found.items() >= wanted.items()
     films = [
-        {path.relative_to(tmp_path / of): path.read_bytes() for path in (tmp_path / of).rglob("*.mp4")}
+        {
+            path.relative_to(tmp_path / of): path.read_bytes()
+            for path in (tmp_path / of).rglob("*.mp4")
+        }
         for of in ("ours", "theirs")
     ]
     assert films[0] == films[1] and len(films[0]) == (3 if of == "filmed" else 0)
     # LeRobot's writer converts through pandas, which drops the fixed length of list columns.
-    schemas = [pq.read_schema(root / "data/chunk-000/file-000.parquet") for root in (tmp_path / "ours", parts[0])]
+    schemas = [
+        pq.read_schema(root / "data/chunk-000/file-000.parquet")
+        for root in (tmp_path / "ours", parts[0])
+    ]
     assert schemas[0].equals(schemas[1])
 
 
 @pytest.mark.parametrize("per_chunk", [2, 1000])
-def test_each_row_shows_its_own_picture_after_merging_twice(filmed, tmp_path, monkeypatch, per_chunk):
+def test_each_row_shows_its_own_picture_after_merging_twice(
+    filmed, tmp_path, monkeypatch, per_chunk
+):
     from taccorl.data import joining
 
     read = joining.read_info
-    monkeypatch.setattr(joining, "read_info", lambda root: read(root) | {"chunks_size": per_chunk})
+    monkeypatch.setattr(
+        joining, "read_info", lambda root: read(root) | {"chunks_size": per_chunk}
+    )
     merge(filmed[:2], tmp_path / "two")
     merge([filmed[2], tmp_path / "two", filmed[1]], tmp_path / "all")
     assert len(list((tmp_path / "all/videos").rglob("*.mp4"))) == 4
@@ -125,7 +168,9 @@ def test_each_row_shows_its_own_picture_after_merging_twice(filmed, tmp_path, mo
     assert row == len(joined) and [*check_bookkeeping(Dataset(tmp_path / "all"))] == []
 
 
-@pytest.mark.parametrize(("limit_mb", "per_chunk", "files"), [(1, 2, 3), (100, 1000, 1)])
+@pytest.mark.parametrize(
+    ("limit_mb", "per_chunk", "files"), [(1, 2, 3), (100, 1000, 1)]
+)
 def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
     parts, tmp_path, monkeypatch, limit_mb, per_chunk, files
 ):
@@ -133,12 +178,18 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
 
     read = joining.read_info
     small = {"data_files_size_in_mb": limit_mb, "chunks_size": per_chunk}
-    monkeypatch.setattr(joining, "_MB", 1024 if limit_mb == 1 else 1024 * 1024)  # no file is smaller than 1 kB
+    monkeypatch.setattr(
+        joining, "_MB", 1024 if limit_mb == 1 else 1024 * 1024
+    )  # no file is smaller than 1 kB
     monkeypatch.setattr(joining, "read_info", lambda root: read(root) | small)
     _join(parts, tmp_path / "all")
     for kind in ("data", "meta/episodes"):
-        assert len(list((tmp_path / "all" / kind).glob("chunk-*/file-*.parquet"))) == files
-        assert len(list((tmp_path / "all" / kind).glob("chunk-*"))) == -(-files // per_chunk)
+        assert (
+            len(list((tmp_path / "all" / kind).glob("chunk-*/file-*.parquet"))) == files
+        )
+        assert len(list((tmp_path / "all" / kind).glob("chunk-*"))) == -(
+            -files // per_chunk
+        )
     assert [*check_bookkeeping(Dataset(tmp_path / "all"))] == []
     joined, numbers = (
         Dataset(tmp_path / "all"),
@@ -150,7 +201,9 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
         np.testing.assert_array_equal(one.arrays["action"], other.arrays["action"])
 
 
-def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(parts, tmp_path, monkeypatch):
+def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(
+    parts, tmp_path, monkeypatch
+):
     shutil.copytree(parts[2], edited := tmp_path / "edited")
     path = edited / "meta/episodes/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(path).drop_columns(["stats/action/min"]), path)
@@ -169,8 +222,13 @@ def test_statistics_that_a_removed_feature_left_behind_do_not_matter(parts, tmp_
     shutil.copytree(parts[0], edited)
     path = edited / "meta/episodes/chunk-000/file-000.parquet"
     episodes = pq.read_table(path)
-    pq.write_table(episodes.append_column("stats/sim.executed/min", episodes["stats/action/min"]), path)
+    pq.write_table(
+        episodes.append_column("stats/sim.executed/min", episodes["stats/action/min"]),
+        path,
+    )
     merge([edited, *parts[1:]], tmp_path / "joined")
     merge(parts, tmp_path / "plain")
-    joined, plain = (table(tmp_path / name, "meta/episodes") for name in ("joined", "plain"))
+    joined, plain = (
+        table(tmp_path / name, "meta/episodes") for name in ("joined", "plain")
+    )
     assert list(joined.columns) == list(plain.columns) and len(joined) == len(plain)

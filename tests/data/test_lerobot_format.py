@@ -21,7 +21,12 @@ from taccorl.data import lerobot_format
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.exact_statistics import QUANTILES, exact_stats
-from taccorl.data.lerobot_format import lerobot_features, merge, quiet_lerobot, write_episodes
+from taccorl.data.lerobot_format import (
+    lerobot_features,
+    merge,
+    quiet_lerobot,
+    write_episodes,
+)
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, RecordingError
 from tests.recordings.pictures import draw_frame_id, read_frame_id
@@ -51,7 +56,13 @@ def spec(tmp_path_factory: pytest.TempPathFactory) -> DatasetSpec:
     return load_dataset_spec(path)
 
 
-def made_up(spec: DatasetSpec, num_rows: int = 40, first_id: int = 0, fail_at: int = -1, seed: int = 0) -> Episode:
+def made_up(
+    spec: DatasetSpec,
+    num_rows: int = 40,
+    first_id: int = 0,
+    fail_at: int = -1,
+    seed: int = 0,
+) -> Episode:
     """Row k shows picture first_id + k, state (first_id + k, k / 7) and random touch."""
     rng = np.random.default_rng(seed)
     k = np.arange(num_rows)
@@ -108,7 +119,9 @@ def test_rows_keep_their_pictures_and_numbers(spec, tmp_path):
     dataset = Dataset(tmp_path / "ds")
     assert dataset.num_episodes == 2
     for index, episode in enumerate(episodes):
-        assert row_ids(dataset.root, index) == [round(x) for x in episode.arrays["observation.state"][:, 0]]
+        assert row_ids(dataset.root, index) == [
+            round(x) for x in episode.arrays["observation.state"][:, 0]
+        ]
         for key, values in episode.arrays.items():
             np.testing.assert_array_equal(dataset.episode(index).arrays[key], values)
         assert dataset.episode(index).instruction == "touch it"
@@ -121,8 +134,12 @@ def test_a_slow_encoder_loses_no_frame(spec, tmp_path, slow_encoder):
     assert row_ids(tmp_path / "ds") == list(range(20))
 
 
-def test_dropped_frames_are_found_and_the_dataset_is_written_again(spec, tmp_path, slow_encoder, monkeypatch, caplog):
-    monkeypatch.setattr(lerobot_format, "_wait_for_room", lambda dataset: None)  # no back-pressure
+def test_dropped_frames_are_found_and_the_dataset_is_written_again(
+    spec, tmp_path, slow_encoder, monkeypatch, caplog
+):
+    monkeypatch.setattr(
+        lerobot_format, "_wait_for_room", lambda dataset: None
+    )  # no back-pressure
     attempts: list[tuple[bool, list[str]]] = []
     original = lerobot_format._write
 
@@ -142,7 +159,9 @@ def test_dropped_frames_are_found_and_the_dataset_is_written_again(spec, tmp_pat
 
 
 def test_a_dataset_that_stays_wrong_is_an_error(spec, tmp_path, monkeypatch):
-    monkeypatch.setattr(Dataset, "video_problems", lambda self: ["front: 3 frames for 9 rows"])
+    monkeypatch.setattr(
+        Dataset, "video_problems", lambda self: ["front: 3 frames for 9 rows"]
+    )
     with pytest.raises(DatasetError, match="3 frames for 9 rows"):
         write_episodes([made_up(spec, 9)], tmp_path / "ds", streaming=False)
 
@@ -150,14 +169,18 @@ def test_a_dataset_that_stays_wrong_is_an_error(spec, tmp_path, monkeypatch):
 def test_an_episode_without_pictures_is_written(spec, tmp_path):
     blind = dataclasses.replace(made_up(spec, 9), picture_keys=())
     write_episodes([blind], tmp_path / "ds")
-    np.testing.assert_array_equal(Dataset(tmp_path / "ds").episode(0).arrays[TOUCH], blind.arrays[TOUCH])
+    np.testing.assert_array_equal(
+        Dataset(tmp_path / "ds").episode(0).arrays[TOUCH], blind.arrays[TOUCH]
+    )
 
 
 # ---- what goes wrong ----
 
 
 @pytest.mark.parametrize(("fail_at", "streaming"), [(0, True), (25, True), (25, False)])
-def test_an_error_in_the_middle_leaves_nothing_behind(spec, tmp_path, fail_at, streaming):
+def test_an_error_in_the_middle_leaves_nothing_behind(
+    spec, tmp_path, fail_at, streaming
+):
     episodes = [made_up(spec, 10), made_up(spec, 40, fail_at=fail_at)]
     with pytest.raises(RecordingError, match="picture 7 is broken"):
         write_episodes(episodes, tmp_path / "ds", streaming=streaming)
@@ -194,16 +217,22 @@ def test_exact_statistics_are_lerobots_within_one_histogram_bin():
     values[:, 8] = np.arange(200)
     ours = exact_stats(values)
     with quiet_lerobot():
-        theirs = compute_episode_stats({"x": values}, {"x": {"dtype": "int16", "shape": (300,)}})["x"]
+        theirs = compute_episode_stats(
+            {"x": values}, {"x": {"dtype": "int16", "shape": (300,)}}
+        )["x"]
     assert set(ours) == set(theirs)
     for name in ours:
         assert ours[name].shape == theirs[name].shape, name
     for name in ("min", "max", "mean", "std", "count"):
-        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-6, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            ours[name], theirs[name], rtol=1e-6, atol=1e-6, err_msg=name
+        )
     bins = (values.max(axis=0) - values.min(axis=0)) / 5000  # LeRobot's histogram
     for q in QUANTILES:
         name = f"q{round(100 * q):02d}"
-        assert (np.abs(ours[name] - theirs[name]) <= bins + 1e-4).all(), name  # its edges are float32
+        assert (np.abs(ours[name] - theirs[name]) <= bins + 1e-4).all(), (
+            name
+        )  # its edges are float32
     # by hand: of 0 … 199, half do not exceed 99 (the 100th), and 1 % (two of them) do not exceed 1
     assert (ours["q50"][8], ours["q01"][8], ours["q99"][8]) == (99, 1, 197)
     assert (ours["std"][7], ours["q99"][7]) == (0.0, 4.0)
@@ -226,7 +255,9 @@ def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec, tmp_
             lerobots.update(shown[key].reshape(-1, 3))
         for name, expected in lerobots.get_statistics().items():
             ours, scale = written[key][name].ravel(), 1 if name == "count" else 255
-            np.testing.assert_allclose(ours * scale, expected, atol=0.06, rtol=2e-4, err_msg=f"{key} {name}")
+            np.testing.assert_allclose(
+                ours * scale, expected, atol=0.06, rtol=2e-4, err_msg=f"{key} {name}"
+            )
 
 
 # ---- the features' own words ----
@@ -256,25 +287,35 @@ def test_features_say_what_their_numbers_mean(spec, tmp_path):
 @pytest.fixture(scope="module")
 def shards(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("shards")
-    write_episodes([made_up(spec, 31), made_up(spec, 32, first_id=100, seed=1)], folder / "a")
+    write_episodes(
+        [made_up(spec, 31), made_up(spec, 32, first_id=100, seed=1)], folder / "a"
+    )
     write_episodes([made_up(spec, 33, first_id=200, seed=2)], folder / "b")
     write_episodes([made_up(spec, 34, first_id=300, seed=3)], folder / "c")
     return [folder / name for name in "abc"]
 
 
 def test_datasets_with_other_features_do_not_merge(spec, shards, tmp_path):
-    three = dataclasses.replace(spec.features["action"], shape=(3,), names=("a", "b", "c"), unit="rad")
+    three = dataclasses.replace(
+        spec.features["action"], shape=(3,), names=("a", "b", "c"), unit="rad"
+    )
     wider = dataclasses.replace(spec, features={**spec.features, "action": three})
     episode = made_up(spec, 9)
     arrays = {**episode.arrays, "action": np.zeros((9, 3), np.float32)}
-    write_episodes([dataclasses.replace(episode, spec=wider, arrays=arrays)], tmp_path / "wide")
+    write_episodes(
+        [dataclasses.replace(episode, spec=wider, arrays=arrays)], tmp_path / "wide"
+    )
     with pytest.raises(DatasetError, match="do not merge"):
         merge([shards[1], tmp_path / "wide"], tmp_path / "all")
 
 
 def test_a_merge_that_loses_frames_is_an_error(shards, tmp_path, monkeypatch):
-    monkeypatch.setattr(Dataset, "video_problems", lambda self: ["front: one is missing"])
-    with pytest.raises(DatasetError, match="after merging, first: front: one is missing"):
+    monkeypatch.setattr(
+        Dataset, "video_problems", lambda self: ["front: one is missing"]
+    )
+    with pytest.raises(
+        DatasetError, match="after merging, first: front: one is missing"
+    ):
         merge(shards[1:], tmp_path / "all")
 
 
@@ -315,7 +356,9 @@ merge([folder / "a", folder / "b"], folder / "all")
 def blind(spec: DatasetSpec, seed: int, instruction: str = "touch it") -> Episode:
     """Nine rows without pictures, with four features so large that their statistics are ours."""
     wide = {
-        f"observation.{name}": dataclasses.replace(spec.features["action"], shape=(300,), names=(), unit="rad")
+        f"observation.{name}": dataclasses.replace(
+            spec.features["action"], shape=(300,), names=(), unit="rad"
+        )
         for name in ("one", "two", "three")
     }
     episode = made_up(spec, 9, seed=seed)
@@ -331,21 +374,38 @@ def blind(spec: DatasetSpec, seed: int, instruction: str = "touch it") -> Episod
 
 @pytest.mark.slow
 def test_every_process_writes_and_merges_the_same_bytes(tmp_path):
-    folders = [tmp_path / hash_seed for hash_seed in "12"]  # of the order in which Python's sets of strings go
+    folders = [
+        tmp_path / hash_seed for hash_seed in "12"
+    ]  # of the order in which Python's sets of strings go
     processes = []
     for folder in folders:
         folder.mkdir()
-        own = {"PYTHONHASHSEED": folder.name, "TACCORL_PROGRAM": "1", "PYTHONPATH": f"{Path(__file__).parents[2]}"}
+        own = {
+            "PYTHONHASHSEED": folder.name,
+            "TACCORL_PROGRAM": "1",
+            "PYTHONPATH": f"{Path(__file__).parents[2]}",
+        }
         words = [sys.executable, "-c", SAME_DATASET, str(folder)]
-        processes.append(subprocess.Popen(words, cwd=Path(__file__).parent, env=os.environ | own))
+        processes.append(
+            subprocess.Popen(words, cwd=Path(__file__).parent, env=os.environ | own)
+        )
     assert [process.wait(timeout=120) for process in processes] == [0, 0]
-    one, two = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in folders)
+    one, two = (
+        {p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()}
+        for f in folders
+    )
     assert [str(name) for name in one if one[name] != two.get(name)] == []
     assert set(one) == set(two)
     stats = json.loads((folders[0] / "all/meta/stats.json").read_text())
     features = json.loads((folders[0] / "all/meta/info.json").read_text())["features"]
-    assert [key for key in stats if key in ("action", TOUCH, "observation.one", "observation.state")] == [
-        key for key in features if key in ("action", TOUCH, "observation.one", "observation.state")
+    assert [
+        key
+        for key in stats
+        if key in ("action", TOUCH, "observation.one", "observation.state")
+    ] == [
+        key
+        for key in features
+        if key in ("action", TOUCH, "observation.one", "observation.state")
     ]
 
 
@@ -355,18 +415,32 @@ def test_an_episode_of_one_row_is_written(spec, tmp_path):
 
 
 @pytest.mark.slow
-def test_data_files_are_those_of_lerobots_writer_left_alone(spec, tmp_path, monkeypatch):
+def test_data_files_are_those_of_lerobots_writer_left_alone(
+    spec, tmp_path, monkeypatch
+):
     import contextlib
 
     import pyarrow.parquet as pq
 
     episodes = [made_up(spec, 300), made_up(spec, 41, 300, seed=1)]
     write_episodes(episodes, tmp_path / "ours")
-    monkeypatch.setattr(lerobot_format, "_large_features_in_blocks", lambda writer: contextlib.nullcontext())
+    monkeypatch.setattr(
+        lerobot_format,
+        "_large_features_in_blocks",
+        lambda writer: contextlib.nullcontext(),
+    )
     write_episodes(episodes, tmp_path / "theirs")
-    ours, theirs = (pq.read_table(next((tmp_path / name / "data").rglob("*.parquet"))) for name in ("ours", "theirs"))
+    ours, theirs = (
+        pq.read_table(next((tmp_path / name / "data").rglob("*.parquet")))
+        for name in ("ours", "theirs")
+    )
     assert ours.schema.equals(theirs.schema)
     assert ours.equals(theirs)
-    said = [json.loads(table.schema.metadata[b"huggingface"])["info"] for table in (ours, theirs)]
+    said = [
+        json.loads(table.schema.metadata[b"huggingface"])["info"]
+        for table in (ours, theirs)
+    ]
     assert said[0] == said[1]
-    assert (tmp_path / "ours/meta/info.json").read_text() == (tmp_path / "theirs/meta/info.json").read_text()
+    assert (tmp_path / "ours/meta/info.json").read_text() == (
+        tmp_path / "theirs/meta/info.json"
+    ).read_text()

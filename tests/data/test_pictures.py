@@ -28,17 +28,27 @@ from taccorl.data.dataset import Dataset
 
 @pytest.mark.parametrize(("codec", "form"), [("libx264", "h264"), ("libx265", "h265")])
 def test_a_video_frame_by_frame_shows_the_picture_of_every_row(tmp_path, codec, form):
-    path = write_mcap(tmp_path / "rec.mcap", messages(picture=video(codec=codec, form=form)))
+    path = write_mcap(
+        tmp_path / "rec.mcap", messages(picture=video(codec=codec, form=form))
+    )
     code, entry = ingest(path, write_spec(tmp_path))
     assert (code, entry["outcome"], entry["rows_lost"]) == (0, "written", 0)
-    for k, shown in enumerate(Dataset(tmp_path / "out").frames(0, "observation.images.top")):
+    for k, shown in enumerate(
+        Dataset(tmp_path / "out").frames(0, "observation.images.top")
+    ):
         # row 0 is at the first picture, 3 ms after the first joint state
-        assert np.abs(shown.astype(int) - scene(k / 30)).mean() < 12  # the bar moves by 1 pixel a row; H.264 twice
+        assert (
+            np.abs(shown.astype(int) - scene(k / 30)).mean() < 12
+        )  # the bar moves by 1 pixel a row; H.264 twice
 
 
 def test_an_episode_in_mid_video_is_decoded_from_the_frames_before_it(tmp_path):
     """State begins at 1.2 s, between two key frames (1.0 and 1.5 s): the rows' pictures need those before them."""
-    sent = [m for m in messages(picture=video(every=60)) if m.topic == CAMERA or m.time_s >= 1.2]
+    sent = [
+        m
+        for m in messages(picture=video(every=60))
+        if m.topic == CAMERA or m.time_s >= 1.2
+    ]
     path = write_mcap(tmp_path / "rec.mcap", sent)
     with open_episodes(path, write_spec(tmp_path)) as [episode]:
         first = next(iter(episode.pictures()))["observation.images.top"]
@@ -47,10 +57,14 @@ def test_an_episode_in_mid_video_is_decoded_from_the_frames_before_it(tmp_path):
 
 def test_a_video_that_begins_between_key_frames_loses_those_pictures_only(tmp_path):
     sent = messages(picture=video(every=60))
-    path = write_mcap(tmp_path / "rec.mcap", [m for m in sent if m.topic != CAMERA or m.time_s > 1.0])
+    path = write_mcap(
+        tmp_path / "rec.mcap", [m for m in sent if m.topic != CAMERA or m.time_s > 1.0]
+    )
     _, entry = ingest(path, write_spec(tmp_path))
     assert entry["outcome"] == "split"
-    assert entry["samples"]["top"]["broken picture"] == 30  # 1.0 … 2.0 s, until the key frame
+    assert (
+        entry["samples"]["top"]["broken picture"] == 30
+    )  # 1.0 … 2.0 s, until the key frame
 
 
 YUV = np.zeros((ROWS, COLUMNS, 2), np.uint8)
@@ -65,7 +79,9 @@ YUV = np.zeros((ROWS, COLUMNS, 2), np.uint8)
         (lambda t: raw(t, "yuv411", YUV), "yuv411"),
     ],
 )  # fmt: skip
-def test_pictures_that_are_not_read_are_refused_with_their_reason(tmp_path, picture, reason, capsys):
+def test_pictures_that_are_not_read_are_refused_with_their_reason(
+    tmp_path, picture, reason, capsys
+):
     path = write_mcap(tmp_path / "rec.mcap", messages(picture=picture))
     spec = write_spec(tmp_path)
     code, entry = ingest(path, spec)
@@ -87,10 +103,19 @@ def test_pictures_that_change_their_size_are_a_warning(tmp_path, capsys):
         rows, columns = sizes[time_s > 2]
         return compressed(time_s, jpeg(cv2.resize(scene(time_s), (columns, rows))))
 
-    path, spec = write_mcap(tmp_path / "rec.mcap", messages(picture=picture)), write_spec(tmp_path)
+    path, spec = (
+        write_mcap(tmp_path / "rec.mcap", messages(picture=picture)),
+        write_spec(tmp_path),
+    )
     _, entry = ingest(path, spec)
-    (found,) = [f for f in entry["episodes"][0]["findings"] if f["check"] == "picture_size"]
-    assert found["severity"] == "warning" and "32×48" in found["text"] and "64×96" in found["text"]
+    (found,) = [
+        f for f in entry["episodes"][0]["findings"] if f["check"] == "picture_size"
+    ]
+    assert (
+        found["severity"] == "warning"
+        and "32×48" in found["text"]
+        and "64×96" in found["text"]
+    )
     capsys.readouterr()
     assert main(["check", str(path), f"--spec={spec}"]) == 1
     assert "picture_size" in capsys.readouterr().out
@@ -107,16 +132,23 @@ def test_pictures_that_change_their_size_are_a_warning(tmp_path, capsys):
         (lambda rgb: rgb[..., 0].astype(np.uint16), "uint16"),
     ],
 )
-def test_stored_arrays_are_read_or_refused_with_their_reason(tmp_path, change, reason, capsys):
+def test_stored_arrays_are_read_or_refused_with_their_reason(
+    tmp_path, change, reason, capsys
+):
     values = arrays(60)
     topic = "/observations/images/top"
     values[topic] = change(values[topic])
-    path, spec = write_hdf5(tmp_path / "rec.hdf5", values), write_spec(tmp_path, reader="hdf5")
+    path, spec = (
+        write_hdf5(tmp_path / "rec.hdf5", values),
+        write_spec(tmp_path, reader="hdf5"),
+    )
     code, entry = ingest(path, spec)
     assert (code, entry["outcome"]) == ((1, "refused") if reason else (0, "written"))
     capsys.readouterr()
     main(["ingest", "inspect", str(path)])
     inspected = capsys.readouterr().out
     assert reason in entry["reason"]
-    assert (f"not decodable {topic}: a picture of {reason}" in inspected) == bool(reason)
+    assert (f"not decodable {topic}: a picture of {reason}" in inspected) == bool(
+        reason
+    )
     assert ("observation.images.top:" in inspected) == (not reason)

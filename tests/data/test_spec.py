@@ -9,7 +9,13 @@ import pytest
 import yaml
 
 from taccorl.data.sensor_spec import load_sensor_spec
-from taccorl.data.spec import RecordingSpec, data_specs_folder, find_spec, load_dataset_spec, load_recording_spec
+from taccorl.data.spec import (
+    RecordingSpec,
+    data_specs_folder,
+    find_spec,
+    load_dataset_spec,
+    load_recording_spec,
+)
 from taccorl.errors import SpecError
 
 REMOVE = object()
@@ -32,7 +38,9 @@ scheme: fixed_scale
 gain_per_count: 0.0133
 """)
 PADS = "dtype: int16, unit: adc_count, frame: pad, rate_hz: 100.0, range: [-255.0, 255.0], pads: [a, b]"
-ARM = "dtype: float32, shape: [2], names: [joint, gripper], frame: joint, rate_hz: 200.0"
+ARM = (
+    "dtype: float32, shape: [2], names: [joint, gripper], frame: joint, rate_hz: 200.0"
+)
 DATASET = yaml.safe_load(f"""
 spec_version: 1
 name: little
@@ -48,7 +56,9 @@ features:
   observation.tactile: {{{PADS}, sensor: pad.yaml, shape: [12]}}
   observation.tactile_window: {{{PADS}, sensor: pad.yaml, shape: [48], history: 4, optional: true}}
 """)
-PAD_CHANNEL = "field: data, clock: log, latency_s: 0.01, rate_hz: 100.0, max_age_s: 0.04"
+PAD_CHANNEL = (
+    "field: data, clock: log, latency_s: 0.01, rate_hz: 100.0, max_age_s: 0.04"
+)
 JOINTS = "topic: /joints, type: sensor_msgs/msg/JointState, field: position, pick: [j1, g], scale: [1.5, 1.0]"
 RECORDING = yaml.safe_load(f"""
 spec_version: 1
@@ -75,7 +85,9 @@ features:
 FILES = {"pad": SENSOR, "dataset": DATASET, "recording": RECORDING}
 
 
-def changed(document: dict[str, Any], path: tuple[Any, ...], value: Any) -> dict[str, Any]:
+def changed(
+    document: dict[str, Any], path: tuple[Any, ...], value: Any
+) -> dict[str, Any]:
     """A copy with one leaf set or removed."""
     out = copy.deepcopy(document)
     node: Any = out
@@ -96,13 +108,21 @@ def write(folder: Path, **documents: dict[str, Any]) -> Path:
 
 
 def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else None
+    items = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else None
+    )
     if items is None:
         return [path]
     return [leaf for key, child in items for leaf in leaves(child, (*path, key))]
 
 
-@pytest.mark.parametrize("path", sorted(data_specs_folder().rglob("*.yaml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted(data_specs_folder().rglob("*.yaml")), ids=lambda p: p.stem
+)
 def test_every_shipped_spec_loads(path):
     loaders = {"sensors": load_sensor_spec, "recordings": load_recording_spec}
     load = loaders.get(path.parent.name, load_dataset_spec)
@@ -111,46 +131,66 @@ def test_every_shipped_spec_loads(path):
 
 def test_shipped_tactile_numbers_are_the_papers():
     spec = load_recording_spec("piper_flexitac_mcap").target
-    tactile, sensor = spec.features["observation.tactile"], spec.sensors["observation.tactile"]
+    tactile, sensor = (
+        spec.features["observation.tactile"],
+        spec.sensors["observation.tactile"],
+    )
     assert tactile.size == 4 * 32 * 12 == 1536
     assert spec.features["observation.tactile_window"].size == 10 * 1536
     assert sensor.max_count == (1023 >> 2) == 255
     assert abs(sensor.gain_per_count * 30 - 0.4) < 1e-6  # λ_f = 0.4 means 30 counts
     assert spec.keys("tactile") == ["observation.tactile", "observation.tactile_window"]
     assert spec.keys("vector") == ["observation.state", "action"]
-    assert spec.keys("video") == [f"observation.images.{c}" for c in ("front", "left_wrist", "right_wrist")]
+    assert spec.keys("video") == [
+        f"observation.images.{c}" for c in ("front", "left_wrist", "right_wrist")
+    ]
 
 
 def test_pipers_angle_factor_is_the_one_that_its_driver_lost():
     spec = load_recording_spec("piper_flexitac_mcap")
     for name in ("left_state", "right_state", "left_command", "right_command"):
-        assert np.allclose(spec.channels[name].scale[:6], (np.pi / 180) / 0.017444, rtol=1e-6, atol=0)
+        assert np.allclose(
+            spec.channels[name].scale[:6], (np.pi / 180) / 0.017444, rtol=1e-6, atol=0
+        )
         assert spec.channels[name].scale[6] == 1.0  # the gripper is in metres
 
 
 def test_the_little_spec_loads_and_its_limits_stand_in_the_order_of_the_names(tmp_path):
     spec = load_recording_spec(write(tmp_path))
-    assert spec.target.features["observation.state"].limits.tolist() == [[-1.5, 1.5], [0.0, 0.1]]
+    assert spec.target.features["observation.state"].limits.tolist() == [
+        [-1.5, 1.5],
+        [0.0, 0.1],
+    ]
     assert spec.target.features["action"].limits.tolist() == [[-2.0, 2.0], [-2.0, 2.0]]
     assert list(spec.mapped) == list(DATASET["features"])
     assert [spec.clock_of(c) for c in ("state", "pad_a")] == ["header", "log"]
 
 
 def test_an_optional_feature_may_stay_empty_and_is_not_mapped(tmp_path):
-    spec = load_recording_spec(write(tmp_path, recording=changed(RECORDING, WINDOW, REMOVE)))
-    assert list(spec.mapped) == [k for k in DATASET["features"] if k != "observation.tactile_window"]
+    spec = load_recording_spec(
+        write(tmp_path, recording=changed(RECORDING, WINDOW, REMOVE))
+    )
+    assert list(spec.mapped) == [
+        k for k in DATASET["features"] if k != "observation.tactile_window"
+    ]
 
 
 def test_digest_ignores_comments_layout_and_the_order_of_keys(tmp_path):
     path = write(tmp_path)
     before = load_recording_spec(path).digest
     for name, document in FILES.items():
-        text = yaml.safe_dump(document, sort_keys=True, default_flow_style=True, width=60)
+        text = yaml.safe_dump(
+            document, sort_keys=True, default_flow_style=True, width=60
+        )
         (tmp_path / f"{name}.yaml").write_text(f"# another layout\n{text}\n# the end\n")
     assert load_recording_spec(path).digest == before
-    spelled = changed(RECORDING, ("channels", "state", "rate_hz"), 200)  # an integer for the same rate
+    spelled = changed(
+        RECORDING, ("channels", "state", "rate_hz"), 200
+    )  # an integer for the same rate
     assert load_recording_spec(write(tmp_path, recording=spelled)).digest == before
-    defaults = changed(RECORDING, ("split_bag",), REMOVE)  # it was written out with its default
+    defaults = changed(
+        RECORDING, ("split_bag",), REMOVE
+    )  # it was written out with its default
     assert load_recording_spec(write(tmp_path, recording=defaults)).digest == before
 
 
@@ -163,9 +203,20 @@ OTHER_WORDS = [
 @pytest.mark.parametrize(
     ("name", "num_changed", "relations"),
     [
-        ("pad", 10, "spec_version rows columns wire.rows wire.columns wire.transpose adc_bits baseline.rule scheme"),
-        pytest.param("dataset", 43, "spec_version action_time dtype shape names sensor history", marks=SLOW),
-        pytest.param("recording", 35, "spec_version dataset by from channels align", marks=SLOW),
+        (
+            "pad",
+            10,
+            "spec_version rows columns wire.rows wire.columns wire.transpose adc_bits baseline.rule scheme",
+        ),
+        pytest.param(
+            "dataset",
+            43,
+            "spec_version action_time dtype shape names sensor history",
+            marks=SLOW,
+        ),
+        pytest.param(
+            "recording", 35, "spec_version dataset by from channels align", marks=SLOW
+        ),
     ],
 )
 def test_digest_changes_with_every_leaf(tmp_path, name, num_changed, relations):
@@ -179,12 +230,23 @@ def test_digest_changes_with_every_leaf(tmp_path, name, num_changed, relations):
         if isinstance(old, bool):
             candidates: list[Any] = [not old]
         elif isinstance(old, int | float):
-            candidates = [v for v in (old + 1, old * 2, type(old)(old * 1.25), type(old)(old + 0.01)) if v != old]
+            candidates = [
+                v
+                for v in (
+                    old + 1,
+                    old * 2,
+                    type(old)(old * 1.25),
+                    type(old)(old + 0.01),
+                )
+                if v != old
+            ]
         else:
             candidates = [w for w in OTHER_WORDS if w != old]
         for value in candidates:
             try:
-                after = load_recording_spec(write(tmp_path, **{name: changed(document, path, value)})).digest
+                after = load_recording_spec(
+                    write(tmp_path, **{name: changed(document, path, value)})
+                ).digest
             except SpecError:
                 continue
             assert after != before, (path, value)
@@ -192,7 +254,9 @@ def test_digest_changes_with_every_leaf(tmp_path, name, num_changed, relations):
         else:
             unchangeable.append(path)
     assert len(leaves(document)) - len(unchangeable) == num_changed
-    last = {next(p for p in reversed(path) if isinstance(p, str)) for path in unchangeable}
+    last = {
+        next(p for p in reversed(path) if isinstance(p, str)) for path in unchangeable
+    }
     named = {".".join(path) for path in unchangeable} if name == "pad" else last
     assert named == set(relations.split())
 
@@ -203,24 +267,55 @@ def test_digest_sees_which_pad_comes_first(tmp_path):
     assert load_recording_spec(write(tmp_path, recording=swapped)).digest != before
 
 
-STATE, FRONT = ("features", "observation.state"), ("features", "observation.images.front")
-TACTILE, WINDOW = ("features", "observation.tactile"), ("features", "observation.tactile_window")
+STATE, FRONT = (
+    ("features", "observation.state"),
+    ("features", "observation.images.front"),
+)
+TACTILE, WINDOW = (
+    ("features", "observation.tactile"),
+    ("features", "observation.tactile_window"),
+)
 
 
 @pytest.mark.parametrize(
     ("path", "value", "place", "reason"),
     [
         (("rows",), 3, "wire", "3×2 with transpose: True does not give the pad's 3×3"),
-        (("wire", "transpose"), False, "wire", "3×2 with transpose: False does not give the pad's 2×3"),
+        (
+            ("wire", "transpose"),
+            False,
+            "wire",
+            "3×2 with transpose: False does not give the pad's 2×3",
+        ),
         (("adc_bits",), 16, "wire → dtype", "16383 counts do not fit the wire's uint8"),
         (("rows",), 0, "rows", "0 is not above 0"),
         (("gain_per_count",), -0.1, "gain_per_count", "-0.1 is not above 0"),
         (("baseline", "frames"), 0, "baseline → frames", "0 is not above 0"),
-        (("wire_shift_bits",), 10, "wire_shift_bits", "10 of 10 bits leave no bit for the count"),
-        (("adc_bits",), 10**9, "wire_shift_bits", "leave no bit for the count"),  # takes no memory to find out
+        (
+            ("wire_shift_bits",),
+            10,
+            "wire_shift_bits",
+            "10 of 10 bits leave no bit for the count",
+        ),
+        (
+            ("adc_bits",),
+            10**9,
+            "wire_shift_bits",
+            "leave no bit for the count",
+        ),  # takes no memory to find out
         (("spec_version",), 2, "spec_version", "2; this taccorl reads version 1"),
-        (("unit",), "counts", "unit", "'counts' is not a unit of datasets; did you mean 'adc_count'?"),
-        (("wire", "dtype"), "float32", "wire → dtype", "'float32' is not one of 'uint8', 'uint16'"),
+        (
+            ("unit",),
+            "counts",
+            "unit",
+            "'counts' is not a unit of datasets; did you mean 'adc_count'?",
+        ),
+        (
+            ("wire", "dtype"),
+            "float32",
+            "wire → dtype",
+            "'float32' is not one of 'uint8', 'uint16'",
+        ),
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(tmp_path, path, value, place, reason):
@@ -231,7 +326,11 @@ def test_a_sensor_that_cannot_be_is_refused(tmp_path, path, value, place, reason
 
 
 def test_counts_must_fit_the_dataset(tmp_path):
-    pad = changed(changed(changed(SENSOR, ("adc_bits",), 16), ("wire_shift_bits",), 0), ("wire", "dtype"), "uint16")
+    pad = changed(
+        changed(changed(SENSOR, ("adc_bits",), 16), ("wire_shift_bits",), 0),
+        ("wire", "dtype"),
+        "uint16",
+    )
     write(tmp_path, pad=pad)
     with pytest.raises(SpecError, match="65535 counts do not fit the dataset's int16"):
         load_sensor_spec(tmp_path / "pad.yaml")
@@ -341,7 +440,9 @@ CHANNELS = ("channels",)
         (("spec_version",), 3, "spec_version", "3; this taccorl reads version 1"),
     ],
 )  # fmt: skip
-def test_a_recording_spec_that_cannot_be_obeyed_is_refused(tmp_path, path, value, place, reason):
+def test_a_recording_spec_that_cannot_be_obeyed_is_refused(
+    tmp_path, path, value, place, reason
+):
     with pytest.raises(SpecError) as caught:
         load_recording_spec(write(tmp_path, recording=changed(RECORDING, path, value)))
     _assert_says(caught.value, tmp_path / "recording.yaml", place, reason)
@@ -349,7 +450,9 @@ def test_a_recording_spec_that_cannot_be_obeyed_is_refused(tmp_path, path, value
 
 def test_markers_cannot_name_the_instruction_without_markers(tmp_path):
     recording = changed(RECORDING, ("episodes",), {"by": "whole_file"})
-    with pytest.raises(SpecError, match=r"instruction → from:.*markers.*`episodes: by: markers`"):
+    with pytest.raises(
+        SpecError, match=r"instruction → from:.*markers.*`episodes: by: markers`"
+    ):
         load_recording_spec(write(tmp_path, recording=recording))
 
 
@@ -357,11 +460,16 @@ def test_an_error_in_a_file_that_is_referred_to_names_that_file(tmp_path):
     path = write(tmp_path, pad=changed(SENSOR, ("rows",), "two"))
     with pytest.raises(SpecError) as caught:
         load_recording_spec(path)
-    assert str(caught.value).startswith(f"{tmp_path}/pad.yaml:3: rows: expected int, found 'two'")
+    assert str(caught.value).startswith(
+        f"{tmp_path}/pad.yaml:3: rows: expected int, found 'two'"
+    )
 
 
 def test_an_unknown_spec_names_the_nearest_shipped_one():
-    with pytest.raises(SpecError, match=r"no spec 'piper_flexitac': .* did you mean 'piper_flexitac_mcap'"):
+    with pytest.raises(
+        SpecError,
+        match=r"no spec 'piper_flexitac': .* did you mean 'piper_flexitac_mcap'",
+    ):
         load_recording_spec("piper_flexitac")
 
 
@@ -393,20 +501,39 @@ def _assert_says(error: SpecError, file: Path, place: str, reason: str) -> None:
 
 def test_action_time_without_an_action_is_refused(tmp_path):
     features = {"observation.state": DATASET["features"]["observation.state"]}
-    (tmp_path / "pads.yaml").write_text(yaml.safe_dump({**DATASET, "features": features}, sort_keys=False))
-    with pytest.raises(SpecError, match="action_time: has no effect without a feature 'action'; remove it"):
+    (tmp_path / "pads.yaml").write_text(
+        yaml.safe_dump({**DATASET, "features": features}, sort_keys=False)
+    )
+    with pytest.raises(
+        SpecError,
+        match="action_time: has no effect without a feature 'action'; remove it",
+    ):
         load_dataset_spec(tmp_path / "pads.yaml")
 
 
 @pytest.mark.parametrize("reader", ["hdf5", "lerobot"])
-@pytest.mark.parametrize("key", ["max_clock_spread_s: 0.3", "field: position", "pick: [a]", "drop_zero_stamp: true"])
-def test_a_key_of_messages_is_refused_for_files_of_rows(tmp_path: Path, reader: str, key: str) -> None:
+@pytest.mark.parametrize(
+    "key",
+    [
+        "max_clock_spread_s: 0.3",
+        "field: position",
+        "pick: [a]",
+        "drop_zero_stamp: true",
+    ],
+)
+def test_a_key_of_messages_is_refused_for_files_of_rows(
+    tmp_path: Path, reader: str, key: str
+) -> None:
     text = (data_specs_folder() / "recordings" / "cobot_magic_hdf5.yaml").read_text()
-    text = text.replace("reader: hdf5", f"reader: {reader}").replace("dataset: ..", f"dataset: {data_specs_folder()}")
+    text = text.replace("reader: hdf5", f"reader: {reader}").replace(
+        "dataset: ..", f"dataset: {data_specs_folder()}"
+    )
     if key.startswith("max"):
         text = text.replace("reader:", f"{key}\nreader:")
     else:
         text = text.replace("lead_frames: 1", f"lead_frames: 1, {key}")
     (tmp_path / "spec.yaml").write_text(text)
-    with pytest.raises(SpecError, match=f"{key.split(':')[0]}: has no effect with reader: {reader}"):
+    with pytest.raises(
+        SpecError, match=f"{key.split(':')[0]}: has no effect with reader: {reader}"
+    ):
         load_recording_spec(tmp_path / "spec.yaml")

@@ -104,16 +104,28 @@ def test_a_wrong_file_names_file_line_key_and_value(tmp_path, text, expected):
 
 
 def test_line_numbers_point_into_the_right_item_of_a_long_file(tmp_path):
-    text = "# a comment first\n\n" + GOOD + "many:\n" + "".join(f"  c{k}:\n    count: {k}\n" for k in range(50))
+    text = (
+        "# a comment first\n\n"
+        + GOOD
+        + "many:\n"
+        + "".join(f"  c{k}:\n    count: {k}\n" for k in range(50))
+    )
     assert read(tmp_path, text).many["c49"].count == 49
     broken = text.replace("    count: 30\n", "    count: thirty\n")
-    assert broken.splitlines()[66] == "    count: thirty"  # 5 lines before the first item, two an item
-    assert refusal(tmp_path, broken).startswith("a.yaml:67: many → c30 → count: expected int")
+    assert (
+        broken.splitlines()[66] == "    count: thirty"
+    )  # 5 lines before the first item, two an item
+    assert refusal(tmp_path, broken).startswith(
+        "a.yaml:67: many → c30 → count: expected int"
+    )
 
 
 def test_anchors_are_shared_and_keys_with_x_in_front_are_ignored(tmp_path):
     value = read(
-        tmp_path, "x-unit: &unit [rad, m]\nx-inner: &inner {count: 7}\n" + GOOD + "unit: *unit\ninner: *inner\n"
+        tmp_path,
+        "x-unit: &unit [rad, m]\nx-inner: &inner {count: 7}\n"
+        + GOOD
+        + "unit: *unit\ninner: *inner\n",
     )
     assert value.unit == ("rad", "m")
     assert value.inner == Inner(count=7)
@@ -122,14 +134,35 @@ def test_anchors_are_shared_and_keys_with_x_in_front_are_ignored(tmp_path):
 
 
 def test_an_anchor_that_holds_itself_does_not_recurse_for_ever(tmp_path):
-    assert "expected one str, found a list" in refusal(tmp_path, GOOD + "unit: &a [*a]\n")
+    assert "expected one str, found a list" in refusal(
+        tmp_path, GOOD + "unit: &a [*a]\n"
+    )
 
 
 @pytest.mark.parametrize(
-    "word", ["no", "on", "off", "Yes", "true", "null", "~", "3", "1.5", "1e5", "2024-01-01", "1:30", "012"]
+    "word",
+    [
+        "no",
+        "on",
+        "off",
+        "Yes",
+        "true",
+        "null",
+        "~",
+        "3",
+        "1.5",
+        "1e5",
+        "2024-01-01",
+        "1:30",
+        "012",
+    ],
 )
-def test_what_yaml_1_1_reads_as_something_else_is_never_taken_for_a_text(tmp_path, word):
-    if word == "1e5":  # YAML 1.1 reads this one as a text, and so do we where a text is wanted
+def test_what_yaml_1_1_reads_as_something_else_is_never_taken_for_a_text(
+    tmp_path, word
+):
+    if (
+        word == "1e5"
+    ):  # YAML 1.1 reads this one as a text, and so do we where a text is wanted
         assert read(tmp_path, f"name: {word}\nrate_hz: 1\n").name == "1e5"
         return
     message = refusal(tmp_path, f"name: {word}\nrate_hz: 1\n")
@@ -139,7 +172,15 @@ def test_what_yaml_1_1_reads_as_something_else_is_never_taken_for_a_text(tmp_pat
 
 @pytest.mark.parametrize(
     ("word", "value"),
-    [("1e-3", 0.001), ("1E3", 1000.0), ("-2", -2.0), ("+.5", 0.5), ("5.", 5.0), ("0", 0.0), ("1.5e+2", 150.0)],
+    [
+        ("1e-3", 0.001),
+        ("1E3", 1000.0),
+        ("-2", -2.0),
+        ("+.5", 0.5),
+        ("5.", 5.0),
+        ("0", 0.0),
+        ("1.5e+2", 150.0),
+    ],
 )
 def test_a_decimal_number_is_that_number(tmp_path, word, value):
     assert read(tmp_path, f"name: a\nrate_hz: {word}\n").rate_hz == value
@@ -150,7 +191,9 @@ def test_a_decimal_number_is_that_number(tmp_path, word, value):
     ["010", "0x10", "0b11", "0o17", "1:30", "1:30.5", "1_000", ".inf", "-.inf", ".nan", "inf", "nan", "1e999", "'30'", '"30"',
      "yes", "2024-01-01", "٣", "1,5", "~", "''"],
 )  # fmt: skip
-def test_what_is_no_plain_decimal_number_is_refused_where_a_number_is_wanted(tmp_path, word):
+def test_what_is_no_plain_decimal_number_is_refused_where_a_number_is_wanted(
+    tmp_path, word
+):
     message = refusal(tmp_path, f"name: a\nrate_hz: {word}\n")
     assert message.startswith("a.yaml:2: rate_hz: expected float, found ")
     assert "a.yaml:3: inner → count: expected int, found " in refusal(
@@ -160,19 +203,27 @@ def test_what_is_no_plain_decimal_number_is_refused_where_a_number_is_wanted(tmp
     )
 
 
-@pytest.mark.parametrize(("word", "value"), [("true", True), ("no", False), ("on", True), ("OFF", False)])
+@pytest.mark.parametrize(
+    ("word", "value"), [("true", True), ("no", False), ("on", True), ("OFF", False)]
+)
 def test_a_switch_reads_every_yaml_word_for_on_and_off(tmp_path, word, value):
-    assert read(tmp_path, GOOD + f"inner: {{count: 1, flag: {word}}}\n").inner == Inner(count=1, flag=value)
+    assert read(tmp_path, GOOD + f"inner: {{count: 1, flag: {word}}}\n").inner == Inner(
+        count=1, flag=value
+    )
 
 
 @pytest.mark.parametrize("word", ["y", "n", "'true'", "1", "enabled"])
 def test_anything_else_is_no_switch(tmp_path, word):
-    assert "expected bool" in refusal(tmp_path, GOOD + f"inner: {{count: 1, flag: {word}}}\n")
+    assert "expected bool" in refusal(
+        tmp_path, GOOD + f"inner: {{count: 1, flag: {word}}}\n"
+    )
 
 
 def test_an_empty_value_is_nothing_only_where_nothing_is_allowed(tmp_path):
     assert read(tmp_path, GOOD + "note:\n").note is None
-    assert refusal(tmp_path, "name:\nrate_hz: 1\n").startswith("a.yaml:1: name: expected str, found ''")
+    assert refusal(tmp_path, "name:\nrate_hz: 1\n").startswith(
+        "a.yaml:1: name: expected str, found ''"
+    )
 
 
 @pytest.mark.parametrize(
@@ -215,7 +266,9 @@ def test_absurd_values_are_refused_soon_and_in_short(tmp_path, text, expected):
     assert len(message) < 700
 
 
-@pytest.mark.parametrize("text", ["a: " + "1" * 5000, "[" * 20_000, "x" * 300_000, "a: [", "\x1b: 1"])
+@pytest.mark.parametrize(
+    "text", ["a: " + "1" * 5000, "[" * 20_000, "x" * 300_000, "a: [", "\x1b: 1"]
+)
 def test_other_peoples_yaml_has_the_same_bounds(tmp_path, text):
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(SpecError, match=r"a\.yaml: is"):
@@ -224,20 +277,28 @@ def test_other_peoples_yaml_has_the_same_bounds(tmp_path, text):
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path):
     (tmp_path / "nope.yaml").touch()
-    with pytest.raises(SpecError, match=r"none\.yaml: no such file; did you mean 'nope\.yaml'"):
+    with pytest.raises(
+        SpecError, match=r"none\.yaml: no such file; did you mean 'nope\.yaml'"
+    ):
         Document(Outer, tmp_path / "none.yaml")
     with pytest.raises(SpecError, match=r"is a folder; give a file"):
         Document(Outer, tmp_path)
 
 
 def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
-    assert read(tmp_path, b"\xef\xbb\xbfname: pad\r\nrate_hz: 3\r\n") == Outer(name="pad", rate_hz=3.0)
+    assert read(tmp_path, b"\xef\xbb\xbfname: pad\r\nrate_hz: 3\r\n") == Outer(
+        name="pad", rate_hz=3.0
+    )
 
 
 def test_error_points_at_the_closest_parent_that_stands_in_the_file(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text(GOOD + "many:\n  a:\n    count: 1\n")
     document = Document(Outer, path)
-    assert str(document.error("many/a/count", "odd")) == f"{path}:5: many → a → count: odd"
-    assert str(document.error("many/a/kind", "odd")) == f"{path}:4: many → a → kind: odd"
+    assert (
+        str(document.error("many/a/count", "odd")) == f"{path}:5: many → a → count: odd"
+    )
+    assert (
+        str(document.error("many/a/kind", "odd")) == f"{path}:4: many → a → kind: odd"
+    )
     assert str(document.error("shape", "odd")) == f"{path}:1: shape: odd"

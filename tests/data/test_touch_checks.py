@@ -64,7 +64,9 @@ def rewired(episode: Episode, change: Change) -> Episode:
     change(counts.reshape(-1, 4, 32, 12))
     baseline = np.round(np.median(counts[:30], axis=0)).astype(np.int64)
     touch = (counts - baseline).astype(np.int16)
-    return dataclasses.replace(with_arrays(episode, touch=touch), baselines={TOUCH: baseline})
+    return dataclasses.replace(
+        with_arrays(episode, touch=touch), baselines={TOUCH: baseline}
+    )
 
 
 def put(where: tuple, value: object) -> Change:
@@ -73,7 +75,9 @@ def put(where: tuple, value: object) -> Change:
 
 def noise(where: tuple, std: float, mean: float = 0.0) -> Change:
     def change(touch: np.ndarray) -> None:
-        touch[where] = np.random.default_rng(0).normal(mean, std, touch[where].shape).round()
+        touch[where] = (
+            np.random.default_rng(0).normal(mean, std, touch[where].shape).round()
+        )
 
     return change
 
@@ -107,20 +111,30 @@ def good() -> Episode:
 def _one_arm(episode: Episode) -> Episode:
     state, action, _ = copies(episode)
     state[:, 7:], action[:, 7:] = state[0, 7:], action[0, 7:]
-    return touched(with_arrays(episode, state=state, action=action), noise(np.s_[:, 2:], 1.3))
+    return touched(
+        with_arrays(episode, state=state, action=action), noise(np.s_[:, 2:], 1.3)
+    )
 
 
 def _whole_pads(touch: np.ndarray) -> None:
-    strength = touch.max(axis=(2, 3), keepdims=True) * (touch.max(axis=(2, 3), keepdims=True) > 15)
+    strength = touch.max(axis=(2, 3), keepdims=True) * (
+        touch.max(axis=(2, 3), keepdims=True) > 15
+    )
     firmer_at_the_tip = np.linspace(0.6, 1.0, 32)[:, None]
-    touch[:] = strength * firmer_at_the_tip + np.random.default_rng(0).normal(0, 1.5, touch.shape).round()
+    touch[:] = (
+        strength * firmer_at_the_tip
+        + np.random.default_rng(0).normal(0, 1.5, touch.shape).round()
+    )
 
 
 def _hold_together(episode: Episode) -> Episode:
     state, action, _ = copies(episode)
     for values in (state, action):
         values[:, GRIPPER["left"]] = values[:, GRIPPER["right"]]
-    return touched(with_arrays(episode, state=state, action=action), lambda t: np.copyto(t[:, :2], t[:, 2:]))
+    return touched(
+        with_arrays(episode, state=state, action=action),
+        lambda t: np.copyto(t[:, :2], t[:, 2:]),
+    )
 
 
 def _window(episode: Episode) -> Episode:
@@ -134,9 +148,13 @@ def _window(episode: Episode) -> Episode:
 UNUSUAL: dict[str, Callable[[Episode], Episode]] = {
     "one arm works": _one_arm,
     "contact over the whole pad": lambda e: touched(e, _whole_pads),
-    "untouched taxels never change": lambda e: touched(e, lambda t: np.copyto(t, 0, where=np.abs(t) < 12)),
+    "untouched taxels never change": lambda e: touched(
+        e, lambda t: np.copyto(t, 0, where=np.abs(t) < 12)
+    ),
     "grippers hold together": _hold_together,
-    "pads of one gripper exchanged": lambda e: reorder(e, [LEFT_B, LEFT_A, RIGHT_A, RIGHT_B]),
+    "pads of one gripper exchanged": lambda e: reorder(
+        e, [LEFT_B, LEFT_A, RIGHT_A, RIGHT_B]
+    ),
     "no baselines": lambda e: dataclasses.replace(e, baselines={}),
     "windows": _window,
 }
@@ -149,8 +167,12 @@ def test_touch_that_is_merely_unusual_gives_nothing(name: str, seed: int) -> Non
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("changes", [{"part_m": {"left": 0.0, "right": 0.0}}, {"noise_count": 0.0}])
-def test_grippers_that_close_on_nothing_and_twins_without_noise_give_nothing(changes: dict, seed: int) -> None:
+@pytest.mark.parametrize(
+    "changes", [{"part_m": {"left": 0.0, "right": 0.0}}, {"noise_count": 0.0}]
+)
+def test_grippers_that_close_on_nothing_and_twins_without_noise_give_nothing(
+    changes: dict, seed: int
+) -> None:
     assert serious_of(make(seed=seed, **changes)) == []
 
 
@@ -160,7 +182,9 @@ def test_part_held_from_start_to_end_gives_nothing(good: Episode) -> None:
     assert serious_of(dataclasses.replace(good, arrays=arrays, picture_keys=())) == []
 
 
-def test_contact_coverage_is_told_and_of_windows_that_of_the_newest_reading(good: Episode) -> None:
+def test_contact_coverage_is_told_and_of_windows_that_of_the_newest_reading(
+    good: Episode,
+) -> None:
     text = one(good, "contact_coverage").text
     for name in PADS:
         share = pad(good, name).contact.mean()
@@ -176,11 +200,19 @@ def test_soft_part_felt_while_the_gripper_still_closes_gives_nothing() -> None:
         for hold in grip_checks.read_grippers(episode).holds[arm]:  # type: ignore[union-attr]
             rows = np.arange(hold.first, hold.end)
             state[rows, GRIPPER[arm]] += 0.0008 * np.exp(-(rows - hold.first) / 15)
-    assert [f for f in serious_of(with_arrays(episode, state=state)) if f.check == "touch_lag"] == []
+    assert [
+        f
+        for f in serious_of(with_arrays(episode, state=state))
+        if f.check == "touch_lag"
+    ] == []
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("no baselines", "saturation not judged"), ("grippers hold together", "swapped pads")]
+    ("name", "words"),
+    [
+        ("no baselines", "saturation not judged"),
+        ("grippers hold together", "swapped pads"),
+    ],
 )
 def test_what_cannot_be_judged_is_said(good: Episode, name: str, words: str) -> None:
     assert any(words in f.text for f in found(UNUSUAL[name](good), "not_judged"))
@@ -195,17 +227,31 @@ def test_enclosed_taxels_ought_to_show_the_lesser_neighbour() -> None:
     frame[0, 4, [2, 5]] = 60, 40  # two taxels between
     frame[0, 0, [0, 4]] = 90, 90  # three taxels between: may be a hollow of the part
     expected = touch_checks.inside_contact(frame)[0]
-    assert expected[2].tolist() == [0, 0, 50, 0, 0, 0, 0] and expected[4].tolist() == [0, 0, 0, 40, 40, 0, 0]
+    assert expected[2].tolist() == [0, 0, 50, 0, 0, 0, 0] and expected[4].tolist() == [
+        0,
+        0,
+        0,
+        40,
+        40,
+        0,
+        0,
+    ]
     assert expected[0].max() == 0
     corner = np.zeros((1, 6, 6))
     corner[0, 1:5, 1], corner[0, 4, 1:5] = 80, 80
-    assert touch_checks.inside_contact(corner)[0, 3, 2] == 0, "the inner corner of an L is not enclosed"
+    assert touch_checks.inside_contact(corner)[0, 3, 2] == 0, (
+        "the inner corner of an L is not enclosed"
+    )
 
 
 def test_holds_are_where_the_command_passes_a_stalled_state() -> None:
     time_s = np.arange(240) / FPS
-    command = np.interp(time_s, [0, 2, 2.5, 6, 6.5, 8], [0.065, 0.065, 0.015, 0.015, 0.065, 0.065])
-    state = np.maximum(np.interp(time_s - 0.08, time_s, command), 0.025)  # part of 25 mm, met at 2.08 + 0.4 s
+    command = np.interp(
+        time_s, [0, 2, 2.5, 6, 6.5, 8], [0.065, 0.065, 0.015, 0.015, 0.065, 0.065]
+    )
+    state = np.maximum(
+        np.interp(time_s - 0.08, time_s, command), 0.025
+    )  # part of 25 mm, met at 2.08 + 0.4 s
     (hold,) = grip_checks.find_holds(state, command, FPS)
     # 1 mm before the part at 100 mm/s is 10 ms earlier.
     assert hold.stop_s == pytest.approx(2.47, abs=0.02)
@@ -213,7 +259,9 @@ def test_holds_are_where_the_command_passes_a_stalled_state() -> None:
     assert hold.end / FPS == pytest.approx(6.1, abs=0.1)
     assert grip_checks.find_holds(state, state, FPS) == []
     (hold,) = grip_checks.find_holds(np.full(90, 0.02), np.full(90, 0.01), FPS)
-    assert (hold.first, hold.end, hold.stop_s) == (0, 90, None), "a hold from the first row has no stop"
+    assert (hold.first, hold.end, hold.stop_s) == (0, 90, None), (
+        "a hold from the first row has no stop"
+    )
 
 
 # ---- taxels ----
@@ -221,23 +269,35 @@ def test_holds_are_where_the_command_passes_a_stalled_state() -> None:
 
 @pytest.mark.parametrize("value", [0, 20, None])
 @pytest.mark.parametrize("p", range(4))
-def test_dead_taxel_in_a_contact_is_found(good: Episode, p: int, value: int | None) -> None:
+def test_dead_taxel_in_a_contact_is_found(
+    good: Episode, p: int, value: int | None
+) -> None:
     """Also one that still shows noise (None): its neighbours feel the part."""
     r, c = deepest(good, p)
     where = np.s_[:, p, r, c]
-    finding = one(touched(good, noise(where, 1.5)) if value is None else rewired(good, put(where, value)), "dead_taxel")
+    finding = one(
+        touched(good, noise(where, 1.5))
+        if value is None
+        else rewired(good, put(where, value)),
+        "dead_taxel",
+    )
     assert finding.severity == "warning"
     assert finding.text.startswith(PADS[p])
     assert f"1 taxel (row, column): ({r}, {c}):" in finding.text
 
 
 @pytest.mark.parametrize("value", [60, 120, 200])
-def test_taxel_stuck_from_the_start_is_found_although_the_baseline_hides_it(good: Episode, value: int) -> None:
+def test_taxel_stuck_from_the_start_is_found_although_the_baseline_hides_it(
+    good: Episode, value: int
+) -> None:
     episode = rewired(good, put(np.s_[:, LEFT_B, 20, 3], value))
     assert (episode.arrays[TOUCH].reshape(-1, 4, 32, 12)[:, LEFT_B, 20, 3] == 0).all()
     [finding] = serious_of(episode)
     assert (finding.check, finding.severity) == ("stuck_taxel", "warning")
-    assert f"left_b: stuck at {value} counts on the wire, 1 taxel (row, column): (20, 3)" in finding.text
+    assert (
+        f"left_b: stuck at {value} counts on the wire, 1 taxel (row, column): (20, 3)"
+        in finding.text
+    )
 
 
 def _constantly_touched(touch: np.ndarray) -> None:
@@ -279,14 +339,24 @@ def test_a_planted_fault_is_the_only_thing_found(good: Episode, name: str) -> No
 
 def _weak(episode: Episode) -> Episode:
     r, c = deepest(episode, RIGHT_A)
-    return touched(episode, lambda touch: touch.__setitem__(np.s_[:, RIGHT_A, r, c], touch[:, RIGHT_A, r, c] // 3))
+    return touched(
+        episode,
+        lambda touch: touch.__setitem__(
+            np.s_[:, RIGHT_A, r, c], touch[:, RIGHT_A, r, c] // 3
+        ),
+    )
 
 
 def _ring(touch: np.ndarray) -> None:
     """With a hole of three taxels."""
     touch[:, LEFT_A] = np.where(np.arange(len(touch))[:, None, None] % 360 > 150, 60, 0)
     touch[:, LEFT_A, 15:18, 5:8] = 0
-    touch[:, LEFT_A] += np.random.default_rng(0).normal(0, 1.5, touch[:, LEFT_A].shape).round().astype(np.int16)
+    touch[:, LEFT_A] += (
+        np.random.default_rng(0)
+        .normal(0, 1.5, touch[:, LEFT_A].shape)
+        .round()
+        .astype(np.int16)
+    )
 
 
 def _residue(touch: np.ndarray) -> None:
@@ -302,7 +372,9 @@ def _residue(touch: np.ndarray) -> None:
         (lambda e: touched(e, _residue), "baseline_drift", ""),
     ],
 )
-def test_what_resembles_a_fault_is_none(good: Episode, plant: Callable, check: str, words: str) -> None:
+def test_what_resembles_a_fault_is_none(
+    good: Episode, plant: Callable, check: str, words: str
+) -> None:
     assert not [f for f in found(plant(good), check) if words in f.text]
 
 
@@ -313,7 +385,9 @@ def test_stuck_taxel_is_no_contact(good: Episode) -> None:
 
 
 @pytest.mark.parametrize(("factor", "severity"), [(1.0, None), (4.0, "warning")])
-def test_contact_beyond_the_wire_is_saturated(good: Episode, factor: float, severity: str | None) -> None:
+def test_contact_beyond_the_wire_is_saturated(
+    good: Episode, factor: float, severity: str | None
+) -> None:
     baseline = good.baselines[TOUCH]
     touch = np.minimum(good.arrays[TOUCH] * factor, 255 - baseline).astype(np.int16)
     findings = found(with_arrays(good, touch=touch), "saturated")
@@ -327,10 +401,16 @@ def test_a_few_saturated_rows_are_a_note(good: Episode) -> None:
     assert (finding.severity, finding.rows) == ("note", (200, 203))
 
 
-@pytest.mark.parametrize(("std", "is_found"), [(2.0, False), (4.5, False), (5.5, True), (12.0, True)])
-def test_noise_above_a_third_of_the_sensors_noise_count_is_found(std: float, is_found: bool) -> None:
+@pytest.mark.parametrize(
+    ("std", "is_found"), [(2.0, False), (4.5, False), (5.5, True), (12.0, True)]
+)
+def test_noise_above_a_third_of_the_sensors_noise_count_is_found(
+    std: float, is_found: bool
+) -> None:
     episode = make(seed=8, noise_count=std)  # noise_count 15: 5 counts
-    assert {f.text.split(":")[0] for f in found(episode, "noisy_pad")} == (set(PADS) if is_found else set())
+    assert {f.text.split(":")[0] for f in found(episode, "noisy_pad")} == (
+        set(PADS) if is_found else set()
+    )
 
 
 # ---- drift ----
@@ -343,15 +423,27 @@ def test_drift_is_found_above_five_counts_an_episode(rate: float) -> None:
     if abs(rate) < 0.5:
         assert findings == []
     else:
-        assert f"{rate:+.2f} counts/s" in findings[0].text or f"{rate * 1.01:+.2f} counts/s" in findings[0].text
+        assert (
+            f"{rate:+.2f} counts/s" in findings[0].text
+            or f"{rate * 1.01:+.2f} counts/s" in findings[0].text
+        )
         assert all(name in findings[0].text for name in PADS)
 
 
 @pytest.mark.parametrize(("step", "is_found"), [(1.5, False), (4.0, True)])
 def test_drift_between_episodes_is_found(step: float, is_found: bool) -> None:
-    episodes = [make(seed=k, duration_s=8.0) for k in range(3)]  # 3 or 8 counts from the first to the last
-    episodes = [with_arrays(e, touch=e.arrays[TOUCH] + np.int16(round(k * step))) for k, e in enumerate(episodes)]
-    texts = [f.text for f in check_recording_episodes(episodes) if f.check == "baseline_drift"]
+    episodes = [
+        make(seed=k, duration_s=8.0) for k in range(3)
+    ]  # 3 or 8 counts from the first to the last
+    episodes = [
+        with_arrays(e, touch=e.arrays[TOUCH] + np.int16(round(k * step)))
+        for k, e in enumerate(episodes)
+    ]
+    texts = [
+        f.text
+        for f in check_recording_episodes(episodes)
+        if f.check == "baseline_drift"
+    ]
     assert bool(texts) == is_found
     assert all("synthetic 0" in text and "synthetic 2" in text for text in texts)
 
@@ -367,7 +459,9 @@ def test_drift_between_episodes_is_found(step: float, is_found: bool) -> None:
         ([LEFT_A, RIGHT_A, LEFT_B, RIGHT_B], {"left_b", "right_a"}),
     ],
 )
-def test_pads_of_the_other_arm_are_an_error(good: Episode, order: list[int], named: set[str]) -> None:
+def test_pads_of_the_other_arm_are_an_error(
+    good: Episode, order: list[int], named: set[str]
+) -> None:
     finding = one(reorder(good, order), "swapped_pads")
     assert finding.severity == "error"
     assert {name for name in PADS if name in finding.text} == named
@@ -376,13 +470,20 @@ def test_pads_of_the_other_arm_are_an_error(good: Episode, order: list[int], nam
 def test_swap_is_seen_when_one_arm_alone_holds() -> None:
     episode = make(seed=13, part_m={"left": 0.0, "right": 0.02})
     assert serious_of(episode) == []
-    assert one(reorder(episode, [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B]), "swapped_pads").severity == "error"
+    assert (
+        one(
+            reorder(episode, [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B]), "swapped_pads"
+        ).severity
+        == "error"
+    )
 
 
 def test_exchanged_arms_show_as_exchanged_pads(good: Episode) -> None:
     """State and command both from the other arm: only touch can tell."""
     state, action, _ = copies(good)
-    episode = with_arrays(good, state=np.roll(state, 7, axis=1), action=np.roll(action, 7, axis=1))
+    episode = with_arrays(
+        good, state=np.roll(state, 7, axis=1), action=np.roll(action, 7, axis=1)
+    )
     assert one(episode, "swapped_pads").severity == "error"
 
 
@@ -393,9 +494,14 @@ def test_unplugged_pad_is_found(good: Episode, p: int) -> None:
     assert [name for name in PADS if name in finding.text] == [PADS[p]]
 
 
-@pytest.mark.parametrize(("clock_s", "is_found"), [(0, False), (0.05, False), (0.25, True), (0.6, True), (-0.25, True)])
+@pytest.mark.parametrize(
+    ("clock_s", "is_found"),
+    [(0, False), (0.05, False), (0.25, True), (0.6, True), (-0.25, True)],
+)
 def test_touch_on_another_clock_is_found(clock_s: float, is_found: bool) -> None:
-    findings = found(make(seed=14, touch_clock_s=dict.fromkeys(PADS, clock_s)), "touch_lag")
+    findings = found(
+        make(seed=14, touch_clock_s=dict.fromkeys(PADS, clock_s)), "touch_lag"
+    )
     assert bool(findings) == is_found
     for finding in findings:
         assert finding.severity == "warning"
@@ -406,15 +512,22 @@ def test_touch_on_another_clock_is_found(clock_s: float, is_found: bool) -> None
 @pytest.mark.parametrize("late", [0.03, 0.2, 0.4])
 def test_one_pad_on_another_clock_is_named(late: float) -> None:
     findings = found(make(seed=15, touch_clock_s={"right_b": late}), "pad_lag")
-    assert [f.text.startswith("right_b feels everything 0.") for f in findings] == [True] * (late > 0.1)
+    assert [f.text.startswith("right_b feels everything 0.") for f in findings] == [
+        True
+    ] * (late > 0.1)
 
 
 def test_short_stretches_of_presses_show_no_pad_late() -> None:
     for seed in (22, 24, 26):
         arrays = make(seed=seed).arrays
         for first in range(124, 249, 31):
-            state, action, touch = (arrays[key][first : first + 63] for key in (STATE, ACTION, TOUCH))
-            assert not found(with_arrays(make(seed=seed), state=state, action=action, touch=touch), "pad_lag")
+            state, action, touch = (
+                arrays[key][first : first + 63] for key in (STATE, ACTION, TOUCH)
+            )
+            assert not found(
+                with_arrays(make(seed=seed), state=state, action=action, touch=touch),
+                "pad_lag",
+            )
 
 
 def test_lag_of_a_whole_recording_is_judged_without_a_rows_slack() -> None:
@@ -428,8 +541,12 @@ def test_wrong_joints_leave_touch_against_grippers_unjudged(good: Episode) -> No
     state, _, _ = copies(good)
     state[:, GRIPPER["left"]] *= 1000
     findings = check_episode(with_arrays(good, state=state), pictures=False)
-    assert not any(f.check in ("touch_lag", "swapped_pads", "noise_only") for f in findings)
-    assert any(f.check == "not_judged" and "touch against grippers" in f.text for f in findings)
+    assert not any(
+        f.check in ("touch_lag", "swapped_pads", "noise_only") for f in findings
+    )
+    assert any(
+        f.check == "not_judged" and "touch against grippers" in f.text for f in findings
+    )
 
 
 # ---- how often faults are found ----
@@ -442,30 +559,61 @@ def _stuck(seed: int) -> Episode:
 
 def _saturated(seed: int) -> Episode:
     touch = np.minimum(on_wire(base(seed)) * 4, 255).reshape(base(seed).num_rows, -1)
-    return with_arrays(base(seed), touch=touch - base(seed).baselines[TOUCH].astype(np.int16))
+    return with_arrays(
+        base(seed), touch=touch - base(seed).baselines[TOUCH].astype(np.int16)
+    )
 
 
 FAULTS: dict[str, tuple[str, Callable[[int], Episode]]] = {
-    "taxel dead": ("dead_taxel", lambda s: rewired(base(s), put(np.s_[:, RIGHT_A, *deepest(base(s), RIGHT_A)], 0))),
+    "taxel dead": (
+        "dead_taxel",
+        lambda s: rewired(
+            base(s), put(np.s_[:, RIGHT_A, *deepest(base(s), RIGHT_A)], 0)
+        ),
+    ),
     "taxel stuck": ("stuck_taxel", _stuck),
     "saturated": ("saturated", _saturated),
-    "arms swapped": ("swapped_pads", lambda s: reorder(base(s), [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B])),
-    "one pad swapped": ("swapped_pads", lambda s: reorder(base(s), [RIGHT_A, LEFT_B, LEFT_A, RIGHT_B])),
+    "arms swapped": (
+        "swapped_pads",
+        lambda s: reorder(base(s), [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B]),
+    ),
+    "one pad swapped": (
+        "swapped_pads",
+        lambda s: reorder(base(s), [RIGHT_A, LEFT_B, LEFT_A, RIGHT_B]),
+    ),
     "noise only": (
         "noise_only",
-        lambda s: touched(base(s), noise(np.s_[:], np.random.default_rng(s).uniform(0.5, 20))),
+        lambda s: touched(
+            base(s), noise(np.s_[:], np.random.default_rng(s).uniform(0.5, 20))
+        ),
     ),
-    "touch late": ("touch_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, 0.3))),
-    "touch early": ("touch_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, -0.3))),
-    "one pad late": ("pad_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s={"left_a": 0.25})),
-    "drift": ("baseline_drift", lambda s: make(seed=s, duration_s=8.0, drift_count_per_s=1.0)),
+    "touch late": (
+        "touch_lag",
+        lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, 0.3)),
+    ),
+    "touch early": (
+        "touch_lag",
+        lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, -0.3)),
+    ),
+    "one pad late": (
+        "pad_lag",
+        lambda s: make(seed=s, duration_s=8.0, touch_clock_s={"left_a": 0.25}),
+    ),
+    "drift": (
+        "baseline_drift",
+        lambda s: make(seed=s, duration_s=8.0, drift_count_per_s=1.0),
+    ),
     "noisy": ("noisy_pad", lambda s: make(seed=s, duration_s=8.0, noise_count=7.0)),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
-@pytest.mark.parametrize("num_episodes", [FEW_SEEDS, pytest.param(NUM_SEEDS, marks=pytest.mark.slow)])
-def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name: str, num_episodes: int) -> None:
+@pytest.mark.parametrize(
+    "num_episodes", [FEW_SEEDS, pytest.param(NUM_SEEDS, marks=pytest.mark.slow)]
+)
+def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(
+    name: str, num_episodes: int
+) -> None:
     check, fault = FAULTS[name]
     hits = sum(bool(serious(found(fault(seed), check))) for seed in range(num_episodes))
     assert hits >= 0.95 * num_episodes, f"{hits} of {num_episodes}"

@@ -17,7 +17,9 @@ NOISE_RAD = 2e-4
 NOISE_NM = 0.05
 
 
-def quick(name: str, hz: tuple[float, float], off: float = 0.0, repeat_of: str | None = None) -> Motion:
+def quick(
+    name: str, hz: tuple[float, float], off: float = 0.0, repeat_of: str | None = None
+) -> Motion:
     """A chirp that lasts 4 s, with 0.5 s of rest before and after it. It has at most half as many rows as the library's
     motions. ``hz``: lowest and highest frequency [Hz]. ``off``: distance of the chirp from the middle of the joint's range, in
     amplitudes of the chirp."""
@@ -48,10 +50,15 @@ def recorded(
     """One motion of the library. ``stated``: its commanded gains are written down; else only by what factor they differ from
     the usual ones. ``effort``: it was recorded."""
     ground = arm_ground(config, signal, rest_pose(signal, None))
-    m = ground.commanded(motion.name, ground.positions(motion), motion.gain, motion.payload_kg)
+    m = ground.commanded(
+        motion.name, ground.positions(motion), motion.gain, motion.payload_kg
+    )
     model, seen = JointModel(config, signal), joint_motion(m, config, signal)
     # A robot has been at rest for long: where K_p (q* − q) + T_ref = 0.
-    rest = dataclasses.replace(seen, start=seen.target[0] + model.gains.torque_ff / (motion.gain * model.gains.kp))
+    rest = dataclasses.replace(
+        seen,
+        start=seen.target[0] + model.gains.torque_ff / (motion.gain * model.gains.kp),
+    )
     answer, rng = model.simulate(rest, model.gains), np.random.default_rng([seed, 77])
     j = m.column(signal)
     measured = m.measured + noise_rad * rng.standard_normal(m.measured.shape)

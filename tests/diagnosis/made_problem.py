@@ -6,7 +6,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, WithoutMaps, candidate
+from taccorl.diagnosis.search.problem import (
+    Candidate,
+    Free,
+    Recording,
+    WithoutMaps,
+    candidate,
+)
 from taccorl.sim.effects.effect import Effect, number
 
 RATE_HZ = 200.0
@@ -41,10 +47,15 @@ class Ripple(Added):
 
 
 def kind(
-    name: str, signal: Callable[[np.ndarray, int], np.ndarray], base: type[Added] = Ripple, **more: Any
+    name: str,
+    signal: Callable[[np.ndarray, int], np.ndarray],
+    base: type[Added] = Ripple,
+    **more: Any,
 ) -> type[Added]:
     """A new effect class called ``name``: it adds ``signal(times, seed)`` (T,) to a trace, and has the parameters of ``base``."""
-    return dataclass(kw_only=True)(type(name, (base,), {"name": name, "signal": staticmethod(signal)} | more))
+    return dataclass(kw_only=True)(
+        type(name, (base,), {"name": name, "signal": staticmethod(signal)} | more)
+    )
 
 
 Bump = kind("bump", lambda t, seed: np.exp(-(((t - 0.6) / 0.1) ** 2)))
@@ -76,7 +87,9 @@ class Squire(Square):
         return Square.signal(t, seed) + 0.001 * np.sin(7.0 * t)
 
 
-Hidden = kind("hidden", lambda t, seed: drive(t, seed))  # As what the gain does: no recording shows it
+Hidden = kind(
+    "hidden", lambda t, seed: drive(t, seed)
+)  # As what the gain does: no recording shows it
 
 
 def drive(t: np.ndarray, seed: int) -> np.ndarray:
@@ -93,9 +106,13 @@ class MadeProblem(WithoutMaps):
     )
 
     def __init__(self, *classes: type[Added]) -> None:
-        self.candidates: dict[str, Candidate] = {cls.name: candidate(cls, {}) for cls in classes}
+        self.candidates: dict[str, Candidate] = {
+            cls.name: candidate(cls, {}) for cls in classes
+        }
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+    def simulate(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+    ) -> np.ndarray:
         t, seed = recording.time_s, recording.data
         total = base["gain"] * drive(t, seed) + base["offset"]
         for effect in effects:
@@ -117,5 +134,10 @@ def record(
     for effect in effects:
         total = total + vars(effect)["strength"] * effect.signal(t, seed)
     return Recording(
-        name=f"made {seed}", time_s=t, measured=total[:, None], floor=np.array([noise]), channels=("it [1]",), data=seed
+        name=f"made {seed}",
+        time_s=t,
+        measured=total[:, None],
+        floor=np.array([noise]),
+        channels=("it [1]",),
+        data=seed,
     )

@@ -44,7 +44,10 @@ def touch(time_s: float) -> np.ndarray:
     """(16, 16) counts of both pads: a bump at row 4, column 10 that grows while the gripper closes below 20 mm."""
     rows, columns = np.mgrid[:16, :16]
     press = np.clip((0.02 - joints(time_s)[5]) / 0.01, 0.0, 1.0)
-    return np.round(REST_COUNT + PEAK_COUNT * press * np.exp(-((rows - 4) ** 2 + (columns - 10) ** 2) / 8.0))
+    return np.round(
+        REST_COUNT
+        + PEAK_COUNT * press * np.exp(-((rows - 4) ** 2 + (columns - 10) ** 2) / 8.0)
+    )
 
 
 def record(path: Path) -> Path:
@@ -52,16 +55,32 @@ def record(path: Path) -> Path:
     messages = []
     for k in range(round(DURATION_S * 100)):
         for topic, lag_s in (("/arm/joint_states", 0.05), ("/arm/joint_commands", 0.0)):
-            messages.append((k * 10_000_000, topic, {"name": NAMES, "position": joints(k / 100 - lag_s).tolist()}))
+            messages.append(
+                (
+                    k * 10_000_000,
+                    topic,
+                    {"name": NAMES, "position": joints(k / 100 - lag_s).tolist()},
+                )
+            )
     for k in range(round(DURATION_S * 50)):
         for topic in ("/touch/inner", "/touch/outer"):
             data = touch(k / 50).astype(np.uint8).tobytes()
-            messages.append((k * 20_000_000, topic, {"layout": {"dim": [], "data_offset": 0}, "data": data}))
+            messages.append(
+                (
+                    k * 20_000_000,
+                    topic,
+                    {"layout": {"dim": [], "data_offset": 0}, "data": data},
+                )
+            )
     for k in range(round(DURATION_S * 30)):
         picture = np.full((96, 128, 3), 3 * (k % 60), np.uint8)
-        cv2.putText(picture, str(k), (10, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.5, (255, 255, 255), 3)
+        cv2.putText(
+            picture, str(k), (10, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.5, (255, 255, 255), 3
+        )
         data = cv2.imencode(".jpg", picture)[1].tobytes()
-        messages.append((k * 10**9 // 30, "/cam/image/compressed", {"format": "jpeg", "data": data}))
+        messages.append(
+            (k * 10**9 // 30, "/cam/image/compressed", {"format": "jpeg", "data": data})
+        )
     with path.open("wb") as file:
         writer = Writer(file)
         kinds = {
@@ -71,11 +90,16 @@ def record(path: Path) -> Path:
         }
         for after_ns, topic, message in sorted(messages, key=lambda m: m[0]):
             time_ns = START_NS + after_ns
-            stamp = {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": ""}
+            stamp = {
+                "stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9},
+                "frame_id": "",
+            }
             filled = message | ({"header": stamp} if "layout" not in message else {})
             if "name" in message:
                 filled |= {"velocity": [], "effort": []}
-            writer.write_message(topic, kinds[topic.split("/")[1]], filled, time_ns, time_ns)
+            writer.write_message(
+                topic, kinds[topic.split("/")[1]], filled, time_ns, time_ns
+            )
         writer.finish()
     return path
 
@@ -93,7 +117,11 @@ def fill_in(folder: Path) -> None:
         "gain_per_count": "0.01",
     }
     for path in folder.glob("mine*.yaml"):
-        path.write_text(re.sub(r"(\w+): TODO\b", lambda m: f"{m[1]}: {told[m[1]]}", path.read_text()))
+        path.write_text(
+            re.sub(
+                r"(\w+): TODO\b", lambda m: f"{m[1]}: {told[m[1]]}", path.read_text()
+            )
+        )
 
 
 @pytest.fixture(scope="module")
@@ -101,17 +129,28 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recorded, inspected, ingested."""
     folder = tmp_path_factory.mktemp("another_robot")
     recording = record(folder / "squeeze.mcap")
-    assert main(["ingest", "inspect", str(recording), f"--draft={folder / 'mine.yaml'}"]) == 0
-    assert {p.name for p in folder.glob("*.yaml")} == {"mine.yaml", "mine_dataset.yaml", "mine_sensor.yaml"}
+    assert (
+        main(["ingest", "inspect", str(recording), f"--draft={folder / 'mine.yaml'}"])
+        == 0
+    )
+    assert {p.name for p in folder.glob("*.yaml")} == {
+        "mine.yaml",
+        "mine_dataset.yaml",
+        "mine_sensor.yaml",
+    }
     fill_in(folder)
     where = [f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
-    assert main(["ingest", str(recording), f"--spec={folder / 'mine.yaml'}", *where]) == 0
+    assert (
+        main(["ingest", str(recording), f"--spec={folder / 'mine.yaml'}", *where]) == 0
+    )
     return folder / "out"
 
 
 def test_its_recording_becomes_a_dataset_with_its_own_joints_and_pads(dataset, capsys):
     there = Dataset(dataset)
-    assert there.spec.features["observation.state"].names == tuple(f"{name}.pos" for name in NAMES)
+    assert there.spec.features["observation.state"].names == tuple(
+        f"{name}.pos" for name in NAMES
+    )
     assert there.spec.features["observation.tactile"].shape == (2 * 16 * 16,)
     episode = there.episode(0)
     at_s = (episode.start_ns - START_NS) * 1e-9 + episode.time_s
@@ -121,7 +160,10 @@ def test_its_recording_becomes_a_dataset_with_its_own_joints_and_pads(dataset, c
     assert np.abs(pads - expected[:, None]).max() <= 61
     held = at_s > 2.1
     assert held.sum() > 20 and (pads[held] == expected[held][:, None]).all()
-    assert np.unravel_index(pads[-1, 0].argmax(), (16, 16)) == (4, 10)  # neither transposed nor exchanged
+    assert np.unravel_index(pads[-1, 0].argmax(), (16, 16)) == (
+        4,
+        10,
+    )  # neither transposed nor exchanged
     main(["check", str(dataset)])
     said = capsys.readouterr().out
     assert "touch_inner" in said and "touch_outer" in said and "error" not in said
@@ -137,15 +179,23 @@ def test_its_episode_is_drawn_with_its_own_pads(dataset, tmp_path):
 
 def test_what_the_twin_or_a_cut_file_has_nothing_for_is_said(dataset, tmp_path, capsys):
     (tmp_path / "twin.yaml").write_text("effects: []\n")
-    words = [str(dataset), f"--against={tmp_path / 'twin.yaml'}", f"--save={tmp_path / 'x.rrd'}"]
+    words = [
+        str(dataset),
+        f"--against={tmp_path / 'twin.yaml'}",
+        f"--save={tmp_path / 'x.rrd'}",
+    ]
     assert main(["view", *words]) == 2
     said = capsys.readouterr().err
     assert "two PiPER arms" in said and "14 targets" in said and "has 6" in said
-    (tmp_path / "cut.mcap").write_bytes((dataset.parent / "squeeze.mcap").read_bytes()[:3000])
+    (tmp_path / "cut.mcap").write_bytes(
+        (dataset.parent / "squeeze.mcap").read_bytes()[:3000]
+    )
     spec = dataset.parent / "mine.yaml"
     where = [f"--out={tmp_path / 'out'}", f"--store={tmp_path / 'store'}"]
     assert main(["ingest", str(tmp_path / "cut.mcap"), f"--spec={spec}", *where]) == 1
-    assert "cut.mcap bytes" in capsys.readouterr().out  # where it is damaged, not that it names no topics
+    assert (
+        "cut.mcap bytes" in capsys.readouterr().out
+    )  # where it is damaged, not that it names no topics
 
 
 @pytest.mark.slow
@@ -154,7 +204,9 @@ def test_the_tactile_policy_is_trained_on_it_and_gives_its_actions(dataset, tmp_
     import torch
     from lerobot.policies.factory import make_pre_post_processors
 
-    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+    from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
+        TactilePI05Config,
+    )
     from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
     words = [
@@ -172,7 +224,13 @@ def test_the_tactile_policy_is_trained_on_it_and_gives_its_actions(dataset, tmp_
     ]
     words += ["--num_workers=0", f"--output_dir={tmp_path / 'run'}"]
     train = [str(Path(sys.executable).with_name("lerobot-train")), *words]
-    done = subprocess.run(train, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"}, timeout=500)
+    done = subprocess.run(
+        train,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        timeout=500,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
 
     folder = tmp_path / "run/checkpoints/last/pretrained_model"
@@ -181,11 +239,21 @@ def test_the_tactile_policy_is_trained_on_it_and_gives_its_actions(dataset, tmp_
     before, after = make_pre_post_processors(policy.config, str(folder))
     episode = Dataset(dataset).episode(0)
     row = episode.num_rows - 1
-    [picture] = [p["observation.images.cam_image"] for k, p in enumerate(episode.pictures()) if k == row]
+    [picture] = [
+        p["observation.images.cam_image"]
+        for k, p in enumerate(episode.pictures())
+        if k == row
+    ]
     observation = {
-        "observation.state": torch.from_numpy(episode.arrays["observation.state"][[row]]),
-        "observation.tactile": torch.from_numpy(episode.arrays["observation.tactile"][[row]]),
-        "observation.images.cam_image": torch.from_numpy(picture / 255.0).float().permute(2, 0, 1)[None],
+        "observation.state": torch.from_numpy(
+            episode.arrays["observation.state"][[row]]
+        ),
+        "observation.tactile": torch.from_numpy(
+            episode.arrays["observation.tactile"][[row]]
+        ),
+        "observation.images.cam_image": torch.from_numpy(picture / 255.0)
+        .float()
+        .permute(2, 0, 1)[None],
         "task": ["squeeze the ball"],
     }
     action = after(policy.select_action(before(observation)))

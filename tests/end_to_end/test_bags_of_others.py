@@ -10,7 +10,9 @@ from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 
 BAGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "bags"
-pytestmark = pytest.mark.skipif(not BAGS.is_dir(), reason=f"no bags of others at {BAGS}")
+pytestmark = pytest.mark.skipif(
+    not BAGS.is_dir(), reason=f"no bags of others at {BAGS}"
+)
 
 DATASET_SPEC = """
 spec_version: 1
@@ -46,7 +48,10 @@ IMU = "plotjuggler_imu_db3"
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("rosbag2_tests_mcap/bag_with_topics_and_service_events", ("/test_topic1", "/test_service1/_service_event")),
+        (
+            "rosbag2_tests_mcap/bag_with_topics_and_service_events",
+            ("/test_topic1", "/test_service1/_service_event"),
+        ),
         ("rosbag2_tests_mcap/cdr_test", ("/array_topic", "/test_topic")),
         ("rosbag2_tests_mcap/wrong_rmw_test", ("/array_topic", "wrong_format")),
         ("rosbag2_wbag_split", ("AAA", "HHH")),
@@ -54,7 +59,9 @@ IMU = "plotjuggler_imu_db3"
         (IMU, ("/imu", "/battery", "/pose")),
     ],
 )
-def test_inspect_describes_every_one(name: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_describes_every_one(
+    name: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["ingest", "inspect", str(BAGS / name)]) == 0
     printed = capsys.readouterr().out
     for word in (*words, "reader:"):
@@ -67,7 +74,13 @@ def test_a_real_imu_bag_becomes_a_dataset_with_its_own_values(tmp_path: Path) ->
     spec = tmp_path / "imu.yaml"
     spec.write_text(RECORDING_SPEC)
     out = tmp_path / "out"
-    words = ["ingest", str(BAGS / IMU), f"--spec={spec}", f"--out={out}", f"--store={tmp_path / 'store'}"]
+    words = [
+        "ingest",
+        str(BAGS / IMU),
+        f"--spec={spec}",
+        f"--out={out}",
+        f"--store={tmp_path / 'store'}",
+    ]
     code = main(words)
     report = json.loads((tmp_path / "out.ingest_report.json").read_text())
     entry = report["recordings"][0]
@@ -80,11 +93,15 @@ def test_a_real_imu_bag_becomes_a_dataset_with_its_own_values(tmp_path: Path) ->
     with AnyReader([BAGS / IMU], default_typestore=get_typestore(Stores.LATEST)) as bag:
         found = [
             (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, m.angular_velocity.z)
-            for c, _, raw in bag.messages([c for c in bag.connections if c.topic == "/imu"])
+            for c, _, raw in bag.messages(
+                [c for c in bag.connections if c.topic == "/imu"]
+            )
             for m in [bag.deserialize(raw, c.msgtype)]
         ]
     stamps, values = np.array([s for s, _ in found]), np.array([v for _, v in found])
     for row in (0, 17, episode.num_rows - 1):
         at = episode.start_ns + round(row * 1e9 / 20)
         newest = np.searchsorted(stamps, at, side="right") - 1
-        assert episode.arrays["observation.state"][row, 2] == pytest.approx(values[newest], rel=1e-6)
+        assert episode.arrays["observation.state"][row, 2] == pytest.approx(
+            values[newest], rel=1e-6
+        )

@@ -23,7 +23,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 SECONDS, SEED = 4.0, 7
 FAULTY_SECONDS = 8.0  # In 8 s the grippers close one after the other, so that exchanged arms and pads can be told apart
 CAMERAS = (96, 128)
-BASE = StandInConfig(duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024)
+BASE = StandInConfig(
+    duration_s=SECONDS, seed=SEED, camera_size=CAMERAS, chunk_size_bytes=96 * 1024
+)
 
 
 def middle_chunk(path: Path) -> tuple[int, int]:
@@ -32,7 +34,17 @@ def middle_chunk(path: Path) -> tuple[int, int]:
     with path.open("rb") as file:
         for record in StreamReader(file, emit_chunks=True).records:
             if isinstance(record, Chunk):
-                size = 9 + 8 + 8 + 8 + 4 + 4 + len(record.compression) + 8 + len(record.data)
+                size = (
+                    9
+                    + 8
+                    + 8
+                    + 8
+                    + 4
+                    + 4
+                    + len(record.compression)
+                    + 8
+                    + len(record.data)
+                )
                 found.append((file.tell() - size, size))
     return found[len(found) // 2]
 
@@ -71,9 +83,21 @@ FROM_BYTES: dict[str, tuple[Callable[[Path], bytes], str, tuple[str, ...]]] = {
     "flipped_chunk_length": (flipped_length, "split", ("record header",)),
     "zeroed_page": (zeroed_page, "split", ("chunk lost",)),
     # only the index at the end is gone: every message is there
-    "no_footer": (lambda p: p.read_bytes()[:-200], "written", ("nothing lost", "no index")),
-    "no_end_magic": (lambda p: p.read_bytes()[:-8], "written", ("nothing lost", "no index")),
-    "wrong_schema": (wrong_schema, "refused", ("/joint_states_left", "PoseStamped", "JointState")),
+    "no_footer": (
+        lambda p: p.read_bytes()[:-200],
+        "written",
+        ("nothing lost", "no index"),
+    ),
+    "no_end_magic": (
+        lambda p: p.read_bytes()[:-8],
+        "written",
+        ("nothing lost", "no index"),
+    ),
+    "wrong_schema": (
+        wrong_schema,
+        "refused",
+        ("/joint_states_left", "PoseStamped", "JointState"),
+    ),
     "empty": (lambda p: b"", "refused", ("empty",)),
     "only_magic": (lambda p: p.read_bytes()[:8], "refused", ("/joint_states_left",)),
     "wrong_first_byte": (
@@ -81,7 +105,11 @@ FROM_BYTES: dict[str, tuple[Callable[[Path], bytes], str, tuple[str, ...]]] = {
         "written",
         ("nothing lost", "not the beginning of an MCAP file"),
     ),
-    "garbage": (lambda p: random.Random(0).randbytes(50_000), "refused", ("not an MCAP",)),
+    "garbage": (
+        lambda p: random.Random(0).randbytes(50_000),
+        "refused",
+        ("not an MCAP",),
+    ),
 }
 FROM_CONFIG: dict[str, tuple[dict[str, Any], str, tuple[str, ...]]] = {
     "degrees": ({"joints_in_degrees": True}, "quarantined", ("degrees?", "left_joint")),
@@ -97,7 +125,11 @@ FROM_CONFIG: dict[str, tuple[dict[str, Any], str, tuple[str, ...]]] = {
         "refused",
         ("/camera_f", "latency_s"),
     ),
-    "gap": ({"gap": [("/camera_l/color/image_raw/compressed", 1.8, 2.3)]}, "split", ("left_wrist",)),
+    "gap": (
+        {"gap": [("/camera_l/color/image_raw/compressed", 1.8, 2.3)]},
+        "split",
+        ("left_wrist",),
+    ),
 }
 
 
@@ -112,41 +144,65 @@ def ingested(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     for name, (make, _, _) in FROM_BYTES.items():
         (inputs / f"{name}.mcap").write_bytes(make(base))
     for name, (faults, _, _) in FROM_CONFIG.items():
-        config = StandInConfig(duration_s=FAULTY_SECONDS, seed=SEED, camera_size=CAMERAS, **faults)
+        config = StandInConfig(
+            duration_s=FAULTY_SECONDS, seed=SEED, camera_size=CAMERAS, **faults
+        )
         write_mcap(inputs / f"{name}.mcap", config)
     before = {p.name: p.read_bytes() for p in inputs.iterdir()}
-    command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(inputs), "--spec=piper_flexitac_mcap"]
+    command = [
+        sys.executable,
+        "-m",
+        "taccorl.cli.main",
+        "ingest",
+        str(inputs),
+        "--spec=piper_flexitac_mcap",
+    ]
     command += [f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1500)
-    assert {p.name: p.read_bytes() for p in inputs.iterdir()} == before, "an original was touched"
+    assert {p.name: p.read_bytes() for p in inputs.iterdir()} == before, (
+        "an original was touched"
+    )
     report = json.loads((folder / "out.ingest_report.json").read_text())
     entries = {Path(e["recording"]).stem: e for e in report["recordings"]}
     return {"entries": entries, "done": done, "out": folder / "out"}
 
 
 @pytest.mark.parametrize("name", [*FROM_BYTES, *FROM_CONFIG])
-def test_each_case_ends_in_its_outcome_with_the_reason(ingested: dict[str, Any], name: str) -> None:
+def test_each_case_ends_in_its_outcome_with_the_reason(
+    ingested: dict[str, Any], name: str
+) -> None:
     _, outcome, words = {**FROM_BYTES, **FROM_CONFIG}[name]
     entry = ingested["entries"][name]
-    assert entry["outcome"] == outcome, (entry["reason"], entry["damage"], entry["losses"])
+    assert entry["outcome"] == outcome, (
+        entry["reason"],
+        entry["damage"],
+        entry["losses"],
+    )
     for word in words:
-        assert word in entry["reason"] + json.dumps(entry["damage"]) + json.dumps(entry["losses"]), (
-            word,
-            entry["reason"],
-        )
+        assert word in entry["reason"] + json.dumps(entry["damage"]) + json.dumps(
+            entry["losses"]
+        ), (word, entry["reason"])
     assert entry["command"].startswith("taccorl ")
 
 
-def test_exit_code_tells_and_no_traceback_reaches_the_user(ingested: dict[str, Any]) -> None:
+def test_exit_code_tells_and_no_traceback_reaches_the_user(
+    ingested: dict[str, Any],
+) -> None:
     done = ingested["done"]
     assert done.returncode == 1
     assert "Traceback" not in done.stdout + done.stderr
-    assert "traceback" not in json.dumps(list(ingested["entries"].values())), "a fault of ours was met"
+    assert "traceback" not in json.dumps(list(ingested["entries"].values())), (
+        "a fault of ours was met"
+    )
     assert "quarantined" in done.stdout and "refused" in done.stdout
 
 
 def test_what_was_written_is_a_sound_dataset(ingested: dict[str, Any]) -> None:
     dataset = Dataset(ingested["out"])
-    written = sum(e["outcome"] == "written" for r in ingested["entries"].values() for e in r["episodes"])
+    written = sum(
+        e["outcome"] == "written"
+        for r in ingested["entries"].values()
+        for e in r["episodes"]
+    )
     assert dataset.num_episodes == written
     assert dataset.video_problems() == []

@@ -69,7 +69,9 @@ class Commands:
         words = [*words, f"--out={folder / 'out'}"]
         if words[0] != "post-train":
             words.append(f"--store={folder / 'store'}")
-        elif (folder / "out" / "settings.json").is_file():  # otherwise it was killed before it had begun
+        elif (
+            folder / "out" / "settings.json"
+        ).is_file():  # otherwise it was killed before it had begun
             words.append("--resume=true")
         assert self.process.stdin is not None
         self.process.stdin.write("\t".join([str(kill_after_s), *words]) + "\n")
@@ -86,12 +88,17 @@ def content(folder: Path) -> dict[str, str]:
     """Digest of every file of a result and of ingest's report, without what states time: manifest.json, seconds in
     post-training's progress.jsonl, and the content of Rerun's files."""
     found = {}
-    for path in (*sorted((folder / "out").rglob("*")), *folder.glob("out.ingest_report.json")):
+    for path in (
+        *sorted((folder / "out").rglob("*")),
+        *folder.glob("out.ingest_report.json"),
+    ):
         if path.is_file() and path.name not in ("manifest.json", ".verified.json"):
             data = path.read_bytes() if path.suffix != ".rrd" else b""
             if path.name == "progress.jsonl":
                 rows = [json.loads(line) for line in data.splitlines()]
-                data = json.dumps([{key: row[key] for key in row if key != "seconds"} for row in rows]).encode()
+                data = json.dumps(
+                    [{key: row[key] for key in row if key != "seconds"} for row in rows]
+                ).encode()
             found[str(path.relative_to(folder))] = hashlib.sha256(data).hexdigest()
     return found
 
@@ -108,8 +115,12 @@ CHECKPOINT = "out/checkpoints/000002"
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("verb", ["ingest", "merge", "augment", "correct", "post-train"])
-def test_thirty_kills_then_the_same_result(verb: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize(
+    "verb", ["ingest", "merge", "augment", "correct", "post-train"]
+)
+def test_thirty_kills_then_the_same_result(
+    verb: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     words, expected_files = command(verb, tmp_path / "inputs", request)
     commands = Commands()
     try:
@@ -127,20 +138,32 @@ def test_thirty_kills_then_the_same_result(verb: str, tmp_path: Path, request: p
                 start = time.monotonic()
                 if commands.run(words, folder, moment_s) == signal.SIGKILL:
                     break
-                duration_s = min(duration_s, time.monotonic() - start)  # a shared machine: faster now
+                duration_s = min(
+                    duration_s, time.monotonic() - start
+                )  # a shared machine: faster now
                 shutil.rmtree(folder)
             else:
-                pytest.fail(f"ended {MOST_TRIES} times before it could be killed after {moment_s:.2f} s")
-            assert commands.run(words, folder) == 0, f"killed after {moment_s:.2f} of {duration_s:.2f} s"
-            assert content(folder) == expected, f"killed after {moment_s:.2f} of {duration_s:.2f} s"
+                pytest.fail(
+                    f"ended {MOST_TRIES} times before it could be killed after {moment_s:.2f} s"
+                )
+            assert commands.run(words, folder) == 0, (
+                f"killed after {moment_s:.2f} of {duration_s:.2f} s"
+            )
+            assert content(folder) == expected, (
+                f"killed after {moment_s:.2f} of {duration_s:.2f} s"
+            )
             assert leftovers(folder) == []
             shutil.rmtree(folder)
-        print(f"{verb}: {NUM_KILLS} runs were killed, the last after {moment_s:.1f} of {duration_s:.1f} s")
+        print(
+            f"{verb}: {NUM_KILLS} runs were killed, the last after {moment_s:.1f} of {duration_s:.1f} s"
+        )
     finally:
         commands.close()
 
 
-def command(verb: str, inputs: Path, request: pytest.FixtureRequest) -> tuple[list[str], tuple[str, ...]]:
+def command(
+    verb: str, inputs: Path, request: pytest.FixtureRequest
+) -> tuple[list[str], tuple[str, ...]]:
     """The words of a command, without --out and --store, and files that it must write."""
 
     def made(name: str) -> str:
@@ -152,12 +175,32 @@ def command(verb: str, inputs: Path, request: pytest.FixtureRequest) -> tuple[li
         return ["merge", f"--real={made('dataset')}"], DATASET
     if verb == "augment":
         source = f"--source={made('collected')}"
-        return ["augment", "--task=assembly_2", source, "--episodes=1", "--images=false"], DATASET
+        return [
+            "augment",
+            "--task=assembly_2",
+            source,
+            "--episodes=1",
+            "--images=false",
+        ], DATASET
     policy = [f"--policy.path={write_checkpoint(inputs)}", "--policy.device=cpu"]
     if verb == "correct":
         small = ["--episodes=2", "--num_envs=2", "--episode_length=3", "--images=false"]
         return ["correct", *policy, "--task=assembly_2", *small], DATASET
-    small = ["--env.num_envs=2", "--env.decisions=2", "--env.episode_length=12", "--iterations=2", "--save_freq=1"]
-    small += ["--anchor.weight=0", "--noise_check=false", "--ppo.adapt_lr=true", "--ppo.privileged_critic=true"]
+    small = [
+        "--env.num_envs=2",
+        "--env.decisions=2",
+        "--env.episode_length=12",
+        "--iterations=2",
+        "--save_freq=1",
+    ]
+    small += [
+        "--anchor.weight=0",
+        "--noise_check=false",
+        "--ppo.adapt_lr=true",
+        "--ppo.privileged_critic=true",
+    ]
     words = ["post-train", *policy, "--env.task=assembly_2", *small]
-    return words, (f"{CHECKPOINT}/pretrained_model/model.safetensors", f"{CHECKPOINT}/training_state/state.safetensors")
+    return words, (
+        f"{CHECKPOINT}/pretrained_model/model.safetensors",
+        f"{CHECKPOINT}/training_state/state.safetensors",
+    )

@@ -45,23 +45,41 @@ def checkpoint(training: Training, step: int, steps: int = 10) -> None:
     (state / "training_step.json").write_text(json.dumps({"step": step}))
 
 
-def test_a_training_begins_goes_on_and_ends(dataset: Path, recipe: Path, tmp_path: Path) -> None:
+def test_a_training_begins_goes_on_and_ends(
+    dataset: Path, recipe: Path, tmp_path: Path
+) -> None:
     training = Training(recipe, dataset, ["--batch_size=4"], tmp_path)
     begin = training.command()
-    assert begin[0] == "lerobot-train" and begin[-1] == f"--output_dir={training.folder}"
-    assert {f"--config_path={recipe}", f"--dataset.root={dataset}", "--batch_size=4"} <= set(begin)
+    assert (
+        begin[0] == "lerobot-train" and begin[-1] == f"--output_dir={training.folder}"
+    )
+    assert {
+        f"--config_path={recipe}",
+        f"--dataset.root={dataset}",
+        "--batch_size=4",
+    } <= set(begin)
     # Killed before its first checkpoint: LeRobot would refuse the folder, so it is cleared away.
     (training.folder / "checkpoints").mkdir(parents=True)
-    assert training.command() == begin and not training.folder.exists() and training.steps == 0
+    assert (
+        training.command() == begin
+        and not training.folder.exists()
+        and training.steps == 0
+    )
     checkpoint(training, step=4)
     begun = training.policy / "train_config.json"
-    assert training.command()[:3] == ["lerobot-train", f"--config_path={begun}", "--resume=true"]
+    assert training.command()[:3] == [
+        "lerobot-train",
+        f"--config_path={begun}",
+        "--resume=true",
+    ]
     assert training.steps == 4
     checkpoint(training, step=10)
     assert training.command() == []
 
 
-def test_other_data_another_recipe_or_other_options_are_another_training(dataset, recipe, tmp_path):
+def test_other_data_another_recipe_or_other_options_are_another_training(
+    dataset, recipe, tmp_path
+):
     first = Training(recipe, dataset, [], tmp_path).folder
     assert Training(recipe, dataset, [], tmp_path).folder == first
     found = {first, Training(recipe, dataset, ["--steps=5"], tmp_path).folder}
@@ -74,12 +92,19 @@ def test_other_data_another_recipe_or_other_options_are_another_training(dataset
         Training(recipe, dataset, [], tmp_path)
 
 
-def test_a_policy_that_was_trained_on_is_scored_again(dataset: Path, recipe: Path, tmp_path: Path) -> None:
+def test_a_policy_that_was_trained_on_is_scored_again(
+    dataset: Path, recipe: Path, tmp_path: Path
+) -> None:
     training = Training(recipe, dataset, [], tmp_path)
     checkpoint(training, step=4)
     scoring = Scoring(training, ["--env.task=puzzle"], episodes=12)
     command = scoring.command()
-    assert {"--env.type=taccorl", "--env.task=puzzle", "--eval.n_episodes=12", "--eval.batch_size=10"} <= set(command)
+    assert {
+        "--env.type=taccorl",
+        "--env.task=puzzle",
+        "--eval.n_episodes=12",
+        "--eval.batch_size=10",
+    } <= set(command)
     scoring.folder.mkdir()
     told = {"per_task": [{"metrics": {"successes": [True, False]}}]}
     (scoring.folder / "eval_info.json").write_text(json.dumps(told))

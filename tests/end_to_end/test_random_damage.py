@@ -30,19 +30,27 @@ from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, wri
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 NUM_EACH = 120
-STAND_IN = StandInConfig(duration_s=2.5, seed=5, camera_size=(48, 64), chunk_size_bytes=64 * 1024)
+STAND_IN = StandInConfig(
+    duration_s=2.5, seed=5, camera_size=(48, 64), chunk_size_bytes=64 * 1024
+)
 OUTCOMES = {"written", "split", "quarantined", "refused"}
 
 
 def bag_of(mcap: Path, folder: Path) -> Path:
     """The same messages in an SQLite bag."""
-    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag, mcap.open("rb") as file:
+    with (
+        Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag,
+        mcap.open("rb") as file,
+    ):
         connections: dict[int, Any] = {}
         for schema, channel, message in make_reader(file).iter_messages():
             assert schema is not None
             if channel.id not in connections:
                 connections[channel.id] = bag.add_connection(
-                    channel.topic, schema.name, msgdef=schema.data.decode(), rihs01="RIHS01_" + "0" * 64
+                    channel.topic,
+                    schema.name,
+                    msgdef=schema.data.decode(),
+                    rihs01="RIHS01_" + "0" * 64,
                 )
             bag.write(connections[channel.id], message.log_time, message.data)
     return next(folder.glob("*.db3"))
@@ -58,7 +66,11 @@ def damaged(data: bytes, rng: random.Random) -> tuple[str, bytes]:
         changed = data[:at] + bytes([data[at] ^ rng.randrange(1, 256)]) + data[at + 1 :]
     elif kind in ("zeros", "noise"):
         size = min(size, len(data) - at)
-        changed = data[:at] + (bytes(size) if kind == "zeros" else rng.randbytes(size)) + data[at + size :]
+        changed = (
+            data[:at]
+            + (bytes(size) if kind == "zeros" else rng.randbytes(size))
+            + data[at + size :]
+        )
     else:
         changed = {
             "cut": data[:at],
@@ -72,11 +84,18 @@ def rows_of(episodes: list[Episode]) -> dict[int, tuple[bytes, ...]]:
     """Time of a row [ns] → its numbers and pictures."""
     found = {}
     for episode in episodes:
-        pictures = list(episode.pictures()) if episode.picture_keys else [{}] * episode.num_rows
+        pictures = (
+            list(episode.pictures())
+            if episode.picture_keys
+            else [{}] * episode.num_rows
+        )
         for row, shown in enumerate(pictures):
             numbers = (array[row].tobytes() for array in episode.arrays.values())
             time_ns = episode.start_ns + round(row * 1e9 / episode.spec.fps)
-            found[time_ns] = (*numbers, *(picture.tobytes() for picture in shown.values()))
+            found[time_ns] = (
+                *numbers,
+                *(picture.tobytes() for picture in shown.values()),
+            )
     return found
 
 
@@ -102,20 +121,39 @@ class Base:
 
     def entries(self, store: Path) -> list[dict[str, Any]]:
         """Entry of each recording in ingest's report."""
-        return [ingest_one(job) for job in find_jobs([self.path], self.spec, "spec", store, dry_run=True)]
+        return [
+            ingest_one(job)
+            for job in find_jobs([self.path], self.spec, "spec", store, dry_run=True)
+        ]
 
 
 def made(kind: str, folder: Path, dataset: Path) -> Base:
     if kind == "hdf5":
         write_cobot_magic_hdf5(folder / "base.hdf5", STAND_IN)
-        return Base(folder / "base.hdf5", load_recording_spec("cobot_magic_hdf5"), (folder / "base.hdf5",))
+        return Base(
+            folder / "base.hdf5",
+            load_recording_spec("cobot_magic_hdf5"),
+            (folder / "base.hdf5",),
+        )
     if kind == "lerobot":
-        root = Path(shutil.copytree(dataset, folder / "base", ignore=shutil.ignore_patterns(".*", "README.md")))
-        files = tuple(p for p in sorted(root.rglob("*")) if p.is_file() and "taccorl" not in p.parts)
+        root = Path(
+            shutil.copytree(
+                dataset,
+                folder / "base",
+                ignore=shutil.ignore_patterns(".*", "README.md"),
+            )
+        )
+        files = tuple(
+            p
+            for p in sorted(root.rglob("*"))
+            if p.is_file() and "taccorl" not in p.parts
+        )
         return Base(root, load_recording_spec("taccorl_lerobot"), files)
     if kind == "rosbag1":
         bag = write_bag(folder / "base.bag", messages(STAND_IN.duration_s), 1)
-        return Base(bag, load_recording_spec(write_spec(folder, reader="rosbag1")), (bag,))
+        return Base(
+            bag, load_recording_spec(write_spec(folder, reader="rosbag1")), (bag,)
+        )
     write_mcap(folder / "base.mcap", STAND_IN)
     spec = load_recording_spec("piper_flexitac_mcap")
     if kind == "mcap":
@@ -130,12 +168,16 @@ Rows = dict[int, tuple[bytes, ...]]
 def wrong(entries: list[dict[str, Any]]) -> str:
     """What is not right about the outcomes of a damaged file by themselves; empty if all is."""
     for one in entries:
-        if one["outcome"] not in OUTCOMES or not (one["reason"] or one["outcome"] == "written"):
+        if one["outcome"] not in OUTCOMES or not (
+            one["reason"] or one["outcome"] == "written"
+        ):
             return f"outcome {one['outcome']!r}, reason {one['reason']!r}"
         if "traceback" in one:
             return one["traceback"][-600:]
         for channel, counts in one["samples"].items():
-            if counts["messages"] != sum(count for reason, count in counts.items() if reason != "messages"):
+            if counts["messages"] != sum(
+                count for reason, count in counts.items() if reason != "messages"
+            ):
                 return f"samples of {channel} do not add up: {counts}"
         lost = sum(loss["rows"] for loss in one["losses"] if loss["wanted"])
         lost += sum(e["rows"] for e in one["episodes"] if e["outcome"] == "quarantined")
@@ -145,7 +187,10 @@ def wrong(entries: list[dict[str, Any]]) -> str:
 
 
 def rows_of_entry(entry: dict[str, Any]) -> int:
-    return sum(e["rows"] for e in entry["episodes"] if e["outcome"] == "written") + entry["rows_lost"]
+    return (
+        sum(e["rows"] for e in entry["episodes"] if e["outcome"] == "written")
+        + entry["rows_lost"]
+    )
 
 
 def span_ns(base: "Base", part: int = 0) -> tuple[int, int]:
@@ -153,7 +198,9 @@ def span_ns(base: "Base", part: int = 0) -> tuple[int, int]:
     _, source = find_sources(base.path, reader=base.spec.reader)[part]
     with opened(source, base.spec) as recording:
         clocks = Cutter(recording).clocks.values()
-        return min(int(c.time_ns[0]) for c in clocks), max(int(c.time_ns[-1]) for c in clocks)
+        return min(int(c.time_ns[0]) for c in clocks), max(
+            int(c.time_ns[-1]) for c in clocks
+        )
 
 
 Span = tuple[int, int]
@@ -173,7 +220,9 @@ def gone_in_silence(
         if entry["outcome"] not in ("written", "split"):
             continue
         first_ns, last_ns = span_of(part)
-        ends_ns = max(0, first_ns - spans_ns[part][0]) + max(0, spans_ns[part][1] - last_ns)
+        ends_ns = max(0, first_ns - spans_ns[part][0]) + max(
+            0, spans_ns[part][1] - last_ns
+        )
         gone = rows_of_entry(whole) - rows_of_entry(entry)
         is_told = any(d["lost"] for d in entry["damage"])
         # 1 more: where the rows begin; and the last command is no row of its own
@@ -197,15 +246,22 @@ def shortened(entry: dict[str, Any]) -> dict[str, Any]:
 def with_fewer_messages(entry: dict[str, Any]) -> dict[str, Any]:
     """By one of the first channel, of which nothing is said."""
     (name, counts), *_ = entry["samples"].items()
-    return entry | {"samples": entry["samples"] | {name: counts | {"messages": counts["messages"] - 1}}}
+    return entry | {
+        "samples": entry["samples"]
+        | {name: counts | {"messages": counts["messages"] - 1}}
+    }
 
 
-def changed_in_silence(base: Base, entries: list[dict[str, Any]], intact: list[Rows]) -> list[bool]:
+def changed_in_silence(
+    base: Base, entries: list[dict[str, Any]], intact: list[Rows]
+) -> list[bool]:
     """For each recording that was written with other rows than the intact one and without a warning, whether its entry states
     that the format cannot show it."""
     found = []
     for part, (entry, expected) in enumerate(zip(entries, intact, strict=False)):
-        warned = any(f["severity"] != "note" for e in entry["episodes"] for f in e["findings"])
+        warned = any(
+            f["severity"] != "note" for e in entry["episodes"] for f in e["findings"]
+        )
         if entry["outcome"] == "written" and not warned:
             shown = rows_read(base, part)
             if any(expected[t] != row for t, row in shown.items() if t in expected):
@@ -214,15 +270,21 @@ def changed_in_silence(base: Base, entries: list[dict[str, Any]], intact: list[R
 
 
 @pytest.mark.parametrize("kind", ["mcap", "db3", "rosbag1", "hdf5", "lerobot"])
-def test_random_damage_ends_in_the_right_outcome(kind, dataset, tmp_path, record_property):
+def test_random_damage_ends_in_the_right_outcome(
+    kind, dataset, tmp_path, record_property
+):
     base = made(kind, tmp_path, dataset)
     clean = base.entries(tmp_path / "store")
     assert {one["outcome"] for one in clean} == {"written"}
     spans_ns = [span_ns(base, part) for part in range(len(clean))]
-    gone = partial(gone_in_silence, clean=clean, spans_ns=spans_ns, fps=base.spec.target.fps)
+    gone = partial(
+        gone_in_silence, clean=clean, spans_ns=spans_ns, fps=base.spec.target.fps
+    )
     assert wrong(clean) == gone(clean, span_of=spans_ns.__getitem__) == ""
     for change in (shortened, with_fewer_messages):
-        assert gone([change(clean[0]), *clean[1:]], span_of=spans_ns.__getitem__), "the comparison finds nothing"
+        assert gone([change(clean[0]), *clean[1:]], span_of=spans_ns.__getitem__), (
+            "the comparison finds nothing"
+        )
     intact = [rows_read(base, part) for part in range(len(clean))]
     assert all(len(rows) > 45 for rows in intact)
     contents = {path: path.read_bytes() for path in base.files}

@@ -33,15 +33,24 @@ SECTIONS = (  # run after README.md, in this order
     ("twin.md", "## Diagnose its pads"),
     ("data.md", "## Look at it"),
 )
-FENCE = re.compile(r"(?:<!--(?P<comment>.*?)-->\n)?```(?P<language>\w*)\n(?P<text>.*?)```", re.DOTALL)
-CELL = re.compile(r"^\|.*?`((?:taccorl|lerobot-\w+) [^`]+)`", re.MULTILINE)  # First command in a row of a table
+FENCE = re.compile(
+    r"(?:<!--(?P<comment>.*?)-->\n)?```(?P<language>\w*)\n(?P<text>.*?)```", re.DOTALL
+)
+CELL = re.compile(
+    r"^\|.*?`((?:taccorl|lerobot-\w+) [^`]+)`", re.MULTILINE
+)  # First command in a row of a table
 PROGRAMS = re.compile(r"(taccorl|lerobot-\w+|make|python) ")
 NOT_RUN = "no test runs these"
 SMALL = {  # verb → options that take the place of the line's own, or are added
     "collect": ("--episodes=1",),
     "augment": ("--episodes=1",),
     "view": ("--save=episode.rrd",),  # there is no screen
-    "lerobot-train": ("--steps=2", "--batch_size=2", "--num_workers=0", "--save_checkpoint=false"),
+    "lerobot-train": (
+        "--steps=2",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--save_checkpoint=false",
+    ),
 }
 ELSEWHERE = {"serve-surrogate": "taccorl.robot_plugin.surrogate_server"}
 """Verb → module that defines its options, if not the verb's own."""
@@ -67,16 +76,28 @@ def commands(page: str) -> list[Command]:
     for block in FENCE.finditer(page):
         if not block["language"]:
             text = block["text"].replace("\\\n", " ")
-            lines = (shlex.split(line, comments=True) for line in text.splitlines() if PROGRAMS.match(line))
-            found += [Command(words, NOT_RUN not in (block["comment"] or "")) for words in lines if words]
-    return found + [Command(shlex.split(line), True) for line in CELL.findall(FENCE.sub("", page))]
+            lines = (
+                shlex.split(line, comments=True)
+                for line in text.splitlines()
+                if PROGRAMS.match(line)
+            )
+            found += [
+                Command(words, NOT_RUN not in (block["comment"] or ""))
+                for words in lines
+                if words
+            ]
+    return found + [
+        Command(shlex.split(line), True) for line in CELL.findall(FENCE.sub("", page))
+    ]
 
 
 def sections() -> list[Command]:
     """Commands of ``SECTIONS``; a section ends at the next heading."""
     found = []
     for name, title in SECTIONS:
-        _, there, rest = (ROOT / "docs" / name).read_text(encoding="utf-8").partition(f"\n{title}\n")
+        _, there, rest = (
+            (ROOT / "docs" / name).read_text(encoding="utf-8").partition(f"\n{title}\n")
+        )
         assert there, f"docs/{name}: no {title}"
         found += commands(re.split(r"\n#+ ", rest)[0])
     return found
@@ -89,11 +110,24 @@ def masked(text: str) -> str:
 
 def options_of(verb: str) -> set[str]:
     """Names of the options of a verb and of its second words, nested ones with a dot: ``engine.workers``."""
-    module = importlib.import_module(ELSEWHERE.get(verb, f"taccorl.cli.{verb.replace('-', '_')}"))
-    configs = [kind for name, kind in vars(module).items() if name.endswith("Config") and is_dataclass(kind)]
-    hints = [(name.rstrip("_"), hint) for config in configs for name, hint in get_type_hints(config).items()]
+    module = importlib.import_module(
+        ELSEWHERE.get(verb, f"taccorl.cli.{verb.replace('-', '_')}")
+    )
+    configs = [
+        kind
+        for name, kind in vars(module).items()
+        if name.endswith("Config") and is_dataclass(kind)
+    ]
+    hints = [
+        (name.rstrip("_"), hint)
+        for config in configs
+        for name, hint in get_type_hints(config).items()
+    ]
     return {"config_path"}.union(
-        *({name, *(f"{name}.{inner}" for inner in _inner_names(hint))} for name, hint in hints)
+        *(
+            {name, *(f"{name}.{inner}" for inner in _inner_names(hint))}
+            for name, hint in hints
+        )
     )
 
 
@@ -103,19 +137,33 @@ def unknown_options(command: Command) -> list[str]:
         return []
     if command.verb not in [verb for verbs in VERBS.values() for verb in verbs]:
         return [command.verb]
-    given = [word.removeprefix("--").partition("=")[0] for word in command.words if word.startswith("--")]
+    given = [
+        word.removeprefix("--").partition("=")[0]
+        for word in command.words
+        if word.startswith("--")
+    ]
     known = options_of(command.verb)
-    return [name for name in given if name not in known and not any(k.startswith(f"{name}.") for k in known)]
+    return [
+        name
+        for name in given
+        if name not in known and not any(k.startswith(f"{name}.") for k in known)
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_option_that_is_shown_exists(page: str) -> None:
-    wrong = {shlex.join(c.words): found for c in commands((ROOT / page).read_text()) if (found := unknown_options(c))}
+    wrong = {
+        shlex.join(c.words): found
+        for c in commands((ROOT / page).read_text())
+        if (found := unknown_options(c))
+    }
     assert not wrong
 
 
 def test_every_line_of_the_readme_calls_a_program_of_ours() -> None:
-    blocks = [block["text"] for block in FENCE.finditer(README) if not block["language"]]
+    blocks = [
+        block["text"] for block in FENCE.finditer(README) if not block["language"]
+    ]
     lines = sum(bool(line.strip()) for text in blocks for line in text.splitlines())
     assert len(commands(README)) == lines + len(CELL.findall(README))
 
@@ -133,7 +181,9 @@ class Walk:
     def __init__(self, folder: Path, recordings: Path) -> None:
         self.folder, self.recordings = folder, recordings
         self.printed = ""
-        self.given: dict[str, Callable[[], None]] = {  # begin of a line → what is made before it
+        self.given: dict[
+            str, Callable[[], None]
+        ] = {  # begin of a line → what is made before it
             "taccorl ingest recordings/": self.some_recordings,
             "taccorl init-robot my_arm.xml": self.model_of_an_arm,
             "taccorl compare sweeps/ --twin=my_robot.yaml": self.tables_of_an_arm,
@@ -144,8 +194,13 @@ class Walk:
 
     def run(self, *words: str) -> None:
         bin_folder = Path(sys.executable).parent
-        env = os.environ | {"PATH": f"{bin_folder}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-        done = subprocess.run(words, cwd=self.folder, env=env, capture_output=True, text=True, check=False)
+        env = os.environ | {
+            "PATH": f"{bin_folder}:{os.environ['PATH']}",
+            "PYTHONPATH": str(ROOT),
+        }
+        done = subprocess.run(
+            words, cwd=self.folder, env=env, capture_output=True, text=True, check=False
+        )
         self.printed += done.stdout
         print(f"$ {shlex.join(words)}\n{done.stdout[-3000:]}{done.stderr[-3000:]}")
         assert done.returncode == 0, f"{shlex.join(words)} ended with {done.returncode}"
@@ -153,7 +208,14 @@ class Walk:
 
     def two_domains(self) -> None:
         shutil.copytree("outputs/my_dataset", "recorded")
-        self.run("taccorl", "augment", "--source=sources", "--task=assembly_2", "--episodes=1", "--out=many")
+        self.run(
+            "taccorl",
+            "augment",
+            "--source=sources",
+            "--task=assembly_2",
+            "--episodes=1",
+            "--out=many",
+        )
 
     def some_recordings(self) -> None:
         shutil.copytree(self.recordings, "recordings")
@@ -165,11 +227,25 @@ class Walk:
     def tables_of_an_arm(self) -> None:
         """The TODOs of the arm's file, filled in, and recordings of a surrogate with dry friction that it lacks."""
         path = Path("my_robot.yaml")
-        text = path.read_text().replace("gravity_compensation: TODO", "gravity_compensation: 0.0")
+        text = path.read_text().replace(
+            "gravity_compensation: TODO", "gravity_compensation: 0.0"
+        )
         path.write_text(text.replace("gains: TODO", "gains: commanded"))
         assert "TODO" not in re.sub(r"#.*", "", path.read_text())
-        hidden = ("--secret=5", "--twin=my_robot.yaml", "--effects=[coulomb_friction]", "--strength=12")
-        self.run("taccorl", "surrogate", *hidden, "--signal=elbow", "--speed=1.5", "--out=arm")
+        hidden = (
+            "--secret=5",
+            "--twin=my_robot.yaml",
+            "--effects=[coulomb_friction]",
+            "--strength=12",
+        )
+        self.run(
+            "taccorl",
+            "surrogate",
+            *hidden,
+            "--signal=elbow",
+            "--speed=1.5",
+            "--out=arm",
+        )
         Path("arm/sweeps").rename("sweeps")
 
     def sweeps_of_the_piper(self) -> None:
@@ -194,10 +270,14 @@ ARM = """
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_every_line_works_from_top_to_bottom(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_line_works_from_top_to_bottom(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     walk, made = Walk(tmp_path, recordings), []
-    typed = {tuple(smaller(c)): c for c in commands(README) + sections() if c.is_run}  # each line once
+    typed = {
+        tuple(smaller(c)): c for c in commands(README) + sections() if c.is_run
+    }  # each line once
     for command in typed.values():
         for line, make in walk.given.items():
             if shlex.join(command.words).startswith(line) and line not in made:
@@ -205,7 +285,11 @@ def test_every_line_works_from_top_to_bottom(recordings: Path, tmp_path: Path, m
                 made.append(line)
         walk.run(*smaller(command))
     assert set(made) == set(walk.given), "the pages no longer need what is made here"
-    shown = "\n".join(block["text"] for block in FENCE.finditer(README) if block["language"] == "text")
+    shown = "\n".join(
+        block["text"] for block in FENCE.finditer(README) if block["language"] == "text"
+    )
     for line in (line.rstrip(" …,") for line in shown.splitlines()):
         assert masked(line).strip() in masked(walk.printed), line
-    assert {"both", "many", "my_robot+coulomb_friction.yaml"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"both", "many", "my_robot+coulomb_friction.yaml"} <= {
+        p.name for p in tmp_path.iterdir()
+    }

@@ -25,10 +25,18 @@ def test_stored_actions_reproduce_the_stored_states_bit_for_bit(recorded):
     plan, sim, spec, episode = recorded
     sim.reset([plan.attempt_seed(0)])
     again = EpisodeRecorder(sim, spec)
-    for sent, intended in zip(episode.arrays["sim.executed"], episode.arrays["action"], strict=True):
+    for sent, intended in zip(
+        episode.arrays["sim.executed"], episode.arrays["action"], strict=True
+    ):
         again.step(sent, intended=intended)
     other = again.episode("again", {})
-    for key in ("sim.state", "observation.state", "action", "sim.subtask", "sim.success"):
+    for key in (
+        "sim.state",
+        "observation.state",
+        "action",
+        "sim.subtask",
+        "sim.success",
+    ):
         np.testing.assert_array_equal(other.arrays[key], episode.arrays[key])
     assert other.success
 
@@ -38,18 +46,24 @@ def test_touch_can_be_recomputed_from_a_stored_state(recorded):
     noise_rng = np.random.default_rng([int(episode.arrays["sim.seed"][0, 0]), 2])
     for row in range(3):
         _restore(sim, episode, row)
-        np.testing.assert_array_equal(sim.touch(noise_rng)[0], episode.arrays["observation.tactile"][row])
+        np.testing.assert_array_equal(
+            sim.touch(noise_rng)[0], episode.arrays["observation.tactile"][row]
+        )
     touched = int(np.abs(episode.arrays["observation.tactile"]).sum(1).argmax())
     _restore(sim, episode, touched)
     clean = sim.touch()[0].astype(int)
     noisy = episode.arrays["observation.tactile"][touched].astype(int)
     inside = (clean > 20) & (clean < 150)
     assert inside.sum() > 20
-    assert np.abs(noisy - clean)[inside].max() <= 1 + 5 * 1.3  # five standard deviations and a step
+    assert (
+        np.abs(noisy - clean)[inside].max() <= 1 + 5 * 1.3
+    )  # five standard deviations and a step
 
 
 def _restore(sim, episode, row: int) -> None:
-    sim.restore_rows(episode.arrays["sim.state"][row : row + 1], episode.arrays["sim.seed"][row])
+    sim.restore_rows(
+        episode.arrays["sim.state"][row : row + 1], episode.arrays["sim.seed"][row]
+    )
 
 
 def test_any_stored_row_restores_the_encoders_and_the_run_goes_on_bit_exactly(recorded):
@@ -57,11 +71,20 @@ def test_any_stored_row_restores_the_encoders_and_the_run_goes_on_bit_exactly(re
     for row in (0, 100, 250):
         _restore(sim, episode, row)
         for later in range(row, row + 3):
-            np.testing.assert_array_equal(sim.state_rows()[0], episode.arrays["sim.state"][later])
+            np.testing.assert_array_equal(
+                sim.state_rows()[0], episode.arrays["sim.state"][later]
+            )
             sim.step(episode.arrays["sim.executed"][later : later + 1].astype(float))
-    for row in (0, len(episode.arrays["action"]) // 2, len(episode.arrays["action"]) - 1):
+    for row in (
+        0,
+        len(episode.arrays["action"]) // 2,
+        len(episode.arrays["action"]) - 1,
+    ):
         _restore(sim, episode, row)
-        np.testing.assert_array_equal(sim.proprioception()[0].astype("f4"), episode.arrays["observation.state"][row])
+        np.testing.assert_array_equal(
+            sim.proprioception()[0].astype("f4"),
+            episode.arrays["observation.state"][row],
+        )
 
 
 def test_success_comes_after_the_hold_and_ends_the_episode(recorded):

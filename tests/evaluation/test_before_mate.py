@@ -33,7 +33,10 @@ class KnownHands:
 
     def act(self, observation) -> Acted:
         self.acts += 1
-        target, own = observation[STATE_KEY][0].astype(float), ROBOT.joint_slice("right")
+        target, own = (
+            observation[STATE_KEY][0].astype(float),
+            ROBOT.joint_slice("right"),
+        )
         goal = self.kinematics.pose(target[own])
         goal[:3, 3] += self.moved_m
         target[own] = self.kinematics.solve(goal, target[own])[0]
@@ -55,7 +58,11 @@ def test_the_regression_written_out():
 
 
 @pytest.mark.parametrize(
-    "task", [*(pytest.param(t, marks=pytest.mark.slow) for t in ("assembly_1", "test_tube")), "puzzle"]
+    "task",
+    [
+        *(pytest.param(t, marks=pytest.mark.slow) for t in ("assembly_1", "test_tube")),
+        "puzzle",
+    ],
 )
 def test_hands_that_stay_keep_a_displacement_and_moved_ones_add_to_it(task):
     scenes = Scenes(tasks=(task,), episodes=2, seed=7)
@@ -63,11 +70,17 @@ def test_hands_that_stay_keep_a_displacement_and_moved_ones_add_to_it(task):
     stay = aims(scenes, task, KnownHands(), 3, across_m=across_m)
     assert [answer.seed for answer in stay] == [7, 7, 7, 8, 8, 8]
     for answer, wanted in zip(stay, 2 * across_m, strict=True):
-        np.testing.assert_allclose(answer.displaced_m, wanted, atol=0.0005)  # what the arm's droop and the servo leave
+        np.testing.assert_allclose(
+            answer.displaced_m, wanted, atol=0.0005
+        )  # what the arm's droop and the servo leave
         np.testing.assert_allclose(answer.aim_m, answer.displaced_m, atol=1e-5)
     np.testing.assert_allclose(aimed(stay).kept, 1.0, atol=0.01)
     moved = aims(
-        Scenes(tasks=(task,), episodes=1, seed=7), task, KnownHands((0.0, 0.0, 0.002)), 3, across_m=across_m[:1]
+        Scenes(tasks=(task,), episodes=1, seed=7),
+        task,
+        KnownHands((0.0, 0.0, 0.002)),
+        3,
+        across_m=across_m[:1],
     )
     beside = np.array([m.aim_m - m.displaced_m for m in moved])
     assert np.all(np.linalg.norm(beside, axis=1) <= 0.00201)

@@ -20,14 +20,28 @@ def write_checkpoint(folder: Path, **changes: Any) -> Path:
     inputs = {
         "observation.state": PolicyFeature(FeatureType.STATE, (14,)),
         "observation.tactile": PolicyFeature(FeatureType.STATE, (1536,)),
-        **{key: PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for key in IMAGE_KEYS.values()},
+        **{
+            key: PolicyFeature(FeatureType.VISUAL, (3, 224, 224))
+            for key in IMAGE_KEYS.values()
+        },
     }
     policy = tiny_policy(
-        fps=30, discrete_state_input=None, action_feature_names=list(arm_names()), input_features=inputs, **changes
+        fps=30,
+        discrete_state_input=None,
+        action_feature_names=list(arm_names()),
+        input_features=inputs,
+        **changes,
     )
-    middle = torch.tensor((ROBOT.action_low + ROBOT.action_high) / 2, dtype=torch.float32)
+    middle = torch.tensor(
+        (ROBOT.action_low + ROBOT.action_high) / 2, dtype=torch.float32
+    )
     statistics = {
-        name: {"q01": middle - 0.05, "q99": middle + 0.05, "min": middle - 0.05, "max": middle + 0.05}
+        name: {
+            "q01": middle - 0.05,
+            "q99": middle + 0.05,
+            "min": middle - 0.05,
+            "max": middle + 0.05,
+        }
         for name in ("action", "observation.state")
     }
     policy.save_pretrained(folder / "pretrained_model")

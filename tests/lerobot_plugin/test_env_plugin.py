@@ -13,7 +13,11 @@ from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.spaces import IMAGE_SHAPE
 from tests.fresh_python import fresh_python
 
-KEYS = {"observation.state", "observation.tactile", *(f"observation.images.{name}" for name in ROBOT.cameras)}
+KEYS = {
+    "observation.state",
+    "observation.tactile",
+    *(f"observation.images.{name}" for name in ROBOT.cameras),
+}
 
 
 def env_config(**settings):
@@ -30,9 +34,19 @@ def test_command_line_becomes_the_config() -> None:
     class Evaluation:
         env: EnvConfig
 
-    said = {"type": "taccorl", "task": "assembly_2", "difficulty": "hard", "twin": "a/twin.yaml", "episode_length": 40}
-    config = draccus.parse(Evaluation, args=[f"--env.{name}={value}" for name, value in said.items()]).env
-    assert config == env_config(task="assembly_2", difficulty="hard", twin="a/twin.yaml", episode_length=40)
+    said = {
+        "type": "taccorl",
+        "task": "assembly_2",
+        "difficulty": "hard",
+        "twin": "a/twin.yaml",
+        "episode_length": 40,
+    }
+    config = draccus.parse(
+        Evaluation, args=[f"--env.{name}={value}" for name, value in said.items()]
+    ).env
+    assert config == env_config(
+        task="assembly_2", difficulty="hard", twin="a/twin.yaml", episode_length=40
+    )
     assert config.type == "taccorl" and config.fps == 30
     with pytest.raises(TaccorlError, match="fps=50"):
         env_config(fps=50)
@@ -45,15 +59,24 @@ def test_features_are_those_of_the_dataset_spec() -> None:
 
     features = env_to_policy_features(env_config())
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
-    wanted = {name: tuple(f.shape) for name, f in spec.features.items() if not f.optional}
+    wanted = {
+        name: tuple(f.shape) for name, f in spec.features.items() if not f.optional
+    }
     found = {name: f.shape for name, f in features.items()}
     for name, shape in wanted.items():
-        assert found.pop(name) == (shape if len(shape) == 1 else (shape[2], *shape[:2]))  # LeRobot: channels first
+        assert found.pop(name) == (
+            shape if len(shape) == 1 else (shape[2], *shape[:2])
+        )  # LeRobot: channels first
     assert not found
-    assert wanted["observation.tactile"] == (ROBOT.num_taxels,) and wanted["observation.images.front"] == IMAGE_SHAPE
+    assert (
+        wanted["observation.tactile"] == (ROBOT.num_taxels,)
+        and wanted["observation.images.front"] == IMAGE_SHAPE
+    )
 
 
-@pytest.mark.parametrize("in_processes", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "in_processes", [False, pytest.param(True, marks=pytest.mark.slow)]
+)
 def test_lerobots_own_rollout_runs(in_processes: bool) -> None:
     """The loop of ``lerobot-eval``, with a policy that stays where it is."""
     import torch
@@ -81,20 +104,35 @@ def test_lerobots_own_rollout_runs(in_processes: bool) -> None:
         seeds=[1000, 1001],
         render_callback=lambda envs: frames.append(np.stack(envs.call("render"))),
     )
-    assert done["action"].shape == (2, 4, 14) and done["done"][:, -1].all() and not done["done"][:, :-1].any()
+    assert (
+        done["action"].shape == (2, 4, 14)
+        and done["done"][:, -1].all()
+        and not done["done"][:, :-1].any()
+    )
     assert done["reward"].sum() == 0 and not done["success"].any()
-    assert set(Stay.seen[0]) >= KEYS and Stay.seen[0]["task"][0].startswith("insert the orange plug")
+    assert set(Stay.seen[0]) >= KEYS and Stay.seen[0]["task"][0].startswith(
+        "insert the orange plug"
+    )
     front = Stay.seen[0]["observation.images.front"]
-    assert front.shape == (2, 3, 224, 224) and front.dtype == Stay.seen[0]["observation.tactile"].dtype == torch.float32
+    assert (
+        front.shape == (2, 3, 224, 224)
+        and front.dtype == Stay.seen[0]["observation.tactile"].dtype == torch.float32
+    )
     assert 0.2 < float(front.mean()) < 0.8 < float(front.max()) <= 1
-    assert [f.shape for f in frames] == [(2, 224, 224, 3)] * 5 and envs.unwrapped.metadata["render_fps"] == 30
+    assert [f.shape for f in frames] == [
+        (2, 224, 224, 3)
+    ] * 5 and envs.unwrapped.metadata["render_fps"] == 30
     envs.close()
     # Scenes are those of the seeds, and the same in one batch as in processes.
     single = TaccorlEnv("assembly_1", images=False)
     observation = single.reset(seed=1001)[0]
     for seen in Stay.seen:
-        assert np.array_equal(seen["observation.tactile"][1].numpy(), observation["observation.tactile"])
-        assert np.array_equal(seen["observation.state"][1].numpy(), observation["observation.state"])
+        assert np.array_equal(
+            seen["observation.tactile"][1].numpy(), observation["observation.tactile"]
+        )
+        assert np.array_equal(
+            seen["observation.state"][1].numpy(), observation["observation.state"]
+        )
         observation = single.step(observation["observation.state"])[0]
 
 
@@ -114,15 +152,20 @@ def test_loading_the_plugin_loads_no_simulator() -> None:
 
 
 def test_worker_processes_need_no_torch() -> None:
-    code = (
-        "import sys, taccorl.sim.lerobot_env; assert not {'torch', 'lerobot'} & {m.split('.')[0] for m in sys.modules}"
-    )
+    code = "import sys, taccorl.sim.lerobot_env; assert not {'torch', 'lerobot'} & {m.split('.')[0] for m in sys.modules}"
     assert fresh_python("-c", code, MUJOCO_GL="egl").returncode == 0
 
 
 def test_poses_of_the_parts_are_observed_on_request():
-    plain, told = TaccorlEnvConfig(task="test_tube"), TaccorlEnvConfig(task="test_tube", part_poses=True)
-    assert "environment_state" not in plain.features and not plain.gym_kwargs["part_poses"]
-    assert told.features["environment_state"].shape == (27,)  # tube, rack and the stand, nine numbers each
+    plain, told = (
+        TaccorlEnvConfig(task="test_tube"),
+        TaccorlEnvConfig(task="test_tube", part_poses=True),
+    )
+    assert (
+        "environment_state" not in plain.features and not plain.gym_kwargs["part_poses"]
+    )
+    assert told.features["environment_state"].shape == (
+        27,
+    )  # tube, rack and the stand, nine numbers each
     assert told.features_map["environment_state"] == "observation.environment_state"
     assert told.gym_kwargs["part_poses"]

@@ -17,7 +17,16 @@ from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 
-FILE_EVENTS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.listdir", "os.scandir", "fcntl.flock"}
+FILE_EVENTS = {
+    "open",
+    "os.mkdir",
+    "os.rename",
+    "os.remove",
+    "os.rmdir",
+    "os.listdir",
+    "os.scandir",
+    "fcntl.flock",
+}
 
 
 def write_two(config: Any, inputs: list[Path], out_dir: Path) -> None:
@@ -36,18 +45,29 @@ TWO, PUBLISHED = Stage("two", write_two), Stage("published", copy_one)
 def run(store: Store) -> None:
     """An artefact in the store, and one that is made from it beside the store."""
     made = store.run(TWO, None, [])
-    store.run(PUBLISHED, None, [made], destination=store.root.with_name(f"{store.root.name}_out"))
+    store.run(
+        PUBLISHED,
+        None,
+        [made],
+        destination=store.root.with_name(f"{store.root.name}_out"),
+    )
 
 
 def wrong(store: Store) -> list[Path]:
     """Artefacts in the store, and published by it, that do not match their manifest."""
     made = [*store.artefacts(), *store.root.parent.glob(f"{store.root.name}_out")]
-    return [path for path in made if not read_manifest(path) or trace(path, None).problems]
+    return [
+        path for path in made if not read_manifest(path) or trace(path, None).problems
+    ]
 
 
 def temporary(folder: Path) -> list[Path]:
     """Temporary folders anywhere below."""
-    return [p for p in folder.rglob(".*") if p.is_dir() and p.name not in (".locks", ".digests", ".destinations")]
+    return [
+        p
+        for p in folder.rglob(".*")
+        if p.is_dir() and p.name not in (".locks", ".digests", ".destinations")
+    ]
 
 
 def survives(kill_at: int, work: Callable[[], Any]) -> bool:

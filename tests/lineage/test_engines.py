@@ -33,7 +33,9 @@ ONE_AND_TWO_WORKERS = pytest.mark.parametrize("workers", [1, 2])
 @ONE_AND_TWO_WORKERS
 def test_results_come_in_the_order_of_the_items(workers):
     done = []
-    results = LocalEngine(workers=workers).map(toys.double, range(6), on_done=lambda *pair: done.append(pair))
+    results = LocalEngine(workers=workers).map(
+        toys.double, range(6), on_done=lambda *pair: done.append(pair)
+    )
     assert results == [0, 2, 4, 6, 8, 10]
     assert sorted(done) == [(0, 0), (1, 2), (2, 4), (3, 6), (4, 8), (5, 10)]
 
@@ -42,7 +44,9 @@ def test_results_come_in_the_order_of_the_items(workers):
 def test_item_that_fails_is_named_and_the_others_are_done(workers):
     done = []
     with pytest.raises(EngineError) as caught:
-        LocalEngine(workers=workers).map(toys.refuse_odd, range(5), on_done=lambda item, _: done.append(item))
+        LocalEngine(workers=workers).map(
+            toys.refuse_odd, range(5), on_done=lambda item, _: done.append(item)
+        )
     assert str(caught.value).splitlines() == [
         "2 of 5 items failed; the others are done:",
         "  1: RecordingError: recording 1 is odd",
@@ -60,16 +64,25 @@ def test_fault_of_the_program_shows_its_traceback(workers):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_full_disk_ends_the_run_at_once_with_the_systems_error(workers, tmp_path):
     with pytest.raises(OSError, match="No space left on device") as caught:
-        LocalEngine(workers=workers).map(toys.fill_disk, [tmp_path / f"{k}" for k in range(40)])
-    assert caught.value.errno == errno.ENOSPC and str(caught.value.filename).startswith(str(tmp_path))
-    assert len(list(tmp_path.iterdir())) < 10  # those that ran at the same time, not all 40
+        LocalEngine(workers=workers).map(
+            toys.fill_disk, [tmp_path / f"{k}" for k in range(40)]
+        )
+    assert caught.value.errno == errno.ENOSPC and str(caught.value.filename).startswith(
+        str(tmp_path)
+    )
+    assert (
+        len(list(tmp_path.iterdir())) < 10
+    )  # those that ran at the same time, not all 40
 
 
 def test_worker_that_crashes_is_named_with_its_item_and_the_others_are_done():
     done = []
     with pytest.raises(EngineError) as caught:
         LocalEngine(workers=2).map(
-            toys.crash_on_seven, range(12), on_done=lambda item, _: done.append(item), name="demo_{}".format
+            toys.crash_on_seven,
+            range(12),
+            on_done=lambda item, _: done.append(item),
+            name="demo_{}".format,
         )
     assert str(caught.value).splitlines() == [
         "2 of 12 items failed; the others are done:",
@@ -84,7 +97,10 @@ def test_function_or_item_that_cannot_be_sent_is_said_before_anything_starts():
         LocalEngine(workers=2).map(lambda x: x, [1, 2])
     with pytest.raises(EngineError, match="item <generator"):
         LocalEngine(workers=2).map(toys.double, [1, (x for x in "ab")])
-    assert LocalEngine().map(lambda x: x, [1, 2]) == [1, 2]  # nothing is sent within one process
+    assert LocalEngine().map(lambda x: x, [1, 2]) == [
+        1,
+        2,
+    ]  # nothing is sent within one process
 
 
 def test_result_that_cannot_be_sent_back_is_named():
@@ -100,7 +116,9 @@ def test_function_that_a_worker_cannot_load_is_said_once(monkeypatch):
     only_here = types.ModuleType("only_here")
     exec("def double(x):\n    return 2 * x", only_here.__dict__)
     monkeypatch.setitem(sys.modules, "only_here", only_here)
-    with pytest.raises(EngineError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
+    with pytest.raises(
+        EngineError, match="cannot be loaded in a worker process: ModuleNotFoundError"
+    ):
         LocalEngine(workers=2).map(only_here.double, [1, 2])
 
 
@@ -131,7 +149,9 @@ def test_items_that_others_gave_rise_to_are_run_before_those_that_wait():
 
 def test_an_item_that_another_gave_rise_to_follows_one_whose_process_died():
     done = []
-    with pytest.raises(EngineError, match="demo_7: the worker process ended with exit code 3"):
+    with pytest.raises(
+        EngineError, match="demo_7: the worker process ended with exit code 3"
+    ):
         LocalEngine(workers=2).map(
             toys.crash_on_seven,
             [7, 1],
@@ -179,7 +199,10 @@ def test_script_without_a_main_guard_is_told_so_instead_of_hanging(tmp_path):
         "LocalEngine(workers=2).map(double, [1, 2])\n"
     )
     done = fresh_python(script, path=Path(toys.__file__).parents[1])
-    assert done.returncode == 1 and "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
+    assert (
+        done.returncode == 1
+        and "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
+    )
 
 
 # Processes that outlive nobody.
@@ -230,7 +253,8 @@ def start_parent(folder: Path, source: str) -> tuple[subprocess.Popen, list[int]
     [
         PARENT,
         pytest.param(
-            PARENT.replace("sleep_and", "spin_and"), marks=pytest.mark.skipif(sys.platform != "linux", reason="prctl")
+            PARENT.replace("sleep_and", "spin_and"),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="prctl"),
         ),
         PARENT_WITHOUT_KERNEL_HELP,
     ],
@@ -250,7 +274,9 @@ def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
 def test_interrupted_engine_ends_its_workers_after_they_tidied_up(tmp_path):
     parent, pids = start_parent(tmp_path, PATIENT_PARENT)
     parent.send_signal(signal.SIGINT)
-    parent.wait(timeout=toys.PATIENCE_S)  # sooner than GRACE_S: they were asked to end, and did
+    parent.wait(
+        timeout=toys.PATIENCE_S
+    )  # sooner than GRACE_S: they were asked to end, and did
     try:
         assert not any(is_running(pid) for pid in pids)
         assert (tmp_path / "a.tidy").exists()
@@ -279,7 +305,10 @@ def is_running(pid: int) -> bool:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except FileNotFoundError:
         return False
-    return state not in ("Z", "X")  # a zombie has ended; only its entry waits for whoever adopted it
+    return state not in (
+        "Z",
+        "X",
+    )  # a zombie has ended; only its entry waits for whoever adopted it
 
 
 @dataclass
@@ -289,13 +318,21 @@ class AnyConfig:
 
 def test_engine_is_chosen_on_the_command_line():
     assert draccus.parse(AnyConfig, args=[]).engine == LocalEngine(workers=1)
-    assert draccus.parse(AnyConfig, args=["--engine.type=local", "--engine.workers=3"]).engine == LocalEngine(workers=3)
-    assert draccus.parse(AnyConfig, args=["--engine.type=ray", "--engine.tasks=2"]).engine == RayEngine(tasks=2)
+    assert draccus.parse(
+        AnyConfig, args=["--engine.type=local", "--engine.workers=3"]
+    ).engine == LocalEngine(workers=3)
+    assert draccus.parse(
+        AnyConfig, args=["--engine.type=ray", "--engine.tasks=2"]
+    ).engine == RayEngine(tasks=2)
 
 
 def test_without_ray_the_way_to_it_is_said(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)  # as if not installed, wherever this runs
-    with pytest.raises(TaccorlError, match=r"pip install \"lerobot_policy_taccorl\[ray\]\""):
+    monkeypatch.setitem(
+        sys.modules, "ray", None
+    )  # as if not installed, wherever this runs
+    with pytest.raises(
+        TaccorlError, match=r"pip install \"lerobot_policy_taccorl\[ray\]\""
+    ):
         RayEngine().map(toys.double, [1, 2])
 
 
@@ -320,10 +357,16 @@ def spoken(item: Path, end: Failed) -> str:
     return f"{item.name}: {end.process}: {end.reason}"
 
 
-def test_an_item_whose_process_died_is_tried_once_more_and_then_has_a_result_that_says_so(tmp_path):
+def test_an_item_whose_process_died_is_tried_once_more_and_then_has_a_result_that_says_so(
+    tmp_path,
+):
     items, done = [tmp_path / name for name in ("a", "once", "always", "b")], []
     found = LocalEngine(workers=2).map(
-        fate, items, on_done=lambda item, result: done.append((item.name, result)), care=TWICE, instead=spoken
+        fate,
+        items,
+        on_done=lambda item, result: done.append((item.name, result)),
+        care=TWICE,
+        instead=spoken,
     )
     assert found == [
         "a 1",
@@ -333,35 +376,59 @@ def test_an_item_whose_process_died_is_tried_once_more_and_then_has_a_result_tha
     ]
     assert (tmp_path / "always").read_text() == "xx"
     assert sorted(done) == sorted(zip(("a", "once", "always", "b"), found, strict=True))
-    assert [name for name, _ in done][-2:] == ["once", "always"]  # alone, after all others
+    assert [name for name, _ in done][-2:] == [
+        "once",
+        "always",
+    ]  # alone, after all others
 
 
 @pytest.mark.slow
 def test_an_item_that_never_ends_is_killed_at_the_limit_and_not_tried_again(tmp_path):
     began_s = time.monotonic()
-    items, care = [tmp_path / name for name in ("hangs", "a", "b")], Care(limit_s=1.0, tries=2)
+    items, care = (
+        [tmp_path / name for name in ("hangs", "a", "b")],
+        Care(limit_s=1.0, tries=2),
+    )
     found = LocalEngine(workers=2).map(fate, items, care=care, instead=spoken)
-    assert found == ["hangs: hung: no end after 1 s; the worker process was killed", "a 1", "b 1"]
+    assert found == [
+        "hangs: hung: no end after 1 s; the worker process was killed",
+        "a 1",
+        "b 1",
+    ]
     assert (tmp_path / "hangs").read_text() == "x"
     assert time.monotonic() - began_s < 20
 
 
 @pytest.mark.slow
 def test_one_item_of_two_workers_does_not_take_the_command_with_it(tmp_path):
-    found = LocalEngine(workers=2).map(fate, [tmp_path / "always"], care=TWICE, instead=spoken)
+    found = LocalEngine(workers=2).map(
+        fate, [tmp_path / "always"], care=TWICE, instead=spoken
+    )
     assert found[0].startswith("always: crashed: ")
 
 
 @pytest.mark.slow
-def test_where_every_one_of_several_dies_the_machine_is_at_fault_and_nothing_is_taken_for_a_result(tmp_path):
+def test_where_every_one_of_several_dies_the_machine_is_at_fault_and_nothing_is_taken_for_a_result(
+    tmp_path,
+):
     items = [tmp_path / "always 1", tmp_path / "always 2"]
-    with pytest.raises(EngineError, match=r"(?s)2 of 2 items failed.*always 1.*exit code 7.*always 2.*exit code 7"):
-        LocalEngine(workers=2).map(fate, items, care=TWICE, instead=lambda *_: pytest.fail("taken for a result"))
+    with pytest.raises(
+        EngineError,
+        match=r"(?s)2 of 2 items failed.*always 1.*exit code 7.*always 2.*exit code 7",
+    ):
+        LocalEngine(workers=2).map(
+            fate,
+            items,
+            care=TWICE,
+            instead=lambda *_: pytest.fail("taken for a result"),
+        )
 
 
 def test_an_exception_is_no_end_of_a_process(tmp_path):
     with pytest.raises(EngineError, match="recording 1 is odd"):
-        LocalEngine(workers=2).map(toys.refuse_odd, [0, 1], care=TWICE, instead=lambda *_: 5)
+        LocalEngine(workers=2).map(
+            toys.refuse_odd, [0, 1], care=TWICE, instead=lambda *_: 5
+        )
 
 
 class RayHere:
@@ -370,7 +437,11 @@ class RayHere:
     exceptions = SimpleNamespace(RayError=ConnectionError)
 
     def remote(self, function: Callable[..., list[Any]]) -> Any:
-        return SimpleNamespace(options=lambda **_: SimpleNamespace(remote=lambda *args: tuple(function(*args))))
+        return SimpleNamespace(
+            options=lambda **_: SimpleNamespace(
+                remote=lambda *args: tuple(function(*args))
+            )
+        )
 
     def wait(self, references: list[Any]) -> tuple[list[Any], list[Any]]:
         return references[-1:], references[:-1]
@@ -392,7 +463,9 @@ ON_A_CLUSTER = [
 
 def on_ray(folder: Path) -> list[Any]:
     care = Care(limit_s=2.0, tries=2)
-    return RayEngine(tasks=2).map(fate, [folder / name for name in NAMES], care=care, instead=spoken)
+    return RayEngine(tasks=2).map(
+        fate, [folder / name for name in NAMES], care=care, instead=spoken
+    )
 
 
 @pytest.mark.slow
@@ -410,7 +483,8 @@ def test_items_of_a_task_that_a_cluster_lost_are_named(monkeypatch):
 
     monkeypatch.setattr(engines, "start_ray", Lossy)
     with pytest.raises(
-        EngineError, match=r"(?s)2 of 5 items failed.*  1: its task ended .*: a node died\n  4: its task"
+        EngineError,
+        match=r"(?s)2 of 5 items failed.*  1: its task ended .*: a node died\n  4: its task",
     ):
         RayEngine(tasks=3).map(toys.double, range(5))
 
@@ -418,7 +492,9 @@ def test_items_of_a_task_that_a_cluster_lost_are_named(monkeypatch):
 @pytest.mark.slow
 def test_the_same_on_ray_itself(tmp_path, monkeypatch):
     ray = pytest.importorskip("ray", reason="extra ray")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(toys.__file__).parents[1]), *sys.path]))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(Path(toys.__file__).parents[1]), *sys.path])
+    )
     ray.init(address="local", num_cpus=2, include_dashboard=False)
     try:
         assert on_ray(tmp_path) == ON_A_CLUSTER
@@ -427,14 +503,18 @@ def test_the_same_on_ray_itself(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("when_ready", [False, True])
-def test_a_worker_for_whom_no_work_is_left_ends_without_a_word(when_ready, capfd) -> None:
+def test_a_worker_for_whom_no_work_is_left_ends_without_a_word(
+    when_ready, capfd
+) -> None:
     context = multiprocessing.get_context("spawn")
     near, far = context.Pipe()
     worker = context.Process(target=_work, args=(far, pickle.dumps(fate), os.getpid()))
     worker.start()
     far.close()
     if when_ready:
-        assert near.poll(60)  # and never read: the worker's next read is reset, not at its end
+        assert near.poll(
+            60
+        )  # and never read: the worker's next read is reset, not at its end
     near.close()
     worker.join(timeout=60)
     assert worker.exitcode == 0

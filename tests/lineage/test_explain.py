@@ -19,11 +19,19 @@ class World:
     """Two raw files, an episode of each in the store, and a dataset merged from both."""
 
     def __init__(self, folder: Path) -> None:
-        self.raw, self.store, self.dataset = make_raw(folder / "raw"), Store(folder / "store"), folder / "dataset"
+        self.raw, self.store, self.dataset = (
+            make_raw(folder / "raw"),
+            Store(folder / "store"),
+            folder / "dataset",
+        )
         config = IngestConfig(rate_hz=20.0)
         self.sources = [self.store.source(path) for path in sorted(self.raw.iterdir())]
-        self.episodes: list[Artefact] = [self.store.run(INGEST, config, [source]) for source in self.sources]
-        self.made = self.store.run(MERGE_DATASET, IngestConfig(), self.episodes, destination=self.dataset)
+        self.episodes: list[Artefact] = [
+            self.store.run(INGEST, config, [source]) for source in self.sources
+        ]
+        self.made = self.store.run(
+            MERGE_DATASET, IngestConfig(), self.episodes, destination=self.dataset
+        )
 
 
 @pytest.fixture
@@ -44,21 +52,36 @@ def test_tree_names_stage_version_key_digest_config_date_and_raw_sources(world):
     made, episode = world.made.manifest, world.episodes[0].manifest
     assert lines[0] == f"merge v1  key {made['key']}  digest {made['digest'][:12]}"
     assert lines[1] == f"│  at {world.dataset}: 5 files"
-    assert lines[2].startswith(f"│  made {made['created']} in {made['seconds']} s by python 3.12")
-    assert text.count("by python") == 1  # said once, as it is the same for the whole tree
+    assert lines[2].startswith(
+        f"│  made {made['created']} in {made['seconds']} s by python 3.12"
+    )
+    assert (
+        text.count("by python") == 1
+    )  # said once, as it is the same for the whole tree
     assert lines[3] == "│  config: all at its default"
-    assert lines[4] == f"├─ ingest v1  key {episode['key']}  digest {episode['digest'][:12]}"
+    assert (
+        lines[4]
+        == f"├─ ingest v1  key {episode['key']}  digest {episode['digest'][:12]}"
+    )
     assert "config: rate_hz=20.0 (all else at its default)" in lines[7]
-    assert lines[8] == f"│  └─ source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}"
+    assert (
+        lines[8]
+        == f"│  └─ source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}"
+    )
     assert lines[9].startswith("└─ ingest v1") and lines[-1] == GOOD
 
 
-def test_any_file_of_a_dataset_explains_the_dataset_and_a_raw_file_is_its_own_source(world):
+def test_any_file_of_a_dataset_explains_the_dataset_and_a_raw_file_is_its_own_source(
+    world,
+):
     whole = render(trace(world.dataset, None))
     assert render(trace(world.dataset / "0.bin", None)) == whole
     assert render(trace(world.dataset / "meta" / "taccorl", None)) == whole
     raw = render(trace(world.raw / "demo_0.raw", None))
-    assert raw.splitlines() == [f"source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}", GOOD]
+    assert raw.splitlines() == [
+        f"source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}",
+        GOOD,
+    ]
     with pytest.raises(LineageError, match="does not exist"):
         render(trace(world.raw / "demo_9.raw", None))
 
@@ -72,16 +95,27 @@ def test_changed_missing_and_added_files_are_reported_by_name(world):
     assert changed.startswith("changed since: 0.bin, digest ")
     assert missing.startswith("missing: 1.bin, digest ")
     assert added == "added since: extra.txt"
-    assert render(trace(world.dataset, None)).endswith("✗ differs from the record in 3 places")
+    assert render(trace(world.dataset, None)).endswith(
+        "✗ differs from the record in 3 places"
+    )
 
 
 def test_input_replaced_by_another_artefact_is_reported(world, tmp_path):
-    made = world.store.run(INGEST, IngestConfig(rate_hz=1.0), [world.store.source(world.raw / "demo_0.raw")])
-    later = world.store.run(MERGE_DATASET, IngestConfig(), [made], destination=tmp_path / "later")
+    made = world.store.run(
+        INGEST,
+        IngestConfig(rate_hz=1.0),
+        [world.store.source(world.raw / "demo_0.raw")],
+    )
+    later = world.store.run(
+        MERGE_DATASET, IngestConfig(), [made], destination=tmp_path / "later"
+    )
     shutil.rmtree(made.path)
     shutil.copytree(world.episodes[0].path, made.path)
     [problem] = problems(later.path)
-    assert problem == f"holds something else now: digest {made.digest[:12]} went into the step above"
+    assert (
+        problem
+        == f"holds something else now: digest {made.digest[:12]} went into the step above"
+    )
 
 
 def test_store_that_was_moved_is_found_by_key(world, tmp_path):
@@ -89,13 +123,22 @@ def test_store_that_was_moved_is_found_by_key(world, tmp_path):
     moved = Store(tmp_path / "elsewhere")
     assert "not in the store any more" in render(trace(world.dataset, None))
     assert "not in the store any more" not in render(trace(world.dataset, moved))
-    (moved.root / "ingest" / world.episodes[1].path.name / "data" / "3.bin").write_text("edited")  # found, so judged
-    assert [problem.partition(",")[0] for problem in problems(world.dataset, moved)] == ["changed since: data/3.bin"]
+    (moved.root / "ingest" / world.episodes[1].path.name / "data" / "3.bin").write_text(
+        "edited"
+    )  # found, so judged
+    assert [
+        problem.partition(",")[0] for problem in problems(world.dataset, moved)
+    ] == ["changed since: data/3.bin"]
 
 
-def test_dataset_whose_store_is_gone_still_tells_its_lineage_down_to_the_raw_files(world, tmp_path):
+def test_dataset_whose_store_is_gone_still_tells_its_lineage_down_to_the_raw_files(
+    world, tmp_path
+):
     again = Store(tmp_path / "other").run(
-        Stage("copy", _write), None, [world.store.source(world.dataset)], destination=tmp_path / "derived"
+        Stage("copy", _write),
+        None,
+        [world.store.source(world.dataset)],
+        destination=tmp_path / "derived",
     )
     merge_key = world.made.manifest["key"]
     for gone in (world.store.root, tmp_path / "other", world.dataset):
@@ -105,13 +148,23 @@ def test_dataset_whose_store_is_gone_still_tells_its_lineage_down_to_the_raw_fil
     assert lines[5].endswith(f"not there any more: {world.dataset}")
     shown = "\n".join(lines)
     for episode, source in zip(world.episodes, world.sources, strict=True):
-        assert f"ingest v1  key {episode.path.name}  digest {episode.digest[:12]}" in shown
+        assert (
+            f"ingest v1  key {episode.path.name}  digest {episode.digest[:12]}" in shown
+        )
         assert f"not in the store any more: {episode.path}" in shown
         assert f"source  {source.path}  digest {source.digest[:12]}" in shown
-    assert shown.count("config: rate_hz=20.0 (all else at its default)") == 2 and lines[-1] == GOOD
-    (world.raw / "demo_0.raw").write_text("edited")  # the raw files are judged all the same
+    assert (
+        shown.count("config: rate_hz=20.0 (all else at its default)") == 2
+        and lines[-1] == GOOD
+    )
+    (world.raw / "demo_0.raw").write_text(
+        "edited"
+    )  # the raw files are judged all the same
     (world.raw / "demo_1.raw").unlink()
-    assert [problem.split(":")[0] for problem in problems(again.path)] == ["changed since", "missing"]
+    assert [problem.split(":")[0] for problem in problems(again.path)] == [
+        "changed since",
+        "missing",
+    ]
 
 
 def test_manifest_without_its_inputs_records_says_that_they_are_missing(world):
@@ -132,34 +185,54 @@ def mine(world, tmp_path):
     source = world.store.source(copy)
     episode = world.store.run(INGEST, IngestConfig(rate_hz=20.0), [source])
     assert episode == world.episodes[0]
-    world.store.run(MERGE_DATASET, IngestConfig(), [episode], destination=tmp_path / "mine", sources=[source])
+    world.store.run(
+        MERGE_DATASET,
+        IngestConfig(),
+        [episode],
+        destination=tmp_path / "mine",
+        sources=[source],
+    )
     return tmp_path / "mine"
 
 
-def test_the_users_own_file_is_named_and_the_path_of_its_equal_is_only_mentioned(mine, world, tmp_path):
+def test_the_users_own_file_is_named_and_the_path_of_its_equal_is_only_mentioned(
+    mine, world, tmp_path
+):
     lines = render(trace(mine, world.store)).splitlines()
     digest = world.sources[0].digest[:12]
     assert lines[4] == f"├─ source  {tmp_path}/my recording.raw  digest {digest}"
     assert lines[5].startswith("└─ ingest v1")
-    assert lines[9] == f"   └─ source  digest {digest}  first read from {world.raw}/demo_0.raw"
+    assert (
+        lines[9]
+        == f"   └─ source  digest {digest}  first read from {world.raw}/demo_0.raw"
+    )
     assert lines[10:] == [GOOD]
 
 
 @pytest.mark.parametrize("store_is_there", [True, False])
-def test_change_of_the_users_own_file_is_reported_and_that_of_its_equal_is_not(mine, world, tmp_path, store_is_there):
+def test_change_of_the_users_own_file_is_reported_and_that_of_its_equal_is_not(
+    mine, world, tmp_path, store_is_there
+):
     store = world.store if store_is_there else None
     if not store_is_there:
         shutil.rmtree(world.store.root)
     (world.raw / "demo_0.raw").unlink()
     assert problems(mine, store) == []
     (tmp_path / "my recording.raw").write_text("edited")
-    assert [problem.split(":")[0] for problem in problems(mine, store)] == ["changed since"]
+    assert [problem.split(":")[0] for problem in problems(mine, store)] == [
+        "changed since"
+    ]
     (tmp_path / "my recording.raw").unlink()
     assert [problem.split(":")[0] for problem in problems(mine, store)] == ["missing"]
 
 
 def test_input_used_twice_is_explained_once(world, tmp_path):
-    twice = world.store.run(MERGE_DATASET, IngestConfig(), [world.episodes[0]] * 2, destination=tmp_path / "twice")
+    twice = world.store.run(
+        MERGE_DATASET,
+        IngestConfig(),
+        [world.episodes[0]] * 2,
+        destination=tmp_path / "twice",
+    )
     text = render(trace(twice.path, world.store))
     assert text.count("demo_0.raw") == 1
     assert text.count("(see above)") == 1
@@ -172,13 +245,19 @@ SHOWN = ", ".join(f"[réc {i}.mcap, written]" for i in range(4))
 @pytest.mark.parametrize(
     ("config", "shown"),
     [
-        ({"noise": {"std_m": 0.01}, "name": "cup"}, "name=cup, noise.std_m=0.01"),  # plain data declare no defaults
+        (
+            {"noise": {"std_m": 0.01}, "name": "cup"},
+            "name=cup, noise.std_m=0.01",
+        ),  # plain data declare no defaults
         (None, "none"),
         (
             {"recordings": RECORDINGS, "part": None, "fit": True, "pads": []},
             f"fit=true, pads=[], recordings=[{SHOWN}, … 96 more]",
         ),
-        ({"twin": "arms:\n  left: 1\n\n" + "x" * 5000, "seed": 3}, "seed=3, twin=arms: left: 1 xxx"),
+        (
+            {"twin": "arms:\n  left: 1\n\n" + "x" * 5000, "seed": 3},
+            "seed=3, twin=arms: left: 1 xxx",
+        ),
     ],
 )
 def test_config_is_shown_in_one_line_to_be_read_not_parsed(tmp_path, config, shown):

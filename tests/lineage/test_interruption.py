@@ -17,7 +17,10 @@ def start(tmp_path: Path, destination: Path) -> subprocess.Popen:
     """The toy pipeline in a process of its own, its imports done, waiting for a line on its input."""
     words = [tmp_path / "store", tmp_path / "raw", tmp_path / "log", destination]
     process = subprocess.Popen(
-        [sys.executable, toys.__file__, *map(str, words)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, toys.__file__, *map(str, words)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -30,11 +33,15 @@ def go(process: subprocess.Popen) -> None:
     process.stdin.flush()
 
 
-def test_killed_before_each_of_its_file_operations_a_run_never_leaves_a_wrong_artefact(tmp_path):
+def test_killed_before_each_of_its_file_operations_a_run_never_leaves_a_wrong_artefact(
+    tmp_path,
+):
     words = [sys.executable, kill_points.__file__, str(tmp_path)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
     num_points, num_wrong = map(int, done.stdout.split())
-    assert num_points >= 30  # folders, files, flushing them, the manifest, the rename, the lock, …
+    assert (
+        num_points >= 30
+    )  # folders, files, flushing them, the manifest, the rename, the lock, …
     assert num_wrong == 0
 
 
@@ -46,13 +53,25 @@ def test_two_processes_at_once_do_the_work_once_and_agree(tmp_path):
     digests = [process.communicate(timeout=30)[0] for process in processes]
     assert [process.returncode for process in processes] == [0, 0]
     assert digests[0] == digests[1] != ""
-    assert sorted((tmp_path / "log").read_text().splitlines()) == ["ingest demo_0.raw", "ingest demo_1.raw", "merge"]
+    assert sorted((tmp_path / "log").read_text().splitlines()) == [
+        "ingest demo_0.raw",
+        "ingest demo_1.raw",
+        "merge",
+    ]
 
 
 def test_two_threads_at_once_do_the_work_once(tmp_path):
-    store, raw, log, digests = Store(tmp_path / "store"), make_raw(tmp_path / "raw"), tmp_path / "log", []
+    store, raw, log, digests = (
+        Store(tmp_path / "store"),
+        make_raw(tmp_path / "raw"),
+        tmp_path / "log",
+        [],
+    )
     threads = [
-        threading.Thread(target=lambda: digests.append(run_pipeline(store, raw, log=log).digest)) for _ in range(3)
+        threading.Thread(
+            target=lambda: digests.append(run_pipeline(store, raw, log=log).digest)
+        )
+        for _ in range(3)
     ]
     for thread in threads:
         thread.start()
@@ -64,7 +83,10 @@ def test_two_threads_at_once_do_the_work_once(tmp_path):
 
 def test_waiting_run_takes_over_when_the_first_is_killed(tmp_path):
     make_raw(tmp_path / "raw")
-    first, second = start(tmp_path, tmp_path / "dataset"), start(tmp_path, tmp_path / "dataset")
+    first, second = (
+        start(tmp_path, tmp_path / "dataset"),
+        start(tmp_path, tmp_path / "dataset"),
+    )
     go(first)
     time.sleep(0.01)
     go(second)
@@ -72,5 +94,7 @@ def test_waiting_run_takes_over_when_the_first_is_killed(tmp_path):
     first.kill()
     first.communicate()
     digest = second.communicate(timeout=30)[0].strip()
-    assert digest == run_pipeline(Store(tmp_path / "reference"), tmp_path / "raw").digest
+    assert (
+        digest == run_pipeline(Store(tmp_path / "reference"), tmp_path / "raw").digest
+    )
     assert temporary(tmp_path) == []

@@ -24,7 +24,9 @@ def world(tmp_path):
     sources = [store.source(path) for path in sorted(raw.iterdir())]
     episodes = [store.run(INGEST, IngestConfig(), [source]) for source in sources[:2]]
     merged = store.run(MERGE, IngestConfig(), episodes)
-    store.run(Stage("finish", _finish), None, [merged], destination=tmp_path / "dataset")
+    store.run(
+        Stage("finish", _finish), None, [merged], destination=tmp_path / "dataset"
+    )
     store.run(INGEST, IngestConfig(rate_hz=20.0), [sources[0]])
     store.run(INGEST, IngestConfig(), [sources[2]])
     return tmp_path
@@ -45,15 +47,24 @@ def test_keeps_what_the_dataset_was_made_from_however_deep_and_frees_the_rest(wo
     ]
     # Five files each: 200 bytes less 0…4, and the text "20.0" or "30.0" at the end of each; and the manifest.
     manifest_bytes = (folders[0].path / "manifest.json").stat().st_size
-    assert folders[0].size_bytes == 5 * 200 - 10 + 5 * 4 + manifest_bytes and folders[2].size_bytes == 1000
+    assert (
+        folders[0].size_bytes == 5 * 200 - 10 + 5 * 4 + manifest_bytes
+        and folders[2].size_bytes == 1000
+    )
     assert delete(store, folders) == []
     assert len(store.folders()) == 3  # two episodes and what they were merged into
-    assert trace(world / "dataset", store).num_problems() == 0 and unneeded(store, [world / "dataset"]) == []
+    assert (
+        trace(world / "dataset", store).num_problems() == 0
+        and unneeded(store, [world / "dataset"]) == []
+    )
 
 
 def test_what_a_published_dataset_was_made_from_stays_without_being_named(world):
     store = Store(world / "store")
-    assert [folder.path.parent.name for folder in unneeded(store)] == ["ingest", "ingest"]
+    assert [folder.path.parent.name for folder in unneeded(store)] == [
+        "ingest",
+        "ingest",
+    ]
     assert unneeded(store) == unneeded(store, [world / "dataset"])
     delete(store, unneeded(store))
     assert trace(world / "dataset", store).num_problems() == 0
@@ -61,19 +72,27 @@ def test_what_a_published_dataset_was_made_from_stays_without_being_named(world)
 
 
 @pytest.mark.parametrize("fate", ["removed", "moved", "replaced"])
-def test_dataset_that_is_no_longer_there_keeps_nothing_unless_its_new_place_is_named(world, fate):
+def test_dataset_that_is_no_longer_there_keeps_nothing_unless_its_new_place_is_named(
+    world, fate
+):
     store, dataset, moved = Store(world / "store"), world / "dataset", world / "moved"
     dataset.rename(moved)
     if fate == "removed":
         shutil.rmtree(moved)
     elif fate == "replaced":
-        other = store.run(INGEST, IngestConfig(rate_hz=20.0), [store.source(world / "raw" / "demo_0.raw")])
+        other = store.run(
+            INGEST,
+            IngestConfig(rate_hz=20.0),
+            [store.source(world / "raw" / "demo_0.raw")],
+        )
         shutil.copytree(other.path, dataset)
     assert store.destinations.gone() == [dataset]
     assert len(unneeded(store)) == 5
     if fate != "removed":
         assert len(unneeded(store, [moved])) == 2
-        delete(store, unneeded(store))  # and even if it is not named, its lineage reaches the raw files
+        delete(
+            store, unneeded(store)
+        )  # and even if it is not named, its lineage reaches the raw files
         text = render(trace(moved, store))
         assert text.count("not in the store any more") == 3
         assert all(f"{world}/raw/demo_{i}.raw" in text for i in range(2))
@@ -82,7 +101,10 @@ def test_dataset_that_is_no_longer_there_keeps_nothing_unless_its_new_place_is_n
 
 def test_store_that_was_made_anew_learns_of_a_dataset_when_its_run_is_repeated(world):
     store, raw = Store(world / "other"), world / "raw"
-    episodes = [store.run(INGEST, IngestConfig(), [store.source(raw / f"demo_{i}.raw")]) for i in range(2)]
+    episodes = [
+        store.run(INGEST, IngestConfig(), [store.source(raw / f"demo_{i}.raw")])
+        for i in range(2)
+    ]
     merged = store.run(MERGE, IngestConfig(), episodes)
     assert len(unneeded(store)) == 3
     store.run(Stage("finish", _finish), None, [merged], destination=world / "dataset")
@@ -94,12 +116,19 @@ def test_what_lies_behind_an_artefact_that_is_gone_is_kept_all_the_same(world):
     [merged] = (store.root / "merge").iterdir()
     shutil.rmtree(merged)
     assert len(store.artefacts()) == 4
-    assert len(unneeded(store)) == 2  # the two episodes stay: the dataset's own manifest tells of them
+    assert (
+        len(unneeded(store)) == 2
+    )  # the two episodes stay: the dataset's own manifest tells of them
 
 
 def test_lineage_through_another_dataset_outside_the_store_is_followed(world):
     store = Store(world / "store")
-    derived = store.run(Stage("copy", _copy), None, [store.source(world / "dataset")], destination=world / "derived")
+    derived = store.run(
+        Stage("copy", _copy),
+        None,
+        [store.source(world / "dataset")],
+        destination=world / "derived",
+    )
     assert len(unneeded(store, [derived.path])) == 2
 
 
@@ -140,7 +169,9 @@ def test_what_a_run_is_building_now_is_neither_listed_nor_deleted(world):
         "print(Store(Path(sys.argv[1])).run(Stage('wait', wait), None, []).path)"
     )
     words = [sys.executable, "-c", script, str(store.root)]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "building\n"
         listed = unneeded(store)
@@ -158,7 +189,9 @@ def test_command_lists_first_and_deletes_only_with_yes(world, capsys):
     words = ["prune", f"--store={world / 'store'}"]
     assert main([*words, f"--keep={world / 'dataset'}"]) == 0
     out = capsys.readouterr().out
-    assert f"not needed for 1 dataset: 2 of 5 folders in {world / 'store'}, 0.0 MB" in out
+    assert (
+        f"not needed for 1 dataset: 2 of 5 folders in {world / 'store'}, 0.0 MB" in out
+    )
     assert "Nothing was deleted" in out
     assert len(Store(world / "store").artefacts()) == 5
     assert main([*words, "--yes=true"]) == 0
@@ -171,7 +204,10 @@ def test_command_lists_first_and_deletes_only_with_yes(world, capsys):
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "3 of 3 folders" in out
-    assert f"1 dataset gone or moved; name moved ones with --keep=DATASET:\n  {world / 'dataset'}\n" in out
+    assert (
+        f"1 dataset gone or moved; name moved ones with --keep=DATASET:\n  {world / 'dataset'}\n"
+        in out
+    )
 
 
 def test_command_explains_and_its_status_tells_if_anything_changed(world, capsys):

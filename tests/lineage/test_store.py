@@ -29,7 +29,14 @@ from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store, is_store
 
 from .kill_points import temporary
-from .toys import INGEST, MERGE_DATASET, IngestConfig, make_raw, run_and_die, run_pipeline
+from .toys import (
+    INGEST,
+    MERGE_DATASET,
+    IngestConfig,
+    make_raw,
+    run_and_die,
+    run_pipeline,
+)
 
 
 @pytest.fixture
@@ -54,13 +61,17 @@ def test_of_a_new_file_that_cannot_be_written_nothing_remains(tmp_path):
     in_child = os.fork()
     if in_child == 0:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # as a full disk would: the second part of the text fails
+        resource.setrlimit(
+            resource.RLIMIT_FSIZE, (100, 100)
+        )  # as a full disk would: the second part of the text fails
         try:
             write_new(path, "x" * 200)
         except OSError:
             os._exit(7)
         os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(in_child, 0)[1]) == 7 and not path.exists()
+    assert (
+        os.waitstatus_to_exitcode(os.waitpid(in_child, 0)[1]) == 7 and not path.exists()
+    )
     write_new(path, "kept")
     with pytest.raises(FileExistsError):
         write_new(path, "other")
@@ -71,22 +82,35 @@ def test_a_place_that_cannot_be_written_is_named_before_any_work(tmp_path):
     (tmp_path / "file").touch()
     check_writable(tmp_path / "new" / "below")
     assert not (tmp_path / "new").exists()
-    with pytest.raises(TaccorlError, match=f"--out={tmp_path}/file/x: {tmp_path}/file is not a folder"):
+    with pytest.raises(
+        TaccorlError, match=f"--out={tmp_path}/file/x: {tmp_path}/file is not a folder"
+    ):
         check_writable(tmp_path / "file" / "x")
-    with pytest.raises(TaccorlError, match="--out=/proc/x/y: /proc cannot be written to"):
+    with pytest.raises(
+        TaccorlError, match="--out=/proc/x/y: /proc cannot be written to"
+    ):
         check_writable(Path("/proc/x/y"))
 
 
-def test_key_is_the_first_16_hex_of_the_sha256_of_stage_version_config_and_inputs(store, raw):
+def test_key_is_the_first_16_hex_of_the_sha256_of_stage_version_config_and_inputs(
+    store, raw
+):
     source = store.source(raw / "demo_0.raw")
     by_hand = hashlib.sha256()
-    for part in ["ingest", "1", '{"rate_hz":30.0,"type":"IngestConfig"}', hashlib.sha256(bytes(200)).hexdigest()]:
+    for part in [
+        "ingest",
+        "1",
+        '{"rate_hz":30.0,"type":"IngestConfig"}',
+        hashlib.sha256(bytes(200)).hexdigest(),
+    ]:
         by_hand.update(len(part).to_bytes(8, "little") + part.encode())
     assert canonical_text(IngestConfig()) == '{"rate_hz":30.0,"type":"IngestConfig"}'
     assert store.key(INGEST, IngestConfig(), [source]) == by_hand.hexdigest()[:16]
 
 
-def test_key_changes_with_stage_version_config_and_inputs_and_with_nothing_else(store, raw):
+def test_key_changes_with_stage_version_config_and_inputs_and_with_nothing_else(
+    store, raw
+):
     a, b = (store.source(path) for path in sorted(raw.iterdir()))
     key = store.key(INGEST, IngestConfig(), [a, b])
     others = [
@@ -98,7 +122,10 @@ def test_key_changes_with_stage_version_config_and_inputs_and_with_nothing_else(
     ]
     assert len({key, *others}) == 6
     copy = shutil.copy(raw / "demo_0.raw", raw / "elsewhere")
-    assert store.key(INGEST, IngestConfig(log=Path("any")), [store.source(Path(copy)), b]) == key
+    assert (
+        store.key(INGEST, IngestConfig(log=Path("any")), [store.source(Path(copy)), b])
+        == key
+    )
 
 
 def test_manifest_says_what_was_made_from_what(store, raw):
@@ -109,18 +136,30 @@ def test_manifest_says_what_was_made_from_what(store, raw):
     assert (manifest["stage"], manifest["stage_version"]) == ("ingest", 1)
     assert manifest["config"] == {"rate_hz": 20.0, "type": "IngestConfig"}
     assert manifest["config_not_default"] == {"rate_hz": 20.0}
-    assert manifest["inputs"] == [{"path": str(raw / "demo_1.raw"), "digest": source.digest, "key": None}]
-    assert manifest["files"]["data/4.bin"] == hashlib.sha256(b"\1" * 196 + b"20.0").hexdigest()
+    assert manifest["inputs"] == [
+        {"path": str(raw / "demo_1.raw"), "digest": source.digest, "key": None}
+    ]
+    assert (
+        manifest["files"]["data/4.bin"]
+        == hashlib.sha256(b"\1" * 196 + b"20.0").hexdigest()
+    )
     assert set(manifest["files"]) == {f"data/{i}.bin" for i in range(5)}
     assert manifest["created"].endswith("+00:00") and 0.02 <= manifest["seconds"] < 10
-    assert manifest["software"]["python"].startswith("3.12") and "taccorl" in manifest["software"]
+    assert (
+        manifest["software"]["python"].startswith("3.12")
+        and "taccorl" in manifest["software"]
+    )
     assert artefact.manifest == manifest
     assert source.manifest == {}
 
 
 def test_equal_content_has_an_equal_digest_whatever_made_it_and_when(store):
     other = Stage("other", write_one, version=7)
-    assert store.run(ONE, "x", []).digest == store.run(other, "x", []).digest != store.run(ONE, "y", []).digest
+    assert (
+        store.run(ONE, "x", []).digest
+        == store.run(other, "x", []).digest
+        != store.run(ONE, "y", []).digest
+    )
 
 
 def test_dataset_used_as_a_source_is_the_artefact_it_is(store, raw, tmp_path):
@@ -129,30 +168,48 @@ def test_dataset_used_as_a_source_is_the_artefact_it_is(store, raw, tmp_path):
     (tmp_path / "dataset" / ".cache" / "junk").write_text("dropped there by a tool")
     source = store.source(tmp_path / "dataset")
     assert source.digest == made.digest
-    assert store.run(ONE, "x", [source]).manifest["inputs"][0]["key"] == made.manifest["key"]
+    assert (
+        store.run(ONE, "x", [source]).manifest["inputs"][0]["key"]
+        == made.manifest["key"]
+    )
     (tmp_path / "dataset" / "0.bin").write_text("edited")
     edited = store.source(tmp_path / "dataset")
     assert edited.digest != made.digest
     assert store.run(ONE, "x", [edited]).manifest["inputs"][0]["key"] is None
 
 
-@pytest.mark.parametrize("hurt", [lambda p: p.write_bytes(b"0123456x89"), lambda p: p.write_bytes(b""), Path.unlink])
-def test_a_dataset_whose_numbers_are_not_as_written_is_refused_and_its_meta_may_change(store, tmp_path, hurt):
+@pytest.mark.parametrize(
+    "hurt",
+    [lambda p: p.write_bytes(b"0123456x89"), lambda p: p.write_bytes(b""), Path.unlink],
+)
+def test_a_dataset_whose_numbers_are_not_as_written_is_refused_and_its_meta_may_change(
+    store, tmp_path, hurt
+):
     def write(config, inputs, out_dir):
         for name in ("data/file-000.parquet", "videos/front.mp4", "meta/stats.json"):
             (out_dir / name).parent.mkdir()
             (out_dir / name).write_bytes(b"0123456789")
 
-    made = store.run(Stage("toy", write, manifest="meta/taccorl/manifest.json"), None, [], destination=tmp_path / "d")
+    made = store.run(
+        Stage("toy", write, manifest="meta/taccorl/manifest.json"),
+        None,
+        [],
+        destination=tmp_path / "d",
+    )
     assert store.dataset(tmp_path / "d") == store.source(tmp_path / "d")
     (tmp_path / "d/meta/stats.json").write_text("{}")  # as lerobot-edit-dataset does
     assert store.dataset(tmp_path / "d").digest != made.digest
     for name in ("data/file-000.parquet", "videos/front.mp4"):
         shutil.copytree(tmp_path / "d", tmp_path / "hurt")
         hurt(tmp_path / "hurt" / name)
-        with pytest.raises(LineageError, match=rf"hurt: {name} is damaged or changed.*explain {tmp_path / 'hurt'}"):
+        with pytest.raises(
+            LineageError,
+            match=rf"hurt: {name} is damaged or changed.*explain {tmp_path / 'hurt'}",
+        ):
             store.dataset(tmp_path / "hurt")
-        (tmp_path / "hurt/meta/taccorl/manifest.json").unlink()  # the way out that it names
+        (
+            tmp_path / "hurt/meta/taccorl/manifest.json"
+        ).unlink()  # the way out that it names
         assert store.dataset(tmp_path / "hurt") == store.source(tmp_path / "hurt")
         shutil.rmtree(tmp_path / "hurt")
     with pytest.raises(LineageError):
@@ -169,14 +226,18 @@ def test_hidden_file_that_a_stage_wrote_is_part_of_the_artefact(store):
     assert store.source(artefact.path).digest == artefact.digest
 
 
-@pytest.mark.parametrize("error", [ValueError("the gripper slipped"), OSError(errno.ENOSPC, "no space")])
+@pytest.mark.parametrize(
+    "error", [ValueError("the gripper slipped"), OSError(errno.ENOSPC, "no space")]
+)
 def test_stage_that_raises_leaves_nothing_and_frees_its_lock(store, error):
     def fail(config, inputs, out_dir):
         (out_dir / "half").write_text("x")
         raise error
 
     for _ in range(2):
-        with pytest.raises(type(error), match=r"slipped|/failing/"):  # of a full disk also the place
+        with pytest.raises(
+            type(error), match=r"slipped|/failing/"
+        ):  # of a full disk also the place
             store.run(Stage("failing", fail), None, [])
     assert list((store.root / "failing").iterdir()) == []
 
@@ -194,7 +255,9 @@ def test_stage_may_run_other_stages_but_not_wait_for_itself(store):
         store.run(Stage("itself", itself), None, [])
 
 
-@pytest.mark.parametrize("what", ["nothing", "the manifest", "a copied manifest", "no folder"])
+@pytest.mark.parametrize(
+    "what", ["nothing", "the manifest", "a copied manifest", "no folder"]
+)
 def test_stage_that_wrote_no_artefact_is_named(store, what):
     inner = store.run(ONE, "x", [])
 
@@ -206,7 +269,9 @@ def test_stage_that_wrote_no_artefact_is_named(store, what):
         elif what == "no folder":
             out_dir.rmdir()
 
-    place = "meta/taccorl/manifest.json" if what == "a copied manifest" else "manifest.json"
+    place = (
+        "meta/taccorl/manifest.json" if what == "a copied manifest" else "manifest.json"
+    )
     with pytest.raises(LineageError, match="stage bad wrote"):
         store.run(Stage("bad", bad, manifest=place), None, [])
     assert list((store.root / "bad").iterdir()) == []
@@ -232,11 +297,18 @@ def test_input_that_is_gone_is_named(store, raw):
 # Destination: the user's own folder.
 
 
-def test_destination_holds_the_dataset_and_a_second_run_leaves_it_untouched(store, raw, tmp_path):
+def test_destination_holds_the_dataset_and_a_second_run_leaves_it_untouched(
+    store, raw, tmp_path
+):
     destination, log = tmp_path / "datasets" / "insert", tmp_path / "log"
     made = run_pipeline(store, raw, destination, log=log)
     assert made.path == destination
-    assert made.manifest["key"] == json.loads((destination / "meta" / "taccorl" / "manifest.json").read_text())["key"]
+    assert (
+        made.manifest["key"]
+        == json.loads((destination / "meta" / "taccorl" / "manifest.json").read_text())[
+            "key"
+        ]
+    )
     assert not (store.root / "merge").exists()
     (destination / "my_notes.txt").write_text("mine")
     assert run_pipeline(store, raw, destination, log=log) == made
@@ -245,32 +317,64 @@ def test_destination_holds_the_dataset_and_a_second_run_leaves_it_untouched(stor
     assert temporary(tmp_path / "datasets") == []
 
 
-def test_manifest_of_a_destination_names_its_sources_and_carries_the_records_of_its_inputs(store, raw, tmp_path):
+def test_manifest_of_a_destination_names_its_sources_and_carries_the_records_of_its_inputs(
+    store, raw, tmp_path
+):
     sources = [store.source(path) for path in sorted(raw.iterdir())]
     episodes = [store.run(INGEST, IngestConfig(), [source]) for source in sources]
     merged = store.run(MERGE_DATASET, IngestConfig(), episodes)
-    made = store.run(ONE, "x", [merged, merged], destination=tmp_path / "d", sources=[*sources, *sources])
-    assert made.manifest["sources"] == [{"path": str(source.path), "digest": source.digest} for source in sources]
+    made = store.run(
+        ONE,
+        "x",
+        [merged, merged],
+        destination=tmp_path / "d",
+        sources=[*sources, *sources],
+    )
+    assert made.manifest["sources"] == [
+        {"path": str(source.path), "digest": source.digest} for source in sources
+    ]
     carried = made.manifest["ancestors"]
     assert set(carried) == {artefact.path.name for artefact in (*episodes, merged)}
     for artefact in (*episodes, merged):
         record = carried[artefact.path.name]
         assert record == {name: artefact.manifest[name] for name in record}
-        assert set(artefact.manifest) - set(record) == {"taccorl_manifest", "place", "seconds", "software", "files"}
+        assert set(artefact.manifest) - set(record) == {
+            "taccorl_manifest",
+            "place",
+            "seconds",
+            "software",
+            "files",
+        }
     with pytest.raises(LineageError, match="manifest, but there is no destination"):
         store.run(ONE, "x", [merged], sources=sources)
 
 
-def test_destination_with_another_config_is_refused_with_both_named(store, raw, tmp_path):
+def test_destination_with_another_config_is_refused_with_both_named(
+    store, raw, tmp_path
+):
     source = store.source(raw / "demo_0.raw")
     made = store.run(
-        MERGE_DATASET, IngestConfig(), [store.run(INGEST, IngestConfig(), [source])], destination=tmp_path / "d"
+        MERGE_DATASET,
+        IngestConfig(),
+        [store.run(INGEST, IngestConfig(), [source])],
+        destination=tmp_path / "d",
     )
     other = IngestConfig(rate_hz=20.0)
     with pytest.raises(DatasetError) as caught:
-        store.run(MERGE_DATASET, other, [store.run(INGEST, other, [source])], destination=tmp_path / "d")
+        store.run(
+            MERGE_DATASET,
+            other,
+            [store.run(INGEST, other, [source])],
+            destination=tmp_path / "d",
+        )
     message = str(caught.value)
-    for part in [str(tmp_path / "d"), made.manifest["key"], "rate_hz: 30.0 → 20.0", "inputs", "another destination"]:
+    for part in [
+        str(tmp_path / "d"),
+        made.manifest["key"],
+        "rate_hz: 30.0 → 20.0",
+        "inputs",
+        "another destination",
+    ]:
         assert part in message
     assert store.source(tmp_path / "d").digest == made.digest
 
@@ -313,10 +417,16 @@ def test_destination_in_the_store_is_refused(store):
         store.run(ONE, "x", [], destination=store.root / "mine")
 
 
-def test_scratch_of_a_dead_run_goes_with_the_next_one_or_with_prune_and_not_while_it_is_used(store):
+def test_scratch_of_a_dead_run_goes_with_the_next_one_or_with_prune_and_not_while_it_is_used(
+    store,
+):
     with store.scratch(ONE, {"of": "a"}) as folder:
         (folder / "x").write_text("x")
-        assert folder.is_relative_to(store.root) and unneeded(store) == [] and store.artefacts() == []
+        assert (
+            folder.is_relative_to(store.root)
+            and unneeded(store) == []
+            and store.artefacts() == []
+        )
         dead = folder.with_name(f"{folder.name}-dead")
         shutil.copytree(folder, dead)
     assert not folder.exists()
@@ -328,12 +438,16 @@ def test_scratch_of_a_dead_run_goes_with_the_next_one_or_with_prune_and_not_whil
         assert not dead.exists() and list(folder.iterdir()) == []
 
 
-def test_leftovers_beside_a_destination_go_only_if_they_are_this_stores(store, tmp_path):
+def test_leftovers_beside_a_destination_go_only_if_they_are_this_stores(
+    store, tmp_path
+):
     for root in (store.root, tmp_path / "other_store"):
         run_and_die(root, tmp_path / "d")
     assert len(temporary(tmp_path)) == 2
     store.run(ONE, "x", [], destination=tmp_path / "d")
-    assert len(temporary(tmp_path)) == 1  # that one's maker may be alive: only the other store's lock can tell
+    assert (
+        len(temporary(tmp_path)) == 1
+    )  # that one's maker may be alive: only the other store's lock can tell
 
 
 # The store's own folder.
@@ -378,7 +492,12 @@ def test_who_waits_for_a_lock_says_for_what_and_who_holds_it(store, caplog):
     (record,) = caplog.records
     assert record.levelname == "WARNING"  # is shown without any setting
     holder = f"process {os.getpid()} on {socket.gethostname()}"
-    for part in ("recording, /data/out", str(store.root), holder, Path(sys.argv[0]).name):
+    for part in (
+        "recording, /data/out",
+        str(store.root),
+        holder,
+        Path(sys.argv[0]).name,
+    ):
         assert part in record.getMessage()
 
 
@@ -406,42 +525,70 @@ DAMAGES = {
 
 @pytest.mark.parametrize("hurt", DAMAGES.values(), ids=DAMAGES)
 @pytest.mark.parametrize("file", ["data/3.bin", "manifest.json"])
-def test_a_damaged_artefact_of_the_store_is_made_anew_and_never_published(store, raw, tmp_path, hurt, file, caplog):
+def test_a_damaged_artefact_of_the_store_is_made_anew_and_never_published(
+    store, raw, tmp_path, hurt, file, caplog
+):
     """The dataset is that of an undamaged store. A manifest's bits outside of its list of files may differ."""
     log, rng = tmp_path / "log", np.random.default_rng(0)
     expected = run_pipeline(store, raw, tmp_path / "before", log=log).digest
     for trial in range(3):
-        (path,) = [p / file for p in store.artefacts() if (p / "data/3.bin").read_bytes().startswith(b"\1")]
+        (path,) = [
+            p / file
+            for p in store.artefacts()
+            if (p / "data/3.bin").read_bytes().startswith(b"\1")
+        ]
         hurt(path, rng)
         log.unlink()
-        again = run_pipeline(Store(store.root), raw, tmp_path / f"again_{trial}", log=log)
+        again = run_pipeline(
+            Store(store.root), raw, tmp_path / f"again_{trial}", log=log
+        )
         assert again.digest == expected and verify(again.path).changed == ()
         made = log.read_text().splitlines()
         if file == "data/3.bin" or hurt not in (flip, flip_and_set_the_times_back):
-            assert made == ["ingest demo_1.raw", "merge"] and f"{path.parents[file.count('/')]}: {file}" in caplog.text
-            assert store.find(INGEST, IngestConfig(), [store.source(raw / "demo_1.raw")]) is not None
+            assert (
+                made == ["ingest demo_1.raw", "merge"]
+                and f"{path.parents[file.count('/')]}: {file}" in caplog.text
+            )
+            assert (
+                store.find(INGEST, IngestConfig(), [store.source(raw / "demo_1.raw")])
+                is not None
+            )
 
 
-def test_an_artefact_is_read_again_only_if_its_size_or_times_changed(store, raw, monkeypatch):
+def test_an_artefact_is_read_again_only_if_its_size_or_times_changed(
+    store, raw, monkeypatch
+):
     monkeypatch.setattr(digest, "FRESH_S", -1.0)  # as if two seconds had passed
     made = store.run(INGEST, IngestConfig(), [store.source(raw / "demo_0.raw")])
     again = Store(store.root)
     source = again.source(raw / "demo_0.raw")
     with monkeypatch.context() as patched:
-        patched.setattr(hashlib, "file_digest", lambda *_: pytest.fail("a file was read"))
-        assert again.run(INGEST, IngestConfig(), [source]) == again.find(INGEST, IngestConfig(), [source]) == made
+        patched.setattr(
+            hashlib, "file_digest", lambda *_: pytest.fail("a file was read")
+        )
+        assert (
+            again.run(INGEST, IngestConfig(), [source])
+            == again.find(INGEST, IngestConfig(), [source])
+            == made
+        )
     flip(made.path / "data/0.bin", np.random.default_rng(0))
     assert again.damaged(made.path) == ["data/0.bin"]
 
 
 @pytest.mark.parametrize("hurt", DAMAGES.values(), ids=DAMAGES)
-def test_a_damaged_artefact_at_a_destination_is_refused_and_left_as_it_is(store, raw, tmp_path, hurt):
+def test_a_damaged_artefact_at_a_destination_is_refused_and_left_as_it_is(
+    store, raw, tmp_path, hurt
+):
     made = run_pipeline(store, raw, tmp_path / "dataset")
     hurt(made.path / "2.bin", np.random.default_rng(0))
     before = {p: p.read_bytes() for p in sorted(made.path.rglob("*")) if p.is_file()}
-    with pytest.raises(DatasetError, match=r"dataset is what this run makes, but 2\.bin"):
+    with pytest.raises(
+        DatasetError, match=r"dataset is what this run makes, but 2\.bin"
+    ):
         run_pipeline(Store(store.root), raw, tmp_path / "dataset")
-    assert {p: p.read_bytes() for p in sorted(made.path.rglob("*")) if p.is_file()} == before
+    assert {
+        p: p.read_bytes() for p in sorted(made.path.rglob("*")) if p.is_file()
+    } == before
 
 
 # --- a published file is not stored twice
@@ -460,12 +607,17 @@ def publish_rows(config, inputs, out_dir):
 
 
 BIG = 1 << 20
-ROWS, PUBLISHED = Stage("rows", write_rows), Stage("published", publish_rows, manifest="meta/taccorl/manifest.json")
+ROWS, PUBLISHED = (
+    Stage("rows", write_rows),
+    Stage("published", publish_rows, manifest="meta/taccorl/manifest.json"),
+)
 ROWS_SHA = hashlib.sha256(np.random.default_rng(0).bytes(BIG)).hexdigest()
 
 
 def publish(store, place):
-    return store.run(PUBLISHED, None, [store.run(ROWS, None, [])], destination=place).path
+    return store.run(
+        PUBLISHED, None, [store.run(ROWS, None, [])], destination=place
+    ).path
 
 
 def sha(path):
@@ -474,8 +626,12 @@ def sha(path):
 
 def used_bytes(*places):
     """As du counts: a file with several names once."""
-    files = [path.stat() for place in places for path in place.rglob("*") if path.is_file()]
-    return sum({(file.st_dev, file.st_ino): file.st_blocks * 512 for file in files}.values())
+    files = [
+        path.stat() for place in places for path in place.rglob("*") if path.is_file()
+    ]
+    return sum(
+        {(file.st_dev, file.st_ino): file.st_blocks * 512 for file in files}.values()
+    )
 
 
 @pytest.fixture
@@ -488,19 +644,30 @@ def without_clones(monkeypatch):
     monkeypatch.setattr(files.fcntl, "ioctl", refuse)
 
 
-def test_a_published_file_is_a_link_to_the_stores_and_meta_is_its_own(store, tmp_path, without_clones):
+def test_a_published_file_is_a_link_to_the_stores_and_meta_is_its_own(
+    store, tmp_path, without_clones
+):
     made = publish(store, tmp_path / "a")
     (stored,) = store.root.glob("rows/*/data/rows")
-    assert (made / "data/rows").samefile(stored) and not (made / "meta/stats").samefile(stored)
+    assert (made / "data/rows").samefile(stored) and not (made / "meta/stats").samefile(
+        stored
+    )
     assert not (made / "data/few").samefile(stored.with_name("few"))
     assert used_bytes(store.root, made) < 2.1 * BIG  # with meta/stats
     assert verify(made).changed == () and store.damaged(stored.parents[1]) == []
     assert not list(tmp_path.rglob("*.shared"))
-    again = publish(store, tmp_path / "b")  # the user's folders share nothing with each other
-    assert not (again / "data/rows").samefile(stored) and sha(again / "data/rows") == ROWS_SHA
+    again = publish(
+        store, tmp_path / "b"
+    )  # the user's folders share nothing with each other
+    assert (
+        not (again / "data/rows").samefile(stored)
+        and sha(again / "data/rows") == ROWS_SHA
+    )
 
 
-def test_what_prune_frees_is_what_no_published_dataset_holds(store, tmp_path, without_clones):
+def test_what_prune_frees_is_what_no_published_dataset_holds(
+    store, tmp_path, without_clones
+):
     made = publish(store, tmp_path / "a").rename(tmp_path / "moved")
     (left,) = unneeded(store)
     assert left.size_bytes < BIG / 10
@@ -509,26 +676,38 @@ def test_what_prune_frees_is_what_no_published_dataset_holds(store, tmp_path, wi
 
 
 @pytest.mark.parametrize("hurt", [flip, flip_and_set_the_times_back])
-def test_what_is_edited_where_it_is_published_is_not_served(store, tmp_path, without_clones, hurt, caplog):
+def test_what_is_edited_where_it_is_published_is_not_served(
+    store, tmp_path, without_clones, hurt, caplog
+):
     made = publish(store, tmp_path / "a")
     hurt(made / "data/rows", np.random.default_rng(1))
     edited = sha(made / "data/rows")
-    with pytest.raises(DatasetError, match=r"data/rows is damaged or changed since written"):
+    with pytest.raises(
+        DatasetError, match=r"data/rows is damaged or changed since written"
+    ):
         publish(Store(store.root), tmp_path / "a")
     other = publish(Store(store.root), tmp_path / "b")
-    assert "data/rows damaged or changed since written, so that the artefact is not used" in caplog.text
+    assert (
+        "data/rows damaged or changed since written, so that the artefact is not used"
+        in caplog.text
+    )
     assert sha(other / "data/rows") == ROWS_SHA and verify(other).changed == ()
     assert sha(made / "data/rows") == edited != ROWS_SHA  # the user's edit stays
     assert verify(made).changed == ("data/rows",)
 
 
-def test_where_a_file_system_neither_clones_nor_links_are_two_copies(store, tmp_path, without_clones, monkeypatch):
+def test_where_a_file_system_neither_clones_nor_links_are_two_copies(
+    store, tmp_path, without_clones, monkeypatch
+):
     def refuse(*_):
         raise OSError(errno.EXDEV, "another file system")
 
     monkeypatch.setattr(Path, "hardlink_to", refuse)
     made = publish(store, tmp_path / "a")
-    assert sha(made / "data/rows") == ROWS_SHA and (made / "data/rows").stat().st_nlink == 1
+    assert (
+        sha(made / "data/rows") == ROWS_SHA
+        and (made / "data/rows").stat().st_nlink == 1
+    )
     assert verify(made).changed == () and not list(tmp_path.rglob("*.shared"))
 
 
@@ -547,4 +726,6 @@ def test_a_clone_is_taken_where_there_are_some(store, tmp_path, monkeypatch):
 def test_the_place_of_a_store_is_told_when_it_is_made(tmp_path, caplog):
     for _ in range(2):
         Store(tmp_path / "store").run(ONE, "x", [])
-    assert [str(tmp_path / "store") in record.getMessage() for record in caplog.records] == [True]
+    assert [
+        str(tmp_path / "store") in record.getMessage() for record in caplog.records
+    ] == [True]

@@ -15,8 +15,19 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.lineage import digest, manifest
-from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
-from taccorl.lineage.digest import DigestCache, digest_bytes, digest_each, digest_file, digest_files
+from taccorl.lineage.canonical import (
+    canonical,
+    canonical_text,
+    differences,
+    not_default,
+)
+from taccorl.lineage.digest import (
+    DigestCache,
+    digest_bytes,
+    digest_each,
+    digest_file,
+    digest_files,
+)
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import is_verified, verify, write_manifest
 from taccorl.training.reading import _warn_unverified
@@ -37,9 +48,15 @@ def stored(tmp_path: Path) -> Path:
 def test_untouched_files_are_what_was_stored(stored):
     assert not is_verified(stored)
     found = verify(stored)
-    assert found is not None and (found.num_files, found.changed, found.missing) == (3, (), ())
+    assert found is not None and (found.num_files, found.changed, found.missing) == (
+        3,
+        (),
+        (),
+    )
     assert is_verified(stored)
-    assert digest_each(stored).keys() == {"data/a", "data/b", "data/c", PLACE}, "the mark is no part of the content"
+    assert digest_each(stored).keys() == {"data/a", "data/b", "data/c", PLACE}, (
+        "the mark is no part of the content"
+    )
 
 
 def test_changed_and_missing_files_are_named_also_with_their_old_times(stored):
@@ -51,7 +68,10 @@ def test_changed_and_missing_files_are_named_also_with_their_old_times(stored):
     (stored / "data" / "c").unlink()
     assert not is_verified(stored)
     found = verify(stored)
-    assert found is not None and (found.changed, found.missing) == (("data/b",), ("data/c",))
+    assert found is not None and (found.changed, found.missing) == (
+        ("data/b",),
+        ("data/c",),
+    )
     assert not is_verified(stored)
 
 
@@ -60,11 +80,17 @@ def test_another_manifest_is_not_verified(stored):
     (stored / "data" / "d").write_bytes(b"d")
     files = digest_each(stored / "data")
     (stored / PLACE).unlink()
-    write_manifest(stored, PLACE, {"files": {f"data/{k}": v for k, v in files.items()}, "digest": "other"})
+    write_manifest(
+        stored,
+        PLACE,
+        {"files": {f"data/{k}": v for k, v in files.items()}, "digest": "other"},
+    )
     assert not is_verified(stored)
 
 
-def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(stored, monkeypatch):
+def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(
+    stored, monkeypatch
+):
     def read(path: Path) -> str:
         digest = digest_file(path)
         if path.name == "b":
@@ -78,7 +104,9 @@ def test_a_file_that_changes_while_others_are_read_is_not_taken_as_verified(stor
 
 
 def test_a_file_that_cannot_be_read_does_not_hide_the_others(stored, monkeypatch):
-    def read(path: Path) -> str:  # root may read everything, so that a mode of 000 would show nothing
+    def read(
+        path: Path,
+    ) -> str:  # root may read everything, so that a mode of 000 would show nothing
         if path.name == "a":
             raise PermissionError(errno.EACCES, "Permission denied", str(path))
         return digest_file(path)
@@ -99,11 +127,22 @@ def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored):
 
 
 @pytest.mark.parametrize(
-    "content", ['{"files": 3}', '{"files": [1, 2]}', '{"files": {}}', "[" * 200_000, '{"files": null}']
+    "content",
+    [
+        '{"files": 3}',
+        '{"files": [1, 2]}',
+        '{"files": {}}',
+        "[" * 200_000,
+        '{"files": null}',
+    ],
 )
-def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(content, stored, caplog):
+def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(
+    content, stored, caplog
+):
     if content.startswith("{"):
-        content = json.dumps(json.loads((stored / PLACE).read_text()) | json.loads(content))
+        content = json.dumps(
+            json.loads((stored / PLACE).read_text()) | json.loads(content)
+        )
     (stored / PLACE).write_text(content)
     with pytest.raises(LineageError):
         verify(stored)
@@ -165,7 +204,9 @@ def test_parts_are_told_apart_by_their_lengths():
     assert digest_bytes(b"a", b"bc") != by_hand
 
 
-def test_folder_digest_sees_names_and_contents_but_neither_times_nor_hidden_files(tmp_path):
+def test_folder_digest_sees_names_and_contents_but_neither_times_nor_hidden_files(
+    tmp_path,
+):
     write(tmp_path / "x" / "b" / "two", "2")
     write(tmp_path / "x" / "one", "abc")
     write(tmp_path / "y" / "one", "abc")
@@ -174,8 +215,14 @@ def test_folder_digest_sees_names_and_contents_but_neither_times_nor_hidden_file
     write(tmp_path / "y" / ".DS_Store", "junk")
     write(tmp_path / "y" / ".cache" / "junk", "junk")
     (tmp_path / "y" / "empty").mkdir()
-    expected = digest_files({"one": SHA256_ABC, "b/two": hashlib.sha256(b"2").hexdigest()})
-    assert manifest.content_digest(tmp_path / "x") == manifest.content_digest(tmp_path / "y") == expected
+    expected = digest_files(
+        {"one": SHA256_ABC, "b/two": hashlib.sha256(b"2").hexdigest()}
+    )
+    assert (
+        manifest.content_digest(tmp_path / "x")
+        == manifest.content_digest(tmp_path / "y")
+        == expected
+    )
     (tmp_path / "y" / "one").rename(tmp_path / "y" / "uno")
     assert manifest.content_digest(tmp_path / "y") != expected
 
@@ -184,7 +231,9 @@ def test_link_to_a_file_counts_as_the_file_and_link_to_a_folder_is_refused(tmp_p
     write(tmp_path / "x" / "one", "abc")
     (tmp_path / "y").mkdir()
     (tmp_path / "y" / "one").symlink_to(tmp_path / "x" / "one")
-    assert manifest.content_digest(tmp_path / "y") == manifest.content_digest(tmp_path / "x")
+    assert manifest.content_digest(tmp_path / "y") == manifest.content_digest(
+        tmp_path / "x"
+    )
     (tmp_path / "y" / "linked").symlink_to(tmp_path / "x")
     with pytest.raises(LineageError, match=r"linked .*link to a folder"):
         manifest.content_digest(tmp_path / "y")
@@ -203,7 +252,9 @@ def test_what_has_no_content_is_named(tmp_path, kind):
         digest_file(path)
 
 
-def test_file_touched_just_now_is_not_cached_and_a_torn_entry_is_ignored(tmp_path, monkeypatch):
+def test_file_touched_just_now_is_not_cached_and_a_torn_entry_is_ignored(
+    tmp_path, monkeypatch
+):
     cache, path = DigestCache(tmp_path / "cache"), write(tmp_path / "a", "abc")
     digest_file(path, cache)
     assert not list(tmp_path.rglob("*.json"))
@@ -251,18 +302,31 @@ class Hdf5Reader(Reader):
 
 
 def test_text_is_written_out():
-    text = canonical_text({"b": (1, 2.5, None), "a": {"deep": True, "at": Path("x/y"), "colour": Colour.RED}})
+    text = canonical_text(
+        {
+            "b": (1, 2.5, None),
+            "a": {"deep": True, "at": Path("x/y"), "colour": Colour.RED},
+        }
+    )
     assert text == '{"a":{"at":"x/y","colour":"RED","deep":true},"b":[1,2.5,null]}'
 
 
 def test_dataclass_is_its_type_and_fields_without_those_that_say_how():
-    expected = {"source": "raw", "timing": {"clock": "log", "rate_hz": 30.0, "type": "Timing"}, "type": "Ingest"}
+    expected = {
+        "source": "raw",
+        "timing": {"clock": "log", "rate_hz": 30.0, "type": "Timing"},
+        "type": "Ingest",
+    }
     assert canonical(Ingest(Path("raw"), workers=8)) == expected
 
 
 def test_equal_configs_have_equal_text_and_others_do_not():
-    assert canonical_text({"a": 1, "b": Path("x")}) == canonical_text({"b": "x", "a": 1})
-    assert canonical_text([np.float64(0.1), np.int32(3), np.True_, np.str_("s")]) == canonical_text([0.1, 3, True, "s"])
+    assert canonical_text({"a": 1, "b": Path("x")}) == canonical_text(
+        {"b": "x", "a": 1}
+    )
+    assert canonical_text(
+        [np.float64(0.1), np.int32(3), np.True_, np.str_("s")]
+    ) == canonical_text([0.1, 3, True, "s"])
     assert canonical_text(True) != canonical_text(1) != canonical_text(1.0)
 
 
@@ -277,7 +341,10 @@ def test_two_plugins_with_the_same_fields_differ_by_their_choice_name():
         ({"a": [1.0, float("nan")]}, r"config\.a\[1\] is nan"),
         ({"a": float("inf")}, r"config\.a is inf"),
         ({"tags": {"x", "y"}}, r"config\.tags is a set"),
-        (Ingest(Path("raw"), Timing(rate_hz=object())), r"config\.timing\.rate_hz is a object"),  # type: ignore[arg-type]
+        (
+            Ingest(Path("raw"), Timing(rate_hz=object())),
+            r"config\.timing\.rate_hz is a object",
+        ),  # type: ignore[arg-type]
         ({"gains": np.zeros(3)}, r"config\.gains is a ndarray"),
         ({1: "x"}, "key 1 of type int"),
         ({"cls": Timing}, r"config\.cls is a type"),
@@ -299,6 +366,13 @@ def test_only_settings_off_their_default_are_named():
 
 
 def test_differences_between_two_configs_are_spelled_out():
-    old, new = {"a": {"b": 30.0, "c": "x"}, "d": [1]}, {"a": {"b": 20.0, "c": "x"}, "e": None}
-    assert differences(old, new) == ["a.b: 30.0 → 20.0", "d: [1] → absent", "e: absent → null"]
+    old, new = (
+        {"a": {"b": 30.0, "c": "x"}, "d": [1]},
+        {"a": {"b": 20.0, "c": "x"}, "e": None},
+    )
+    assert differences(old, new) == [
+        "a.b: 30.0 → 20.0",
+        "d: [1] → absent",
+        "e: absent → null",
+    ]
     assert differences(old, old) == []

@@ -19,7 +19,9 @@ from taccorl.lineage.store import Store
 PAUSE_S = 0.004
 NUM_PARTS = 5
 PATIENCE_S = 240.0  # Time after which a test gives up waiting: long, so that no test depends on how busy the machine is
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,14 +36,18 @@ def ingest(config: Any, inputs: list[Path], out_dir: Path) -> None:
     (out_dir / "data").mkdir()
     for i in range(NUM_PARTS):
         time.sleep(PAUSE_S)
-        (out_dir / "data" / f"{i}.bin").write_bytes(content[i:] + str(config.rate_hz).encode())
+        (out_dir / "data" / f"{i}.bin").write_bytes(
+            content[i:] + str(config.rate_hz).encode()
+        )
 
 
 def merge(config: Any, inputs: list[Path], out_dir: Path) -> None:
     _log(config.log, "merge")
     for i in range(NUM_PARTS):
         time.sleep(PAUSE_S)
-        (out_dir / f"{i}.bin").write_bytes(b"".join((path / "data" / f"{i}.bin").read_bytes() for path in inputs))
+        (out_dir / f"{i}.bin").write_bytes(
+            b"".join((path / "data" / f"{i}.bin").read_bytes() for path in inputs)
+        )
 
 
 def _log(path: Path | None, line: str) -> None:
@@ -62,21 +68,47 @@ def make_raw(folder: Path, num: int = 2) -> Path:
     return folder
 
 
-def run_pipeline(store: Store, raw: Path, destination: Path | None = None, *, log: Path | None = None) -> Artefact:
+def run_pipeline(
+    store: Store, raw: Path, destination: Path | None = None, *, log: Path | None = None
+) -> Artefact:
     config = IngestConfig(log=log)
-    episodes = [store.run(INGEST, config, [store.source(path)]) for path in sorted(raw.iterdir())]
-    return store.run(MERGE if destination is None else MERGE_DATASET, config, episodes, destination=destination)
+    episodes = [
+        store.run(INGEST, config, [store.source(path)])
+        for path in sorted(raw.iterdir())
+    ]
+    return store.run(
+        MERGE if destination is None else MERGE_DATASET,
+        config,
+        episodes,
+        destination=destination,
+    )
 
 
 def run_and_die(store_root: Path, destination: Path | None = None) -> None:
     """A run in another process that is killed while its stage works: leaves a temporary folder with 1000 bytes."""
-    script = "import sys; from lineage.toys import start_dying; start_dying(*sys.argv[1:])"
-    words = [sys.executable, "-c", script, str(store_root), *([str(destination)] if destination else [])]
-    assert subprocess.run(words, env=ENVIRONMENT, check=False).returncode == -signal.SIGKILL
+    script = (
+        "import sys; from lineage.toys import start_dying; start_dying(*sys.argv[1:])"
+    )
+    words = [
+        sys.executable,
+        "-c",
+        script,
+        str(store_root),
+        *([str(destination)] if destination else []),
+    ]
+    assert (
+        subprocess.run(words, env=ENVIRONMENT, check=False).returncode
+        == -signal.SIGKILL
+    )
 
 
 def start_dying(store_root: str, destination: str | None = None) -> None:
-    Store(Path(store_root)).run(Stage("one", _die), "x", [], destination=Path(destination) if destination else None)
+    Store(Path(store_root)).run(
+        Stage("one", _die),
+        "x",
+        [],
+        destination=Path(destination) if destination else None,
+    )
 
 
 def _die(config: Any, inputs: list[Path], out_dir: Path) -> None:
@@ -116,7 +148,9 @@ def sleep_and_leave_pid(path: Path) -> None:
 
 def spin_and_leave_pid(path: Path) -> None:
     path.write_text(str(os.getpid()))
-    sum(range(10**11))  # a minute or more of C code that lets no other Python thread run
+    sum(
+        range(10**11)
+    )  # a minute or more of C code that lets no other Python thread run
 
 
 def fill_disk(path: Path) -> None:

@@ -18,7 +18,13 @@ from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Polic
 
 
 def config(**settings) -> TactilePI05Config:
-    values = {"device": "cpu", "backbone": "tiny", "chunk_size": 3, "n_action_steps": 3, "use_relative_actions": True}
+    values = {
+        "device": "cpu",
+        "backbone": "tiny",
+        "chunk_size": 3,
+        "n_action_steps": 3,
+        "use_relative_actions": True,
+    }
     return TactilePI05Config(**values | settings)
 
 
@@ -36,13 +42,20 @@ def test_each_step_is_normalised_by_its_own_mean_and_deviation():
     """q01 … q99 is 4 wide: x = 1.2 is 0.1 normalised; μ = 1 is 0 and σ = 0.2 is 0.1 there, so z = (0.1 − 0) / 0.1 = 1."""
     steps = ChunkSteps.of_statistics(STATISTICS, config(), 2)
     np.testing.assert_allclose(steps.mean_HA, [[0, 0], [0.5, 0], [1, 0]], atol=1e-6)
-    np.testing.assert_allclose(steps.std_HA, [[0.1, 0.4], [0.2, 0.4], [0.4, 0.01]], atol=1e-6)
+    np.testing.assert_allclose(
+        steps.std_HA, [[0.1, 0.4], [0.2, 0.4], [0.4, 0.01]], atol=1e-6
+    )
     raw = torch.tensor([[[1.2, 0.25], [2.4, 0.35], [2.2, 0.25]]])
     half, middle = torch.tensor([2.0, 0.25]), torch.tensor([1.0, 0.25])
     lerobots = (raw - middle) / half
-    torch.testing.assert_close(steps.normalized(lerobots), torch.tensor([[[1.0, 0.0], [1.0, 1.0], [-1.0, 0.0]]]))
+    torch.testing.assert_close(
+        steps.normalized(lerobots),
+        torch.tensor([[[1.0, 0.0], [1.0, 1.0], [-1.0, 0.0]]]),
+    )
     torch.testing.assert_close(steps.restored(steps.normalized(lerobots)), lerobots)
-    torch.testing.assert_close(steps.normalized(lerobots[:, :2]), steps.normalized(lerobots)[:, :2])
+    torch.testing.assert_close(
+        steps.normalized(lerobots[:, :2]), steps.normalized(lerobots)[:, :2]
+    )
 
 
 def test_without_statistics_nothing_changes_and_other_normalisations_are_refused():
@@ -50,7 +63,9 @@ def test_without_statistics_nothing_changes_and_other_normalisations_are_refused
     x = torch.randn(4, 3, 2)
     assert torch.equal(steps.normalized(x), x) and torch.equal(steps.restored(x), x)
     other = config(normalization_mapping={"ACTION": NormalizationMode.MEAN_STD})
-    with pytest.raises(TaccorlError, match=r"normalize_steps=true.*MEAN_STD.*normalize_steps=false"):
+    with pytest.raises(
+        TaccorlError, match=r"normalize_steps=true.*MEAN_STD.*normalize_steps=false"
+    ):
         ChunkSteps.of_statistics(STATISTICS, other, 2)
 
 
@@ -62,7 +77,11 @@ def test_without_statistics_nothing_changes_and_other_normalisations_are_refused
         ({"use_relative_actions": False}, False, 0.0),
         ({"normalize_steps": False, "average_decay": 0.0}, False, 0.0),
         ({"backbone": "full"}, False, 0.0),
-        ({"backbone": "full", "normalize_steps": True, "average_decay": 0.9}, True, 0.9),
+        (
+            {"backbone": "full", "normalize_steps": True, "average_decay": 0.9},
+            True,
+            0.9,
+        ),
     ],
 )
 def test_backbones_have_what_they_gain_from(settings, steps, decay):
@@ -109,7 +128,9 @@ def trained(policy: TactilePI05Policy) -> None:
 
 
 @pytest.mark.parametrize("acting", [True, False])
-def test_a_checkpoint_acts_with_the_mean_and_trains_on_from_the_weights(tmp_path, acting):
+def test_a_checkpoint_acts_with_the_mean_and_trains_on_from_the_weights(
+    tmp_path, acting
+):
     policy = tiny_policy(average_decay=0.5)
     trained(policy)
     weights = copy.deepcopy(policy.model.state_dict())
@@ -154,13 +175,20 @@ def statistics(share: float) -> dict:
 @pytest.fixture(scope="module")
 def rows() -> dict[str, torch.Tensor]:
     """A dataset of 8 rows, 6 of them simulated."""
-    return {**batch_of(*[True, False] * 4), IS_SIM: torch.tensor([1.0, 1, 0, 1, 1, 0, 1, 1])}
+    return {
+        **batch_of(*[True, False] * 4),
+        IS_SIM: torch.tensor([1.0, 1, 0, 1, 1, 0, 1, 1]),
+    }
 
 
-def trained_on(rows: dict[str, torch.Tensor], alpha: float, share: float | None = None) -> TactilePI05Policy:
+def trained_on(
+    rows: dict[str, torch.Tensor], alpha: float, share: float | None = None
+) -> TactilePI05Policy:
     torch.manual_seed(0)
     share = rows[IS_SIM].mean().item() if share is None else share
-    return TactilePI05Policy(tiny_config(sim_weight=alpha), dataset_stats=statistics(share))
+    return TactilePI05Policy(
+        tiny_config(sim_weight=alpha), dataset_stats=statistics(share)
+    )
 
 
 def row_losses(rows: dict[str, torch.Tensor], seed: int) -> torch.Tensor:
@@ -181,7 +209,10 @@ def test_over_the_dataset_the_loss_is_the_papers_equation(rows, alpha):
     torch.testing.assert_close(loss.detach(), wanted, rtol=1e-6, atol=0)
     assert said["loss_sim"] == pytest.approx(losses[is_sim].mean().item(), rel=1e-6)
     assert said["loss_real"] == pytest.approx(losses[~is_sim].mean().item(), rel=1e-6)
-    assert said["loss"] == pytest.approx(wanted.item(), rel=1e-6) and said["contact_rate"] == 0.5
+    assert (
+        said["loss"] == pytest.approx(wanted.item(), rel=1e-6)
+        and said["contact_rate"] == 0.5
+    )
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 0.95, 1.0])
@@ -206,7 +237,12 @@ def test_the_mean_over_batches_is_the_equation_whatever_each_batch_holds(alpha, 
 def test_steps_behind_the_episodes_end_do_not_count(rows):
     pad = torch.zeros(8, 10, dtype=torch.bool)
     pad[2, 7:], pad[5, 1:] = True, True
-    other = {**rows, "action": torch.where(pad[:, :, None], torch.full_like(rows["action"], 9.0), rows["action"])}
+    other = {
+        **rows,
+        "action": torch.where(
+            pad[:, :, None], torch.full_like(rows["action"], 9.0), rows["action"]
+        ),
+    }
     full = row_losses(rows, seed=5)
     masked = row_losses({**rows, "action_is_pad": pad}, seed=5)
     assert torch.equal(full[[0, 1, 3, 4, 6, 7]], masked[[0, 1, 3, 4, 6, 7]])
@@ -227,7 +263,11 @@ def test_steps_behind_the_episodes_end_do_not_count(rows):
 @pytest.mark.parametrize(
     ("alpha", "share", "said"),
     [
-        (0.5, 1.0, "gives real rows the weight 0.5, but according to observation.is_sim .*sim_weight=1"),
+        (
+            0.5,
+            1.0,
+            "gives real rows the weight 0.5, but according to observation.is_sim .*sim_weight=1",
+        ),
         (0.95, 0.0, "gives simulated rows the weight 0.95.*--policy.sim_weight=0"),
         (0.0, 1.0, "gives real rows the weight 1"),
         (1.0, 0.0, "gives simulated rows the weight 1"),
@@ -236,7 +276,9 @@ def test_steps_behind_the_episodes_end_do_not_count(rows):
 )
 def test_a_weight_for_a_domain_without_rows_is_an_error(alpha, share, said):
     with pytest.raises(TaccorlError, match=said):
-        TactilePI05Policy(tiny_config(sim_weight=alpha), dataset_stats=statistics(share))
+        TactilePI05Policy(
+            tiny_config(sim_weight=alpha), dataset_stats=statistics(share)
+        )
 
 
 @pytest.mark.parametrize(("alpha", "share"), [(1.0, 1.0), (0.0, 0.0)])
@@ -246,13 +288,18 @@ def test_one_domain_alone_is_its_own_mean(rows, alpha, share):
     torch.manual_seed(5)
     loss, said = policy.forward(alone)
     torch.testing.assert_close(loss.detach(), row_losses(rows, seed=5).mean())
-    assert ("loss_sim" in said) == (share == 1.0) and ("loss_real" in said) == (share == 0.0)
+    assert ("loss_sim" in said) == (share == 1.0) and ("loss_real" in said) == (
+        share == 0.0
+    )
 
 
 def test_a_dataset_of_one_untold_domain_is_not_weighted(rows):
     untold = {k: v for k, v in rows.items() if k != IS_SIM}
     torch.manual_seed(0)
-    policy = TactilePI05Policy(tiny_config(sim_weight=0.95), dataset_stats={TACTILE: {"mean": torch.zeros(1536)}})
+    policy = TactilePI05Policy(
+        tiny_config(sim_weight=0.95),
+        dataset_stats={TACTILE: {"mean": torch.zeros(1536)}},
+    )
     torch.manual_seed(5)
     loss, said = policy.forward(untold)
     torch.testing.assert_close(loss.detach(), row_losses(rows, seed=5).mean())

@@ -25,7 +25,9 @@ class Dark:
 def draw_frame_id(picture: np.ndarray, frame_id: int) -> None:
     """Draw the lower 16 bits of ``frame_id`` into a uint8 picture (rows, columns, 3); white is 1."""
     bits = (frame_id >> np.arange(15, -1, -1)) & 1
-    corner = np.kron(bits.reshape(_BITS), np.full((BLOCK_PX, BLOCK_PX), 255)).astype(np.uint8)
+    corner = np.kron(bits.reshape(_BITS), np.full((BLOCK_PX, BLOCK_PX), 255)).astype(
+        np.uint8
+    )
     picture[: corner.shape[0], : corner.shape[1]] = corner[..., None]
 
 
@@ -50,13 +52,26 @@ class Scene:
 
     def __init__(self, story: Story, camera_size: tuple[int, int], seed: int) -> None:
         self.story, self.size = story, camera_size
-        self._rng = {camera: np.random.default_rng([seed, 3, c]) for c, camera in enumerate(ROBOT.cameras)}
+        self._rng = {
+            camera: np.random.default_rng([seed, 3, c])
+            for c, camera in enumerate(ROBOT.cameras)
+        }
         rows, columns = camera_size
-        grain = np.random.default_rng(7).normal(0, 1, (rows, columns, 1)).astype(np.float32)
-        coarse = cv2.resize(grain[: rows // 8, : columns // 8], (columns, rows), interpolation=cv2.INTER_CUBIC)
-        self._table = np.array([108, 152, 190], np.float32) + 10 * grain + 24 * coarse[..., None]
+        grain = (
+            np.random.default_rng(7).normal(0, 1, (rows, columns, 1)).astype(np.float32)
+        )
+        coarse = cv2.resize(
+            grain[: rows // 8, : columns // 8],
+            (columns, rows),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        self._table = (
+            np.array([108, 152, 190], np.float32) + 10 * grain + 24 * coarse[..., None]
+        )
 
-    def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
+    def pictures_bgr(
+        self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray
+    ) -> Iterator[np.ndarray]:
         """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s]. The
         noise depends on the number of pictures drawn before."""
         rows, columns = self.size
@@ -64,15 +79,27 @@ class Scene:
         for joints, frame_id in zip(state, frame_ids.tolist(), strict=True):
             if camera == "front":
                 picture = self._table.copy()
-                for arm, colour in zip(ARMS, ((60, 60, 200), (200, 90, 40)), strict=True):
+                for arm, colour in zip(
+                    ARMS, ((60, 60, 200), (200, 90, 40)), strict=True
+                ):
                     turn, reach, *_ = joints[ROBOT.joint_slice(arm)]
-                    at = round(columns * (0.5 - 0.6 * turn)), round(rows * (0.2 + 0.2 * reach))
+                    at = (
+                        round(columns * (0.5 - 0.6 * turn)),
+                        round(rows * (0.2 + 0.2 * reach)),
+                    )
                     cv2.circle(picture, at, rows // 8, colour, -1)
             else:
-                shift = np.rint(rows * joints[ROBOT.joint_slice(camera.split("_")[0])][:2]).astype(int)
+                shift = np.rint(
+                    rows * joints[ROBOT.joint_slice(camera.split("_")[0])][:2]
+                ).astype(int)
                 picture = np.roll(self._table, shift.tolist(), axis=(1, 0))
             noise = rng.normal(0, 4, (rows // 2, columns // 2, 1)).astype(np.float32)
-            picture = picture + cv2.resize(noise, (columns, rows), interpolation=cv2.INTER_NEAREST)[..., None]
+            picture = (
+                picture
+                + cv2.resize(noise, (columns, rows), interpolation=cv2.INTER_NEAREST)[
+                    ..., None
+                ]
+            )
             picture = np.clip(picture, 0, 255).astype(np.uint8)
             draw_frame_id(picture, frame_id)
             yield picture

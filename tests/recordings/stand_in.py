@@ -25,7 +25,12 @@ from tests.recordings.story import Story, plan_episodes
 
 ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
 _JOINT_TOPICS = (*drivers.STATE_TOPICS.values(), *drivers.COMMAND_TOPICS.values())
-SPEC_TOPICS = (*_JOINT_TOPICS, *drivers.CAMERA_TOPICS.values(), *drivers.PAD_TOPICS.values(), drivers.EPISODE_TOPIC)
+SPEC_TOPICS = (
+    *_JOINT_TOPICS,
+    *drivers.CAMERA_TOPICS.values(),
+    *drivers.PAD_TOPICS.values(),
+    drivers.EPISODE_TOPIC,
+)
 """All topics that the shipped data spec names."""
 
 Gap = tuple[str, float, float]  # topic, from, to [s since the start]
@@ -43,7 +48,9 @@ class StandInConfig(drivers.DriverConfig):
     swap_arms: bool = False
     """Fault: the joint topics of each arm hold the other arm's messages (exchanged CAN adapters); cameras and pads are
     correct."""
-    sim_time_stamps: bool = False  # Fault: header stamps count from 0, while log times are wall-clock times
+    sim_time_stamps: bool = (
+        False  # Fault: header stamps count from 0, while log times are wall-clock times
+    )
     clock_offset_s: dict[str, float] = field(default_factory=dict)
     """Fault: topic → time by which its clock is ahead [s]. It moves the header stamp, or the log time of messages without a
     header."""
@@ -51,7 +58,9 @@ class StandInConfig(drivers.DriverConfig):
     """Fault: missing messages, (topic, from, to) in seconds since the start; one or several."""
     frozen_camera: str | None = None
     """Fault: name of a camera that repeats one picture, with new stamps, after a third of the recording."""
-    swap_pads: tuple[str, str] | None = None  # Fault: two pads whose messages are published under each other's topic
+    swap_pads: tuple[str, str] | None = (
+        None  # Fault: two pads whose messages are published under each other's topic
+    )
 
     @property
     def gaps(self) -> list[Gap]:
@@ -70,7 +79,9 @@ class StandInTruth:
     """Arm → (start, end) of the contact of its pads [s], one interval per episode."""
     sampled_s: dict[str, np.ndarray]
     """Topic → true time of what each message shows [s]: stamp without clock faults, or middle of a pad's scan. MCAP only."""
-    log_s: dict[str, np.ndarray]  # Topic → log time of each message [s], clock faults included. MCAP only
+    log_s: dict[
+        str, np.ndarray
+    ]  # Topic → log time of each message [s], clock faults included. MCAP only
     frame_ids: dict[str, np.ndarray]
     """Camera → frame id in each published picture: the index of the camera's tick, counting lost ones."""
 
@@ -80,7 +91,12 @@ class StandInStreams(drivers.Streams):
 
     config: StandInConfig
 
-    def __init__(self, config: StandInConfig, true: drivers.TrueSignals, scene: drivers.CameraPictures) -> None:
+    def __init__(
+        self,
+        config: StandInConfig,
+        true: drivers.TrueSignals,
+        scene: drivers.CameraPictures,
+    ) -> None:
         super().__init__(config, true, scene)
         self._sampled_s = {topic: array("d") for topic in SPEC_TOPICS}
         self._log_s = {topic: array("d") for topic in SPEC_TOPICS}
@@ -94,7 +110,9 @@ class StandInStreams(drivers.Streams):
                 for a, b in _each_other(*topics.values())
             }
         if config.swap_pads:
-            self._renamed |= dict(_each_other(*(drivers.PAD_TOPICS[pad] for pad in config.swap_pads)))
+            self._renamed |= dict(
+                _each_other(*(drivers.PAD_TOPICS[pad] for pad in config.swap_pads))
+            )
 
     def all(self) -> list[Iterator[drivers.Event]]:
         return [self._with_faults(stream) for stream in super().all()]
@@ -105,23 +123,45 @@ class StandInStreams(drivers.Streams):
             topic = self._renamed.get(event.topic, event.topic)
             message: Any = event.message
             offset_s = config.clock_offset_s.get(topic, 0.0)
-            log_s = event.log_s + (0.0 if isinstance(message, dict) and "header" in message else offset_s)
-            if isinstance(message, dict) and "header" in message and message["header"]["stamp"]["sec"]:
+            log_s = event.log_s + (
+                0.0 if isinstance(message, dict) and "header" in message else offset_s
+            )
+            if (
+                isinstance(message, dict)
+                and "header" in message
+                and message["header"]["stamp"]["sec"]
+            ):
                 message["header"]["stamp"] = self._stamp(event.sampled_s + offset_s)
             tick = event.tick
             if topic in _JOINT_TOPICS and config.joints_in_degrees:
                 joints = message["position"][: ROBOT.num_joints]
-                message["position"][: ROBOT.num_joints] = [x / drivers.PIPER_RAD_PER_DEG for x in joints]
-            if topic == drivers.CAMERA_TOPICS.get(config.frozen_camera or "") and tick >= self._freezes_at:
-                message = message | {"data": self._still.setdefault(topic, message["data"])}
+                message["position"][: ROBOT.num_joints] = [
+                    x / drivers.PIPER_RAD_PER_DEG for x in joints
+                ]
+            if (
+                topic == drivers.CAMERA_TOPICS.get(config.frozen_camera or "")
+                and tick >= self._freezes_at
+            ):
+                message = message | {
+                    "data": self._still.setdefault(topic, message["data"])
+                }
                 tick = self._freezes_at
-            time_s = event.sampled_s - (drivers.SCAN_S / 2 if topic in drivers.PAD_TOPICS.values() else 0.0)
-            if any(topic == gap and start_s <= time_s < end_s for gap, start_s, end_s in config.gaps):
+            time_s = event.sampled_s - (
+                drivers.SCAN_S / 2 if topic in drivers.PAD_TOPICS.values() else 0.0
+            )
+            if any(
+                topic == gap and start_s <= time_s < end_s
+                for gap, start_s, end_s in config.gaps
+            ):
                 continue
             if topic in SPEC_TOPICS:
                 self._sampled_s[topic].append(event.sampled_s)
                 self._log_s[topic].append(log_s)
-            for camera in (camera for camera in drivers.CAMERAS if drivers.CAMERA_TOPICS[camera] == topic):
+            for camera in (
+                camera
+                for camera in drivers.CAMERAS
+                if drivers.CAMERA_TOPICS[camera] == topic
+            ):
                 self._frame_ids[camera].append(tick)
             yield event._replace(log_s=log_s, topic=topic, message=message)
 
@@ -143,7 +183,10 @@ class StandInStreams(drivers.Streams):
         self._frame_ids[camera].extend(ticks.tolist())
         still = None
         for picture, tick, k in zip(
-            self.scene.pictures_bgr(camera, time_s[ticks], ticks), ticks, range(len(ticks)), strict=True
+            self.scene.pictures_bgr(camera, time_s[ticks], ticks),
+            ticks,
+            range(len(ticks)),
+            strict=True,
         ):
             still = picture if tick == k else still
             assert still is not None
@@ -154,9 +197,13 @@ class StandInStreams(drivers.Streams):
         return StandInTruth(
             story=story,
             contact_s={arm: story.contact_s(arm) for arm in drivers.ARMS},
-            sampled_s={topic: np.array(times) for topic, times in self._sampled_s.items()},
+            sampled_s={
+                topic: np.array(times) for topic, times in self._sampled_s.items()
+            },
             log_s={topic: np.array(times) for topic, times in self._log_s.items()},
-            frame_ids={camera: np.array(ids) for camera, ids in self._frame_ids.items()},
+            frame_ids={
+                camera: np.array(ids) for camera, ids in self._frame_ids.items()
+            },
         )
 
 
@@ -165,9 +212,13 @@ def _each_other(a: str, b: str) -> Iterator[tuple[str, str]]:
 
 
 def _stand_in(config: StandInConfig) -> tuple[StandInStreams, Story]:
-    plans = plan_episodes(config.duration_s, config.episodes, config.outcomes, config.seed)
+    plans = plan_episodes(
+        config.duration_s, config.episodes, config.outcomes, config.seed
+    )
     story = Story(plans, config.duration_s, config.seed)
-    return StandInStreams(config, story, Scene(story, config.camera_size, config.seed)), story
+    return StandInStreams(
+        config, story, Scene(story, config.camera_size, config.seed)
+    ), story
 
 
 def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
@@ -180,7 +231,9 @@ def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
         "duration_s": f"{config.duration_s:g}",
         "episodes": str(config.episodes),
         "instruction": config.instruction,
-        "differs_from_default": json.dumps({k: v for k, v in asdict(config).items() if v != default[k]}),
+        "differs_from_default": json.dumps(
+            {k: v for k, v in asdict(config).items() if v != default[k]}
+        ),
     }
     drivers.publish(path, streams, label)
     return streams.truth(story)
@@ -197,17 +250,23 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
         "observations/qpos": drivers.as_piper_publishes(story.at("state", time_s)),
         "observations/qvel": story.at("velocity", time_s),
         "observations/effort": story.at("effort", time_s),
-        "action": drivers.as_piper_publishes(story.at("command", time_s + 1 / drivers.CAMERA_HZ)),
+        "action": drivers.as_piper_publishes(
+            story.at("command", time_s + 1 / drivers.CAMERA_HZ)
+        ),
     }
     if config.joints_in_degrees:
         for name in ("observations/qpos", "action"):
             arms[name][:, ROBOT.joint_indices] /= drivers.PIPER_RAD_PER_DEG
-    arms["observations/qvel"][:, ROBOT.gripper_indices] = 0.0  # PiPER reports none for its grippers
+    arms["observations/qvel"][:, ROBOT.gripper_indices] = (
+        0.0  # PiPER reports none for its grippers
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         file.attrs.update({"sim": False, "compress": True} | labelled(ORIGIN))
         for name, rows in arms.items():
-            file[name] = np.roll(rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1).astype(np.float32)
+            file[name] = np.roll(
+                rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1
+            ).astype(np.float32)
         file["base_action"] = np.zeros((len(time_s), 2), np.float32)
         lengths = np.zeros((len(drivers.CAMERAS), len(time_s)), np.float32)
         for c, camera in enumerate(drivers.CAMERAS):
@@ -216,11 +275,17 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     return streams.truth(story)
 
 
-def _write_pictures(file: h5py.File, camera: str, time_s: np.ndarray, streams: StandInStreams) -> np.ndarray:
+def _write_pictures(
+    file: h5py.File, camera: str, time_s: np.ndarray, streams: StandInStreams
+) -> np.ndarray:
     """Fills one camera's dataset and returns the length of every JPEG."""
     config, lengths = streams.config, np.zeros(len(time_s))
-    name = "observations/images/" + ("cam_high" if camera == "front" else f"cam_{camera}")
-    pictures = file.create_dataset(name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096))
+    name = "observations/images/" + (
+        "cam_high" if camera == "front" else f"cam_{camera}"
+    )
+    pictures = file.create_dataset(
+        name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096)
+    )
     for n, picture in enumerate(streams.pictures_bgr(camera, time_s)):
         data = np.frombuffer(drivers.jpeg(picture, config.jpeg_quality), np.uint8)
         lengths[n] = len(data)

@@ -37,7 +37,9 @@ _, POSITION = swing(seconds=6.0)
 
 def small(**fields) -> Report:
     before = comparison(trace(5e-3 * np.sign(POSITION), POSITION))
-    return Report(**{"title": "made twin beside made traces", "comparison": before} | fields)
+    return Report(
+        **{"title": "made twin beside made traces", "comparison": before} | fields
+    )
 
 
 class Tags(HTMLParser):
@@ -51,7 +53,9 @@ class Tags(HTMLParser):
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.addresses += [
+            value or "" for name, value in attrs if name in ("src", "href")
+        ]
         if tag not in ("meta", "img", "br"):
             self.open.append(tag)
 
@@ -75,19 +79,37 @@ def test_page_needs_no_other_file_and_says_where_its_data_is_from(written: Path)
     page = written.read_text()
     tags = Tags(page)
     assert tags.open == [], "every element is closed"
-    assert tags.addresses and all(a.startswith("data:image/png;base64,") for a in tags.addresses)
-    assert not re.search(r"https?://|<script|@import|url\(", page) and f"data: {ORIGIN}" in tags.text
-    assert "where the twin is off, not why" in tags.text and "taccorl compare sweeps" in tags.text
+    assert tags.addresses and all(
+        a.startswith("data:image/png;base64,") for a in tags.addresses
+    )
+    assert (
+        not re.search(r"https?://|<script|@import|url\(", page)
+        and f"data: {ORIGIN}" in tags.text
+    )
+    assert (
+        "where the twin is off, not why" in tags.text
+        and "taccorl compare sweeps" in tags.text
+    )
 
 
 def test_numbers_are_those_of_the_comparison(tmp_path: Path):
-    report = small(after=comparison(trace(2e-4 * np.sign(POSITION), POSITION), twin="mended twin"))
+    report = small(
+        after=comparison(trace(2e-4 * np.sign(POSITION), POSITION), twin="mended twin")
+    )
     write_report(report, tmp_path)
     found = json.loads((tmp_path / NUMBERS).read_text())
     score = report.comparison.scores()[0]
-    assert found["scores"][0]["rmse"] == score.rmse and found["scores"][0]["ratio"] == score.ratio
-    assert found["scores_after"][0]["ratio"] == pytest.approx(1.0, rel=1e-3) and found["data"] == [str(ORIGIN)]
-    assert {c["regime"] for c in found["where"]["cells"]} >= {"after a reversal", "high speed"}
+    assert (
+        found["scores"][0]["rmse"] == score.rmse
+        and found["scores"][0]["ratio"] == score.ratio
+    )
+    assert found["scores_after"][0]["ratio"] == pytest.approx(1.0, rel=1e-3) and found[
+        "data"
+    ] == [str(ORIGIN)]
+    assert {c["regime"] for c in found["where"]["cells"]} >= {
+        "after a reversal",
+        "high speed",
+    }
     text = Tags((tmp_path / PAGE).read_text()).text
     assert "5 mrad" in text and "-96%" in text and "mended twin" in text
 
@@ -96,21 +118,34 @@ def test_errors_hold_up_the_joints_of_their_own_recordings_only():
     both = comparison(
         trace(0 * POSITION, POSITION, recording="a.csv", signal="left_joint5"),
         trace(0 * POSITION, POSITION, recording="b.csv", signal="left_joint4"),
-        clock={"b.csv": (Finding("shifted_from_twin", "error", "left_joint4", "leads"),)},
+        clock={
+            "b.csv": (Finding("shifted_from_twin", "error", "left_joint4", "leads"),)
+        },
     )
     report = small(
-        comparison=both, findings={"a.csv": [], "b.csv": [Finding("unit", "error", "left_joint4", "degrees")]}
+        comparison=both,
+        findings={
+            "a.csv": [],
+            "b.csv": [Finding("unit", "error", "left_joint4", "degrees")],
+        },
     )
     assert report.unsettled("left_joint5") == []
     assert report.unsettled("left_joint4") == ["b.csv: degrees", "b.csv: leads"]
-    assert report.unsettled("left pads") == report.unsettled("left_joint4"), "a part without traces sees all"
+    assert report.unsettled("left pads") == report.unsettled("left_joint4"), (
+        "a part without traces sees all"
+    )
 
 
-def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(written: Path, tmp_path: Path):
+def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(
+    written: Path, tmp_path: Path
+):
     shutil.copytree(written.parent, tmp_path, dirs_exist_ok=True)
     page = tmp_path / PAGE
     (said,) = write_report(small(title="the second"), tmp_path).text
-    assert re.search(r"replaced .* \d{4}-\d\d-\d\d \d\d:\d\d", cell(said).text) and "the second" in page.read_text()
+    assert (
+        re.search(r"replaced .* \d{4}-\d\d-\d\d \d\d:\d\d", cell(said).text)
+        and "the second" in page.read_text()
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == [PAGE, NUMBERS]
     (tmp_path / NUMBERS).write_text('{"mine": 1}')
     with pytest.raises(TaccorlError, match="not a report of taccorl"):
@@ -125,7 +160,13 @@ def test_names_from_files_are_text_and_no_html(tmp_path: Path):
     name = "<script>alert(1)</script>&.csv"
     signal = "<img src=x onerror=alert(1)>"
     own = dataclasses.replace(
-        trace(1e-3 * POSITION, POSITION, recording=name, origin=Origin(text="<b>robot</b>")), signal=signal
+        trace(
+            1e-3 * POSITION,
+            POSITION,
+            recording=name,
+            origin=Origin(text="<b>robot</b>"),
+        ),
+        signal=signal,
     )
     bad = comparison(own, left_out=(f"touch of {name}",), twin="<i>twin</i>")
     report = small(
@@ -137,10 +178,24 @@ def test_names_from_files_are_text_and_no_html(tmp_path: Path):
     write_report(report, tmp_path)
     text = (tmp_path / PAGE).read_text()
     tags = Tags(text)
-    assert "script" not in tags.open and "<img src=x" not in text and "<i>twin" not in text and "<u>" not in text
-    for words in (name, signal, "<b>robot</b>", "<i>twin</i>", "steps < 5 ms & more", "<u>compare"):
+    assert (
+        "script" not in tags.open
+        and "<img src=x" not in text
+        and "<i>twin" not in text
+        and "<u>" not in text
+    )
+    for words in (
+        name,
+        signal,
+        "<b>robot</b>",
+        "<i>twin</i>",
+        "steps < 5 ms & more",
+        "<u>compare",
+    ):
         assert words in tags.text
-    (policy,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
+    (policy,) = re.findall(
+        r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text
+    )
     assert "default-src 'none'" in policy and "script-src" not in policy
 
 
@@ -152,12 +207,18 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, P
     few = ["coulomb_friction", "asymmetric_friction", "position_dependent_friction"]
     few += ["backlash", "sensor_delay", "cogging"]
     without = [name for name in effects if name not in few]
-    finding = diagnose_joint(TwinConfig(), SIGNAL, measured, search=SearchConfig(width=1), without=without)
+    finding = diagnose_joint(
+        TwinConfig(), SIGNAL, measured, search=SearchConfig(width=1), without=without
+    )
     report = Report(
         title="what is missing",
         comparison=compare(TwinConfig(), measured, name="nominal twin"),
-        refitted=PiperTwin.nominal().refitted([finding]).compare(measured, name="refitted twin"),
-        after=PiperTwin.nominal().mended([finding])[0].compare(measured, name="mended twin"),
+        refitted=PiperTwin.nominal()
+        .refitted([finding])
+        .compare(measured, name="refitted twin"),
+        after=PiperTwin.nominal()
+        .mended([finding])[0]
+        .compare(measured, name="mended twin"),
         found=[finding],
         options=["--twin=a.yaml"],
     )
@@ -172,37 +233,86 @@ def facts(finding: JointFinding) -> list[str]:
     (effect,), cls = d.effects, effects.get("coulomb_friction")
     low, high = effect.interval["torque_nm"]
     rivals = d.rivals.get(effect.name, ())
-    found = [SIGNAL, effect.name, d.words, finding.noise, finding.numbers, finding.measured]
-    found += [f"{of[use]:.2f}" for of in map(d.errors.get, ("before", "fitted")) for use in of if use != "fit"]
-    found += [f"{d.errors['after']['validation'] / d.errors['fitted']['validation'] - 1:+.0%}"]
+    found = [
+        SIGNAL,
+        effect.name,
+        d.words,
+        finding.noise,
+        finding.numbers,
+        finding.measured,
+    ]
+    found += [
+        f"{of[use]:.2f}"
+        for of in map(d.errors.get, ("before", "fitted"))
+        for use in of
+        if use != "fit"
+    ]
+    found += [
+        f"{d.errors['after']['validation'] / d.errors['fitted']['validation'] - 1:+.0%}"
+    ]
     found += [clean(x, high - low) for x in (effect.torque_nm, low, high)]  # pyright: ignore[reportAttributeAccessIssue]
     found += [cls.equation, cls.in_words, cls.at_a_policy, cls.to_record]
-    found += [text for name, why in cls.near_twins.items() for text in (f"near-twin {name}", why)]
-    found += [text for n in known.identifiable for text in (n.name, clean(n.value, n.high - n.low))]
-    found += [" … ".join(clean(end, n.high - n.low) for end in (n.low, n.high)) for n in known.identifiable]
-    found += [word for r in d.rounds for e in r.evidence[:6] for word in (e.name, f"{e.score:.1f}")]
-    found += [f"taccorl add-effect {effect.name}", *finding.recordings["validation"], *known.pinned_by, *rivals]
+    found += [
+        text
+        for name, why in cls.near_twins.items()
+        for text in (f"near-twin {name}", why)
+    ]
+    found += [
+        text
+        for n in known.identifiable
+        for text in (n.name, clean(n.value, n.high - n.low))
+    ]
+    found += [
+        " … ".join(clean(end, n.high - n.low) for end in (n.low, n.high))
+        for n in known.identifiable
+    ]
+    found += [
+        word
+        for r in d.rounds
+        for e in r.evidence[:6]
+        for word in (e.name, f"{e.score:.1f}")
+    ]
+    found += [
+        f"taccorl add-effect {effect.name}",
+        *finding.recordings["validation"],
+        *known.pinned_by,
+        *rivals,
+    ]
     apart = separable(d, effect.name, rivals)
-    return found + [f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *apart])}"] * bool(apart)
+    return found + [
+        f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *apart])}"
+    ] * bool(apart)
 
 
 def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(diagnosed, capsys):
     finding, path = diagnosed
-    verdict = Report(title="", comparison=small().comparison, found=[finding]).verdicts()[SIGNAL]
+    verdict = Report(
+        title="", comparison=small().comparison, found=[finding]
+    ).verdicts()[SIGNAL]
     show(brief(finding, verdict), sections_of(finding, ()))
-    page, terminal = (" ".join(text.split()) for text in (Tags(path.read_text()).text, capsys.readouterr().out))
+    page, terminal = (
+        " ".join(text.split())
+        for text in (Tags(path.read_text()).text, capsys.readouterr().out)
+    )
     for fact in facts(finding):
         assert fact in page and fact in terminal, fact
     for row in finding.diagnosis.rounds[0].evidence:
         assert effects.get(row.name).equation in page and row.verdict in page
     name, d = finding.diagnosis.names[0], finding.diagnosis
-    assert page.count("--twin=a.yaml") == 1 + bool(separable(d, name, d.rivals.get(name, ()))), "add-effect, excite"
+    assert page.count("--twin=a.yaml") == 1 + bool(
+        separable(d, name, d.rivals.get(name, ()))
+    ), "add-effect, excite"
 
 
-def test_a_lead_that_only_one_effect_of_several_left_behind_holds_nothing_up(diagnosed: tuple[JointFinding, Path]):
+def test_a_lead_that_only_one_effect_of_several_left_behind_holds_nothing_up(
+    diagnosed: tuple[JointFinding, Path],
+):
     """A second missing effect can look like an offset; the search may go on. One that was there from the beginning stays."""
     leads = {"b.csv": (Finding("shifted_from_twin", "error", SIGNAL, "leads"),)}
-    before, after = (comparison(trace(0 * POSITION, POSITION, recording="b.csv", signal=SIGNAL)) for _ in range(2))
+    before, after = (
+        comparison(trace(0 * POSITION, POSITION, recording="b.csv", signal=SIGNAL))
+        for _ in range(2)
+    )
     stopped = dataclasses.replace(diagnosed[0].diagnosis, status="too_many")
     for d, clock, told in (
         (stopped, {}, []),
@@ -218,43 +328,80 @@ def test_a_lead_that_only_one_effect_of_several_left_behind_holds_nothing_up(dia
 
 
 def test_a_number_that_is_nothing_beside_its_interval_is_zero_and_no_change_has_no_sign():
-    assert (clean(2.6e-13, 4e-5), clean(-0.0285, 0.001), clean(0.01200032, 6e-7)) == ("0", "-0.0285", "0.01200032")
+    assert (clean(2.6e-13, 4e-5), clean(-0.0285, 0.001), clean(0.01200032, 6e-7)) == (
+        "0",
+        "-0.0285",
+        "0.01200032",
+    )
     assert (change(100.0, 99.7), change(2.0, 1.0)) == ("+0%", "-50%")
 
 
-def test_heat_maps_are_of_the_twin_whose_gains_are_refitted(diagnosed: tuple[JointFinding, Path]):
+def test_heat_maps_are_of_the_twin_whose_gains_are_refitted(
+    diagnosed: tuple[JointFinding, Path],
+):
     """The first row of a score is the twin as given; the map must not credit an effect with what gains removed."""
     finding, path = diagnosed
     found = json.loads((path.parent / NUMBERS).read_text())
     assert found["where"]["twin"] == "refitted twin"
     given, refitted_, after = (
-        next(s["ratio"] for s in found[k] if s["kind"] == "position" and s["use"] == "fit")
+        next(
+            s["ratio"]
+            for s in found[k]
+            if s["kind"] == "position" and s["use"] == "fit"
+        )
         for k in ("scores", "scores_refitted", "scores_after")
     )
     cells = [c for c in found["where"]["cells"] if c["kind"] == "position"]
-    thirds = [c for c in cells if c["regime"] in ("first third", "second third", "last third")]
-    over_all = np.sqrt(sum(c["ratio"] ** 2 * c["n"] for c in thirds) / sum(c["n"] for c in thirds))
+    thirds = [
+        c for c in cells if c["regime"] in ("first third", "second third", "last third")
+    ]
+    over_all = np.sqrt(
+        sum(c["ratio"] ** 2 * c["n"] for c in thirds) / sum(c["n"] for c in thirds)
+    )
     assert over_all == pytest.approx(refitted_, rel=0.3)
     assert given > refitted_ > 2 * after, "gains took some of it, the effect the rest"
     assert finding.diagnosis.steps[0][0] == "" and len(finding.diagnosis.steps) == 2
 
 
-def test_numbers_hold_the_diagnosis_and_first_those_that_are_identified(diagnosed: tuple[JointFinding, Path]):
+def test_numbers_hold_the_diagnosis_and_first_those_that_are_identified(
+    diagnosed: tuple[JointFinding, Path],
+):
     """Recorded efforts determine the scale of the torques, so that the friction of 1 N·m is identified and not only its ratio
     to K_p. No residuals are among the numbers."""
     finding, path = diagnosed
     content = (path.parent / NUMBERS).read_text()
     every = json.loads(content)
-    own, found, d = every["diagnoses"][SIGNAL], every["identified"][SIGNAL], finding.diagnosis
-    assert (own["effects"][0]["effect"], own["status"], own["errors"]) == ("coulomb_friction", d.status, d.errors)
-    assert own["effects"][0]["torque_nm"] == vars(d.effects[0])["torque_nm"] and len(content) < 200_000
+    own, found, d = (
+        every["diagnoses"][SIGNAL],
+        every["identified"][SIGNAL],
+        finding.diagnosis,
+    )
+    assert (own["effects"][0]["effect"], own["status"], own["errors"]) == (
+        "coulomb_friction",
+        d.status,
+        d.errors,
+    )
+    assert (
+        own["effects"][0]["torque_nm"] == vars(d.effects[0])["torque_nm"]
+        and len(content) < 200_000
+    )
     assert found["pinned_by"] == list(finding.known.pinned_by) == ["recorded effort"]
     numbers = {n["name"]: n for n in found["identifiable"]}
-    assert numbers["kd/kp"]["unit"] == "s" and numbers["coulomb_friction.torque_nm/kp"]["unit"] == "rad"
-    assert numbers["coulomb_friction.torque_nm"]["value"] == pytest.approx(1.0, rel=0.03)
+    assert (
+        numbers["kd/kp"]["unit"] == "s"
+        and numbers["coulomb_friction.torque_nm/kp"]["unit"] == "rad"
+    )
+    assert numbers["coulomb_friction.torque_nm"]["value"] == pytest.approx(
+        1.0, rel=0.03
+    )
     page = Tags(path.read_text()).text
-    assert page.index("coulomb_friction.torque_nm/kp") < page.index("number of the twin")
-    assert "identified: coulomb_friction.torque_nm/kp" in finding.diagnosis.effects[0].evidence
+    assert page.index("coulomb_friction.torque_nm/kp") < page.index(
+        "number of the twin"
+    )
+    assert (
+        "identified: coulomb_friction.torque_nm/kp"
+        in finding.diagnosis.effects[0].evidence
+    )
 
 
 @pytest.mark.slow
@@ -263,19 +410,27 @@ def test_numbers_hold_the_diagnosis_and_first_those_that_are_identified(diagnose
     not (shutil.which("chromium") and find_spec("playwright")),
     reason="no browser to look with: apt-get install chromium, pip install playwright",
 )
-def test_a_browser_shows_every_picture_and_asks_nobody(diagnosed: tuple[JointFinding, Path], tmp_path: Path):
+def test_a_browser_shows_every_picture_and_asks_nobody(
+    diagnosed: tuple[JointFinding, Path], tmp_path: Path
+):
     from playwright.sync_api import sync_playwright
 
     asked: list[str] = []
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.on("request", lambda request: asked.append(request.url))
         page.goto(diagnosed[1].as_uri())
-        sizes = page.evaluate("[...document.images].map(i => [i.naturalWidth, i.complete])")
+        sizes = page.evaluate(
+            "[...document.images].map(i => [i.naturalWidth, i.complete])"
+        )
         wide = page.evaluate("document.documentElement.scrollWidth")
         browser.close()
-    assert len(sizes) >= 6 and all(width > 300 and complete for width, complete in sizes)
+    assert len(sizes) >= 6 and all(
+        width > 300 and complete for width, complete in sizes
+    )
     assert [a for a in asked if not a.startswith("data:")] == [diagnosed[1].as_uri()]
     assert wide <= 1280, "nothing sticks out of the window"
 
@@ -301,18 +456,25 @@ PNG = b"\x89PNG"
         Section(command=BAD),
         Section(figures=[Picture(lambda: PNG, BAD)]),
         Section(parts=[Section(text=[BAD])]),
-        *(Section(rows=[(Cell(BAD, style),)]) for style in ("", "bad", "bold", "code", "link")),
+        *(
+            Section(rows=[(Cell(BAD, style),)])
+            for style in ("", "bad", "bold", "code", "link")
+        ),
         Section(rows=[(Cell("x", hint=BAD),)]),
         Section(rows=[(Cell("x", more=[BAD]),)]),
     ],
 )
 def test_text_is_escaped_wherever_it_enters(section: Section):
     page = html(BAD, [section], BAD)
-    assert "<img src=x" not in page and page.count(SHOWN) >= 4, "title, heading, generator and the section"
+    assert "<img src=x" not in page and page.count(SHOWN) >= 4, (
+        "title, heading, generator and the section"
+    )
     assert "default-src 'none'" in page and "<script" not in page
 
 
-def test_a_section_of_one_place_is_in_that_place_only(capsys: pytest.CaptureFixture[str]):
+def test_a_section_of_one_place_is_in_that_place_only(
+    capsys: pytest.CaptureFixture[str],
+):
     both = [Section(text=["p"], only="page"), Section(text=["b"])]
     show(*both, Section(title="outer", parts=both))
     assert capsys.readouterr().out.split() == ["b", "outer", "b"]
@@ -331,12 +493,18 @@ def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(monkeypatch, cap
         "reason": reason,
         "command": f"taccorl check {path}",
     }
-    show(ingested({"recordings": [{**entry, "episodes": []}], "outcomes": {"refused": 1}}))
+    show(
+        ingested(
+            {"recordings": [{**entry, "episodes": []}], "outcomes": {"refused": 1}}
+        )
+    )
     shown = capsys.readouterr().out
     assert f"refused {reason}\n" in shown and f"taccorl check {path}\n" in shown
     assert "…" not in shown
     table = shown.split("refused /data")[0]
-    assert path in "".join(line.split("  ")[0].strip() for line in table.splitlines()[1:])  # folded, not cut
+    assert path in "".join(
+        line.split("  ")[0].strip() for line in table.splitlines()[1:]
+    )  # folded, not cut
 
 
 def test_no_other_module_writes_html():
@@ -344,11 +512,28 @@ def test_no_other_module_writes_html():
     root = Path(taccorl.__file__).parent
     for path in root.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        assert not re.search(r"<!doctype|import html$|html\.escape|Markup", text, re.MULTILINE), path
-        assert not re.search(r"f[\"']<(p|h1|h2|h3|td|tr|li|ul|div|b|span|code|details)[ >]", text), path
+        assert not re.search(
+            r"<!doctype|import html$|html\.escape|Markup", text, re.MULTILINE
+        ), path
+        assert not re.search(
+            r"f[\"']<(p|h1|h2|h3|td|tr|li|ul|div|b|span|code|details)[ >]", text
+        ), path
 
 
-@pytest.mark.parametrize("name", ["a<b", "a>b", "a&b", "a\x1b[31m", "a\nb", "a\u202eb", "\x9b2J", "a\u2028b", "\x00"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a<b",
+        "a>b",
+        "a&b",
+        "a\x1b[31m",
+        "a\nb",
+        "a\u202eb",
+        "\x9b2J",
+        "a\u2028b",
+        "\x00",
+    ],
+)
 def test_names_that_steer_a_terminal_or_a_page_are_refused_with_their_place(name: str):
     with pytest.raises(SpecError, match=r"arm\.urdf:3: .*character"):
         plain_name(name, "arm.urdf:3: <joint>")

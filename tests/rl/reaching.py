@@ -21,7 +21,11 @@ class LinePolicy(FlowPolicy):
         torch.manual_seed(seed)
         self.encoder = nn.Sequential(nn.Linear(1, width), nn.SiLU())
         self.expert = nn.Sequential(
-            nn.Linear(width + H + 1, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, H)
+            nn.Linear(width + H + 1, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, H),
         )
         self.scored_HD = torch.ones(H, 1, dtype=torch.bool)
 
@@ -32,24 +36,34 @@ class LinePolicy(FlowPolicy):
         return chunk_BHD
 
     def velocity(self, seen_BF: Tensor, x_BHD: Tensor, t_B: Tensor) -> Tensor:
-        return self.expert(torch.cat([seen_BF, x_BHD.flatten(1), t_B[:, None]], dim=1))[:, :, None]
+        return self.expert(torch.cat([seen_BF, x_BHD.flatten(1), t_B[:, None]], dim=1))[
+            :, :, None
+        ]
 
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
         seen_BF = self.encoder(batch["distance"])
-        return compute(slice(None), lambda x, t: self.velocity(seen_BF, x, t), seen_BF.detach())
+        return compute(
+            slice(None), lambda x, t: self.velocity(seen_BF, x, t), seen_BF.detach()
+        )
 
-    def flow_loss(self, distance_B1: Tensor, chunk_BHD: Tensor, generator: torch.Generator) -> Tensor:
+    def flow_loss(
+        self, distance_B1: Tensor, chunk_BHD: Tensor, generator: torch.Generator
+    ) -> Tensor:
         noise = torch.randn(chunk_BHD.shape, generator=generator)
         t = torch.rand(len(chunk_BHD), generator=generator)
         x = t[:, None, None] * noise + (1 - t[:, None, None]) * chunk_BHD
-        return ((self.velocity(self.encoder(distance_B1), x, t) - (noise - chunk_BHD)) ** 2).mean()
+        return (
+            (self.velocity(self.encoder(distance_B1), x, t) - (noise - chunk_BHD)) ** 2
+        ).mean()
 
 
 def demonstrations(num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """(num, 1) distances and (num, H, 1) chunks, in units of the largest step."""
     distance = 2 * torch.rand(num, 1, generator=generator) - 1
     share = ((distance + BEYOND) / (STEP * H)).clamp(-1, 1)
-    return distance, (share[:, None, :] + 0.1 * torch.randn(num, H, 1, generator=generator)).clamp(-1, 1)
+    return distance, (
+        share[:, None, :] + 0.1 * torch.randn(num, H, 1, generator=generator)
+    ).clamp(-1, 1)
 
 
 def imitated(seed: int = 0, steps: int = 400) -> LinePolicy:
@@ -71,7 +85,9 @@ class DemoAnchor:
         self.rows_seen: list[int] = []
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
-        loss = self.policy.flow_loss(*demonstrations(self.batch_size, generator), generator)
+        loss = self.policy.flow_loss(
+            *demonstrations(self.batch_size, generator), generator
+        )
         (self.weight * loss).backward()
         self.rows_seen.append(self.batch_size)
         return float(loss.detach())
@@ -79,7 +95,9 @@ class DemoAnchor:
     @torch.no_grad()
     def drift(self, num_rows: int) -> float:
         generator = torch.Generator().manual_seed(3)
-        return float(self.policy.flow_loss(*demonstrations(num_rows, generator), generator))
+        return float(
+            self.policy.flow_loss(*demonstrations(num_rows, generator), generator)
+        )
 
 
 class LineWorld:
@@ -88,15 +106,23 @@ class LineWorld:
     def __init__(self, num_envs: int, seed: int = 0) -> None:
         self.num_envs, self.clock = num_envs, Clock()
         self.generator = torch.Generator().manual_seed(seed)
-        self.distance, self.age = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.long)
+        self.distance, self.age = (
+            torch.zeros(num_envs),
+            torch.zeros(num_envs, dtype=torch.long),
+        )
         self.reset(torch.ones(num_envs, dtype=torch.bool))
 
     def reset(self, mask: Tensor) -> None:
-        self.distance[mask] = 2 * torch.rand(int(mask.sum()), generator=self.generator) - 1
+        self.distance[mask] = (
+            2 * torch.rand(int(mask.sum()), generator=self.generator) - 1
+        )
         self.age[mask] = 0
 
     def _seen(self, rows: Tensor) -> Observations:
-        return Observations({"distance": self.distance[rows][:, None].clone()}, torch.zeros(int(rows.sum()), 0))
+        return Observations(
+            {"distance": self.distance[rows][:, None].clone()},
+            torch.zeros(int(rows.sum()), 0),
+        )
 
     def observe(self) -> Observations:
         return self._seen(torch.ones(self.num_envs, dtype=torch.bool))
@@ -111,4 +137,15 @@ class LineWorld:
         self.reset(won | late)
         none, whole = np.zeros(self.num_envs, dtype=np.int64), np.full(self.num_envs, H)
         actions, rewards = actions_NHA.numpy(), won.numpy().astype(np.float64)
-        return Acted(rewards, won.numpy(), late.numpy(), last, outcome, none > 0, whole, none, none, actions)
+        return Acted(
+            rewards,
+            won.numpy(),
+            late.numpy(),
+            last,
+            outcome,
+            none > 0,
+            whole,
+            none,
+            none,
+            actions,
+        )

@@ -31,11 +31,17 @@ def same(a: Any, b: Any) -> bool:
     """Equal in type, shape and every bit."""
     if isinstance(a, torch.Tensor | np.ndarray):
         arrays = [np.asarray(x) for x in (a, b)]
-        equal = arrays[0].dtype == arrays[1].dtype and arrays[0].shape == arrays[1].shape
+        equal = (
+            arrays[0].dtype == arrays[1].dtype and arrays[0].shape == arrays[1].shape
+        )
         bits = [x.tolist() if x.dtype == object else x.tobytes() for x in arrays]
         return type(a) is type(b) and equal and bits[0] == bits[1]
     if isinstance(a, dict):
-        return list(a) == list(b) and list(map(type, a)) == list(map(type, b)) and all(same(a[k], b[k]) for k in a)
+        return (
+            list(a) == list(b)
+            and list(map(type, a)) == list(map(type, b))
+            and all(same(a[k], b[k]) for k in a)
+        )
     if isinstance(a, list | tuple):
         return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
     return type(a) is type(b) and repr(a) == repr(b)
@@ -54,11 +60,25 @@ def made_state() -> dict[str, Any]:
         "numpy": np.random.RandomState(3).get_state(),
         "torch": torch.get_rng_state(),
         "generator": np.random.default_rng(1).bit_generator.state,
-        "kept": [({"seeds": np.array([2**63 - 1]), "flags": np.array([True, False])}, numbers.T[1:])],
+        "kept": [
+            (
+                {"seeds": np.array([2**63 - 1]), "flags": np.array([True, False])},
+                numbers.T[1:],
+            )
+        ],
         "views": [numbers[1:], numbers[1:], torch.zeros(2, 3).T],
         "names": np.array([["dropped", None], [None, "a"]], dtype=object),
         "empty": (np.zeros((0, 7)), [], {}, ""),
-        "others": [float("nan"), float("-inf"), 0.1, -0.0, True, None, {"tensor": "0"}, {"dict": []}],
+        "others": [
+            float("nan"),
+            float("-inf"),
+            0.1,
+            -0.0,
+            True,
+            None,
+            {"tensor": "0"},
+            {"dict": []},
+        ],
     }
 
 
@@ -118,7 +138,9 @@ BEGUN = [
 
 
 def resumed(*argv: str) -> PostTrainConfig:
-    stored = run_settings.stored_options(parse(PostTrainConfig, argv).out, given_names(argv))
+    stored = run_settings.stored_options(
+        parse(PostTrainConfig, argv).out, given_names(argv)
+    )
     return parse(PostTrainConfig, [*argv, *stored])
 
 
@@ -131,28 +153,50 @@ def out(tmp_path: Path) -> Path:
 
 
 def test_everything_comes_from_the_run_but_what_is_given(out: Path) -> None:
-    found = resumed(f"--out={out}", "--resume=true", "--iterations=50", "--policy.device=cpu")
+    found = resumed(
+        f"--out={out}", "--resume=true", "--iterations=50", "--policy.device=cpu"
+    )
     assert isinstance(found, PostTrainConfig) and found.resume and found.out == out
-    assert found.policy.path == Path("outputs/a #3").resolve() and found.policy.device == "cpu"
-    assert (found.env.task, found.ppo.actor_lr, found.anchor.weight) == ("puzzle", 4e-6, 0)
+    assert (
+        found.policy.path == Path("outputs/a #3").resolve()
+        and found.policy.device == "cpu"
+    )
+    assert (found.env.task, found.ppo.actor_lr, found.anchor.weight) == (
+        "puzzle",
+        4e-6,
+        0,
+    )
     assert found.env.twin is None and found.iterations == 50
     run_settings.refuse_changes(found)
     assert resumed(f"--out={out}", "--resume=true").iterations == 30
 
 
 def test_other_settings_are_refused_by_name(out: Path, tmp_path: Path) -> None:
-    with pytest.raises(TaccorlError, match=r"--ppo\.clip 0\.2 there, 0\.3 here.* or none"):
+    with pytest.raises(
+        TaccorlError, match=r"--ppo\.clip 0\.2 there, 0\.3 here.* or none"
+    ):
         run_settings.refuse_changes(resumed(f"--out={out}", "--ppo.clip=0.3"))
     file = tmp_path / "other.yaml"
     file.write_text("ppo: {clip: 0.1}\nnoise:\n  level: 0.2\n")
-    with pytest.raises(TaccorlError, match=r"--noise\.level 0\.5 there, 0\.2 here; --ppo\.clip 0\.2 there, 0\.1 here"):
+    with pytest.raises(
+        TaccorlError,
+        match=r"--noise\.level 0\.5 there, 0\.2 here; --ppo\.clip 0\.2 there, 0\.1 here",
+    ):
         run_settings.refuse_changes(resumed(f"--out={out}", f"--config_path={file}"))
-    run_settings.refuse_changes(resumed(f"--out={out}", "--save_freq=3", "--env.task=puzzle"))
+    run_settings.refuse_changes(
+        resumed(f"--out={out}", "--save_freq=3", "--env.task=puzzle")
+    )
 
 
-def test_settings_that_a_run_of_an_older_version_lacks_have_their_defaults(out: Path) -> None:
+def test_settings_that_a_run_of_an_older_version_lacks_have_their_defaults(
+    out: Path,
+) -> None:
     file = out / "settings.json"
-    file.write_text(file.read_text().replace('"ppo.adapt_lr": false,', "").replace('"iterations": 30,', ""))
+    file.write_text(
+        file.read_text()
+        .replace('"ppo.adapt_lr": false,', "")
+        .replace('"iterations": 30,', "")
+    )
     found = resumed(f"--out={out}")
     run_settings.refuse_changes(found)
     assert found.iterations == 100 and not found.ppo.adapt_lr
@@ -160,7 +204,9 @@ def test_settings_that_a_run_of_an_older_version_lacks_have_their_defaults(out: 
 
 def test_a_run_with_a_setting_that_no_longer_exists_is_refused(out: Path) -> None:
     file = out / "settings.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"noise.correlation": 0.9}))
+    file.write_text(
+        json.dumps(json.loads(file.read_text()) | {"noise.correlation": 0.9})
+    )
     with pytest.raises(TaccorlError, match=r"noise\.correlation=0\.9"):
         run_settings.refuse_changes(resumed(f"--out={out}"))
 
@@ -168,7 +214,9 @@ def test_a_run_with_a_setting_that_no_longer_exists_is_refused(out: Path) -> Non
 def test_a_changed_twin_is_refused(tmp_path: Path) -> None:
     twin = tmp_path / "twin.yaml"
     twin.write_text("seed: 1\n")
-    run_settings.write(parse(PostTrainConfig, [f"--env.twin={twin}", f"--out={tmp_path}"]))
+    run_settings.write(
+        parse(PostTrainConfig, [f"--env.twin={twin}", f"--out={tmp_path}"])
+    )
     run_settings.refuse_changes(resumed(f"--out={tmp_path}"))
     twin.write_text("seed: 2\n")
     with pytest.raises(TaccorlError, match=r"twin_sha256"):

@@ -15,12 +15,18 @@ ALL = torch.ones(H, D, dtype=torch.bool)
 
 
 def sde(num_steps: int = 4, level: float = 0.5, steps: str = "one") -> FlowSDE:
-    return FlowSDE(FlowSDESettings(num_steps=num_steps, level=level, stochastic_steps=steps))
+    return FlowSDE(
+        FlowSDESettings(num_steps=num_steps, level=level, stochastic_steps=steps)
+    )
 
 
 def smooth(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
     """A velocity field without meaning that mixes all numbers of a chunk."""
-    mixed = x.flatten(1) @ torch.linspace(-1, 1, H * D * H * D, dtype=x.dtype).reshape(H * D, H * D) / (H * D)
+    mixed = (
+        x.flatten(1)
+        @ torch.linspace(-1, 1, H * D * H * D, dtype=x.dtype).reshape(H * D, H * D)
+        / (H * D)
+    )
     return torch.tanh(mixed).reshape(x.shape) + t[:, None, None].to(x.dtype)
 
 
@@ -31,7 +37,9 @@ def to_gaussian(mean: float, std: float):
         t = t[:, None, None].to(x.dtype)
         spread = (1 - t) ** 2 * std**2 + t**2
         off = x - (1 - t) * mean
-        return t / spread * off - (mean + (1 - t) * std**2 / spread * off)  # E[ε | x] − E[a | x]
+        return t / spread * off - (
+            mean + (1 - t) * std**2 / spread * off
+        )  # E[ε | x] − E[a | x]
 
     return velocity
 
@@ -40,7 +48,9 @@ def draws(sampler: FlowSDE, n: int, seed: int = 0) -> Draws:
     return sampler.draw(n, (H, D), torch.Generator().manual_seed(seed))
 
 
-def propagated(mean: float, std: float, steps: int, level: float) -> tuple[float, float]:
+def propagated(
+    mean: float, std: float, steps: int, level: float
+) -> tuple[float, float]:
     """Mean and deviation at t = 0 when all steps are stochastic: every step is affine, so both follow exactly."""
     sampler, velocity = sde(steps, level, "all"), to_gaussian(mean, std)
     points = torch.tensor([0.0, 1.0], dtype=torch.float64).reshape(2, 1, 1)
@@ -48,14 +58,18 @@ def propagated(mean: float, std: float, steps: int, level: float) -> tuple[float
     yes = torch.ones(2, 1, 1, dtype=torch.bool)
     for k, t in enumerate(sampler.times):
         at = torch.full((2,), k)
-        (b,), (ab,) = sampler.mean(points, velocity(points, torch.full((2,), t)), at, yes)[0][:, 0].tolist()
+        (b,), (ab,) = sampler.mean(
+            points, velocity(points, torch.full((2,), t)), at, yes
+        )[0][:, 0].tolist()
         m, var = (ab - b) * m + b, (ab - b) ** 2 * var + sampler.stds[k] ** 2
     return m, math.sqrt(var)
 
 
 def test_published_schedule() -> None:
     """level · √(d t / (1 − t)): 0.5·√(¼·1/¼), 0.5·√(¼·¾/¼), 0.5·√(¼·½/½), 0.5·√(¼·¼/¾)."""
-    assert sde().stds == pytest.approx([0.5, 0.5 * math.sqrt(0.75), 0.25, 0.5 * math.sqrt(1 / 12)])
+    assert sde().stds == pytest.approx(
+        [0.5, 0.5 * math.sqrt(0.75), 0.25, 0.5 * math.sqrt(1 / 12)]
+    )
     assert sde().stds[0] == sde(10).stds[0] == 0.5 == sde(1).stds[0]
 
 
@@ -65,10 +79,18 @@ def test_one_transition_by_hand() -> None:
     x, v = torch.full((1, H, D), 2.0), torch.full((1, H, D), 3.0)
     k = torch.tensor([1])
     mean, std = sde().mean(x, v, k, ALL[None])
-    assert mean.unique().tolist() == pytest.approx([0.90625]) and std.item() == pytest.approx(math.sqrt(0.1875))
+    assert mean.unique().tolist() == pytest.approx(
+        [0.90625]
+    ) and std.item() == pytest.approx(math.sqrt(0.1875))
     z = (1 - 0.90625) / math.sqrt(0.1875)
-    by_hand = H * D * (-0.5 * z**2 - math.log(math.sqrt(0.1875)) - 0.5 * math.log(2 * math.pi))
-    found = sde().log_prob(lambda x, t: v, x[:, None], torch.ones(1, 1, H, D), k[:, None], ALL)
+    by_hand = (
+        H
+        * D
+        * (-0.5 * z**2 - math.log(math.sqrt(0.1875)) - 0.5 * math.log(2 * math.pi))
+    )
+    found = sde().log_prob(
+        lambda x, t: v, x[:, None], torch.ones(1, 1, H, D), k[:, None], ALL
+    )
     assert found.item() == pytest.approx(by_hand, rel=1e-6)
 
 
@@ -78,14 +100,18 @@ def test_level_zero_is_lerobots_integrator_bit_for_bit(steps: str) -> None:
         sampler = sde(num_steps, 0.0, steps)
         given = draws(sampler, 5)
         sampled = sampler.sample(smooth, given, ALL)
-        assert torch.equal(sampled.chunk_BHD, euler_integrate(smooth, given.initial_BHD, num_steps))
+        assert torch.equal(
+            sampled.chunk_BHD, euler_integrate(smooth, given.initial_BHD, num_steps)
+        )
         assert torch.equal(sampled.log_prob_B, torch.zeros(5))
 
 
 @pytest.mark.parametrize("level", [0.1, 0.5])
 def test_marginals_converge_to_the_data_at_first_order(level: float) -> None:
     error = [abs(propagated(0.7, 0.2, n, level)[1] - 0.2) for n in (64, 128, 256)]
-    assert error[1] / error[0] == pytest.approx(0.5, abs=0.15) and error[2] / error[1] == pytest.approx(0.5, abs=0.2)
+    assert error[1] / error[0] == pytest.approx(0.5, abs=0.15) and error[2] / error[
+        1
+    ] == pytest.approx(0.5, abs=0.2)
     assert propagated(0.7, 0.2, 4, level)[0] == pytest.approx(0.7, abs=1e-9)
 
 
@@ -96,8 +122,19 @@ def test_scoring_gives_the_log_probability_of_sampling(steps: str) -> None:
     sampled = sampler.sample(smooth, given, ALL)
     order = torch.randperm(64, generator=torch.Generator().manual_seed(3))
     for rows in order.split(7):  # another order and another batch size
-        again = sampler.log_prob(smooth, sampled.before_BSHD[rows], sampled.after_BSHD[rows], given.step_BS[rows], ALL)
-        torch.testing.assert_close((again - sampled.log_prob_B[rows]).exp(), torch.ones(len(rows)), atol=1e-5, rtol=0)
+        again = sampler.log_prob(
+            smooth,
+            sampled.before_BSHD[rows],
+            sampled.after_BSHD[rows],
+            given.step_BS[rows],
+            ALL,
+        )
+        torch.testing.assert_close(
+            (again - sampled.log_prob_B[rows]).exp(),
+            torch.ones(len(rows)),
+            atol=1e-5,
+            rtol=0,
+        )
 
 
 def test_steps_are_drawn_per_sample_and_evenly() -> None:
@@ -111,13 +148,17 @@ def test_only_scored_numbers_get_noise_and_are_counted() -> None:
     scored[:2, :2] = True
     sampler = sde()
     given = draws(sampler, 200)
-    last = given._replace(step_BS=torch.full((200, 1), 3))  # so that no later step mixes the numbers
+    last = given._replace(
+        step_BS=torch.full((200, 1), 3)
+    )  # so that no later step mixes the numbers
     sampled = sampler.sample(smooth, last, scored)
     euler = euler_integrate(smooth, given.initial_BHD, 4)
     assert torch.equal(sampled.chunk_BHD[:, ~scored], euler[:, ~scored])
     assert (sampled.chunk_BHD[:, scored] != euler[:, scored]).all()
     z = last.noise_BSHD[:, 0][:, scored]
-    by_hand = (-0.5 * z**2).sum(1) - 4 * (math.log(sampler.stds[3]) + 0.5 * math.log(2 * math.pi))
+    by_hand = (-0.5 * z**2).sum(1) - 4 * (
+        math.log(sampler.stds[3]) + 0.5 * math.log(2 * math.pi)
+    )
     torch.testing.assert_close(sampled.log_prob_B, by_hand, atol=1e-4, rtol=0)
 
 
@@ -135,4 +176,6 @@ def test_noise_of_early_steps_does_not_reach_a_certain_action() -> None:
     given = draws(sampler, 4000)
     chunks = sampler.sample(to_gaussian(0.7, 1e-6), given, ALL).chunk_BHD
     stds = [chunks[given.step_BS[:, 0] == k].std().item() for k in range(4)]
-    assert stds[:3] == pytest.approx([0, 0, 0], abs=1e-4) and stds[3] == pytest.approx(0.150, abs=0.003)
+    assert stds[:3] == pytest.approx([0, 0, 0], abs=1e-4) and stds[3] == pytest.approx(
+        0.150, abs=0.003
+    )

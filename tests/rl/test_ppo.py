@@ -18,13 +18,26 @@ from taccorl.rl.settings import FlowSDESettings, PPOSettings
 SETTINGS = PPOSettings(actor_lr=3e-4, critic_lr=1e-3, batch_size=64)
 
 
-def ppo(policy: LinePolicy, settings: PPOSettings = SETTINGS, beta: float | None = None, steps: str = "one") -> PPO:
+def ppo(
+    policy: LinePolicy,
+    settings: PPOSettings = SETTINGS,
+    beta: float | None = None,
+    steps: str = "one",
+) -> PPO:
     torch.manual_seed(1)
     sde = FlowSDE(FlowSDESettings(stochastic_steps=steps))
-    return PPO(policy, Critic(64, hidden=(64, 64)), sde, settings, None if beta is None else DemoAnchor(policy, beta))
+    return PPO(
+        policy,
+        Critic(64, hidden=(64, 64)),
+        sde,
+        settings,
+        None if beta is None else DemoAnchor(policy, beta),
+    )
 
 
-def rollout(learner: PPO, num_envs: int = 16, decisions: int = 12, seed: int = 0) -> Decisions:
+def rollout(
+    learner: PPO, num_envs: int = 16, decisions: int = 12, seed: int = 0
+) -> Decisions:
     generator = torch.Generator().manual_seed(seed)
     return collect(LineWorld(num_envs, seed), learner, decisions, generator).decisions
 
@@ -35,13 +48,21 @@ def weights(policy: LinePolicy) -> torch.Tensor:
 
 def gradient(beta: float | None, micro_batch: int = 128) -> torch.Tensor:
     """Of one optimiser step, before clipping."""
-    settings = PPOSettings(batch_size=192, micro_batch=micro_batch, max_grad_norm=math.inf)
+    settings = PPOSettings(
+        batch_size=192, micro_batch=micro_batch, max_grad_norm=math.inf
+    )
     learner = ppo(LinePolicy(), settings, beta)
     found = rollout(learner)
     advantage = torch.randn(len(found), generator=torch.Generator().manual_seed(5))
     found = dataclasses.replace(found, advantage_M=advantage)
     learner._actor_gradient(found, torch.Generator().manual_seed(6), True)
-    return torch.cat([p.grad.flatten() for p in learner.actor.trained_parameters() if p.grad is not None])
+    return torch.cat(
+        [
+            p.grad.flatten()
+            for p in learner.actor.trained_parameters()
+            if p.grad is not None
+        ]
+    )
 
 
 def test_clipped_loss_by_hand() -> None:
@@ -53,7 +74,9 @@ def test_clipped_loss_by_hand() -> None:
     assert loss.item() == pytest.approx(0.15)
     loss.backward()
     assert log_ratio.grad is not None  # none where it is clipped
-    assert log_ratio.grad.tolist() == pytest.approx([0.0, -0.125, 0.375, 0.0])  # −ratio · A / 4, where not clipped
+    assert log_ratio.grad.tolist() == pytest.approx(
+        [0.0, -0.125, 0.375, 0.0]
+    )  # −ratio · A / 4, where not clipped
 
 
 @pytest.mark.parametrize("steps", ["one", "all"])
@@ -77,7 +100,9 @@ def test_gradient_is_linear_in_beta_and_the_same_in_any_micro_batches() -> None:
     torch.testing.assert_close(g0, without)
     assert (g1 - g0).norm() > 0.1 * g0.norm()  # a dead anchor: 0
     torch.testing.assert_close(g2 - g0, 2 * (g1 - g0), atol=1e-6, rtol=1e-4)
-    torch.testing.assert_close(gradient(1.0, 192), gradient(1.0, 50), atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(
+        gradient(1.0, 192), gradient(1.0, 50), atol=1e-6, rtol=1e-4
+    )
 
 
 def test_critic_and_actor_do_not_reach_each_other() -> None:
@@ -88,7 +113,10 @@ def test_critic_and_actor_do_not_reach_each_other() -> None:
     learner.critic_optimizer.zero_grad()
     learner._actor_gradient(found, torch.Generator(), True)
     assert all(p.grad is None for p in learner.critic.parameters())
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.actor.trained_parameters())
+    assert all(
+        p.grad is not None and p.grad.abs().sum() > 0
+        for p in learner.actor.trained_parameters()
+    )
     features = torch.zeros(3, 64, requires_grad=True)
     learner.critic(features, torch.zeros(3, 0)).sum().backward()
     assert features.grad is None
@@ -112,7 +140,9 @@ def test_advantages_are_normalised_over_the_rollout() -> None:
     for scale, shift in ((1.0, 0.0), (10.0, 7.0)):
         learner = ppo(LinePolicy())
         found = rollout(learner)
-        found = Decisions(**{**vars(found), "advantage_M": scale * found.advantage_M + shift})
+        found = Decisions(
+            **{**vars(found), "advantage_M": scale * found.advantage_M + shift}
+        )
         learner.update(found, torch.Generator().manual_seed(2))
         moved.append(weights(learner.actor))  # pyright: ignore
     torch.testing.assert_close(*moved, atol=2e-5, rtol=0)
@@ -125,14 +155,23 @@ def test_learning_rate_zero_moves_nothing() -> None:
     before = weights(learner.actor)  # pyright: ignore
     facts = learner.update(rollout(learner), torch.Generator())
     assert torch.equal(before, weights(learner.actor))  # pyright: ignore
-    assert abs(facts["kl"]) < 1e-9 and facts["clip_fraction"] == 0 and facts["actor_steps"] == 6
+    assert (
+        abs(facts["kl"]) < 1e-9
+        and facts["clip_fraction"] == 0
+        and facts["actor_steps"] == 6
+    )
 
 
 def test_every_decision_is_used_once_in_an_epoch() -> None:
     learner = ppo(LinePolicy(), PPOSettings(batch_size=50))
     parts = learner._minibatches(192, torch.Generator())
-    assert [len(p) for p in parts] == [50, 50, 50, 42] and sorted(torch.cat(list(parts)).tolist()) == list(range(192))
-    assert len(ppo(LinePolicy(), PPOSettings())._minibatches(128 * 36, torch.Generator())) == 9  # the paper's numbers
+    assert [len(p) for p in parts] == [50, 50, 50, 42] and sorted(
+        torch.cat(list(parts)).tolist()
+    ) == list(range(192))
+    assert (
+        len(ppo(LinePolicy(), PPOSettings())._minibatches(128 * 36, torch.Generator()))
+        == 9
+    )  # the paper's numbers
 
 
 def test_the_anchor_has_its_rows_in_every_step() -> None:
@@ -161,7 +200,9 @@ def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
 
 
 def test_updates_stop_when_the_policy_has_moved_too_far() -> None:
-    learner = ppo(LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=16, epochs=5, kl_stop=0.02))
+    learner = ppo(
+        LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=16, epochs=5, kl_stop=0.02)
+    )
     facts = learner.update(rollout(learner), torch.Generator())
     assert facts["kl_stopped"] == 1 and 1 <= facts["actor_steps"] < 60
 
@@ -169,13 +210,22 @@ def test_updates_stop_when_the_policy_has_moved_too_far() -> None:
 @pytest.mark.parametrize("batch_size", [64, 192])
 def test_a_step_that_goes_too_far_is_undone(batch_size: int) -> None:
     """The first of three steps, which the next minibatch sees, and the only one, which is measured after it."""
-    learner = ppo(LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=batch_size, adapt_lr=True))
-    before, state = weights(learner.actor), learner.state_dict()["actor_optimizer"]["state"]  # pyright: ignore
+    learner = ppo(
+        LinePolicy(), PPOSettings(actor_lr=0.05, batch_size=batch_size, adapt_lr=True)
+    )
+    before, state = (
+        weights(learner.actor),
+        learner.state_dict()["actor_optimizer"]["state"],
+    )  # pyright: ignore
     facts = learner.update(rollout(learner), torch.Generator())
     assert torch.equal(before, weights(learner.actor)) and not state  # pyright: ignore
     assert not learner.actor_optimizer.state  # moments are those of before, too
     assert facts["undone_steps"] == facts["actor_steps"] == facts["kl_stopped"] == 1
-    assert facts["actor_lr"] == 0.05 and learner.actor_lr == 0.025 and facts["last_kl"] < 1e-9
+    assert (
+        facts["actor_lr"] == 0.05
+        and learner.actor_lr == 0.025
+        and facts["last_kl"] < 1e-9
+    )
 
 
 def test_what_is_undone_does_not_depend_on_micro_batches() -> None:
@@ -183,23 +233,32 @@ def test_what_is_undone_does_not_depend_on_micro_batches() -> None:
     found = rollout(ppo(LinePolicy()))
     kept: dict[int, tuple[float, float]] = {}
     for micro_batch in (192, 64, 4):
-        settings = PPOSettings(actor_lr=8e-3, batch_size=192, micro_batch=micro_batch, kl_stop=0.05)
+        settings = PPOSettings(
+            actor_lr=8e-3, batch_size=192, micro_batch=micro_batch, kl_stop=0.05
+        )
         learner = ppo(LinePolicy(), settings)
         facts = learner.update(found, torch.Generator().manual_seed(2))
         kept[micro_batch] = facts["undone_steps"], facts["last_kl"]
     assert len({undone for undone, _ in kept.values()}) == 1
-    assert [kl for _, kl in kept.values()] == pytest.approx([kept[192][1]] * 3, rel=1e-4)
+    assert [kl for _, kl in kept.values()] == pytest.approx(
+        [kept[192][1]] * 3, rel=1e-4
+    )
 
 
 def test_only_the_last_step_is_undone() -> None:
     """The same order and one step less, with a limit that is never reached, gives the same policy."""
     found = rollout(ppo(LinePolicy()))
-    learner = ppo(LinePolicy(), PPOSettings(actor_lr=2e-3, batch_size=16, adapt_lr=True, kl_stop=0.01))
+    learner = ppo(
+        LinePolicy(),
+        PPOSettings(actor_lr=2e-3, batch_size=16, adapt_lr=True, kl_stop=0.01),
+    )
     facts = learner.update(found, torch.Generator().manual_seed(2))
     kept = int(facts["actor_steps"]) - 1
     assert facts["undone_steps"] == 1 and 0 < kept < 11 and 0 < facts["last_kl"] <= 0.01
     assert learner.actor_lr == pytest.approx(0.7 * 2e-3)
-    other = ppo(LinePolicy(), PPOSettings(actor_lr=2e-3, batch_size=16, kl_stop=math.inf))
+    other = ppo(
+        LinePolicy(), PPOSettings(actor_lr=2e-3, batch_size=16, kl_stop=math.inf)
+    )
     order = other._minibatches  # the critic has one epoch of its own
     calls = []
 
@@ -211,15 +270,26 @@ def test_only_the_last_step_is_undone() -> None:
     other.update(found, torch.Generator().manual_seed(2))
     assert torch.equal(weights(learner.actor), weights(other.actor))  # pyright: ignore
     ours, theirs = (x.actor_optimizer.state_dict()["state"] for x in (learner, other))
-    assert all(torch.equal(ours[k][name], theirs[k][name]) for k in theirs for name in theirs[k])
+    assert all(
+        torch.equal(ours[k][name], theirs[k][name])
+        for k in theirs
+        for name in theirs[k]
+    )
 
 
 def test_the_learning_rate_grows_while_steps_are_small_up_to_ten_times() -> None:
-    learner, generator = ppo(LinePolicy(), PPOSettings(actor_lr=1e-7, batch_size=192, adapt_lr=True)), torch.Generator()
+    learner, generator = (
+        ppo(LinePolicy(), PPOSettings(actor_lr=1e-7, batch_size=192, adapt_lr=True)),
+        torch.Generator(),
+    )
     found = rollout(learner)
     rates = [learner.update(found, generator)["actor_lr"] for _ in range(15)]
-    assert rates[:3] == pytest.approx([1e-7, 1.2e-7, 1.44e-7]) and rates[-1] == pytest.approx(1e-6)
-    learner = ppo(LinePolicy(), PPOSettings(actor_lr=1e-7, critic_warmup=9, adapt_lr=True))
+    assert rates[:3] == pytest.approx([1e-7, 1.2e-7, 1.44e-7]) and rates[
+        -1
+    ] == pytest.approx(1e-6)
+    learner = ppo(
+        LinePolicy(), PPOSettings(actor_lr=1e-7, critic_warmup=9, adapt_lr=True)
+    )
     assert learner.update(found, generator)["actor_lr"] == learner.actor_lr == 1e-7
     fixed = ppo(LinePolicy(), PPOSettings(actor_lr=1e-7))
     fixed.update(found, generator)
@@ -233,27 +303,39 @@ def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
     torch.nn.init.constant_(learner.critic.head[-1].bias, 7.0)  # pyright: ignore
     world = LineWorld(32)
     found = collect(world, learner, 20, torch.Generator().manual_seed(0))
-    assert found.facts["outcomes"][SUCCESS] > 0 and found.facts["outcomes"]["timeout"] > 0
+    assert (
+        found.facts["outcomes"][SUCCESS] > 0 and found.facts["outcomes"]["timeout"] > 0
+    )
     returns = found.decisions.return_M
     wins = (returns - 1.0).abs() < 1e-5
     assert int(wins.sum()) == found.facts["outcomes"][SUCCESS]
-    torch.testing.assert_close(returns[~wins], torch.full((int((~wins).sum()),), 0.99 * 7))
+    torch.testing.assert_close(
+        returns[~wins], torch.full((int((~wins).sum()),), 0.99 * 7)
+    )
 
 
 def test_waiting_costs_only_gamma_unless_a_time_out_counts_as_a_failure() -> None:
     """Three hands 10 from the goal, of which 8 decisions (LIMIT) make 3.2 at most, so that time runs out. A critic that always
     says 0.6, γ = 0.9, λ = 1: the return of decision t = 0 … 7 is 0.9^(8 − t) · 0.6 with bootstrap, so that one decision more of
     waiting loses 10 % (advantage 0.54 − 0.6 = −0.06 at the end); without it is 0, and the advantage −0.6 in every decision."""
-    expected = {True: torch.tensor([0.6 * 0.9 ** (8 - t) for t in range(8)]), False: torch.zeros(8)}
+    expected = {
+        True: torch.tensor([0.6 * 0.9 ** (8 - t) for t in range(8)]),
+        False: torch.zeros(8),
+    }
     for bootstrap, returns_T in expected.items():
-        learner = ppo(LinePolicy(), PPOSettings(gamma=0.9, gae_lambda=1.0, bootstrap_time_limit=bootstrap))
+        learner = ppo(
+            LinePolicy(),
+            PPOSettings(gamma=0.9, gae_lambda=1.0, bootstrap_time_limit=bootstrap),
+        )
         torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
         torch.nn.init.constant_(learner.critic.head[-1].bias, 0.6)  # pyright: ignore
         world = LineWorld(3)
         world.distance[:] = 10.0
         found = collect(world, learner, 8, torch.Generator().manual_seed(0))
         assert found.facts["outcomes"] == {"timeout": 3}
-        torch.testing.assert_close(found.decisions.return_M.reshape(8, 3), returns_T[:, None].expand(8, 3))
+        torch.testing.assert_close(
+            found.decisions.return_M.reshape(8, 3), returns_T[:, None].expand(8, 3)
+        )
         advantage_TN = found.decisions.advantage_M.reshape(8, 3)
         torch.testing.assert_close(advantage_TN, returns_T[:, None].expand(8, 3) - 0.6)
 
@@ -267,25 +349,39 @@ def test_float32_weights_keep_a_small_learning_rate() -> None:
 
 
 def test_running_normalisation_of_privileged_numbers() -> None:
-    x = torch.randn(100, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor([0.0, 3.0, -2.0])
+    x = torch.randn(100, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor(
+        [0.0, 3.0, -2.0]
+    )
     critic = Critic(2, 3)
     for part in x.split(17):
         critic.observe(part)
     torch.testing.assert_close(critic.mean_P, x.mean(0), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(critic.square_P / 100, x.var(0, correction=0), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(
+        critic.square_P / 100, x.var(0, correction=0), atol=1e-4, rtol=1e-4
+    )
 
 
 def train(iterations: int, beta: float | None = None) -> tuple[float, float, float]:
     """Success without noise before and after, and the flow loss on the demonstrations after."""
     policy = imitated()
-    learner = ppo(policy, PPOSettings(actor_lr=5e-4, critic_lr=1e-3, batch_size=512, critic_warmup=2), beta)
+    learner = ppo(
+        policy,
+        PPOSettings(actor_lr=5e-4, critic_lr=1e-3, batch_size=512, critic_warmup=2),
+        beta,
+    )
     quiet = FlowSDE(FlowSDESettings(level=0.0))
 
     def success() -> float:
-        found = first_episodes(LineWorld(512, seed=99), policy, quiet, torch.Generator().manual_seed(0), 10)
+        found = first_episodes(
+            LineWorld(512, seed=99), policy, quiet, torch.Generator().manual_seed(0), 10
+        )
         return found.count(SUCCESS) / 512
 
-    before, world, generator = success(), LineWorld(128), torch.Generator().manual_seed(0)
+    before, world, generator = (
+        success(),
+        LineWorld(128),
+        torch.Generator().manual_seed(0),
+    )
     for _ in range(iterations):
         found = collect(world, learner, 16, generator)
         learner.update(found.decisions, generator)
@@ -320,12 +416,20 @@ def test_three_decisions_by_hand() -> None:
     }
     given = {name: torch.tensor(x)[:, None] for name, x in column.items()}
     advantage, returns = estimate_advantages(**given, gamma=0.5, gae_lambda=0.5)
-    assert advantage[:, 0].tolist() == [0.25, 1.0, 2.0] and returns[:, 0].tolist() == [2.25, 5.0, 3.0]
+    assert advantage[:, 0].tolist() == [0.25, 1.0, 2.0] and returns[:, 0].tolist() == [
+        2.25,
+        5.0,
+        3.0,
+    ]
 
 
 def test_normalised_advantages_and_explained_variance() -> None:
     found = normalise(torch.tensor([1.0, 2.0, 3.0, 6.0]))  # mean 3, deviation √3.5
-    assert found.tolist() == pytest.approx([(x - 3) / (3.5**0.5 + 1e-5) for x in (1, 2, 3, 6)])
+    assert found.tolist() == pytest.approx(
+        [(x - 3) / (3.5**0.5 + 1e-5) for x in (1, 2, 3, 6)]
+    )
     returns = torch.tensor([0.0, 1.0, 0.0, 1.0])
-    assert explained_variance(returns + 5, returns) == pytest.approx(1.0)  # an offset is not variance
+    assert explained_variance(returns + 5, returns) == pytest.approx(
+        1.0
+    )  # an offset is not variance
     assert explained_variance(torch.zeros(4), returns) == pytest.approx(0.0)

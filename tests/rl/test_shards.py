@@ -29,7 +29,12 @@ ENVS: dict[str, Any] = {
     "max_episode_steps": 8,
     "part_poses": True,
 }
-OPTIONS: dict[str, Any] = {"history": 3, "starts": StartStates(0.5, 4), "privileged": True, "first": 4}
+OPTIONS: dict[str, Any] = {
+    "history": 3,
+    "starts": StartStates(0.5, 4),
+    "privileged": True,
+    "first": 4,
+}
 
 
 def maker(**changes: Any) -> Any:
@@ -44,7 +49,10 @@ def call(shard: Shard, method: str, *args: Any) -> Any:
 def agree(there: Shard) -> None:
     """Three chunks over a time limit, and a state that goes from there to here."""
     here = LocalShard(maker())
-    assert call(there, "facts") == call(here, "facts") and call(here, "facts").num_envs == 2
+    assert (
+        call(there, "facts") == call(here, "facts")
+        and call(here, "facts").num_envs == 2
+    )
 
     def check(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
         assert one.keys() == other.keys() >= {PRIVILEGED, "observation.tactile"}
@@ -56,7 +64,10 @@ def agree(there: Shard) -> None:
     for step in range(3):
         seen = call(here, "observe")
         check(seen, call(there, "observe"))
-        actions = np.repeat(seen["observation.state"][:, None].astype(np.float32), 5, axis=1) + 0.02
+        actions = (
+            np.repeat(seen["observation.state"][:, None].astype(np.float32), 5, axis=1)
+            + 0.02
+        )
         one, other = call(here, "act", actions), call(there, "act", actions)
         for name, value in one._asdict().items():
             if name != "last":
@@ -99,7 +110,9 @@ def test_a_process_that_was_killed_is_named() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="extra ray is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None, reason="extra ray is not installed"
+)
 def test_an_actor_gives_the_numbers_of_this_process() -> None:
     ray = start_ray()
     agree(RayShard(ray, maker(), 1))
@@ -120,7 +133,9 @@ def test_environments_end_with_the_process_that_was_killed(tmp_path: Path) -> No
         "    print(shard.process.pid, flush=True)\n"
         "    time.sleep(60)\n"
     )
-    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True
+    )
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     parent.kill()

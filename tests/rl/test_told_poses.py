@@ -31,12 +31,27 @@ TOUCH = "observation.tactile"
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Any:
     names = list(part_pose_names(tasks.get("assembly_2")))
     told = {"part_poses": True, "pictures": False, "part_names": names}
-    return open_checkpoint(write_checkpoint(tmp_path_factory.mktemp("checkpoint"), **told), "cpu")
+    return open_checkpoint(
+        write_checkpoint(tmp_path_factory.mktemp("checkpoint"), **told), "cpu"
+    )
 
 
 def world_of(opened: Any, task: str = "assembly_2") -> TwinWorld:
-    envs = {"task": task, "num_envs": 2, "max_episode_steps": 7, "num_threads": 1, "part_poses": True}
-    shard = LocalShard(partial(make_shard, envs, history=opened.config.tactile_history, starts=StartStates()))
+    envs = {
+        "task": task,
+        "num_envs": 2,
+        "max_episode_steps": 7,
+        "num_threads": 1,
+        "part_poses": True,
+    }
+    shard = LocalShard(
+        partial(
+            make_shard,
+            envs,
+            history=opened.config.tactile_history,
+            starts=StartStates(),
+        )
+    )
     return TwinWorld([shard], opened, Clock())
 
 
@@ -45,16 +60,24 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     assert not needs_images(opened.config)
     world.restart(5)
     seen = world.observe().batch
-    assert {PART_POSES, PARTS_KEY, "observation.state", TOUCH} <= set(seen) and not any("images" in key for key in seen)
+    assert {PART_POSES, PARTS_KEY, "observation.state", TOUCH} <= set(seen) and not any(
+        "images" in key for key in seen
+    )
     (shard,) = world.shards
     assert isinstance(shard, LocalShard)
     observation = shard.twins.envs.observe()
     observation[TOUCH] = np.repeat(observation[TOUCH][:, None], 10, axis=1)
-    expected = policy_batch(opened.preprocessor, observation, [shard.twins.facts().instruction] * 2)
+    expected = policy_batch(
+        opened.preprocessor, observation, [shard.twins.facts().instruction] * 2
+    )
     assert torch.equal(seen[PART_POSES], expected[PART_POSES])  # pyright: ignore
     for _ in range(2):
         acted = world.act(seen["observation.state"][:, None].expand(-1, 5, -1))
-    assert acted.truncated_N.all() and acted.last is not None and PART_POSES in acted.last.batch
+    assert (
+        acted.truncated_N.all()
+        and acted.last is not None
+        and PART_POSES in acted.last.batch
+    )
     actor = TactileFlowPolicy(opened.load(0).policy, PolicySettings(), num_steps=4)
     features = actor.features(world.observe().batch)
     width = 96 + 14 + 69  # mean token of the prefix, state, poses of the parts
@@ -73,7 +96,13 @@ def test_evaluation_switches_the_poses_on(opened: Any) -> None:
 
 
 def test_another_task_is_refused(opened: Any) -> None:
-    with pytest.raises(TaccorlError, match=r"assembly_1: its part poses are plug.x, socket.x .* plug.x, cradle.x"):
+    with pytest.raises(
+        TaccorlError,
+        match=r"assembly_1: its part poses are plug.x, socket.x .* plug.x, cradle.x",
+    ):
         world_of(opened, "assembly_1")
     with pytest.raises(TaccorlError, match="another task"):
-        score(Scenes(tasks=("assembly_1",), episodes=1, seed=7, episode_length=6), opened.load(0))
+        score(
+            Scenes(tasks=("assembly_1",), episodes=1, seed=7, episode_length=6),
+            opened.load(0),
+        )

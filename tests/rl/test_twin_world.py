@@ -32,7 +32,9 @@ TOUCH = "observation.tactile"
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return open_checkpoint(write_checkpoint(tmp_path_factory.mktemp("checkpoint")), "cpu")
+    return open_checkpoint(
+        write_checkpoint(tmp_path_factory.mktemp("checkpoint")), "cpu"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +46,18 @@ def envs() -> Iterator[TaccorlVectorEnv]:
 
 def envs_of(num: int, steps: int) -> TaccorlVectorEnv:
     still = {"autoreset": AutoresetMode.DISABLED, "num_threads": 1}
-    return TaccorlVectorEnv("assembly_2", num, images="on_request", max_episode_steps=steps, **still)
+    return TaccorlVectorEnv(
+        "assembly_2", num, images="on_request", max_episode_steps=steps, **still
+    )
 
 
-def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True, **other: Any) -> TwinWorld:
+def make_world(
+    envs: TaccorlVectorEnv,
+    opened: Any,
+    seed: int = 5,
+    privileged: bool = True,
+    **other: Any,
+) -> TwinWorld:
     return world_of([envs], opened, seed, privileged=privileged, **other)
 
 
@@ -65,10 +75,17 @@ def world_of(
 ) -> TwinWorld:
     first, shards = 0, []
     for envs in all_envs:
-        options = {"history": history, "stride": stride, "privileged": privileged, "starts": StartStates(share, size)}
+        options = {
+            "history": history,
+            "stride": stride,
+            "privileged": privileged,
+            "starts": StartStates(share, size),
+        }
         shards.append(LocalShard(partial(TwinShard, envs, first=first, **options)))
         first += envs.num_envs
-    changes = ScenePictures.of_policy(opened.config) if pictures == "randomised" else None
+    changes = (
+        ScenePictures.of_policy(opened.config) if pictures == "randomised" else None
+    )
     made = TwinWorld(shards, opened, Clock(), changes)
     made.restart(seed)
     return made
@@ -90,7 +107,10 @@ def home(world: TwinWorld, n: int = 5) -> torch.Tensor:
 def test_without_noise_actions_are_those_of_evaluation(envs, opened, pictures):
     """Two chunks of five steps through ``select_action`` and through a rollout, from the same noise."""
     actor = opened.load(0)
-    noise = [torch.randn(N, 10, 32, generator=torch.Generator().manual_seed(k)) for k in range(2)]
+    noise = [
+        torch.randn(N, 10, 32, generator=torch.Generator().manual_seed(k))
+        for k in range(2)
+    ]
     world = make_world(envs, opened, pictures=pictures)
     given = iter(noise)
     actor.policy.model.sample_noise = lambda shape, device: next(given)
@@ -106,32 +126,54 @@ def test_without_noise_actions_are_those_of_evaluation(envs, opened, pictures):
     world.restart(5)
     executed: list[np.ndarray] = []
     step = envs.step_chunk
-    envs.step_chunk = lambda actions: (executed.append(actions.copy()), step(actions))[1]  # pyright: ignore
+    envs.step_chunk = lambda actions: (executed.append(actions.copy()), step(actions))[
+        1
+    ]  # pyright: ignore
     quiet = FlowSDE(FlowSDESettings(level=0.0))
     for k in range(2):
         seen = world.observe().batch
         assert (PICTURES_CHANGED in seen) == (pictures == "randomised")
-        filled = torch.cat([windows[5 * k][:1]] * (10 - len(windows[5 * k])) + [windows[5 * k]]).transpose(0, 1)
+        filled = torch.cat(
+            [windows[5 * k][:1]] * (10 - len(windows[5 * k])) + [windows[5 * k]]
+        ).transpose(0, 1)
         assert torch.equal(seen[TOUCH], filled)
-        draws = quiet.draw(N, (10, 32), torch.Generator())._replace(initial_BHD=noise[k])
+        draws = quiet.draw(N, (10, 32), torch.Generator())._replace(
+            initial_BHD=noise[k]
+        )
         world.act(policy.actions(policy.sample(seen, quiet, draws)[0].chunk_BHD))
     envs.step_chunk = step  # pyright: ignore
-    np.testing.assert_allclose(np.concatenate(executed, 1), np.stack(expected, 1), atol=2e-6)
+    np.testing.assert_allclose(
+        np.concatenate(executed, 1), np.stack(expected, 1), atol=2e-6
+    )
 
 
 def test_ratios_of_randomised_pictures_are_1_before_the_first_update(envs, opened):
     """The stored pictures are scored as they were seen: whole values, cropped and changed once."""
-    world, policy = make_world(envs, opened, pictures="randomised"), opened.load(0).policy
-    actor, sde = TactileFlowPolicy(policy, PolicySettings(), num_steps=4), FlowSDE(FlowSDESettings(level=0.5))
+    world, policy = (
+        make_world(envs, opened, pictures="randomised"),
+        opened.load(0).policy,
+    )
+    actor, sde = (
+        TactileFlowPolicy(policy, PolicySettings(), num_steps=4),
+        FlowSDE(FlowSDESettings(level=0.5)),
+    )
     seen, clear = world.observe().batch, make_world(envs, opened).observe().batch
     draws = actor.draw(N, sde, torch.Generator().manual_seed(3))
     sampled, _ = actor.sample(seen, sde, draws)
-    scored = actor.log_prob(seen, sde, sampled.before_BSHD, sampled.after_BSHD, draws.step_BS)
+    scored = actor.log_prob(
+        seen, sde, sampled.before_BSHD, sampled.after_BSHD, draws.step_BS
+    )
     torch.testing.assert_close(scored, sampled.log_prob_B, rtol=0, atol=1e-5)
     front = "observation.images.front"
-    assert seen[front].dtype == torch.uint8 and seen[front].shape == (N, 3, *policy.config.image_resolution)
+    assert seen[front].dtype == torch.uint8 and seen[front].shape == (
+        N,
+        3,
+        *policy.config.image_resolution,
+    )
     assert clear[front].shape[-2:] == (224, 224) and PICTURES_CHANGED not in clear
-    picture = policy._preprocess_images({k: x / 255 if x.dtype == torch.uint8 else x for k, x in seen.items()})[0][0]
+    picture = policy._preprocess_images(
+        {k: x / 255 if x.dtype == torch.uint8 else x for k, x in seen.items()}
+    )[0][0]
     torch.testing.assert_close(picture, 2 * (seen[front] / 255) - 1, rtol=0, atol=1e-6)
 
 
@@ -141,24 +183,36 @@ def test_time_limit_gives_the_last_observation_before_the_reset(envs, opened):
     first = world.observe()
     for _ in range(2):
         acted = world.act(home(world))
-        assert acted.last is None and acted.outcome_N.tolist() == [None, None] and not acted.truncated_N.any()
+        assert (
+            acted.last is None
+            and acted.outcome_N.tolist() == [None, None]
+            and not acted.truncated_N.any()
+        )
     acted = world.act(home(world) + 0.3)
     assert (
-        acted.truncated_N.all() and not acted.terminated_N.any() and acted.outcome_N.tolist() == ["timeout", "timeout"]
+        acted.truncated_N.all()
+        and not acted.terminated_N.any()
+        and acted.outcome_N.tolist() == ["timeout", "timeout"]
     )
     assert acted.last is not None and acted.reward_N.tolist() == [0, 0]
     now = world.observe()
-    assert not torch.equal(acted.last.batch["observation.state"], now.batch["observation.state"])
+    assert not torch.equal(
+        acted.last.batch["observation.state"], now.batch["observation.state"]
+    )
     assert (
         not torch.equal(acted.last.privileged_NP, now.privileged_NP)
         and now.privileged_NP.shape == first.privileged_NP.shape
     )
     assert envs.facts()["seed"].tolist() == [episode_seed(5, i, 1) for i in range(N)]
-    assert torch.equal(now.batch[TOUCH][:, :1].expand(-1, 10, -1), now.batch[TOUCH])  # the past is forgotten
+    assert torch.equal(
+        now.batch[TOUCH][:, :1].expand(-1, 10, -1), now.batch[TOUCH]
+    )  # the past is forgotten
 
 
 @pytest.mark.parametrize(("history", "stride"), [(10, 1), (3, 4)])
-def test_readings_after_the_end_are_not_in_the_last_window(envs, opened, history, stride):
+def test_readings_after_the_end_are_not_in_the_last_window(
+    envs, opened, history, stride
+):
     world = make_world(envs, opened, history=history, stride=stride)
     assert world.observe().batch[TOUCH].shape == (N, history, 1536)
     readings = [envs.observe()[TOUCH]]
@@ -182,9 +236,15 @@ def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs, opened)
     chunk = home(world).clone()
     chunk[1, 3, 2] = torch.nan
     acted = world.act(chunk)
-    assert acted.outcome_N.tolist() == [None, "bad_action"] and acted.terminated_N.tolist() == [False, True]
+    assert acted.outcome_N.tolist() == [
+        None,
+        "bad_action",
+    ] and acted.terminated_N.tolist() == [False, True]
     assert acted.reward_N.tolist() == [0, 0]
-    assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
+    assert envs.facts()["seed"].tolist() == [
+        episode_seed(5, 0, 0),
+        episode_seed(5, 1, 1),
+    ]
 
 
 def test_a_reset_is_of_its_rows_only(envs, opened):
@@ -194,7 +254,10 @@ def test_a_reset_is_of_its_rows_only(envs, opened):
     twins(world).reset(np.array([False, True]))
     after = world.observe()
     assert envs.facts()["steps"].tolist() == [5, 0]
-    assert envs.facts()["seed"].tolist() == [episode_seed(5, 0, 0), episode_seed(5, 1, 1)]
+    assert envs.facts()["seed"].tolist() == [
+        episode_seed(5, 0, 0),
+        episode_seed(5, 1, 1),
+    ]
     for key, value in before.batch.items():
         assert torch.equal(value[0], after.batch[key][0]), key
 
@@ -202,7 +265,10 @@ def test_a_reset_is_of_its_rows_only(envs, opened):
 @pytest.mark.parametrize("pictures", ["clear", "randomised"])
 def test_a_stopped_world_goes_on_bit_for_bit(envs, opened, tmp_path, pictures):
     world = make_world(envs, opened, pictures=pictures)
-    moves = [0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k)) for k in range(4)]
+    moves = [
+        0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k))
+        for k in range(4)
+    ]
     world.observe()
     world.act(moves[0])
     checkpoint.write_state(tmp_path / "pretrained_model", world.state_dict())
@@ -211,7 +277,11 @@ def test_a_stopped_world_goes_on_bit_for_bit(envs, opened, tmp_path, pictures):
         found = []
         for move in moves[1:]:  # over a reset
             seen = world.observe()
-            found += [*seen.batch.values(), seen.privileged_NP, torch.from_numpy(world.act(move).truncated_N)]
+            found += [
+                *seen.batch.values(),
+                seen.privileged_NP,
+                torch.from_numpy(world.act(move).truncated_N),
+            ]
         return found
 
     expected = go_on(world)
@@ -223,15 +293,21 @@ def test_a_stopped_world_goes_on_bit_for_bit(envs, opened, tmp_path, pictures):
 # states of earlier episodes -------------------------------------------------------------------------------------------
 
 
-def later_world(envs: TaccorlVectorEnv, opened: Any, share: float = 1.0, size: int = 3) -> TwinWorld:
+def later_world(
+    envs: TaccorlVectorEnv, opened: Any, share: float = 1.0, size: int = 3
+) -> TwinWorld:
     return world_of([envs], opened, share=share, size=size)
 
 
-def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_counted_apart(envs, opened, monkeypatch):
+def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_counted_apart(
+    envs, opened, monkeypatch
+):
     """12 control steps, 5 a chunk. One third of the time must be left: states after 5 steps are kept, those after 10 are not."""
     monkeypatch.setattr(start_states, "_KEPT", 1.0)
     world = later_world(envs, opened)
-    envs.sim.judge.subtask[0] = 2  # environment 0 is done, says the judge, environment 1 holds its parts
+    envs.sim.judge.subtask[0] = (
+        2  # environment 0 is done, says the judge, environment 1 holds its parts
+    )
     envs.sim.judge.subtask[1] = 1
     world.act(home(world) + 0.1)
     assert len(twins(world).starts) == 1
@@ -240,18 +316,27 @@ def test_episodes_begin_in_states_of_earlier_ones_with_their_touch_and_are_count
     world.act(home(world))
     assert len(twins(world).starts) == 1, "too late"
     acted = world.act(home(world))
-    assert acted.outcome_N.tolist() == ["timeout", "timeout"] and not acted.began_later_N.any()
+    assert (
+        acted.outcome_N.tolist() == ["timeout", "timeout"]
+        and not acted.began_later_N.any()
+    )
     for i in range(N):
         now = envs.sim.snapshot(np.array([i]))
         np.testing.assert_array_equal(now.physics, kept.physics)
-        assert now.judge["steps"] == kept.judge["steps"] == 5 and now.seeds == kept.seeds
+        assert (
+            now.judge["steps"] == kept.judge["steps"] == 5 and now.seeds == kept.seeds
+        )
         assert torch.equal(world.observe().batch[TOUCH][i], felt)
     world.act(home(world))
     acted = world.act(home(world))  # 5 + 5 + 2 of 12 steps
-    assert acted.outcome_N.tolist() == ["timeout", "timeout"] and acted.began_later_N.all()
+    assert (
+        acted.outcome_N.tolist() == ["timeout", "timeout"] and acted.began_later_N.all()
+    )
 
 
-def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(envs, opened, monkeypatch):
+def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(
+    envs, opened, monkeypatch
+):
     monkeypatch.setattr(start_states, "_KEPT", 0.7)
     world = later_world(envs, opened, share=0.5, size=2)
 
@@ -269,7 +354,9 @@ def test_with_states_of_earlier_episodes_a_world_resumes_bit_for_bit(envs, opene
     expected = steps(9)
     world = later_world(envs, opened, share=0.5, size=2)
     world.load_state_dict(state)
-    assert all(torch.equal(one, other) for one, other in zip(steps(9), expected, strict=True))
+    assert all(
+        torch.equal(one, other) for one, other in zip(steps(9), expected, strict=True)
+    )
 
 
 def test_a_share_beyond_one_is_refused():
@@ -284,7 +371,9 @@ def test_shards_give_what_one_gives(opened):
     """Three environments at once, and as two and one: scenes, touch, randomised pictures, outcomes, last observations."""
 
     def made(*sizes: int) -> TwinWorld:
-        return world_of([envs_of(size, 8) for size in sizes], opened, 7, pictures="randomised")
+        return world_of(
+            [envs_of(size, 8) for size in sizes], opened, 7, pictures="randomised"
+        )
 
     one, two = made(3), made(2, 1)
     assert one.num_envs == two.num_envs == 3

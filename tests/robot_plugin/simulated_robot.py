@@ -21,10 +21,18 @@ class SimulatedRobot(TaccorlSurrogate):
     """``TaccorlSurrogate`` whose clock is the body's; messages go through the link's own parser."""
 
     def __init__(
-        self, folder: Path, faults: tuple[str, ...] = (), *, camera_px: int = 0, paced: bool = False, **options: Any
+        self,
+        folder: Path,
+        faults: tuple[str, ...] = (),
+        *,
+        camera_px: int = 0,
+        paced: bool = False,
+        **options: Any,
     ) -> None:
         """``paced``: a period passes with every observation, as in LeRobot's loops."""
-        self.simulated = SurrogateBody(SurrogateConfig(task="bench", camera_px=camera_px, faults=list(faults)))
+        self.simulated = SurrogateBody(
+            SurrogateConfig(task="bench", camera_px=camera_px, faults=list(faults))
+        )
         self.now_s, self.commands, self._due, self._paced = 0.0, 0, [], paced
         self._turn = threading.Lock()
         config = TaccorlSurrogateConfig(
@@ -68,9 +76,16 @@ class SimulatedRobot(TaccorlSurrogate):
             for message in [m for m in self._due if m.due_s <= self.now_s + 1e-9]:
                 self._due.remove(message)
                 if "lost_socket" not in self.simulated.faults:
-                    link._take(json.dumps({**message.header, "kind": message.kind}).encode(), message.payload)
+                    link._take(
+                        json.dumps({**message.header, "kind": message.kind}).encode(),
+                        message.payload,
+                    )
         until = time.monotonic() + 5.0  # the pads' threads have read what came
-        while self.pads and self.pads._drivers and any(not p.empty() for p in link.pads.values()):
+        while (
+            self.pads
+            and self.pads._drivers
+            and any(not p.empty() for p in link.pads.values())
+        ):
             assert time.monotonic() < until
             time.sleep(0.0005)
 

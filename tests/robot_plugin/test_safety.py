@@ -16,7 +16,13 @@ from taccorl.robot_plugin.safety import Guard, Observed, SafetyConfig, Stopped, 
 from taccorl.robots import ROBOT
 
 PERIOD_S = 1 / 30
-HOLD_AFTER_S = {"dead_camera": 0.2, "frozen_camera": 0.2, "silent_pad": 0.1, "late_state": 0.1, "hung_policy": 0.2}
+HOLD_AFTER_S = {
+    "dead_camera": 0.2,
+    "frozen_camera": 0.2,
+    "silent_pad": 0.1,
+    "late_state": 0.1,
+    "hung_policy": 0.2,
+}
 STOPS = ("pressed_pad", "jammed", "lost_socket", "nan_action", "workspace")
 FAULTS = (*HOLD_AFTER_S, *STOPS)
 NOTHING: Mapping[str, float] = {}
@@ -36,14 +42,22 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> SimulatedRobot:
     return robot
 
 
-def loop(robot: SimulatedRobot, periods: int, changed: Mapping[str, float] = NOTHING, acts: bool = True) -> str:
+def loop(
+    robot: SimulatedRobot,
+    periods: int,
+    changed: Mapping[str, float] = NOTHING,
+    acts: bool = True,
+) -> str:
     """Reason of the stop after that many periods of a loop that asks for a slow motion; empty while there was none."""
     for _ in range(periods):
         robot.pass_period()
         try:
             seen = robot.get_observation()
             if acts:
-                target = {n: seen[n] + (0.01 if n == "left_joint_1.pos" else 0.0) for n in robot.body.names}
+                target = {
+                    n: seen[n] + (0.01 if n == "left_joint_1.pos" else 0.0)
+                    for n in robot.body.names
+                }
                 robot.send_action(target | dict(changed))
         except Stopped:
             return robot.guard.stopped
@@ -60,9 +74,13 @@ def fresh(robot: SimulatedRobot) -> None:
     robot._seen_s = robot._sent_s = -math.inf
 
 
-@pytest.mark.parametrize("of_each", [1, pytest.param(20, marks=pytest.mark.slow)])  # 20 of 10 kinds: 200 faults
+@pytest.mark.parametrize(
+    "of_each", [1, pytest.param(20, marks=pytest.mark.slow)]
+)  # 20 of 10 kinds: 200 faults
 @pytest.mark.parametrize("fault", FAULTS)
-def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(fault, of_each, robot, caplog):
+def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(
+    fault, of_each, robot, caplog
+):
     rng, right, moved = np.random.default_rng(FAULTS.index(fault)), 0, []
     for _ in range(of_each):
         fresh(robot)
@@ -74,14 +92,18 @@ def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(fault, of_ea
         least = math.ceil(HOLD_AFTER_S.get(fault, 0.0) / PERIOD_S) + 2
         within = least + 60 * (fault == "workspace") + 10 * (fault == "lost_socket")
         reason = loop(robot, within, changed, acts=fault != "hung_policy")
-        reacted = bool(reason) if fault in STOPS else bool(robot.guard.holding) and not reason
+        reacted = (
+            bool(reason) if fault in STOPS else bool(robot.guard.holding) and not reason
+        )
         sent = robot.commands
         for _ in range(4):  # one period and a tick
             robot.tick()
         where = robot.simulated.sim.proprioception()[0]
         for _ in range(3):
             robot.tick()
-        moved.append(float(np.abs(robot.simulated.sim.proprioception()[0] - where).max()))
+        moved.append(
+            float(np.abs(robot.simulated.sim.proprioception()[0] - where).max())
+        )
         if fault in STOPS:
             for _ in range(3):
                 with pytest.raises(Stopped):
@@ -89,13 +111,21 @@ def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(fault, of_ea
         else:
             loop(robot, 2, acts=fault != "hung_policy")
         logged = any(
-            r.levelno >= logging.WARNING and (robot.guard.stopped or robot.guard.holding) for r in caplog.records
+            r.levelno >= logging.WARNING
+            and (robot.guard.stopped or robot.guard.holding)
+            for r in caplog.records
         )
-        right += reacted and robot.commands == sent and moved[-1] < AT_REST_RAD and logged
-    assert right == of_each, f"{fault}: {right} of {of_each}; {moved}; {robot.guard.stopped or robot.guard.holding}"
+        right += (
+            reacted and robot.commands == sent and moved[-1] < AT_REST_RAD and logged
+        )
+    assert right == of_each, (
+        f"{fault}: {right} of {of_each}; {moved}; {robot.guard.stopped or robot.guard.holding}"
+    )
 
 
-def test_arms_follow_again_after_a_late_state_and_stop_if_it_lasts(robot: SimulatedRobot) -> None:
+def test_arms_follow_again_after_a_late_state_and_stop_if_it_lasts(
+    robot: SimulatedRobot,
+) -> None:
     fresh(robot)
     loop(robot, 4)
     robot.simulated.faults.add("silent_pad")
@@ -108,11 +138,16 @@ def test_arms_follow_again_after_a_late_state_and_stop_if_it_lasts(robot: Simula
     assert "left_a" in reason and "at most 1 s" in reason
 
 
-def test_a_robot_that_does_not_answer_is_stopped_and_said(robot: SimulatedRobot, monkeypatch) -> None:
+def test_a_robot_that_does_not_answer_is_stopped_and_said(
+    robot: SimulatedRobot, monkeypatch
+) -> None:
     def lost(*_: object) -> None:
         raise DeviceNotConnectedError("the arm is gone")
 
-    for method, said in (("read", "does not answer: the arm is gone"), ("send", "takes no command: the arm is gone")):
+    for method, said in (
+        ("read", "does not answer: the arm is gone"),
+        ("send", "takes no command: the arm is gone"),
+    ):
         fresh(robot)
         loop(robot, 3)
         monkeypatch.setattr(robot.body, method, lost)
@@ -123,12 +158,18 @@ def test_a_robot_that_does_not_answer_is_stopped_and_said(robot: SimulatedRobot,
             robot.send_action(dict.fromkeys(robot.body.names, 0.1))
 
 
-@pytest.mark.parametrize(("fault", "oldest_s"), [("jitter", 0.09), ("slow_camera", 0.18)])
-def test_jitter_of_30_ms_and_a_camera_at_6_hz_are_no_fault(fault: str, oldest_s: float, robot: SimulatedRobot) -> None:
+@pytest.mark.parametrize(
+    ("fault", "oldest_s"), [("jitter", 0.09), ("slow_camera", 0.18)]
+)
+def test_jitter_of_30_ms_and_a_camera_at_6_hz_are_no_fault(
+    fault: str, oldest_s: float, robot: SimulatedRobot
+) -> None:
     fresh(robot)
     robot.simulated.faults.add(fault)
     assert loop(robot, 40) == "" and robot.guard.counts["hold"] == 0
-    assert max(list(robot.timing["age of camera:front"])[-40:]) == pytest.approx(oldest_s, abs=0.02)
+    assert max(list(robot.timing["age of camera:front"])[-40:]) == pytest.approx(
+        oldest_s, abs=0.02
+    )
 
 
 def guard(now: list[float], **config: object) -> Guard:
@@ -148,7 +189,9 @@ def test_speed_is_limited_to_speed_times_time_and_ranges_to_their_ends() -> None
     np.testing.assert_allclose(found.target, [3.0 / 30, -0.05, 0.002], atol=1e-12)
     now[0] += 10.0  # a pause does not add up
     found = one.command({"joint_0.pos": 5.0, "joint_1.pos": 0.0, "gripper.pos": 0.0})
-    assert found.target is not None and found.target[0] == pytest.approx(0.1 + 2 * 3.0 / 30)
+    assert found.target is not None and found.target[0] == pytest.approx(
+        0.1 + 2 * 3.0 / 30
+    )
 
 
 def test_a_stop_after_a_late_action_says_so() -> None:
@@ -156,13 +199,18 @@ def test_a_stop_after_a_late_action_says_so() -> None:
     for passed_s in (PERIOD_S, 0.5, PERIOD_S):
         now[0] += passed_s
         one.command(dict.fromkeys(one.names, 0.0))
-    assert one.stop("effort").reason == "effort; the loop was late: no action for 0.45 s"  # 0.9 of it, a period later
+    assert (
+        one.stop("effort").reason == "effort; the loop was late: no action for 0.45 s"
+    )  # 0.9 of it, a period later
 
 
 def test_an_action_without_a_joint_stops() -> None:
     one = guard([0.0])
     assert one.command({"joint_0.pos": 0.0, "gripper.pos": 0.0}).kind == "stop"
-    assert "joint_1.pos" in one.stopped and one.command(dict.fromkeys(one.names, 0.0)).target is None
+    assert (
+        "joint_1.pos" in one.stopped
+        and one.command(dict.fromkeys(one.names, 0.0)).target is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,10 +225,17 @@ def test_an_action_without_a_joint_stops() -> None:
 )
 def test_limits_that_cannot_hold_are_refused(config: dict, said: str) -> None:
     with pytest.raises(TaccorlError, match=said):
-        Guard(SafetyConfig(**config), ["joint_1.pos"], PERIOD_S, lambda: 0.0, piper=False)
+        Guard(
+            SafetyConfig(**config), ["joint_1.pos"], PERIOD_S, lambda: 0.0, piper=False
+        )
 
 
 def test_hands_are_where_the_policys_kinematics_has_them() -> None:
-    chains, state = torch.tensor(arm_chains(), dtype=torch.float64), (ROBOT.action_low + 2 * ROBOT.action_high) / 3
+    chains, state = (
+        torch.tensor(arm_chains(), dtype=torch.float64),
+        (ROBOT.action_low + 2 * ROBOT.action_high) / 3,
+    )
     poses = tcp_poses(torch.from_numpy(state)[None], chains)
-    np.testing.assert_allclose(_hands()(state), [pose[0, :3, 3].numpy() for pose in poses], atol=1e-12)
+    np.testing.assert_allclose(
+        _hands()(state), [pose[0, :3, 3].numpy() for pose in poses], atol=1e-12
+    )

@@ -16,7 +16,12 @@ from taccorl.robot_plugin.bodies import ARM_NAMES, SurrogateArms
 from taccorl.robot_plugin.config_robots import TaccorlSurrogateConfig
 from taccorl.robot_plugin.robots import TaccorlSurrogate
 from taccorl.robot_plugin.safety import SafetyConfig, Stopped
-from taccorl.robot_plugin.surrogate_body import FAULTS, SurrogateBody, SurrogateConfig, hidden_twin
+from taccorl.robot_plugin.surrogate_body import (
+    FAULTS,
+    SurrogateBody,
+    SurrogateConfig,
+    hidden_twin,
+)
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
 from taccorl.robot_plugin.surrogate_server import SurrogateServer
 from taccorl.robots import ROBOT
@@ -28,7 +33,9 @@ def body() -> SurrogateBody:
     return SurrogateBody(SurrogateConfig(task="bench", camera_px=16))
 
 
-def test_a_second_has_200_states_100_frames_of_each_pad_and_30_pictures_of_each_camera(body: SurrogateBody) -> None:
+def test_a_second_has_200_states_100_frames_of_each_pad_and_30_pictures_of_each_camera(
+    body: SurrogateBody,
+) -> None:
     body.reset(0)
     messages = [message for _ in range(100) for message in body.tick()]
     states = [s for m in messages if m.kind == "state" for s in m.header["stamps_s"]]
@@ -49,14 +56,22 @@ def test_the_time_of_a_scene_begins_at_its_reset(body: SurrogateBody) -> None:
     assert body.outcome()["seconds"] == 1.0 and len(led) == 30
 
 
-def test_a_command_is_reached_in_a_straight_line_in_a_thirtieth_of_a_second(body: SurrogateBody, monkeypatch) -> None:
+def test_a_command_is_reached_in_a_straight_line_in_a_thirtieth_of_a_second(
+    body: SurrogateBody, monkeypatch
+) -> None:
     body.reset(0)
     begin, motors, seen = body._target.copy(), body.sim.action_actuators, []
     goal = begin + ROBOT.per_action(0.03, -0.003)
     body.command(goal)
-    monkeypatch.setattr(body, "_state", lambda: seen.append(body.sim.arrays["ctrl"][0, motors]) or np.zeros((3, 14)))
+    monkeypatch.setattr(
+        body,
+        "_state",
+        lambda: seen.append(body.sim.arrays["ctrl"][0, motors]) or np.zeros((3, 14)),
+    )
     [body.tick() for _ in range(4)]
-    share = np.minimum(0.15 * np.arange(1, 9), 1)[:, None]  # each 5 ms: in larger steps, the arms press harder
+    share = np.minimum(0.15 * np.arange(1, 9), 1)[
+        :, None
+    ]  # each 5 ms: in larger steps, the arms press harder
     np.testing.assert_allclose(seen, begin + share * (goal - begin), atol=1e-12)
     np.testing.assert_array_equal(body._target, body._goal)
     with pytest.raises(TaccorlError, match="left_joint2"):
@@ -64,7 +79,9 @@ def test_a_command_is_reached_in_a_straight_line_in_a_thirtieth_of_a_second(body
 
 
 @pytest.mark.parametrize("fault", sorted(set(FAULTS) - {"lost_socket"}))
-def test_every_fault_changes_the_messages_it_names(fault: str, body: SurrogateBody) -> None:
+def test_every_fault_changes_the_messages_it_names(
+    fault: str, body: SurrogateBody
+) -> None:
     body.reset(0)
     body.faults = set()
     [body.tick() for _ in range(8)]
@@ -99,7 +116,9 @@ def test_hidden_effects_come_from_the_secret() -> None:
 
 
 def test_names_that_are_unknown_are_refused_with_the_nearest() -> None:
-    with pytest.raises(TaccorlError, match="no hidden effect 'coulomb_fricton'; did you mean"):
+    with pytest.raises(
+        TaccorlError, match="no hidden effect 'coulomb_fricton'; did you mean"
+    ):
         hidden_twin(SurrogateConfig(secret=3, effects=["coulomb_fricton"]))
     with pytest.raises(TaccorlError, match="did you mean 'silent_pad'"):
         SurrogateBody(SurrogateConfig(faults=["silent_pads"]))
@@ -107,25 +126,36 @@ def test_names_that_are_unknown_are_refused_with_the_nearest() -> None:
         SurrogateBody(SurrogateConfig(task="asembly_1"))
 
 
-def test_no_client_gets_privileged_state(body: SurrogateBody, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_client_gets_privileged_state(
+    body: SurrogateBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The simulator's privileged accessors are blinded; messages and facts are made without them."""
 
     def blind(*_: object) -> None:
         raise AssertionError("privileged state was read")
 
     body.reset(0)
-    monkeypatch.setattr(body.sim.judge, "update", lambda *_: None)  # the judge beside the robot may see
+    monkeypatch.setattr(
+        body.sim.judge, "update", lambda *_: None
+    )  # the judge beside the robot may see
     for name in ("poses", "velocities", "tcp", "pads_touching", "contact"):
         monkeypatch.setattr(SeenScene, name, blind)
     found = [m for _ in range(10) for m in body.tick()]
-    assert {key for m in found for key in m.header} == {"stamps_s", "lead", "pads", "camera"}
+    assert {key for m in found for key in m.header} == {
+        "stamps_s",
+        "lead",
+        "pads",
+        "camera",
+    }
     assert set(body.facts()) == {"task", "instruction", "seed", "cameras", "origin"}
     assert body.facts()["origin"]["domain"] == "surrogate"
 
 
 @contextmanager
 def running(port: int = 0) -> Iterator[SurrogateServer]:
-    server = SurrogateServer(SurrogateBody(SurrogateConfig(task="bench", camera_px=16)), port)
+    server = SurrogateServer(
+        SurrogateBody(SurrogateConfig(task="bench", camera_px=16)), port
+    )
     ended = threading.Event()
     thread = threading.Thread(target=server.run, kwargs={"stop": ended.is_set})
     thread.start()
@@ -143,8 +173,15 @@ def server() -> Iterator[SurrogateServer]:
 
 def connected(port: int, folder: Path) -> TaccorlSurrogate:
     """A robot whose time limits are long, because a busy machine may stop a process for half a second."""
-    patient = SafetyConfig(max_age_s={"state": 3, "pad": 3, "camera": 3}, stop_after_s=9)
-    options = {"camera_px": 16, "lost_after_s": 2.0, "safety": patient, "calibration_dir": folder}
+    patient = SafetyConfig(
+        max_age_s={"state": 3, "pad": 3, "camera": 3}, stop_after_s=9
+    )
+    options = {
+        "camera_px": 16,
+        "lost_after_s": 2.0,
+        "safety": patient,
+        "calibration_dir": folder,
+    }
     robot = TaccorlSurrogate(TaccorlSurrogateConfig(port=port, **options))
     robot.connect()
     return robot
@@ -157,7 +194,9 @@ def until(condition: object, timeout_s: float = 10.0) -> bool:
     return bool(condition())  # pyright: ignore[reportCallIssue]
 
 
-def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server: SurrogateServer) -> None:
+def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(
+    server: SurrogateServer,
+) -> None:
     first, second = SurrogateLink(server.port), SurrogateLink(server.port)
     first.connect(10.0)
     with pytest.raises(TaccorlError, match="another robot is connected: process"):
@@ -165,7 +204,10 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     with pytest.raises(TaccorlError, match="no scripted expert"):
         SurrogateLink(server.port, LEADER_ROLE).connect(10.0)
     assert until(lambda: len(first.states) > 3 and all(first.pads.values()))
-    tick, server.body.tick = server.body.tick, lambda *lead: time.sleep(1.2) or tick(*lead)
+    tick, server.body.tick = (
+        server.body.tick,
+        lambda *lead: time.sleep(1.2) or tick(*lead),
+    )
     assert until(lambda: server.slipped_s > 1.0)  # the machine was busy: nobody is dead
     server.body.tick = tick
     first.send("command", target=[0.0] * 14)
@@ -176,9 +218,13 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     thread.join()
     assert until(lambda: not server._clients)
     np.testing.assert_array_equal(server.body._goal, server.body._target)
-    assert server.body._goal.any(), "it holds where it has come to, and not the zeros of the command"
+    assert server.body._goal.any(), (
+        "it holds where it has come to, and not the zeros of the command"
+    )
     facts = second.connect(10.0)
-    assert facts["origin"]["domain"] == "surrogate" and facts["seed"] == 1  # a new scene for a new client
+    assert (
+        facts["origin"]["domain"] == "surrogate" and facts["seed"] == 1
+    )  # a new scene for a new client
     assert second.request("reset", 10.0, seed=5)["seed"] == 5
     assert second.request("outcome", 10.0)["outcome"]["success"] is False
     second.close()
@@ -192,26 +238,46 @@ def test_a_taken_port_and_a_missing_surrogate_are_said(server: SurrogateServer) 
     with pytest.raises(TaccorlError, match="taccorl serve-surrogate --port=9"):
         SurrogateLink(9).connect(60.0)
     arms = SurrogateArms(SurrogateLink(server.port), ["front"], 224)
-    with pytest.raises(TaccorlError, match=r"its cameras are .*'front': \[16, 16\].*, not .*224"):
+    with pytest.raises(
+        TaccorlError, match=r"its cameras are .*'front': \[16, 16\].*, not .*224"
+    ):
         arms.connect()
 
 
-def test_an_episode_begins_with_samples_of_its_own_scene(server: SurrogateServer, tmp_path: Path) -> None:
+def test_an_episode_begins_with_samples_of_its_own_scene(
+    server: SurrogateServer, tmp_path: Path
+) -> None:
     robot = connected(server.port, tmp_path)
     for given, expected in ((7, 7), (None, 8)):
         for _ in range(5):  # from home as fast as safety allows
-            robot.send_action({name: 0.0 for name in robot.body.names if robot.get_observation()})
-        newest = robot.body.read().stamps_s | {name: f[-1][0] for name, f in robot.pads._frames.items()}
+            robot.send_action(
+                {name: 0.0 for name in robot.body.names if robot.get_observation()}
+            )
+        newest = robot.body.read().stamps_s | {
+            name: f[-1][0] for name, f in robot.pads._frames.items()
+        }
         robot.begin_episode(given)
-        oldest = robot.body.read().stamps_s | {name: f[0][0] for name, f in robot.pads._frames.items()}
-        assert server.body.scene_seed == expected and all(oldest[channel] > newest[channel] for channel in newest)
-        asked = {name: value for name, value in robot.get_observation().items() if name in robot.body.names}
-        assert robot.send_action(asked) == pytest.approx(asked, abs=2e-3), "not limited by where the last episode ended"
+        oldest = robot.body.read().stamps_s | {
+            name: f[0][0] for name, f in robot.pads._frames.items()
+        }
+        assert server.body.scene_seed == expected and all(
+            oldest[channel] > newest[channel] for channel in newest
+        )
+        asked = {
+            name: value
+            for name, value in robot.get_observation().items()
+            if name in robot.body.names
+        }
+        assert robot.send_action(asked) == pytest.approx(asked, abs=2e-3), (
+            "not limited by where the last episode ended"
+        )
     robot.disconnect()
 
 
 @pytest.mark.slow
-def test_a_robot_whose_server_dies_stops_and_may_be_connected_to_the_next(tmp_path: Path) -> None:
+def test_a_robot_whose_server_dies_stops_and_may_be_connected_to_the_next(
+    tmp_path: Path,
+) -> None:
     with running() as server:
         robot = connected(server.port, tmp_path)
         assert robot.get_observation() and not robot.guard.stopped
@@ -239,19 +305,28 @@ def test_names_units_zero_and_order_are_those_of_the_data_spec(tmp_path: Path) -
     seen = robot.get_observation()
     here = robot.simulated.sim.proprioception()[0]
     np.testing.assert_allclose([seen[name] for name in ARM_NAMES], here, atol=2e-3)
-    assert seen["tactile"].newest.shape == (1536,) and np.abs(seen["tactile"].newest).max() <= 8  # untouched: noise
+    assert (
+        seen["tactile"].newest.shape == (1536,)
+        and np.abs(seen["tactile"].newest).max() <= 8
+    )  # untouched: noise
     robot.simulated.faults.add("pressed_pad")
     for _ in range(2):
         robot.pass_period()
     seen = robot.get_observation()
     pads = seen["tactile"].newest.reshape(4, 384)
     assert pads[0].min() > 150 and np.abs(pads[1:]).max() <= 8
-    shown = np.split(seen["tactile"].picture().astype(int).sum(axis=2), 4, axis=1)  # a pad each, in Rerun's live view
-    assert shown[0][25:200, 8:70].min() > 1.5 * shown[1][25:200, 8:70].max()  # which is noise
+    shown = np.split(
+        seen["tactile"].picture().astype(int).sum(axis=2), 4, axis=1
+    )  # a pad each, in Rerun's live view
+    assert (
+        shown[0][25:200, 8:70].min() > 1.5 * shown[1][25:200, 8:70].max()
+    )  # which is noise
     assert robot.robot_type == spec.robot_type
 
 
-def test_a_dry_run_sends_nothing_and_says_whether_the_loop_can_be_held(tmp_path: Path) -> None:
+def test_a_dry_run_sends_nothing_and_says_whether_the_loop_can_be_held(
+    tmp_path: Path,
+) -> None:
     robot = SimulatedRobot(tmp_path, dry_run=True)
     robot.connect()
     for _ in range(20):
@@ -260,10 +335,15 @@ def test_a_dry_run_sends_nothing_and_says_whether_the_loop_can_be_held(tmp_path:
         robot.send_action({name: seen[name] for name in ARM_NAMES})
     said = "\n".join(robot.summary())
     assert robot.commands == 0 and "dry run, nothing was sent" in said
-    assert "a loop of 30 Hz can be held: p99 of the period 30.0 ms" in said and "age of pad:left_a: p50" in said
+    assert (
+        "a loop of 30 Hz can be held: p99 of the period 30.0 ms" in said
+        and "age of pad:left_a: p50" in said
+    )
 
 
-def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(tmp_path: Path) -> None:
+def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(
+    tmp_path: Path,
+) -> None:
     robot = SimulatedRobot(tmp_path)
     robot.connect()
     assert robot.pads is not None
@@ -279,15 +359,23 @@ def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(tmp_p
 
 @pytest.mark.parametrize(
     ("fault", "said"),
-    [("silent_pad", "left_a: 0 frames"), ("exchanged_pads", "on its port is right_a"), ("gripping", "is it touched")],
+    [
+        ("silent_pad", "left_a: 0 frames"),
+        ("exchanged_pads", "on its port is right_a"),
+        ("gripping", "is it touched"),
+    ],
 )
-def test_pads_are_checked_when_they_are_connected(fault: str, said: str, tmp_path: Path) -> None:
+def test_pads_are_checked_when_they_are_connected(
+    fault: str, said: str, tmp_path: Path
+) -> None:
     first = SimulatedRobot(tmp_path)
     first.connect()
     first.pads and first.pads.close()
     second = SimulatedRobot(tmp_path, () if fault == "gripping" else (fault,))
     if fault == "gripping":  # steadily, so that no frame differs from the others
-        held = np.random.default_rng(0).uniform(0, 120, second.simulated.baselines[0].shape)
+        held = np.random.default_rng(0).uniform(
+            0, 120, second.simulated.baselines[0].shape
+        )
         second.simulated.baselines[0] += held
     with pytest.raises(TaccorlError, match=said):
         second.connect()

@@ -21,10 +21,34 @@ ALLOWED = {
 }
 """(File, literal) that mean something else, or that cannot ask ``ROBOT``."""
 
-_NAMES = [set(names) for names in (ROBOT.arms, ROBOT.cameras, ROBOT.pads, ROBOT.joints, ROBOT.action_names)]
+_NAMES = [
+    set(names)
+    for names in (
+        ROBOT.arms,
+        ROBOT.cameras,
+        ROBOT.pads,
+        ROBOT.joints,
+        ROBOT.action_names,
+    )
+]
 _SIZES = {ROBOT.num_actions, ROBOT.num_taxels, ROBOT.pad.num_taxels}
-_ARRAYS = {"empty", "zeros", "ones", "full", "reshape", "range", "arange", "rand", "randn", "normal", "uniform", "eye"}
-_SIGNALS = re.compile(r"joints|actions?\b|state|targets?\b|commands?\b|proprioception|reported|measured")
+_ARRAYS = {
+    "empty",
+    "zeros",
+    "ones",
+    "full",
+    "reshape",
+    "range",
+    "arange",
+    "rand",
+    "randn",
+    "normal",
+    "uniform",
+    "eye",
+}
+_SIGNALS = re.compile(
+    r"joints|actions?\b|state|targets?\b|commands?\b|proprioception|reported|measured"
+)
 
 
 def robot_literals(code: str) -> Iterator[tuple[int, str]]:
@@ -38,32 +62,63 @@ def robot_literals(code: str) -> Iterator[tuple[int, str]]:
             case ast.Tuple(elts=parts) | ast.List(elts=parts) | ast.Set(elts=parts):
                 values = [_value(part) for part in parts]
                 texts = {v for v in values if isinstance(v, str)}
-                if len(texts) > 1 and len(texts) == len(values) and any(texts <= names for names in _NAMES):
+                if (
+                    len(texts) > 1
+                    and len(texts) == len(values)
+                    and any(texts <= names for names in _NAMES)
+                ):
                     yield node.lineno, str(tuple(values))
-                if values == ROBOT.gripper_indices or tuple(values[-2:]) == ROBOT.pad.shape:
+                if (
+                    values == ROBOT.gripper_indices
+                    or tuple(values[-2:]) == ROBOT.pad.shape
+                ):
                     yield node.lineno, str(tuple(values))
                 yield from ((node.lineno, str(v)) for v in values if _is_size(v))
             case ast.BinOp(left=left, op=ast.Mult(), right=right):
                 for one, other in ((left, right), (right, left)):
-                    if _value(one) == ROBOT.num_per_arm and not isinstance(other, ast.Constant | ast.List | ast.Tuple):
+                    if _value(one) == ROBOT.num_per_arm and not isinstance(
+                        other, ast.Constant | ast.List | ast.Tuple
+                    ):
                         yield node.lineno, f"{ROBOT.num_per_arm} *"
-                    if _value(one) in (ROBOT.num_joints, ROBOT.num_per_arm) and isinstance(other, ast.List | ast.Tuple):
+                    if _value(one) in (
+                        ROBOT.num_joints,
+                        ROBOT.num_per_arm,
+                    ) and isinstance(other, ast.List | ast.Tuple):
                         yield node.lineno, f"* {_value(one)}"
-            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=args) if name in _ARRAYS:
+            case ast.Call(
+                func=ast.Name(id=name) | ast.Attribute(attr=name), args=args
+            ) if name in _ARRAYS:
                 values = [_value(arg) for arg in args]
-                if name == "range" and values in ([ROBOT.num_joints], [1, ROBOT.num_per_arm]):
+                if name == "range" and values in (
+                    [ROBOT.num_joints],
+                    [1, ROBOT.num_per_arm],
+                ):
                     yield node.lineno, f"range({', '.join(map(str, values))})"
                 some = _SIZES | (
-                    {ROBOT.num_per_arm} if name in ("empty", "zeros", "ones", "full", "reshape") else set()
+                    {ROBOT.num_per_arm}
+                    if name in ("empty", "zeros", "ones", "full", "reshape")
+                    else set()
                 )
-                yield from ((node.lineno, str(v)) for v in values if type(v) is int and v in some)
+                yield from (
+                    (node.lineno, str(v))
+                    for v in values
+                    if type(v) is int and v in some
+                )
             case ast.Assign(value=value) if _is_size(_value(value)):
                 yield node.lineno, str(_value(value))
             case ast.Compare(left=left, comparators=others):
-                yield from ((node.lineno, str(_value(n))) for n in (left, *others) if _is_size(_value(n)))
-            case ast.Subscript(value=value, slice=index) if _SIGNALS.search(ast.unparse(value)):
+                yield from (
+                    (node.lineno, str(_value(n)))
+                    for n in (left, *others)
+                    if _is_size(_value(n))
+                )
+            case ast.Subscript(value=value, slice=index) if _SIGNALS.search(
+                ast.unparse(value)
+            ):
                 numbers = {_value(n) for n in ast.walk(index)}
-                places = {*ROBOT.gripper_indices, ROBOT.num_per_arm} & {n for n in numbers if type(n) is int}
+                places = {*ROBOT.gripper_indices, ROBOT.num_per_arm} & {
+                    n for n in numbers if type(n) is int
+                }
                 if places:
                     yield node.lineno, ast.unparse(node)
 
@@ -77,12 +132,18 @@ def _is_size(value: object) -> bool:
 
 
 def _is_literal_type(node: ast.AST) -> bool:
-    return isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name) and node.value.id == "Literal"
+    return (
+        isinstance(node, ast.Subscript)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "Literal"
+    )
 
 
 def test_no_module_states_numbers_or_names_of_the_robot_itself() -> None:
     found, used = [], set()
-    for path in sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+    for path in sorted(
+        path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")
+    ):
         name = path.relative_to(ROOT).as_posix()
         if name.startswith(ROBOTS):
             continue

@@ -33,7 +33,9 @@ def expert_episode() -> ExpertEpisode:
         states.append(sim.snapshot())
         actions.append(expert.act())
         sim.step(actions[-1][None])
-    assert sim.judge.outcome.success[0], "the expert's scene for these tests must be one where it succeeds"
+    assert sim.judge.outcome.success[0], (
+        "the expert's scene for these tests must be one where it succeeds"
+    )
     return ExpertEpisode(np.array(actions), states[MIDDLE], states[-3])
 
 
@@ -45,4 +47,6 @@ def together(*states: Snapshot) -> Snapshot:
             return {name: join([v[name] for v in values]) for name in values[0]}
         return np.concatenate(values)
 
-    return Snapshot(**{f.name: join([getattr(s, f.name) for s in states]) for f in fields(Snapshot)})
+    return Snapshot(
+        **{f.name: join([getattr(s, f.name) for s in states]) for f in fields(Snapshot)}
+    )

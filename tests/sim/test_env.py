@@ -29,31 +29,47 @@ def env() -> TaccorlEnv:
 
 
 def same(one: dict, other: dict) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+    return one.keys() == other.keys() and all(
+        np.array_equal(one[k], other[k]) for k in one
+    )
 
 
 def test_gymnasium_checks_pass(env: TaccorlEnv) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # Joint angles are neither bounded nor scaled to ±1: that is the robot's business, gymnasium only recommends it.
-        warnings.filterwarnings("ignore", message=".*infinity|.*symmetric and normalized")
+        warnings.filterwarnings(
+            "ignore", message=".*infinity|.*symmetric and normalized"
+        )
         warnings.filterwarnings("ignore", message=".*no render modes|.*render_mode")
         check_env(env, skip_render_check=True, skip_close_check=True)
 
 
 def test_every_task_is_registered_with_its_own_time_limit() -> None:
-    assert env_id("test_tube") == "taccorl/TestTube-v0" and env_id("assembly_1") == "taccorl/Assembly1-v0"
+    assert (
+        env_id("test_tube") == "taccorl/TestTube-v0"
+        and env_id("assembly_1") == "taccorl/Assembly1-v0"
+    )
     for name in tasks:
-        assert gymnasium.spec(env_id(name)).max_episode_steps == round(30 * tasks.get(name).time_limit_s)
+        assert gymnasium.spec(env_id(name)).max_episode_steps == round(
+            30 * tasks.get(name).time_limit_s
+        )
 
 
 def test_gymnasium_makes_one_and_many() -> None:
-    one = gymnasium.make("taccorl.sim.env:taccorl/Assembly1-v0", images=False, difficulty="easy")
-    assert isinstance(one.unwrapped, TaccorlEnv) and one.unwrapped.sim.task.clearance_m == 0.001
+    one = gymnasium.make(
+        "taccorl.sim.env:taccorl/Assembly1-v0", images=False, difficulty="easy"
+    )
+    assert (
+        isinstance(one.unwrapped, TaccorlEnv)
+        and one.unwrapped.sim.task.clearance_m == 0.001
+    )
     many = gymnasium.make_vec("taccorl/Assembly1-v0", num_envs=2, num_threads=1)
     assert isinstance(many.unwrapped, TaccorlVectorEnv) and many.num_envs == 2
     observation, _ = many.reset(seed=[4, 5])
-    assert same({name: values[0] for name, values in observation.items()}, one.reset(seed=4)[0])
+    assert same(
+        {name: values[0] for name, values in observation.items()}, one.reset(seed=4)[0]
+    )
 
 
 def test_expert_actions_earn_one_reward_at_the_last_step(env: TaccorlEnv) -> None:
@@ -67,7 +83,12 @@ def test_expert_actions_earn_one_reward_at_the_last_step(env: TaccorlEnv) -> Non
         assert truncated is False and terminated == info["is_success"]
     assert rewards[-1] == 1.0 and sum(rewards) == 1.0
     last = infos[-1]
-    assert last["is_success"] is True and last["failure"] == "" and last["partial"] == 1 and last["seed"] == SEED
+    assert (
+        last["is_success"] is True
+        and last["failure"] == ""
+        and last["partial"] == 1
+        and last["seed"] == SEED
+    )
     assert last["steps"] == len(episode.actions) and last["subtask"].tolist() == [2, 2]
     assert last["measures"]["depth_m"] > 0.034
     # The part was in place for 0.5 s, 15 control steps, before it counted.
@@ -81,7 +102,12 @@ def test_an_episode_that_is_over_stands_still(env: TaccorlEnv) -> None:
         end = env.step(action)
     before = env.sim.snapshot().physics
     again = env.step(episode.actions[0])
-    assert same(end[0], again[0]) and again[1] == 0.0 and again[2] is True and again[4]["is_success"] is True
+    assert (
+        same(end[0], again[0])
+        and again[1] == 0.0
+        and again[2] is True
+        and again[4]["is_success"] is True
+    )
     assert np.array_equal(env.sim.snapshot().physics, before)
 
 
@@ -106,7 +132,11 @@ def test_an_episode_goes_on_bit_exactly_from_its_middle(env: TaccorlEnv) -> None
     env.reset(seed=99)  # something else in between
     env.step(episode.actions[0])
     observation, info = env.reset(options={"state": state})
-    assert same(observation, straight[16][0]) and info["steps"] == MIDDLE + 17 and info["seed"] == SEED
+    assert (
+        same(observation, straight[16][0])
+        and info["steps"] == MIDDLE + 17
+        and info["seed"] == SEED
+    )
     for k in range(17, 30):
         observation, _, _, _, info = env.step(episode.actions[MIDDLE + k])
         assert same(observation, straight[k][0])
@@ -117,7 +147,9 @@ def test_an_episode_goes_on_bit_exactly_from_its_middle(env: TaccorlEnv) -> None
 def test_pads_are_noisy_yet_repeatable(env: TaccorlEnv) -> None:
     first = env.reset(seed=3)[0]
     later = env.step(first[STATE])[0]
-    assert not np.array_equal(first[TACTILE], later[TACTILE])  # nothing touches: only noise differs
+    assert not np.array_equal(
+        first[TACTILE], later[TACTILE]
+    )  # nothing touches: only noise differs
     # Noise of σ = 1.3 counts, then floor: √(1.3² + 1/12) = 1.33; n = 1536, so ± 5 % is two standard errors of σ.
     assert first[TACTILE].std() == pytest.approx(1.33, rel=0.15)
     assert same(env.reset(seed=3)[0], first) and same(env.step(first[STATE])[0], later)
@@ -125,22 +157,38 @@ def test_pads_are_noisy_yet_repeatable(env: TaccorlEnv) -> None:
 
 def test_wrong_actions_are_named(env: TaccorlEnv) -> None:
     action = env.reset(seed=0)[0][STATE]
-    with pytest.raises(TaccorlError, match=r"action: shape \(13,\), expected \(14\): left_joint1"):
+    with pytest.raises(
+        TaccorlError, match=r"action: shape \(13,\), expected \(14\): left_joint1"
+    ):
         env.step(action[:13])
     broken = action.copy()
     broken[9] = np.nan
-    for bad, why in ((broken, "right_joint3 is nan"), (np.rad2deg(action), "Joints are in rad")):
+    for bad, why in (
+        (broken, "right_joint3 is nan"),
+        (np.rad2deg(action), "Joints are in rad"),
+    ):
         _, reward, terminated, truncated, info = env.step(bad)
         assert (reward, terminated, truncated) == (0.0, True, False)
-        assert info["failure"] == "bad_action" and why in info["reason"] and info["steps"] == 0
+        assert (
+            info["failure"] == "bad_action"
+            and why in info["reason"]
+            and info["steps"] == 0
+        )
         env.reset(seed=0)
     beyond = action.copy()
     beyond[6] = 0.2  # m; the gripper opens 0.07
     assert env.step(beyond)[4]["clipped"] is True
-    assert env.step(np.clip(action, env.action_space.low, env.action_space.high))[4]["clipped"] is False
+    assert (
+        env.step(np.clip(action, env.action_space.low, env.action_space.high))[4][
+            "clipped"
+        ]
+        is False
+    )
 
 
-def test_limits_of_the_action_space_are_within_reach_of_float32(env: TaccorlEnv) -> None:
+def test_limits_of_the_action_space_are_within_reach_of_float32(
+    env: TaccorlEnv,
+) -> None:
     env.reset(seed=0)
     for _ in range(20):
         assert env.step(env.action_space.sample())[4]["clipped"] is False
@@ -148,11 +196,15 @@ def test_limits_of_the_action_space_are_within_reach_of_float32(env: TaccorlEnv)
 
 
 def test_wrong_settings_are_named(env: TaccorlEnv, tmp_path: Path) -> None:
-    with pytest.raises(TaccorlError, match="no task 'asembly_1'; did you mean 'assembly_1'"):
+    with pytest.raises(
+        TaccorlError, match="no task 'asembly_1'; did you mean 'assembly_1'"
+    ):
         TaccorlEnv("asembly_1")
     with pytest.raises(TaccorlError, match="no difficulty 'hrd'; did you mean 'hard'"):
         TaccorlEnv("assembly_1", difficulty="hrd")
-    with pytest.raises(TaccorlError, match="reset option: 'sate' does not exist; did you mean 'state'"):
+    with pytest.raises(
+        TaccorlError, match="reset option: 'sate' does not exist; did you mean 'state'"
+    ):
         env.reset(options={"sate": None})
     with pytest.raises(TaccorlError, match=r"twin\.yaml"):
         TaccorlEnv("assembly_1", twin=tmp_path / "twin.yaml")
@@ -184,18 +236,25 @@ def test_a_reset_that_is_refused_changes_nothing() -> None:
     other.reset()
     for arguments, said in (
         ({"options": {"state": 1}}, r"state: 1.*Snapshot; give.*sim\.snapshot\(\)"),
-        ({"options": {"state": other.sim.snapshot()}}, "another task, difficulty, twin or randomisation"),
+        (
+            {"options": {"state": other.sim.snapshot()}},
+            "another task, difficulty, twin or randomisation",
+        ),
         ({"seed": -1}, "seed: -1 is no whole number"),
         ({"seed": 2**70}, f"seed: {2**70} is no whole number"),
     ):
         with pytest.raises(TaccorlError, match=said):
             env.reset(**arguments)
     np.testing.assert_array_equal(env.sim.state_rows(), before)
-    assert env.reset()[1]["seed"] == episode_seed(4, 0, 1)  # and no seed of the stream was used up
+    assert env.reset()[1]["seed"] == episode_seed(
+        4, 0, 1
+    )  # and no seed of the stream was used up
     assert env.reset(seed=2**63 - 1)[1]["seed"] == 2**63 - 1
 
 
-def test_a_closed_environment_frees_its_renderers_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_environment_frees_its_renderers_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     env, closed = TaccorlEnv("bench", images=False), []
     monkeypatch.setattr(env.sim, "close", lambda: closed.append("sim"))
     env.reset(seed=0)
@@ -203,11 +262,15 @@ def test_a_closed_environment_frees_its_renderers_and_says_so(monkeypatch: pytes
     env.close()
     assert closed == ["sim"]
     for use in (env.reset, env.render, lambda: env.step(np.zeros(14))):
-        with pytest.raises(TaccorlError, match="this environment was closed; make a new one"):
+        with pytest.raises(
+            TaccorlError, match="this environment was closed; make a new one"
+        ):
             use()
 
 
-def test_a_twin_without_a_camera_is_refused_only_where_pictures_are_wanted(tmp_path: Path) -> None:
+def test_a_twin_without_a_camera_is_refused_only_where_pictures_are_wanted(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text("cameras: {front: null}\n")
     said = "twin.*camera front;.*left_wrist,.*images"
@@ -227,7 +290,9 @@ def test_a_twin_without_a_camera_is_refused_only_where_pictures_are_wanted(tmp_p
 def test_a_twin_file_is_obeyed(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text("physics:\n  steps_per_control_step: 20\n")
-    assert TaccorlEnv("assembly_1", images=False, twin=str(path)).sim.model.opt.timestep == pytest.approx(1 / 600)
+    assert TaccorlEnv(
+        "assembly_1", images=False, twin=str(path)
+    ).sim.model.opt.timestep == pytest.approx(1 / 600)
     path.write_text("fizzics: 1\n")
     with pytest.raises(TaccorlError, match="fizzics"):
         TaccorlEnv("assembly_1", twin=path)
@@ -245,7 +310,9 @@ def test_numbers_are_the_simulators_poses(task):
     for k, body in enumerate(posed_bodies(sim.task)):
         assert names[9 * k] == f"{body}.x" and names[9 * k + 8] == f"{body}.r21"
         pose = sim.poses(body)
-        expected = np.concatenate([pose[:, :3, 3], pose[:, :3, 0], pose[:, :3, 1]], axis=1).astype(np.float32)
+        expected = np.concatenate(
+            [pose[:, :3, 3], pose[:, :3, 0], pose[:, :3, 1]], axis=1
+        ).astype(np.float32)
         np.testing.assert_array_equal(found[:, 9 * k : 9 * k + 9], expected)
     assert not np.array_equal(found[0], found[1])
 
@@ -266,24 +333,39 @@ def test_rows_and_environments_have_the_same_numbers():
         recorder.step(actions[0])
         observation = envs.step(actions)[0]
     arrays = recorder.episode("test", {}).arrays
-    np.testing.assert_array_equal(arrays["observation.state"], np.stack([state for state, _ in seen]))
-    np.testing.assert_array_equal(arrays[PARTS_KEY], np.stack([poses for _, poses in seen]))
+    np.testing.assert_array_equal(
+        arrays["observation.state"], np.stack([state for state, _ in seen])
+    )
+    np.testing.assert_array_equal(
+        arrays[PARTS_KEY], np.stack([poses for _, poses in seen])
+    )
     again = Simulation(tasks.get("assembly_2")())
     again.restore_rows(arrays["sim.state"][2:3], arrays["sim.seed"][2])
     np.testing.assert_allclose(part_poses(again)[0], arrays[PARTS_KEY][2], atol=1e-6)
-    assert (np.abs(arrays[PARTS_KEY]) <= np.array(spec.features[PARTS_KEY].limits)[:, 1]).all()
+    assert (
+        np.abs(arrays[PARTS_KEY]) <= np.array(spec.features[PARTS_KEY].limits)[:, 1]
+    ).all()
     envs.close()
 
 
 def test_environments_show_poses_on_request_only():
     env = TaccorlEnv("assembly_1", images=False)
-    assert PARTS_KEY not in env.reset(seed=0)[0] and PARTS_KEY not in env.observation_space.spaces  # pyright: ignore
+    assert (
+        PARTS_KEY not in env.reset(seed=0)[0]
+        and PARTS_KEY not in env.observation_space.spaces
+    )  # pyright: ignore
     told = TaccorlEnv("assembly_1", images=False, part_poses=True)
     observation, _ = told.reset(seed=0)
-    assert told.observation_space.contains(observation) and observation[PARTS_KEY].shape == (18,)
+    assert told.observation_space.contains(observation) and observation[
+        PARTS_KEY
+    ].shape == (18,)
     np.testing.assert_array_equal(observation[PARTS_KEY], part_poses(told.sim)[0])
-    np.testing.assert_array_equal(raw_names(observation)["environment_state"], observation[PARTS_KEY])
-    made = gymnasium.make("taccorl.sim.env:taccorl/Assembly1-v0", images=False, part_poses=True)
+    np.testing.assert_array_equal(
+        raw_names(observation)["environment_state"], observation[PARTS_KEY]
+    )
+    made = gymnasium.make(
+        "taccorl.sim.env:taccorl/Assembly1-v0", images=False, part_poses=True
+    )
     assert PARTS_KEY in made.reset(seed=0)[0]
     for one in (env, told, made):
         one.close()

@@ -15,7 +15,9 @@ from taccorl.sim.shapes import triangle_outline
 
 PADS = ("a", "b")
 STIFFNESS_N_PER_M = 1e4
-PAD_CONTACT = 'friction=".01 .005 .0001" condim="4" solref=".004 1" solimp=".95 .99 .001 .5 2"'
+PAD_CONTACT = (
+    'friction=".01 .005 .0001" condim="4" solref=".004 1" solimp=".95 .99 .001 .5 2"'
+)
 SURFACE = 'friction="1 .005 .0001" condim="4"'
 PARTS = {
     "box": f'<geom type="box" size=".01 .015 .02" {SURFACE}/>',
@@ -62,15 +64,25 @@ def model_of(bodies: str) -> mujoco.MjModel:
 
 
 def rig(
-    part: str, mass_kg: float = 0.04, sprung: bool = True, tilts: bool = False, height_m: float = 0.0
+    part: str,
+    mass_kg: float = 0.04,
+    sprung: bool = True,
+    tilts: bool = False,
+    height_m: float = 0.0,
 ) -> mujoco.MjModel:
     """Two fingers and a part that hangs between them by friction."""
-    solids = f'<freejoint name="part"/><inertial mass="{mass_kg}" {SMALL}/>{PARTS[part]}'
+    solids = (
+        f'<freejoint name="part"/><inertial mass="{mass_kg}" {SMALL}/>{PARTS[part]}'
+    )
     body = f'<body name="part" pos="0 0 {height_m}">{solids}</body>'
-    return model_of(finger_xml("a", -1, sprung, tilts) + finger_xml("b", 1, sprung, tilts) + body)
+    return model_of(
+        finger_xml("a", -1, sprung, tilts) + finger_xml("b", 1, sprung, tilts) + body
+    )
 
 
-def squeezed(model: mujoco.MjModel, force_n: float, time_s: float = 0.6) -> mujoco.MjData:
+def squeezed(
+    model: mujoco.MjModel, force_n: float, time_s: float = 0.6
+) -> mujoco.MjData:
     """After squeezing from rest with this force on each finger."""
     data = mujoco.MjData(model)
     data.ctrl[:] = force_n
@@ -155,7 +167,9 @@ def test_all_parts_on_one_pad_are_felt_and_of_those_at_one_taxel_the_deepest() -
 
 @pytest.mark.parametrize("tilts", [False, True])
 @pytest.mark.parametrize("part", PARTS)
-def test_rate_is_the_central_difference_of_the_depth_along_any_motion(part: str, tilts: bool) -> None:
+def test_rate_is_the_central_difference_of_the_depth_along_any_motion(
+    part: str, tilts: bool
+) -> None:
     """Of plain penetration and of what sprung pads read; part, fingers and pads move and turn at random."""
     model = rig(part, tilts=tilts)
     data = squeezed(model, 10.0)
@@ -182,7 +196,9 @@ def test_rate_is_the_central_difference_of_the_depth_along_any_motion(part: str,
             difference = (after.depth_m.astype(float) - before.depth_m) / (2 * step_s)
             assert np.abs(now.depth_rate_mps - difference)[smooth].max(initial=0) < 1e-4
             compared += smooth.sum()
-            fastest = max(fastest, float(np.abs(now.depth_rate_mps[smooth]).max(initial=0)))
+            fastest = max(
+                fastest, float(np.abs(now.depth_rate_mps[smooth]).max(initial=0))
+            )
     assert compared > 50
     assert fastest > 0.02
 
@@ -201,7 +217,9 @@ def test_batch_gives_the_bits_of_each_sim_alone(part: str) -> None:
     batch.state[:] = state
     rng = np.random.default_rng(1)
     joint = model.joint("part")
-    batch.qpos[:, joint.qposadr[0] : joint.qposadr[0] + 3] += rng.normal(0, 0.002, (num_sims, 3))
+    batch.qpos[:, joint.qposadr[0] : joint.qposadr[0] + 3] += rng.normal(
+        0, 0.002, (num_sims, 3)
+    )
     batch.qvel[:] = rng.normal(0, 0.05, (num_sims, model.nv))
     bound = {field: batch.bind(field) for field in KINEMATIC_FIELDS}
     batch.forward()
@@ -216,13 +234,18 @@ def test_batch_gives_the_bits_of_each_sim_alone(part: str) -> None:
         row = state_of({field: array[sim : sim + 1] for field, array in bound.items()})
         for alone in (pads.touch(row), pads.touch(OneSim(one))):
             assert alone.depth_m.tobytes() == together.depth_m[sim].tobytes()
-            assert alone.depth_rate_mps.tobytes() == together.depth_rate_mps[sim].tobytes()
+            assert (
+                alone.depth_rate_mps.tobytes() == together.depth_rate_mps[sim].tobytes()
+            )
 
 
 def test_sim_that_diverged_reads_nothing_and_leaves_the_others_alone() -> None:
     model = rig("box")
     data = squeezed(model, 10.0, time_s=0.1)
-    fields = {field: np.repeat(getattr(data, field)[None], 3, axis=0) for field in KINEMATIC_FIELDS}
+    fields = {
+        field: np.repeat(getattr(data, field)[None], 3, axis=0)
+        for field in KINEMATIC_FIELDS
+    }
     pads = PadArray(model, PADS)
 
     sound = pads.touch(state_of(fields))
@@ -237,7 +260,9 @@ def test_sim_that_diverged_reads_nothing_and_leaves_the_others_alone() -> None:
 def test_fields_bound_after_the_last_step_are_refused() -> None:
     model = rig("box")
     batch = Batch(model, 2, 1)
-    said = r"site 'a' has no orientation: bind site_xpos, .* before the batch's last step"
+    said = (
+        r"site 'a' has no orientation: bind site_xpos, .* before the batch's last step"
+    )
     with pytest.raises(TaccorlError, match=said):
         PadArray(model, PADS).touch(batch)
 
@@ -249,16 +274,22 @@ def readings_m(part: str, sprung: bool, force_n: float = 10.0) -> np.ndarray:
     """(2 masses, 2 pads): deepest taxel under a part of 40 and of 300 g."""
     return np.array(
         [
-            (lambda m: touch_of(m, squeezed(m, force_n)).depth_m[0].max(axis=1))(rig(part, mass_kg, sprung))
+            (lambda m: touch_of(m, squeezed(m, force_n)).depth_m[0].max(axis=1))(
+                rig(part, mass_kg, sprung)
+            )
             for mass_kg in (0.04, 0.3)
         ]
     )
 
 
-@pytest.mark.parametrize("part", ["box", "cylinder", "cylinder end on", "sphere", "tiled"])
+@pytest.mark.parametrize(
+    "part", ["box", "cylinder", "cylinder end on", "sphere", "tiled"]
+)
 def test_sprung_pads_read_the_grip_force_whatever_the_parts_mass(part: str) -> None:
     for force_n in (2.5, 10.0):
-        assert readings_m(part, True, force_n) == pytest.approx(force_n / STIFFNESS_N_PER_M, rel=1e-3)
+        assert readings_m(part, True, force_n) == pytest.approx(
+            force_n / STIFFNESS_N_PER_M, rel=1e-3
+        )
 
 
 @pytest.mark.parametrize("part", ["box", "cylinder", "sphere", "tiled"])
@@ -271,8 +302,12 @@ def test_pads_that_tilt_read_the_same_under_a_light_and_a_heavy_part(part: str) 
         tilt_rad = abs(data.joint("a_tilt_y").qpos[0])
         assert tilt_rad > 0.005
         touches.append(touch_of(model, data).depth_m[0])
-        if part == "sphere":  # one spot: pressed in by 10 N / K and by the tilt times its distance from the middle
-            assert touches[-1].max() == pytest.approx(0.001 + tilt_rad * data.body("part").xpos[2], rel=0.01)
+        if (
+            part == "sphere"
+        ):  # one spot: pressed in by 10 N / K and by the tilt times its distance from the middle
+            assert touches[-1].max() == pytest.approx(
+                0.001 + tilt_rad * data.body("part").xpos[2], rel=0.01
+            )
     light, heavy = touches
     assert heavy.max(axis=1) == pytest.approx(light.max(axis=1), rel=0.025)
     assert heavy.sum(axis=1) == pytest.approx(light.sum(axis=1), rel=0.05)
@@ -291,7 +326,9 @@ def test_deepest_taxel_moves_as_the_spring_does() -> None:
         deepest = touch.depth_m[0, p].argmax()
         assert abs(spring.qvel[0]) > 1e-4
         assert touch.depth_m[0, p, deepest] == pytest.approx(spring.qpos[0], abs=1e-9)
-        assert touch.depth_rate_mps[0, p, deepest] == pytest.approx(spring.qvel[0], abs=1e-7)
+        assert touch.depth_rate_mps[0, p, deepest] == pytest.approx(
+            spring.qvel[0], abs=1e-7
+        )
 
 
 def test_plate_that_tilts_is_pressed_in_by_a_plane() -> None:
@@ -342,7 +379,12 @@ def test_other_arms_and_the_table_are_felt() -> None:
         model = gripper(extra)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        rows = np.argwhere(PadArray(model, PADS).penetration(OneSim(data)).depth_m[0, 0].reshape(32, 12))[:, 0]
+        rows = np.argwhere(
+            PadArray(model, PADS)
+            .penetration(OneSim(data))
+            .depth_m[0, 0]
+            .reshape(32, 12)
+        )[:, 0]
         assert len(rows)
         assert low <= rows.min() <= rows.max() <= high
 
@@ -358,10 +400,15 @@ def test_geoms_that_do_not_collide_are_not_felt() -> None:
 # ---- names ----
 
 
-def test_sprung_pads_are_named_and_an_unknown_pad_is_refused_with_the_nearest_name() -> None:
+def test_sprung_pads_are_named_and_an_unknown_pad_is_refused_with_the_nearest_name() -> (
+    None
+):
     assert PadArray(rig("box"), PADS).sprung == PADS
     assert PadArray(rig("box", sprung=False), PADS).sprung == ()
-    with pytest.raises(TaccorlError, match=r"pad 'bone_c': the model has no site of that name; known: a, b"):
+    with pytest.raises(
+        TaccorlError,
+        match=r"pad 'bone_c': the model has no site of that name; known: a, b",
+    ):
         PadArray(rig("box"), ("a", "bone_c"))
 
 

@@ -33,7 +33,9 @@ def test_sample_k_is_the_twin_before_command_k_acts(bench):
     tau_s = ROBOT.kd_nms_per_rad[3] / ROBOT.kp_nm_per_rad[3]
     for row in (11, 15, 25):
         expected = 0.02 * (1 - np.exp(-(row - 10) / 200 / tau_s))
-        assert done.reported[row, 3] - start[3] == pytest.approx(expected, abs=0.02 * 0.012)
+        assert done.reported[row, 3] - start[3] == pytest.approx(
+            expected, abs=0.02 * 0.012
+        )
     np.testing.assert_allclose(done.time_s, np.arange(30) / 200)
 
 
@@ -41,7 +43,10 @@ def test_a_measured_episode_is_replayed_row_by_row(bench):
     # "Measured" in a twin with friction: its rows hold the state at each 1/30 s and the target reached 1/30 s later. The twin
     # without friction replays it: same rows, same commands, and the residual is what friction does; with friction it is nothing.
     def sticky() -> Simulation:
-        sim = Simulation(Bench(), TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0)]))
+        sim = Simulation(
+            Bench(),
+            TwinConfig(effects=[make_effect("coulomb_friction", torque_nm=1.0)]),
+        )
         sim.reset([0])
         return sim
 
@@ -49,20 +54,35 @@ def test_a_measured_episode_is_replayed_row_by_row(bench):
     state, action = [], []
     for k in range(45):
         state.append(measured.proprioception()[0].astype(np.float32))
-        measured.step(measured.targets + 0.01 * np.sin(0.25 * k) * (np.arange(14) % 7 != 6))
+        measured.step(
+            measured.targets + 0.01 * np.sin(0.25 * k) * (np.arange(14) % 7 != 6)
+        )
         action.append(measured.targets[0].astype(np.float32))
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     arrays = {"observation.state": np.array(state), "action": np.array(action)}
-    episode = Episode("run 1", spec, 0, arrays, lambda: iter(()), (), "sweep", origin=Origin("surrogate", "stand-in"))
+    episode = Episode(
+        "run 1",
+        spec,
+        0,
+        arrays,
+        lambda: iter(()),
+        (),
+        "sweep",
+        origin=Origin("surrogate", "stand-in"),
+    )
     twin = replay_episode(bench, episode)
     np.testing.assert_array_equal(twin.arrays["action"], episode.arrays["action"])
     assert twin.arrays["observation.state"].shape == (45, 14)
     assert twin.arrays["observation.tactile"].shape == (45, 1536)
     assert twin.origin == Origin("twin", "replay of: stand-in")
-    residual = np.abs(twin.arrays["observation.state"] - episode.arrays["observation.state"]).max()
+    residual = np.abs(
+        twin.arrays["observation.state"] - episode.arrays["observation.state"]
+    ).max()
     same = replay_episode(sticky(), episode)
     assert residual > 3e-4
-    np.testing.assert_allclose(same.arrays["observation.state"], episode.arrays["observation.state"], atol=2e-5)
+    np.testing.assert_allclose(
+        same.arrays["observation.state"], episode.arrays["observation.state"], atol=2e-5
+    )
 
 
 def test_rates_that_fall_between_physics_steps_are_refused(bench):

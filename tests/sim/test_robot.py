@@ -28,18 +28,25 @@ def test_forward_kinematics_agrees_with_the_published_joint_frames():
     for seed in range(20):
         for arm in ROBOT.arms:
             joints = np.random.default_rng(seed).uniform(*limits.T)
-            data.qpos[[model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]] = joints
+            data.qpos[[model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]] = (
+                joints
+            )
             mujoco.mj_kinematics(model, data)
             base = data.body(f"{arm}_base_link").xpos
             for i, link in enumerate(ROBOT.links):
                 ours = link_poses(joints)[i]
                 body = data.body(f"{arm}_{link.name}")
                 np.testing.assert_allclose(body.xpos - base, ours[:3, 3], atol=1e-12)
-                np.testing.assert_allclose(body.xmat.reshape(3, 3), ours[:3, :3], atol=1e-12)
+                np.testing.assert_allclose(
+                    body.xmat.reshape(3, 3), ours[:3, :3], atol=1e-12
+                )
 
 
 def test_both_mass_sets_are_physical_and_differ_by_a_third():
-    moving = {name: sum(link.mass_kg for link in links) + 2 * 0.025 for name, links in INERTIAS.items()}
+    moving = {
+        name: sum(link.mass_kg for link in links) + 2 * 0.025
+        for name, links in INERTIAS.items()
+    }
     assert moving["manufacturer"] == pytest.approx(3.64, abs=0.005)
     assert moving["menagerie"] == pytest.approx(2.20, abs=0.01)
     for links in INERTIAS.values():
@@ -47,7 +54,9 @@ def test_both_mass_sets_are_physical_and_differ_by_a_third():
             xx, yy, zz, xy, xz, yz = link.about_com_kgm2()
             a, b, c = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             assert a > 0
-            assert a + b >= c * (1 - 1e-6)  # no mass distribution breaks the triangle inequality
+            assert a + b >= c * (
+                1 - 1e-6
+            )  # no mass distribution breaks the triangle inequality
 
 
 @pytest.mark.parametrize("inertias", ["manufacturer", "menagerie"])
@@ -58,9 +67,13 @@ def test_compiled_model_has_the_table_s_masses_and_limits(inertias):
             body = model.body(f"{arm}_{link.name}")
             assert body.mass[0] == pytest.approx(inertia.mass_kg)
             np.testing.assert_allclose(body.ipos, inertia.com_link_m, atol=1e-12)
-            trace = sum(inertia.about_com_kgm2()[:3])  # of the tensor: the same in any axes
+            trace = sum(
+                inertia.about_com_kgm2()[:3]
+            )  # of the tensor: the same in any axes
             assert body.inertia.sum() == pytest.approx(trace)
-            np.testing.assert_allclose(model.joint(f"{arm}_joint{link.name[-1]}").range, link.range_rad)
+            np.testing.assert_allclose(
+                model.joint(f"{arm}_joint{link.name[-1]}").range, link.range_rad
+            )
 
 
 def test_arms_are_mirror_images_and_stand_where_they_were_told():
@@ -80,16 +93,23 @@ def test_taxel_frames_look_at_each_other_and_run_from_palm_to_tip():
         for frame in (a, b):
             np.testing.assert_allclose(frame[:, 1], hand[:, 2], atol=1e-12)
         # closed fingers: both undeformed surfaces lie in the hand's middle plane
-        np.testing.assert_allclose(data.site(f"{arm}_a").xpos, data.site(f"{arm}_tcp").xpos, atol=1e-12)
+        np.testing.assert_allclose(
+            data.site(f"{arm}_a").xpos, data.site(f"{arm}_tcp").xpos, atol=1e-12
+        )
     for pad in ROBOT.pads:
         half = model.geom(pad).size
-        assert half[[0, 2]] * 2 == pytest.approx([ROBOT.pad.width_m, ROBOT.pad.length_m])
+        assert half[[0, 2]] * 2 == pytest.approx(
+            [ROBOT.pad.width_m, ROBOT.pad.length_m]
+        )
 
 
 def test_an_arm_touches_table_parts_and_the_other_arm_but_not_itself():
     model = compiled()
     bits = {
-        arm: {(int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in _geoms(model, arm)}
+        arm: {
+            (int(model.geom_contype[g]), int(model.geom_conaffinity[g]))
+            for g in _geoms(model, arm)
+        }
         for arm in ROBOT.arms
     }
     (left,), (right,) = (bits[arm] - {(1, 1)} for arm in ROBOT.arms)
@@ -105,7 +125,11 @@ def test_an_arm_touches_table_parts_and_the_other_arm_but_not_itself():
 
 
 def _geoms(model: mujoco.MjModel, arm: str) -> list[int]:
-    return [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name.startswith(arm)]
+    return [
+        g
+        for g in range(model.ngeom)
+        if model.body(model.geom_bodyid[g]).name.startswith(arm)
+    ]
 
 
 # gripping -----------------------------------------------------------------------------------------------------------------
@@ -152,22 +176,36 @@ def test_an_arm_can_be_built_alone():
     [
         *(
             (name, wrong, "finite number > 0")
-            for name in ("mount_spacing_m", "pad_stiffness_n_per_m", "grip_stiffness_n_per_m", "grip_force_max_n")
+            for name in (
+                "mount_spacing_m",
+                "pad_stiffness_n_per_m",
+                "grip_stiffness_n_per_m",
+                "grip_force_max_n",
+            )
             for wrong in (0.0, -1.0, float("inf"))
         ),
         *(
             (name, wrong, "finite number ≥ 0")
-            for name in ("armature_kgm2", "pad_damping_ns_per_m", "grip_damping_ns_per_m")
+            for name in (
+                "armature_kgm2",
+                "pad_damping_ns_per_m",
+                "grip_damping_ns_per_m",
+            )
             for wrong in (-1e-9, float("nan"))
         ),
-        *((name, float("nan"), "finite number") for name in ("mount_height_m", "gravity_compensation")),
+        *(
+            (name, float("nan"), "finite number")
+            for name in ("mount_height_m", "gravity_compensation")
+        ),
         ("pad_tilt_stiffness_nm_per_rad", (40.0, 0.0), "finite number > 0"),
         ("pad_tilt_stiffness_nm_per_rad", (40.0,), "not two numbers"),
         ("armature_kgm2", "0.01", "finite number ≥ 0"),
     ],
 )
 def test_numbers_that_no_robot_has_are_refused_by_name(name, wrong, wanted):
-    with pytest.raises(TaccorlError, match=rf"robot\.{name}: {re.escape(str(wrong))} .*{wanted}"):
+    with pytest.raises(
+        TaccorlError, match=rf"robot\.{name}: {re.escape(str(wrong))} .*{wanted}"
+    ):
         RobotConfig(**{name: wrong})
 
 
@@ -188,7 +226,11 @@ def test_actuators_hold_the_paper_s_numbers():
     model = empty_bench(TwinConfig()).compile()
     for arm in ROBOT.arms:
         for joint, kp, kd, bias in zip(
-            ROBOT.joints, ROBOT.kp_nm_per_rad, ROBOT.kd_nms_per_rad, ROBOT.torque_ff_nm, strict=True
+            ROBOT.joints,
+            ROBOT.kp_nm_per_rad,
+            ROBOT.kd_nms_per_rad,
+            ROBOT.torque_ff_nm,
+            strict=True,
         ):
             actuator = model.actuator(f"{arm}_{joint}")
             assert actuator.gainprm[0] == kp
@@ -213,12 +255,18 @@ def test_step_response_is_a_first_order_lag_with_kd_over_kp(joint):
 def test_arm_rests_torque_over_stiffness_away_from_its_target():
     sim = Simulation(Bench())
     sim.reset([0])
-    np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=1e-9)
+    np.testing.assert_allclose(
+        sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=1e-9
+    )
     offset = sim.proprioception()[0, 7:13] - sim.targets[0, 7:13]
-    np.testing.assert_allclose(offset, np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9)
+    np.testing.assert_allclose(
+        offset, np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9
+    )
     for _ in range(30):
         sim.step(sim.targets.copy())
-    np.testing.assert_allclose(sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=2e-5)  # it stays there
+    np.testing.assert_allclose(
+        sim.proprioception()[0, 7:13], Bench.home_rad["right"], atol=2e-5
+    )  # it stays there
 
 
 def test_an_arm_may_have_gains_of_its_own():
@@ -227,8 +275,12 @@ def test_an_arm_may_have_gains_of_its_own():
     sim.reset([0])
     offset = sim.proprioception()[0] - sim.targets[0]
     np.testing.assert_allclose(offset[7:13], 0.5 / 100.0, atol=1e-9)
-    np.testing.assert_allclose(offset[:6], np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9)
-    with pytest.raises(TaccorlError, match=r"arm_controllers: no arm 'rigth'; did you mean 'right'"):
+    np.testing.assert_allclose(
+        offset[:6], np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9
+    )
+    with pytest.raises(
+        TaccorlError, match=r"arm_controllers: no arm 'rigth'; did you mean 'right'"
+    ):
         TwinConfig(arm_controllers={"rigth": own})
 
 
@@ -236,10 +288,22 @@ def test_an_arm_may_have_gains_of_its_own():
     ("settings", "said"),
     [
         ({"kp_nm_per_rad": [1.0] * 5}, "kp_nm_per_rad: 5 values"),
-        ({"kp_nm_per_rad": [1.0] * 5 + [0.0]}, r"controller\.kp_nm_per_rad: .*0\.0\].* finite number > 0"),
-        ({"kd_nms_per_rad": [1, 1, 1, 1, 1, -1]}, r"controller\.kd_nms_per_rad: .*-1\].* finite number ≥ 0"),
-        ({"torque_ff_nm": [0.0] * 5 + [float("nan")]}, r"controller\.torque_ff_nm: .*nan\].* finite number"),
-        ({"kp_nm_per_rad": [1.0] * 5 + ["2"]}, r"controller\.kp_nm_per_rad: .*'2'\].* finite number"),
+        (
+            {"kp_nm_per_rad": [1.0] * 5 + [0.0]},
+            r"controller\.kp_nm_per_rad: .*0\.0\].* finite number > 0",
+        ),
+        (
+            {"kd_nms_per_rad": [1, 1, 1, 1, 1, -1]},
+            r"controller\.kd_nms_per_rad: .*-1\].* finite number ≥ 0",
+        ),
+        (
+            {"torque_ff_nm": [0.0] * 5 + [float("nan")]},
+            r"controller\.torque_ff_nm: .*nan\].* finite number",
+        ),
+        (
+            {"kp_nm_per_rad": [1.0] * 5 + ["2"]},
+            r"controller\.kp_nm_per_rad: .*'2'\].* finite number",
+        ),
     ],
 )
 def test_wrong_gains_are_refused_by_name(settings, said):

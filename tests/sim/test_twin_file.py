@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from taccorl.errors import SpecError, TaccorlError
-from taccorl.sim.cameras import CameraConfig, CameraOffset, bench_cameras, sensor_intrinsics
+from taccorl.sim.cameras import (
+    CameraConfig,
+    CameraOffset,
+    bench_cameras,
+    sensor_intrinsics,
+)
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.robot import RobotConfig
@@ -34,13 +39,21 @@ def test_the_nominal_twin_is_the_nominal_twin() -> None:
 
 
 def test_the_nominal_twin_is_written_as_nothing_at_all(tmp_path: Path) -> None:
-    lines = [line for line in written(tmp_path, TwinConfig()).splitlines() if not line.startswith("#")]
+    lines = [
+        line
+        for line in written(tmp_path, TwinConfig()).splitlines()
+        if not line.startswith("#")
+    ]
     assert lines == ["effects: []"]
     assert load_twin(tmp_path / "twin.yaml") == TwinConfig()
 
 
-@pytest.mark.parametrize("text", ["\n\n", "# effects: []\n", "  # nothing yet\n\n# at all"])
-def test_a_file_that_says_nothing_is_the_nominal_twin(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    "text", ["\n\n", "# effects: []\n", "  # nothing yet\n\n# at all"]
+)
+def test_a_file_that_says_nothing_is_the_nominal_twin(
+    tmp_path: Path, text: str
+) -> None:
     assert read(tmp_path, text) == TwinConfig()
 
 
@@ -50,7 +63,9 @@ def test_a_file_without_a_byte_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["robot", "axis", "cells"])
-def test_a_file_of_another_machine_is_refused_with_its_kind_and_line(tmp_path: Path, kind: str) -> None:
+def test_a_file_of_another_machine_is_refused_with_its_kind_and_line(
+    tmp_path: Path, kind: str
+) -> None:
     path = tmp_path / "drive.yaml"
     path.write_text(f"# mine\nkind: {kind}  # of the bench\nname: slide\n")
     with pytest.raises(SpecError, match=rf"drive\.yaml:2: .*'{kind}'.*twin\.yaml"):
@@ -71,8 +86,12 @@ def changed_everywhere() -> TwinConfig:
     )
     return TwinConfig(
         robot=RobotConfig(inertias="menagerie", armature_kgm2=1e-5, pads="rigid"),
-        controller=ControllerConfig(kp_nm_per_rad=[float(x) for x in np.geomspace(1e-3, 1e17, 6)]),
-        arm_controllers={"right": ControllerConfig(torque_ff_nm=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6])},
+        controller=ControllerConfig(
+            kp_nm_per_rad=[float(x) for x in np.geomspace(1e-3, 1e17, 6)]
+        ),
+        arm_controllers={
+            "right": ControllerConfig(torque_ff_nm=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+        },
         physics=PhysicsConfig(steps_per_control_step=20),
         cameras=[dataclasses.replace(front, offset=turned), aimed, right, extra],
         sensor=FlexiTacConfig(gain_count=80.0, resting_count=(5, 6), seed=3),
@@ -164,7 +183,9 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         ("effects:\n- effect: payload\n  effect: armature\n", 3, "stands here twice"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, text: str, line: int, said: str) -> None:
+def test_what_is_wrong_is_named_with_its_line(
+    tmp_path: Path, text: str, line: int, said: str
+) -> None:
     with pytest.raises(SpecError) as caught:
         read(tmp_path, text)
     message = str(caught.value)
@@ -172,7 +193,9 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, text: str, line: i
     assert said in message
 
 
-@pytest.mark.parametrize("text", ["null", "\t- x", "a: [", "- 1\n", "effects: &x [*x]\n"])
+@pytest.mark.parametrize(
+    "text", ["null", "\t- x", "a: [", "- 1\n", "effects: &x [*x]\n"]
+)
 def test_what_is_no_twin_file_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(SpecError, match=r"twin\.yaml"):
         read(tmp_path, text)
@@ -193,7 +216,10 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one_alone(tmp_path: Path) 
 
 def test_a_twin_that_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
     before = written(tmp_path, TwinConfig())
-    twice = [make_effect("camera_pose", cameras=["front"], turn_x_rad=x) for x in (0.01, 0.02)]
+    twice = [
+        make_effect("camera_pose", cameras=["front"], turn_x_rad=x)
+        for x in (0.01, 0.02)
+    ]
     with pytest.raises(TaccorlError, match="camera_pose acts on front twice"):
         save_twin(TwinConfig(effects=twice), tmp_path / "twin.yaml")
     assert (tmp_path / "twin.yaml").read_text(encoding="utf-8") == before

@@ -52,7 +52,9 @@ def test_parts_in_hands_move_as_in_mujoco_c(warp):
         c.step(goal)
     assert np.abs(parts(c) - before).max() > 1e-3  # otherwise standing still would pass
     free, mating_m = np.abs(parts(ours) - parts(c)).max((1, 2))
-    assert free < 1e-6 and mating_m < 1e-5  # 2e-5 with the normals of another collision of boxes
+    assert (
+        free < 1e-6 and mating_m < 1e-5
+    )  # 2e-5 with the normals of another collision of boxes
     assert np.median(np.abs(ours.arrays["qpos"] - c.arrays["qpos"])) < 1e-6
     np.testing.assert_array_equal(ours.arrays["time"], c.arrays["time"])
     np.testing.assert_array_equal(ours.pads_touching("plug"), c.pads_touching("plug"))
@@ -103,13 +105,17 @@ def test_a_world_of_nan_ends_alone_and_a_reset_revives_it(warp):
     ours.step(ours.targets)
     fresh.step(fresh.targets)
     assert not ours.diverged.any()
-    np.testing.assert_allclose(ours.arrays["qpos"][0], fresh.arrays["qpos"][0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        ours.arrays["qpos"][0], fresh.arrays["qpos"][0], rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.slow
 def test_a_world_that_diverges_on_the_device_is_reported(warp):
     ours, goal = mating(ON_CPU)
-    ours.arrays["qvel"][0] = 1e7  # finite for MuJoCo C's check, and no more after a few steps
+    ours.arrays["qvel"][0] = (
+        1e7  # finite for MuJoCo C's check, and no more after a few steps
+    )
     ours.step(goal)
     assert ours.diverged.tolist() == [True, False]
     assert np.isfinite(ours.arrays["qpos"][1]).all()
@@ -129,7 +135,9 @@ def test_a_frozen_world_stays_as_it_is_and_goes_on_from_there(warp):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "few"), [("contacts", 4), ("constraints", 40)])
-def test_full_buffers_are_an_error_that_states_a_setting_which_is_enough(warp, name, few):
+def test_full_buffers_are_an_error_that_states_a_setting_which_is_enough(
+    warp, name, few
+):
     def on_the_table(physics: str) -> Simulation:
         sim = Simulation(tasks.get("assembly_1")(), num_sims=2, physics=physics)
         sim.reset([0, 1])
@@ -137,11 +145,16 @@ def test_full_buffers_are_an_error_that_states_a_setting_which_is_enough(warp, n
 
     ours = on_the_table(f"{ON_CPU},{name}={few}")
     before = ours.arrays["qpos"].copy()
-    with pytest.raises(TaccorlError, match=f"room for more than {few} {name} .*Raise it: .*{name}=") as error:
+    with pytest.raises(
+        TaccorlError, match=f"room for more than {few} {name} .*Raise it: .*{name}="
+    ) as error:
         ours.step(ours.targets)
     np.testing.assert_array_equal(ours.arrays["qpos"], before)
     np.testing.assert_array_equal(ours.arrays["time"], 0.0)
-    enough, whole = (on_the_table(f"{ON_CPU},{name}={str(error.value).rpartition('=')[2]}"), on_the_table(ON_CPU))
+    enough, whole = (
+        on_the_table(f"{ON_CPU},{name}={str(error.value).rpartition('=')[2]}"),
+        on_the_table(ON_CPU),
+    )
     for sim in (enough, whole):
         sim.step(ours.targets)
     np.testing.assert_array_equal(parts(enough), parts(whole))
@@ -150,11 +163,22 @@ def test_full_buffers_are_an_error_that_states_a_setting_which_is_enough(warp, n
 @pytest.mark.slow
 def test_a_cylinder_on_the_table_touches_it_and_is_not_thrown_off(warp):
     """1 … 10 µm deep, tilted by 0.3 mrad: none of 4000 may be without contact, as many are beside a box, or as deep as 1 mm."""
-    rng, n, part = np.random.default_rng(1), 4000, '<body><freejoint/><geom type="cylinder" size="0.02 0.01"/></body>'
+    rng, n, part = (
+        np.random.default_rng(1),
+        4000,
+        '<body><freejoint/><geom type="cylinder" size="0.02 0.01"/></body>',
+    )
     table = '<geom name="table" type="box" size="0.5 0.7 0.02" pos="0.35 0 -0.02"/>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{table}{part}</worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{table}{part}</worldbody></mujoco>"
+    )
     made, yaw = _for_warp(model), rng.uniform(0, 2 * np.pi, n)
-    poses = [rng.uniform(0, 0.6, n), rng.uniform(-0.3, 0.3, n), 0.01 - rng.uniform(1e-6, 1e-5, n), np.cos(yaw / 2)]
+    poses = [
+        rng.uniform(0, 0.6, n),
+        rng.uniform(-0.3, 0.3, n),
+        0.01 - rng.uniform(1e-6, 1e-5, n),
+        np.cos(yaw / 2),
+    ]
     poses += [*(1.5e-4 * rng.normal(size=(2, n))), np.sin(yaw / 2)]
     settings = WarpSettings(device="cpu", contacts=8)
     worlds = _Worlds(made, n, settings, [])
@@ -167,17 +191,28 @@ def test_a_cylinder_on_the_table_touches_it_and_is_not_thrown_off(warp):
 
 
 @pytest.mark.slow
-def test_a_world_whose_contact_is_given_up_has_diverged_and_stops_no_other(warp, monkeypatch):
+def test_a_world_whose_contact_is_given_up_has_diverged_and_stops_no_other(
+    warp, monkeypatch
+):
     """Room for two edges of EPA's horizon: the cylinder in the box of the first world is not found; the second one's falls."""
     part = '<body><freejoint/><geom type="cylinder" size="0.02 0.01"/></body><geom type="box" size="0.1 0.1 0.01"/>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{part}</worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{part}</worldbody></mujoco>"
+    )
 
     def falling(edges: int) -> tuple[list[int], np.ndarray]:
-        monkeypatch.setattr("mujoco_warp._src.collision_convex.MJ_MAX_EPAHORIZON", edges)
+        monkeypatch.setattr(
+            "mujoco_warp._src.collision_convex.MJ_MAX_EPAHORIZON", edges
+        )
         batch = WarpBatch(model, 2, 1, settings=WarpSettings(device="cpu", contacts=8))
-        batch.bind("qpos")[:] = [[0.0, 0.02, 0.019, 1.0, 0.0, 0.0, 0.0], [0.0, 0.02, 1.0, 1.0, 0.0, 0.0, 0.0]]
+        batch.bind("qpos")[:] = [
+            [0.0, 0.02, 0.019, 1.0, 0.0, 0.0, 0.0],
+            [0.0, 0.02, 1.0, 1.0, 0.0, 0.0, 0.0],
+        ]
         batch.step(nstep=5, stage=mujoco.mjtStage.mjSTAGE_POS)
-        return batch.warning[:, int(mujoco.mjtWarning.mjWARN_BADQACC), 1].tolist(), batch.bind("qpos")[1].copy()
+        return batch.warning[
+            :, int(mujoco.mjtWarning.mjWARN_BADQACC), 1
+        ].tolist(), batch.bind("qpos")[1].copy()
 
     (lost, fell), (none, whole) = falling(2), falling(24)
     assert lost == [1, 0] and none == [0, 0]
@@ -186,35 +221,59 @@ def test_a_world_whose_contact_is_given_up_has_diverged_and_stops_no_other(warp,
 
 # A delay in MuJoCo's history, a friction of the model, further joints, and what is rewritten after each physics step.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["command_delay", "coulomb_friction", "joint_compliance", "torque_lag"])
+@pytest.mark.parametrize(
+    "name", ["command_delay", "coulomb_friction", "joint_compliance", "torque_lag"]
+)
 def test_an_effect_acts_as_in_mujoco_c(warp, name):
     def swung(physics: str, *present: Effect) -> np.ndarray:
-        config = TwinConfig(physics=PhysicsConfig(steps_per_control_step=20), effects=list(present))
+        config = TwinConfig(
+            physics=PhysicsConfig(steps_per_control_step=20), effects=list(present)
+        )
         sim = Simulation(tasks.get("assembly_1")(), config, physics=physics)
         sim.reset([3])
         start, is_joint = sim.targets.copy(), np.arange(14) % 7 != 6
         for k in range(3):
-            sim.step(start + 0.2 * np.sin(0.7 * (k + 1)) * np.cos(np.arange(14)) * is_joint)
+            sim.step(
+                start + 0.2 * np.sin(0.7 * (k + 1)) * np.cos(np.arange(14)) * is_joint
+            )
         return sim.proprioception()[0]
 
-    effect = make_effect(name, **{p.name: p.typical for p in effects.get(name).parameters()})
+    effect = make_effect(
+        name, **{p.name: p.typical for p in effects.get(name).parameters()}
+    )
     acts = np.abs(swung("c", effect) - swung("c")).max()
     assert acts > 1e-4  # 30 times the tolerance
-    np.testing.assert_allclose(swung(ON_CPU, effect), swung("c", effect), rtol=0, atol=3e-6)
+    np.testing.assert_allclose(
+        swung(ON_CPU, effect), swung("c", effect), rtol=0, atol=3e-6
+    )
 
 
 def test_an_effect_that_mujoco_warp_lacks_is_refused_by_name(warp):
     effect = make_effect("integral_action", rate_per_s=0.5)
-    others = [make_effect("coulomb_friction", torque_nm=0.4), make_effect("taxel_saturation", limit=4.0)]
-    with pytest.raises(TaccorlError, match=r"integral_action: .*does not support mjDYN_PID; use physics=c"):
-        Simulation(tasks.get("assembly_1")(), TwinConfig(effects=[*others, effect]), physics=ON_CPU)
+    others = [
+        make_effect("coulomb_friction", torque_nm=0.4),
+        make_effect("taxel_saturation", limit=4.0),
+    ]
+    with pytest.raises(
+        TaccorlError,
+        match=r"integral_action: .*does not support mjDYN_PID; use physics=c",
+    ):
+        Simulation(
+            tasks.get("assembly_1")(),
+            TwinConfig(effects=[*others, effect]),
+            physics=ON_CPU,
+        )
 
 
 @pytest.mark.slow
 def test_worlds_that_do_not_fit_are_an_error_that_says_how_many_do(warp, monkeypatch):
     """An allocation that fails as Warp's do, on a device with 2048 MB free."""
     monkeypatch.setattr("taccorl.sim.warp_batch._FEW", (1, 2))
-    monkeypatch.setattr(type(__import__("warp").get_device("cpu")), "free_memory", property(lambda device: 2**31))
+    monkeypatch.setattr(
+        type(__import__("warp").get_device("cpu")),
+        "free_memory",
+        property(lambda device: 2**31),
+    )
     allocate = _Worlds._allocate
 
     def failing(self: _Worlds, model: mujoco.MjModel) -> Any:
@@ -226,10 +285,14 @@ def test_worlds_that_do_not_fit_are_an_error_that_says_how_many_do(warp, monkeyp
     sim = Simulation(tasks.get("assembly_1")(), num_sims=3, physics=ON_CPU)
     sim.reset([0, 1, 2])
     with pytest.raises(
-        TaccorlError, match=r"3 worlds do not fit the memory of cpu .*about \d+ fit, at \S+ MB each"
+        TaccorlError,
+        match=r"3 worlds do not fit the memory of cpu .*about \d+ fit, at \S+ MB each",
     ) as error:
         sim.step(sim.targets)
-    fit, each_mb = (float(x) for x in re.findall(r"about (\d+) fit, at (\S+) MB", str(error.value))[0])
+    fit, each_mb = (
+        float(x)
+        for x in re.findall(r"about (\d+) fit, at (\S+) MB", str(error.value))[0]
+    )
     assert 0.1 < each_mb < 5
     assert abs(fit * each_mb - 2048) < 0.06 * 2048
 
@@ -237,7 +300,9 @@ def test_worlds_that_do_not_fit_are_an_error_that_says_how_many_do(warp, monkeyp
 def test_settings_are_read_from_one_word():
     assert WarpSettings.parse("c") is None
     assert WarpSettings.parse("warp") == WarpSettings()
-    assert WarpSettings.parse("warp:device=cuda:1,contacts=128") == WarpSettings(device="cuda:1", contacts=128)
+    assert WarpSettings.parse("warp:device=cuda:1,contacts=128") == WarpSettings(
+        device="cuda:1", contacts=128
+    )
 
 
 @pytest.mark.parametrize(
@@ -256,11 +321,16 @@ def test_wrong_physics_is_an_error_that_names_the_nearest(physics, named):
 
 
 def test_a_missing_device_is_named_with_the_ways_out(warp):
-    with pytest.raises(TaccorlError, match=r"no device 'cuda:7'; Warp finds .*physics=c, or .*device=cpu"):
+    with pytest.raises(
+        TaccorlError,
+        match=r"no device 'cuda:7'; Warp finds .*physics=c, or .*device=cpu",
+    ):
         Simulation(tasks.get("assembly_1")(), physics="warp:device=cuda:7")
 
 
 def test_a_missing_extra_is_named_with_the_command_that_installs_it(monkeypatch):
-    monkeypatch.setattr("taccorl.extras._is_installed", lambda module: module != "mujoco_warp")
+    monkeypatch.setattr(
+        "taccorl.extras._is_installed", lambda module: module != "mujoco_warp"
+    )
     with pytest.raises(TaccorlError, match=r"needs mujoco_warp.*pip install .*\[gpu\]"):
         Simulation(tasks.get("assembly_1")(), physics="warp")

@@ -9,9 +9,14 @@ from taccorl.lineage.processes import Done, Failed
 
 
 def test_pads_come_first_and_reference_loops_are_among_the_cases():
-    made = [*jobs("single", "chirp", ["cogging"], range(60)), *jobs("single", "press", ["touch_lag"], range(30))]
+    made = [
+        *jobs("single", "chirp", ["cogging"], range(60)),
+        *jobs("single", "press", ["touch_lag"], range(30)),
+    ]
     order = diagnosis_study.ordered(made, "now")
-    assert [j.design for j in order if isinstance(j, Job)] == ["press"] * 30 + ["chirp"] * 60
+    assert [j.design for j in order if isinstance(j, Job)] == ["press"] * 30 + [
+        "chirp"
+    ] * 60
     assert [k for k, j in enumerate(order) if isinstance(j, str)] == [0, 41, 82]
 
 
@@ -19,13 +24,24 @@ def test_final_seeds_are_none_that_anything_was_tuned_on():
     for name, jobs_of in diagnosis_study.STUDIES.items():
         seeds = {j.seed for j in jobs_of(diagnosis_study.FIRST_SEED, 10)}
         assert min(seeds) >= 60000, name
-    assert len(diagnosis_study.STUDIES["none"](0, 10)) >= 150 and len(diagnosis_study.STUDIES["outside"](0, 10)) >= 60
+    assert (
+        len(diagnosis_study.STUDIES["none"](0, 10)) >= 150
+        and len(diagnosis_study.STUDIES["outside"](0, 10)) >= 60
+    )
 
 
 def test_of_a_case_that_was_run_again_the_last_row_counts(tmp_path, monkeypatch):
     rows = tmp_path / "rows.jsonl"
-    first = failed(Job(study="single", hidden=("cogging",), seed=1, design="chirp"), "its process died")
-    rows.write_text(json.dumps(first) + "\n" + json.dumps({"key": first["key"], "study": "single"}) + "\n")
+    first = failed(
+        Job(study="single", hidden=("cogging",), seed=1, design="chirp"),
+        "its process died",
+    )
+    rows.write_text(
+        json.dumps(first)
+        + "\n"
+        + json.dumps({"key": first["key"], "study": "single"})
+        + "\n"
+    )
     assert diagnosis_study.read_rows(rows) == [{"key": first["key"], "study": "single"}]
     assert diagnosis_study.read_rows(tmp_path / "none.jsonl") == []
 
@@ -39,7 +55,12 @@ def test_a_run_skips_what_is_there_and_stores_what_fails(tmp_path, monkeypatch, 
         for k, job in enumerate(these):
             if not isinstance(job, str) and job.study != "warm-up":
                 good = job.hidden == ("backlash",)
-                take(k, Done(row(job)) if good else Failed("ValueError: no", "Traceback\nValueError: no"))
+                take(
+                    k,
+                    Done(row(job))
+                    if good
+                    else Failed("ValueError: no", "Traceback\nValueError: no"),
+                )
 
     monkeypatch.setattr(diagnosis_study, "run_in_processes", ran)
     monkeypatch.setitem(diagnosis_study.STUDIES, "chirp", lambda first, n: made)
@@ -72,7 +93,10 @@ def row(job: Job, **other: Any) -> dict[str, Any]:
         },
         "conditions": ["effort"],
         "findings": [],
-        "numbers": {"kd/kp": [0.1, 0.09, 0.11, 0.105], f"{name or 'x'}.a/kp": [1.0, 0.9, 1.1, 1.2]},
+        "numbers": {
+            "kd/kp": [0.1, 0.09, 0.11, 0.105],
+            f"{name or 'x'}.a/kp": [1.0, 0.9, 1.1, 1.2],
+        },
         "cpu_s": 5.0,
     } | other
 
@@ -81,15 +105,31 @@ def test_the_page_counts_failed_cases_as_wrong_and_shows_them(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").mkdir()
     made = jobs("single", "chirp", ["cogging"], range(20000, 20004))
-    rows = [row(j) for j in made[:3]] + [failed(made[3], "Traceback\nValueError: no robot")]
-    rows.append({"key": "m", "study": "machine", "machine": "EPYC, 16 cores", "workers": 16})
-    rows += [{"key": f"reference {k}", "study": "reference", "cpu_s": s} for k, s in enumerate((2.0, 2.4, 3.0))]
+    rows = [row(j) for j in made[:3]] + [
+        failed(made[3], "Traceback\nValueError: no robot")
+    ]
+    rows.append(
+        {"key": "m", "study": "machine", "machine": "EPYC, 16 cores", "workers": 16}
+    )
+    rows += [
+        {"key": f"reference {k}", "study": "reference", "cpu_s": s}
+        for k, s in enumerate((2.0, 2.4, 3.0))
+    ]
     diagnosis_page.write_page(rows)
     text = (tmp_path / "docs" / "diagnosis.md").read_text()
-    assert "| one hidden joint effect, pack and chirp: exact, counted as one | ≥ 87% | 75% (3 of 4;" in text
+    assert (
+        "| one hidden joint effect, pack and chirp: exact, counted as one | ≥ 87% | 75% (3 of 4;"
+        in text
+    )
     assert "- single chirp cogging seed 20003: ValueError: no robot" in text
-    assert "EPYC, 16 cores, 16 processes" in text and "2.40 CPU-s in the median of 3 runs (2.00 to 3.00)" in text
+    assert (
+        "EPYC, 16 cores, 16 processes" in text
+        and "2.40 CPU-s in the median of 3 runs (2.00 to 3.00)" in text
+    )
     # kd/kp is inside, the hidden effect's own number is not, in three cases.
     assert "hold the truth, joints | ≥ 88% | 50% (3 of 6;" in text
     assert "| … numbers of the hidden effects only |  | 0% (0 of 3;" in text
-    assert "simulated" in text and (tmp_path / "docs" / "diagnosis_confusion_chirp.png").is_file()
+    assert (
+        "simulated" in text
+        and (tmp_path / "docs" / "diagnosis_confusion_chirp.png").is_file()
+    )

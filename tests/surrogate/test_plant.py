@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from taccorl.alignment.measurements.motions import CHIRP, LOADED_CHIRP, POSES, RATE_HZ, Motion, Room
+from taccorl.alignment.measurements.motions import (
+    CHIRP,
+    LOADED_CHIRP,
+    POSES,
+    RATE_HZ,
+    Motion,
+    Room,
+)
 from taccorl.sim.robot import RobotConfig, link_poses
 from taccorl.sim.twin import TwinConfig, empty_bench
 from taccorl.surrogate.arm import GRAVITY, bodies, mass_matrix, torques
@@ -25,7 +32,12 @@ ROOM = Room.of(JOINT, POSE[JOINT - 1], INERTIA, WEIGHT)
 
 
 def robot(torque_ff: float = 0.0, **drive: float) -> Robot:
-    return Robot(f"left_joint{JOINT}", (KP, KD, torque_ff), [Change(drive=drive)] if drive else [], POSE)
+    return Robot(
+        f"left_joint{JOINT}",
+        (KP, KD, torque_ff),
+        [Change(drive=drive)] if drive else [],
+        POSE,
+    )
 
 
 def of_targets(target: np.ndarray) -> Motion:
@@ -38,22 +50,30 @@ def joint(run: Run) -> np.ndarray:
 
 
 REST = of_targets(np.zeros(400))
-SLOW = of_targets(0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0]))  # 0.1 rad/s
+SLOW = of_targets(
+    0.3 * np.interp(np.arange(2400) / 2400, [0, 0.25, 0.75, 1.0], [0, 1, -1, 0])
+)  # 0.1 rad/s
 
 
 def test_without_effects_a_joint_is_the_linear_one_of_its_inertia_and_gains():
-    discrete = cont2discrete(([KP / INERTIA], [1.0, KD / INERTIA, KP / INERTIA]), 1 / RATE_HZ)
+    discrete = cont2discrete(
+        ([KP / INERTIA], [1.0, KD / INERTIA, KP / INERTIA]), 1 / RATE_HZ
+    )
     target = CHIRP.target(ROOM) - POSE[JOINT - 1]
     linear = lfilter(np.ravel(discrete[0]), discrete[1], target)
     swing = np.sqrt(np.mean(linear**2))
     # Half a step of the twin (0.42 ms) more of damping than the continuous joint, see LATE_S: 3e-3 of the swing.
-    assert np.sqrt(np.mean((joint(robot().run(CHIRP, ROOM)) - linear) ** 2)) < 5e-3 * swing
+    assert (
+        np.sqrt(np.mean((joint(robot().run(CHIRP, ROOM)) - linear) ** 2)) < 5e-3 * swing
+    )
 
 
 def test_it_rests_where_its_constant_torque_turns_it():
     run = robot(torque_ff=0.01 * KP).run(REST, ROOM)
     np.testing.assert_allclose(joint(run), 0.01, atol=1e-6)
-    np.testing.assert_allclose(run.effort[:, JOINT - 1], 0.0, atol=1e-6)  # the weight is carried
+    np.testing.assert_allclose(
+        run.effort[:, JOINT - 1], 0.0, atol=1e-6
+    )  # the weight is carried
 
 
 def test_energy_stays_when_nothing_drives_or_brakes():
@@ -62,19 +82,26 @@ def test_energy_stays_when_nothing_drives_or_brakes():
     start = np.array([0.0, 1.0, -1.0, 0.3, 0.2, 0.1])
     target = np.tile(start, (100, 1))
     drive = Drive(kp=0.0, kd=0.0, torque_ff=0.0)
-    run = simulate(free, 4, drive, target, start, np.zeros((500, 6)), np.zeros(500, np.int64), 0)
+    run = simulate(
+        free, 4, drive, target, start, np.zeros((500, 6)), np.zeros(500, np.int64), 0
+    )
 
     def energy(q: np.ndarray, v: np.ndarray) -> float:
         moving = 0.5 * v @ (mass_matrix(arm, q) + 0.01 * np.eye(6)) @ v
         poses = link_poses(q)
         return moving + GRAVITY * sum(
-            float(p[2, :3] @ h + m * p[2, 3]) for p, h, m in zip(poses, arm.moment, arm.mass, strict=True)
+            float(p[2, :3] @ h + m * p[2, 3])
+            for p, h, m in zip(poses, arm.moment, arm.mass, strict=True)
         )
 
-    total = np.array([energy(q, v) for q, v in zip(run.angle[::10], run.velocity[::10], strict=True)])
+    total = np.array(
+        [energy(q, v) for q, v in zip(run.angle[::10], run.velocity[::10], strict=True)]
+    )
     fallen = 0.5 * run.velocity[-1] @ run.velocity[-1]
     assert fallen > 1.0  # it did move
-    assert np.ptp(total) < 2e-3 * (energy(run.angle[-1], run.velocity[-1]) - energy(run.angle[-1], NONE))
+    assert np.ptp(total) < 2e-3 * (
+        energy(run.angle[-1], run.velocity[-1]) - energy(run.angle[-1], NONE)
+    )
 
 
 def test_stiction_is_greater_in_slow_motion_than_in_fast():
@@ -104,7 +131,9 @@ def test_an_encoders_bias_is_taken_for_the_angle():
     biased = robot(encoder_bias=0.05)
     run = biased.run(REST, ROOM)
     np.testing.assert_allclose(joint(run), -0.05, atol=1e-5)
-    np.testing.assert_allclose(biased.reported(run)[:, JOINT - 1], POSE[JOINT - 1], atol=1e-5)
+    np.testing.assert_allclose(
+        biased.reported(run)[:, JOINT - 1], POSE[JOINT - 1], atol=1e-5
+    )
 
 
 # Joint 1 turns about a vertical axis: no weight, so that in its play the motor is alone.
@@ -119,7 +148,13 @@ def geared(target: np.ndarray, **drive: float) -> np.ndarray:
     return made.run(Motion(name="made", target=lambda room: target), room).angle[::5, 0]
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (k % 4 > 0)) for k, n in enumerate(KINDS)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=[pytest.mark.slow] * (k % 4 > 0))
+        for k, n in enumerate(KINDS)
+    ],
+)
 def test_every_hidden_effect_changes_what_is_reported(name):
     k = KINDS[name]
     number = 5 if 5 in k.joints else k.joints[-1]  # a joint with weight
@@ -142,7 +177,9 @@ def test_every_hidden_effect_changes_what_is_reported(name):
     moved = []
     for severity in (math.sqrt(low * high), high):
         change = k.plant(k.values(severity, scale, shape))
-        changed = Robot(f"left_joint{number}", (kp, kd, 0.01 * kp), [change], tuple(pose))
+        changed = Robot(
+            f"left_joint{number}", (kp, kd, 0.01 * kp), [change], tuple(pose)
+        )
         other = changed.reported(changed.run(LOADED_CHIRP, room))
         assert np.isfinite(other).all()
         moved.append(np.abs(other - plain.reported(run)).max())
@@ -164,8 +201,12 @@ def test_torques_are_those_of_mujocos_inverse_dynamics(config, arm):
     twin = TwinConfig(robot=config)
     twin.robot.gravity_compensation = 0.0
     model = empty_bench(twin).compile()
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # the discrete one changes what "inverse" means
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    model.opt.integrator = (
+        mujoco.mjtIntegrator.mjINT_EULER
+    )  # the discrete one changes what "inverse" means
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    )
     data = mujoco.MjData(model)
     joints = [model.joint(f"{arm}_joint{k}") for k in range(1, 7)]
     at, dof = [j.qposadr[0] for j in joints], [j.dofadr[0] for j in joints]
@@ -180,7 +221,10 @@ def test_torques_are_those_of_mujocos_inverse_dynamics(config, arm):
         data.qacc[dof] = a
         mujoco.mj_inverse(model, data)
         np.testing.assert_allclose(
-            torques(own, q, v, a, GRAVITY) + ARMATURE * a, data.qfrc_inverse[dof], rtol=0, atol=1e-9
+            torques(own, q, v, a, GRAVITY) + ARMATURE * a,
+            data.qfrc_inverse[dof],
+            rtol=0,
+            atol=1e-9,
         )
 
 
@@ -190,6 +234,8 @@ def test_mass_matrix_is_what_accelerations_cost(config):
     for _ in range(20):
         q, a = rng.uniform(-2, 2, 6), rng.normal(size=6)
         mass = mass_matrix(arm, q)
-        np.testing.assert_allclose(mass @ a, torques(arm, q, NONE, a, 0.0), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            mass @ a, torques(arm, q, NONE, a, 0.0), rtol=0, atol=1e-12
+        )
         np.testing.assert_allclose(mass, mass.T, atol=1e-14)
         assert np.linalg.eigvalsh(mass).min() > 0

@@ -19,7 +19,9 @@ JOINTS = range(1, 7)
 
 def room_of(joint: int) -> motions.Room:
     pose = motions.POSES[joint - 1]
-    return motions.Room.of(joint, pose[joint - 1], *inertia_and_weight(np.array(pose), joint))
+    return motions.Room.of(
+        joint, pose[joint - 1], *inertia_and_weight(np.array(pose), joint)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +39,17 @@ def measurements(case):
 def test_motions_keep_limits_and_speed_and_begin_and_end_at_rest(motion, joint):
     for off in (-0.1, 0.1):  # middles are drawn
         pose = motions.POSES[joint - 1]
-        room = motions.Room.of(joint, pose[joint - 1] + off, *inertia_and_weight(np.array(pose), joint))
+        room = motions.Room.of(
+            joint, pose[joint - 1] + off, *inertia_and_weight(np.array(pose), joint)
+        )
         target = motion.target(room)
         low, high = ROBOT.links[joint - 1].range_rad
         assert low < target.min() and target.max() < high
         # amplitudes change within the chirp, too
-        assert np.abs(np.diff(target)).max() * motions.RATE_HZ < 1.3 * motions.SPEED_RAD_PER_S
+        assert (
+            np.abs(np.diff(target)).max() * motions.RATE_HZ
+            < 1.3 * motions.SPEED_RAD_PER_S
+        )
         rest = round(motions.REST_S * motions.RATE_HZ)
         assert np.ptp(target[:rest]) == 0 and np.ptp(target[-rest:]) < 1e-3
         assert np.ptp(target) > 0.03
@@ -52,10 +59,15 @@ def test_motions_keep_limits_and_speed_and_begin_and_end_at_rest(motion, joint):
 def test_torques_stay_within_what_is_allowed(joint):
     room, pose = room_of(joint), motions.POSES[joint - 1]
     inertia, _ = inertia_and_weight(np.array(pose), joint)
-    robot = Robot(f"left_joint{joint}", (inertia * 18.0**2, 2 * inertia * 18.0, 0.0), [], pose)
+    robot = Robot(
+        f"left_joint{joint}", (inertia * 18.0**2, 2 * inertia * 18.0, 0.0), [], pose
+    )
     for motion in motions.DESIGNS["pack"][:4]:
         run = robot.run(motion, room)
-        assert np.abs(run.effort[:, joint - 1] + robot.carried_nm(run)).max() < motions.TORQUE_NM[joint - 1]
+        assert (
+            np.abs(run.effort[:, joint - 1] + robot.carried_nm(run)).max()
+            < motions.TORQUE_NM[joint - 1]
+        )
         assert np.abs(run.velocity[:, joint - 1]).max() < 4.0
 
 
@@ -67,11 +79,15 @@ def test_over_the_wide_range_the_arm_touches_nothing(joint):
         for k, angle in enumerate((0.0, 1.732, -0.883, 0.0, 0.2, 0.0)):
             data.qpos[model.joint(f"{arm}_joint{k + 1}").qposadr] = angle
         for finger in "ab":
-            data.qpos[model.joint(f"{arm}_finger_{finger}").qposadr] = motions.OPENING_M / 2
+            data.qpos[model.joint(f"{arm}_finger_{finger}").qposadr] = (
+                motions.OPENING_M / 2
+            )
     room = room_of(joint)
     for k, angle in enumerate(motions.POSES[joint - 1]):
         data.qpos[model.joint(f"left_joint{k + 1}").qposadr] = angle
-    for angle in np.linspace(room.middle_rad - room.wide_rad - 0.1, room.middle_rad + room.wide_rad + 0.1, 40):
+    for angle in np.linspace(
+        room.middle_rad - room.wide_rad - 0.1, room.middle_rad + room.wide_rad + 0.1, 40
+    ):
         data.qpos[model.joint(f"left_joint{joint}").qposadr] = angle
         mujoco.mj_forward(model, data)
         assert data.ncon == 0
@@ -79,7 +95,15 @@ def test_over_the_wide_range_the_arm_touches_nothing(joint):
 
 def test_recordings_are_divided_and_hold_what_readers_want(measurements):
     names = [m.name for m in measurements.fit]
-    assert names == ["chirp", "chirp_again", "wide_triangle", "steps", "small_chirp", "chirp_2x_gain", "chirp_payload"]
+    assert names == [
+        "chirp",
+        "chirp_again",
+        "wide_triangle",
+        "steps",
+        "small_chirp",
+        "chirp_2x_gain",
+        "chirp_payload",
+    ]
     assert [m.name for m in measurements.validation] == [
         "held_chirp",
         "held_triangle",
@@ -93,7 +117,9 @@ def test_recordings_are_divided_and_hold_what_readers_want(measurements):
     for m in measurements.all:
         assert m.rate_hz == 200
         assert m.origin.domain == "surrogate" and "not a robot" in m.origin.text
-        assert np.isfinite(m.measured).all() and m.has_effort()[m.column("right_joint5")]
+        assert (
+            np.isfinite(m.measured).all() and m.has_effort()[m.column("right_joint5")]
+        )
 
 
 @pytest.mark.slow
@@ -101,15 +127,22 @@ def test_checks_of_telemetry_find_no_fault(measurements):
     for name, findings in check_measurements(measurements.all).items():
         # A soft drive sags under a load: that is so, and a check may say so.
         # Dry friction lets the joint stand elsewhere after the same steps: that is so, too.
-        allowed = {"chirp_payload": {"start_offset"}, "held_steps_again": {"does_not_repeat"}}.get(name, set())
-        assert {f.check for f in findings if f.severity in ("error", "warning")} <= allowed, name
+        allowed = {
+            "chirp_payload": {"start_offset"},
+            "held_steps_again": {"does_not_repeat"},
+        }.get(name, set())
+        assert {
+            f.check for f in findings if f.severity in ("error", "warning")
+        } <= allowed, name
 
 
 def test_readings_come_in_the_drivers_steps(measurements):
     m = measurements.fit[0]
     step = np.radians(0.001)
     joints = [k for k in range(14) if k % 7 != 6]
-    np.testing.assert_allclose(m.measured[:, joints] / step, np.round(m.measured[:, joints] / step), atol=1e-6)
+    np.testing.assert_allclose(
+        m.measured[:, joints] / step, np.round(m.measured[:, joints] / step), atol=1e-6
+    )
     np.testing.assert_allclose(m.effort * 1000, np.round(m.effort * 1000), atol=1e-6)
 
 

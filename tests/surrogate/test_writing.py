@@ -39,7 +39,9 @@ def few_motions():
 
 @pytest.fixture(scope="module")
 def case():
-    return draw_case(["coulomb_friction"], 7, signal="left_joint4", design="chirp", strength=8.0)
+    return draw_case(
+        ["coulomb_friction"], 7, signal="left_joint4", design="chirp", strength=8.0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,9 @@ def read(folder):
 
 def test_what_is_read_back_is_what_was_recorded(case, read):
     made = recordings(case)
-    assert [m.name.removesuffix(".mcap")[3:] for m in read.all] == [m.name for m in made.all]
+    assert [m.name.removesuffix(".mcap")[3:] for m in read.all] == [
+        m.name for m in made.all
+    ]
     assert [len(getattr(read, use)) for use in ("fit", "validation", "test")] == [
         len(part) for part in (made.fit, made.validation, made.test)
     ]
@@ -64,13 +68,25 @@ def test_what_is_read_back_is_what_was_recorded(case, read):
     for one, back in zip(made.all, read.all, strict=True):
         rows = one.num_rows - back.num_rows
         assert 0 <= rows <= 10  # until the first command is seen
-        same = np.abs(one.target[rows:] - back.target) < 1e-6  # piper_ros' factor of 0.017444 is undone to 1e-7
-        assert same.mean() > 0.97  # drivers repeat one message in fifty, and the reader draws a line there
+        same = (
+            np.abs(one.target[rows:] - back.target) < 1e-6
+        )  # piper_ros' factor of 0.017444 is undone to 1e-7
+        assert (
+            same.mean() > 0.97
+        )  # drivers repeat one message in fifty, and the reader draws a line there
         moved = np.abs(one.measured[rows:] - back.measured)[:, :6]
         assert np.median(moved) < 1e-6 and (moved < 2e-3).all()
         assert np.median(np.abs(one.effort[rows:] - back.effort)) < 1e-9
-        assert back.origin == one.origin and back.origin.domain == "surrogate" and "not a robot" in back.origin.text
-        assert (back.kp, back.gain_scale, back.payload_kg) == (one.kp, one.gain_scale, one.payload_kg)
+        assert (
+            back.origin == one.origin
+            and back.origin.domain == "surrogate"
+            and "not a robot" in back.origin.text
+        )
+        assert (back.kp, back.gain_scale, back.payload_kg) == (
+            one.kp,
+            one.gain_scale,
+            one.payload_kg,
+        )
     assert read.fit[1].repeat_of == read.fit[0].name
 
 
@@ -83,7 +99,9 @@ def test_the_truth_is_sealed_and_can_be_revealed(case, folder, capsys):
     assert "coulomb" not in text and "torque_nm" not in text
     assert reveal(folder)["hidden"] == json.loads(json.dumps(case.truth()))["hidden"]
     assert main(["surrogate", f"--reveal={folder}"]) == 0
-    assert json.loads(capsys.readouterr().out)["hidden"][0]["name"] == "coulomb_friction"
+    assert (
+        json.loads(capsys.readouterr().out)["hidden"][0]["name"] == "coulomb_friction"
+    )
 
 
 def test_nothing_that_reads_measurements_opens_the_truth(folder):

@@ -11,7 +11,9 @@ from taccorl.tasks.experts.hands import ScriptedExpertConfig
 from taccorl.tasks.experts.scripted import ScriptedExpert
 
 
-def pose_at(*at_m: float, euler_deg: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+def pose_at(
+    *at_m: float, euler_deg: tuple[float, float, float] = (0, 0, 0)
+) -> np.ndarray:
     """(4, 4); angles about z, y, x in turn."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", euler_deg, degrees=True).as_matrix()
@@ -19,7 +21,9 @@ def pose_at(*at_m: float, euler_deg: tuple[float, float, float] = (0, 0, 0)) -> 
     return pose
 
 
-def put(sim: Simulation, part: str, pose: np.ndarray, velocity_mps: Any = (0, 0, 0)) -> None:
+def put(
+    sim: Simulation, part: str, pose: np.ndarray, velocity_mps: Any = (0, 0, 0)
+) -> None:
     """Write a world pose (4, 4) and a velocity into the state."""
     joint = sim.model.joint(part)
     at, speed = joint.qposadr[0], joint.dofadr[0]
@@ -54,7 +58,9 @@ class Episode:
     ) -> None:
         sim.reset([seed])
         self.seed = seed
-        self.expert: ScriptedExpert = expert_of(sim.task)(sim, np.random.default_rng([seed, rng_seed]), config)
+        self.expert: ScriptedExpert = expert_of(sim.task)(
+            sim, np.random.default_rng([seed, rng_seed]), config
+        )
         self.expert.start()
         self.actions, self.tcps_m, self.force_n, self.joints_rad = [], [], [], []
         self.subtasks: list[tuple[int, int]] = []
@@ -63,10 +69,14 @@ class Episode:
             self.actions.append(self.expert.act())
             sim.step(self.actions[-1][None])
             contacts = [sim.contact(*pair) for pair in sim.task.mating]
-            self.penetration_m = max(self.penetration_m, *(float(c.penetration_m[0]) for c in contacts))
+            self.penetration_m = max(
+                self.penetration_m, *(float(c.penetration_m[0]) for c in contacts)
+            )
             self.force_n.append(float(contacts[0].force_n[0]))
             self.tcps_m.append([sim.tcp(arm)[0, :3, 3] for arm in ("left", "right")])
-            self.joints_rad.append(np.delete(sim.proprioception()[0], [6, 13]).reshape(2, 6))
+            self.joints_rad.append(
+                np.delete(sim.proprioception()[0], [6, 13]).reshape(2, 6)
+            )
             self.lost_steps = max(self.lost_steps, sim.judge.lasted[0].max())
             current = tuple(sim.judge.subtask[0].tolist())
             if not self.subtasks or self.subtasks[-1] != current:
@@ -74,7 +84,10 @@ class Episode:
             if len(self.actions) % 5 == 0:
                 self.met |= contacts_of(sim)
         self.outcome, self.duration_s = sim.judge.outcome, len(self.actions) / 30
-        self.success, self.failure = bool(self.outcome.success[0]), str(self.outcome.failure[0])
+        self.success, self.failure = (
+            bool(self.outcome.success[0]),
+            str(self.outcome.failure[0]),
+        )
 
     def noted(self, what: str) -> int:
         return sum(what in event for _, event in self.expert.events)
@@ -91,6 +104,9 @@ def contacts_of(sim: Simulation) -> set[frozenset[str]]:
 
     data = mujoco.MjData(sim.model)
     data.qpos[:] = sim.arrays["qpos"][0]
-    data.mocap_pos[:], data.mocap_quat[:] = sim.arrays["mocap_pos"][0], sim.arrays["mocap_quat"][0]
+    data.mocap_pos[:], data.mocap_quat[:] = (
+        sim.arrays["mocap_pos"][0],
+        sim.arrays["mocap_quat"][0],
+    )
     mujoco.mj_fwdPosition(sim.model, data)
     return {frozenset(map(kind, contact.geom)) for contact in data.contact}

@@ -39,10 +39,15 @@ def test_it_states_what_it_is(sim):
     assert task.__doc__ and task.time_limit_s > 0
     assert set(task.home_rad) == set(ROBOT.arms)
     for arm, home in task.home_rad.items():
-        low, high = ROBOT.action_low[ROBOT.joint_slice(arm)], ROBOT.action_high[ROBOT.joint_slice(arm)]
+        low, high = (
+            ROBOT.action_low[ROBOT.joint_slice(arm)],
+            ROBOT.action_high[ROBOT.joint_slice(arm)],
+        )
         assert (low <= home).all(), arm
         assert (home <= high).all(), arm
-    assert {tasks.get(task.name)(difficulty).clearance_m for difficulty in CLEARANCES_M} == set(CLEARANCES_M.values())
+    assert {
+        tasks.get(task.name)(difficulty).clearance_m for difficulty in CLEARANCES_M
+    } == set(CLEARANCES_M.values())
 
 
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another(sim):
@@ -59,7 +64,9 @@ def test_nothing_is_reached_or_failed_at_reset_and_for_a_second_of_rest(sim):
     sim.reset([3])
     names = {arm: [s.name for s in own] for arm, own in sim.task.subtasks().items()}
     assert set(names) == set(ROBOT.arms)
-    assert len({name for own in names.values() for name in own}) == sum(map(len, names.values()))
+    assert len({name for own in names.values() for name in own}) == sum(
+        map(len, names.values())
+    )
     command = sim.arrays["ctrl"][:, sim.action_actuators].copy()
     for _ in range(30):
         now = sim.task.look(sim)
@@ -68,7 +75,9 @@ def test_nothing_is_reached_or_failed_at_reset_and_for_a_second_of_rest(sim):
         assert not any(seen.any() for seen in now.failures.values()), now.failures
         assert (now.partial >= 0).all()
         assert (now.partial <= sim.task.max_partial).all()
-        assert not any(own[0].done(sim).any() for own in sim.task.subtasks().values() if own)
+        assert not any(
+            own[0].done(sim).any() for own in sim.task.subtasks().values() if own
+        )
         sim.step(command)
     assert not sim.judge.outcome.over.any()
 
@@ -84,7 +93,9 @@ def test_rows_are_drawn_within_their_bounds_and_every_one_moves_the_reset(sim):
         values = np.array([draw(task.rows, rng)[row.name] for _ in range(50)])
         assert (row.low <= values).all()
         assert (values <= row.high).all()
-        assert repr(task.reset(nominal | {row.name: np.array(row.high)})) != repr(task.reset(nominal)), row.name
+        assert repr(task.reset(nominal | {row.name: np.array(row.high)})) != repr(
+            task.reset(nominal)
+        ), row.name
 
 
 def test_all_but_the_empty_bench_can_be_demonstrated_and_multiplied():
@@ -97,7 +108,9 @@ def test_its_mimicgen_spec_fits_it(name):
     check_task(spec, task)
     rehearse(spec.signals, spec.task_constraint_configs)  # no arm waits for ever
     held = {s.held_object for own in spec.subtask_configs.values() for s in own}
-    assert all(held & set(pair) for pair in task.mating), "parts that mate, and neither is held"
+    assert all(held & set(pair) for pair in task.mating), (
+        "parts that mate, and neither is held"
+    )
 
 
 @pytest.mark.slow
@@ -112,7 +125,9 @@ def test_its_expert_succeeds_and_ends_every_subtask(name):
             if sim.judge.outcome.over[0]:
                 break
         if sim.judge.outcome.success[0]:
-            assert sim.judge.subtask[0].tolist() == [len(sim.task.subtasks()[arm]) for arm in ROBOT.arms]
+            assert sim.judge.subtask[0].tolist() == [
+                len(sim.task.subtasks()[arm]) for arm in ROBOT.arms
+            ]
             return
     raise AssertionError(f"{name}: no success in 3 attempts")
 
@@ -128,10 +143,14 @@ def install(site: Path) -> Path:
     project = tomllib.loads((site / "pyproject.toml").read_text())["project"]
     info = site / f"{project['name']}-{project['version']}.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
     points = project["entry-points"][ENTRY_POINT_GROUP]
     lines = [f"{name} = {value}" for name, value in points.items()]
-    (info / "entry_points.txt").write_text("\n".join([f"[{ENTRY_POINT_GROUP}]", *lines, ""]))
+    (info / "entry_points.txt").write_text(
+        "\n".join([f"[{ENTRY_POINT_GROUP}]", *lines, ""])
+    )
     return site
 
 
@@ -155,14 +174,32 @@ def taccorl(*words: Any) -> None:
     assert main([str(word) for word in words]) == 0
 
 
-def test_it_is_collected_augmented_and_evaluated(installed, tmp_path, monkeypatch, capsys):
+def test_it_is_collected_augmented_and_evaluated(
+    installed, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     task, rest = f"--task={NAME}", ("--store=store",)
     taccorl("collect", task, "--episodes=1", "--images=false", "--out=sources", *rest)
-    taccorl("augment", task, "--source=sources", "--episodes=1", "--images=false", "--out=many", *rest)
+    taccorl(
+        "augment",
+        task,
+        "--source=sources",
+        "--episodes=1",
+        "--images=false",
+        "--out=many",
+        *rest,
+    )
     made = Dataset(tmp_path / "many")
     assert [e.instruction for e in (made.episode(0),)] == ["lift the yellow block"]
-    taccorl("evaluate", task, "--policy.type=expert", "--images=false", "--episodes=2", "--failures=0", "--out=scored")
+    taccorl(
+        "evaluate",
+        task,
+        "--policy.type=expert",
+        "--images=false",
+        "--episodes=2",
+        "--failures=0",
+        "--out=scored",
+    )
     assert f"expert, {NAME}: 2 of 2 episodes succeeded" in capsys.readouterr().out
 
 
@@ -177,7 +214,14 @@ def test_it_is_in_the_lists_that_are_made_by_registration(installed, capsys):
 
 @pytest.mark.slow
 def test_the_tests_of_every_task_find_it_and_pass(tmp_path):
-    words = ["tests/tasks/test_every_task.py", "-q", "-k", NAME, "-p", "no:cacheprovider"]
+    words = [
+        "tests/tasks/test_every_task.py",
+        "-q",
+        "-k",
+        NAME,
+        "-p",
+        "no:cacheprovider",
+    ]
     run = fresh_python("-m", "pytest", *words, path=install(tmp_path / "site"))
     assert run.returncode == 0, run.stdout  # 5: no test selected
 
@@ -190,7 +234,9 @@ def test_the_tests_of_every_task_find_it_and_pass(tmp_path):
         (("mine", "--out=there"), "there/mine: is there already"),
     ],
 )
-def test_a_new_task_takes_no_name_or_folder_of_another(tmp_path, monkeypatch, capsys, words, told):
+def test_a_new_task_takes_no_name_or_folder_of_another(
+    tmp_path, monkeypatch, capsys, words, told
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there" / "mine").mkdir(parents=True)
     assert main(["task", "new", *words]) == 2

@@ -27,7 +27,9 @@ ON_TRAY_M = 0.014  # and when it stands on the tray's top: base and 10 mm of dep
 
 @pytest.fixture(scope="module")
 def built() -> Simulation:
-    return Simulation(Puzzle(), scale=0.0)  # nothing drawn: everything at its nominal place
+    return Simulation(
+        Puzzle(), scale=0.0
+    )  # nothing drawn: everything at its nominal place
 
 
 @pytest.fixture
@@ -37,11 +39,22 @@ def sim(built) -> Simulation:
 
 
 def over_hole(
-    sim: Simulation, hole: str, height_m: float, *, turned_deg: float = 0.0, aside_m: float = 0.0
+    sim: Simulation,
+    hole: str,
+    height_m: float,
+    *,
+    turned_deg: float = 0.0,
+    aside_m: float = 0.0,
 ) -> np.ndarray:
     """World pose (4, 4) of a piece that stands level over a hole of the tray."""
-    pose = sim.poses("tray")[0] @ Puzzle().tray.holes[hole].part_from_hole @ np.diag([1.0, -1, -1, 1])
-    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    pose = (
+        sim.poses("tray")[0]
+        @ Puzzle().tray.holes[hole].part_from_hole
+        @ np.diag([1.0, -1, -1, 1])
+    )
+    pose[:3, :3] = (
+        pose[:3, :3] @ Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    )
     pose[:3, 3] = (pose[0, 3] + aside_m, pose[1, 3], height_m)
     return pose
 
@@ -55,7 +68,9 @@ def move_hand(sim: Simulation, arm: str, tcp: np.ndarray, opening_m: float) -> N
     """Put an arm at rest with its TCP at a world pose (4, 4)."""
     joints = sim.proprioception()[0].copy()
     a = 7 * ROBOT.arms.index(arm)
-    joints[a : a + 6] = ArmKinematics(arm, RobotConfig()).search(tcp, np.random.default_rng(0))
+    joints[a : a + 6] = ArmKinematics(arm, RobotConfig()).search(
+        tcp, np.random.default_rng(0)
+    )
     joints[a + 6] = opening_m
     sim.place_arms(joints, joints)
 
@@ -81,7 +96,9 @@ def footprint(part: Part) -> BaseGeometry:
             case Cylinder():
                 outline = Point(0, 0).buffer(solid.radius_m)
             case Box():
-                outline = box(-solid.half_m[0], -solid.half_m[1], solid.half_m[0], solid.half_m[1])
+                outline = box(
+                    -solid.half_m[0], -solid.half_m[1], solid.half_m[0], solid.half_m[1]
+                )
             case _:
                 raise TypeError(solid)
         outlines.append(affinity.translate(outline, *solid.part_from_solid[:2, 3]))
@@ -90,37 +107,62 @@ def footprint(part: Part) -> BaseGeometry:
 
 def placed_at(outline: BaseGeometry, pose7: np.ndarray) -> BaseGeometry:
     yaw = Rotation.from_quat(pose7[3:], scalar_first=True).as_euler("zyx")[0]
-    return affinity.translate(affinity.rotate(outline, yaw, origin=(0, 0), use_radians=True), *pose7[:2])
+    return affinity.translate(
+        affinity.rotate(outline, yaw, origin=(0, 0), use_radians=True), *pose7[:2]
+    )
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_support_and_position_add_up(side):
     task = Puzzle()
-    values = {row.name: np.array(row.high if side > 0 else row.low) for row in task.rows}
+    values = {
+        row.name: np.array(row.high if side > 0 else row.low) for row in task.rows
+    }
     poses = task.reset(values).poses
-    reach_m = {"circle": (0.040, 0.040), "heart": (0.040, 0.037), "triangle": (0.040, 0.037)}  # 30 + 10, 27 + 10 mm
+    reach_m = {
+        "circle": (0.040, 0.040),
+        "heart": (0.040, 0.037),
+        "triangle": (0.040, 0.037),
+    }  # 30 + 10, 27 + 10 mm
     for piece in PIECES:
-        np.testing.assert_allclose(poses[piece][:2] - PIECES_AT_M[piece], side * np.array(reach_m[piece]), atol=1e-12)
+        np.testing.assert_allclose(
+            poses[piece][:2] - PIECES_AT_M[piece],
+            side * np.array(reach_m[piece]),
+            atol=1e-12,
+        )
         yaw = Rotation.from_quat(poses[piece][3:], scalar_first=True).as_euler("zyx")[0]
         assert yaw - YAW_RAD == pytest.approx(side * np.deg2rad(10))
     np.testing.assert_allclose(poses["tray"][:2] - TRAY_AT_M, side * 0.005, atol=1e-12)
-    tray_yaw = Rotation.from_quat(poses["tray"][3:], scalar_first=True).as_euler("zyx")[0]
+    tray_yaw = Rotation.from_quat(poses["tray"][3:], scalar_first=True).as_euler("zyx")[
+        0
+    ]
     assert tray_yaw - YAW_RAD == pytest.approx(side * np.deg2rad(5))
 
 
 def test_nothing_overlaps_in_500_draws_and_500_corners_of_the_ranges():
     task, rng = Puzzle(), np.random.default_rng(0)
-    outlines = {name: footprint(part) for name, part in {"tray": task.tray, **task.pieces}.items()}
+    outlines = {
+        name: footprint(part)
+        for name, part in {"tray": task.tray, **task.pieces}.items()
+    }
     assert outlines["tray"].area == pytest.approx(0.200 * 0.080)  # base and plate
     assert outlines["circle"].area == pytest.approx(np.pi * 0.020**2, rel=0.01)
 
     def smallest_gap_m(values: dict[str, np.ndarray]) -> float:
         poses = task.reset(values).poses
-        covered = [placed_at(outline, poses[name]) for name, outline in outlines.items()]
-        return min(one.distance(other) for one, other in itertools.combinations(covered, 2))
+        covered = [
+            placed_at(outline, poses[name]) for name, outline in outlines.items()
+        ]
+        return min(
+            one.distance(other) for one, other in itertools.combinations(covered, 2)
+        )
 
     corners = [
-        {row.name: np.where(rng.random(len(row.low)) < 0.5, row.low, row.high) for row in task.rows} for _ in range(500)
+        {
+            row.name: np.where(rng.random(len(row.low)) < 0.5, row.low, row.high)
+            for row in task.rows
+        }
+        for _ in range(500)
     ]
     drawn = [draw(task.rows, np.random.default_rng(seed)) for seed in range(500)]
     assert min(map(smallest_gap_m, drawn + corners)) > 0.004
@@ -155,33 +197,53 @@ def test_all_three_in_their_holes_succeed_after_half_a_second(sim):
         ("heart", 0, 0, 180, False),
     ],
 )
-def test_a_piece_is_in_near_the_floor_level_and_turned_as_it_fits(sim, piece, above_mm, tilt_deg, turned_deg, counts):
+def test_a_piece_is_in_near_the_floor_level_and_turned_as_it_fits(
+    sim, piece, above_mm, tilt_deg, turned_deg, counts
+):
     pose = over_hole(sim, piece, IN_HOLE_M + above_mm / 1e3, turned_deg=turned_deg)
-    pose[:3, :3] = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix() @ pose[:3, :3]
+    pose[:3, :3] = (
+        Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix() @ pose[:3, :3]
+    )
     put_all_in(sim, **{piece: pose})
     assert now(sim).goal[0] == counts
     assert now(sim).partial[0] == (3 if counts else 2)
 
 
 def test_the_wrong_piece_in_a_hole_counts_for_nothing(sim):
-    put_all_in(sim, circle=over_hole(sim, "triangle", IN_HOLE_M), triangle=over_hole(sim, "circle", IN_HOLE_M))
+    put_all_in(
+        sim,
+        circle=over_hole(sim, "triangle", IN_HOLE_M),
+        triangle=over_hole(sim, "circle", IN_HOLE_M),
+    )
     assert now(sim).partial[0] == 1  # the heart
 
 
 def test_a_piece_in_flight_through_its_place_does_not_count(sim):
     put_all_in(sim)
     for speed_mps, counts in ((-0.05, False), (-0.01, True)):  # falling
-        put(sim, "triangle", over_hole(sim, "triangle", IN_HOLE_M + 1e-4), (0, 0, speed_mps))
+        put(
+            sim,
+            "triangle",
+            over_hole(sim, "triangle", IN_HOLE_M + 1e-4),
+            (0, 0, speed_mps),
+        )
         assert now(sim).goal[0] == counts and now(sim).partial[0] == 2 + counts
 
 
-@pytest.mark.parametrize("height_m", [0.0005, 0.0020])  # lying in, and hovering low enough to count
+@pytest.mark.parametrize(
+    "height_m", [0.0005, 0.0020]
+)  # lying in, and hovering low enough to count
 def test_a_piece_that_a_hand_still_holds_in_its_hole_does_not_count(sim, height_m):
     held = over_hole(sim, "heart", IN_HOLE_M + height_m)
     put_all_in(sim, heart=held)
     assert now(sim).goal[0]
-    move_hand(sim, "right", hand_over(held, 0.060), opening_m=0.0178)  # the knob is 18 mm wide
-    assert sim.pads_touching("heart")[0].tolist() == [False, False, True, True] and not now(sim).goal[0]
+    move_hand(
+        sim, "right", hand_over(held, 0.060), opening_m=0.0178
+    )  # the knob is 18 mm wide
+    assert (
+        sim.pads_touching("heart")[0].tolist() == [False, False, True, True]
+        and not now(sim).goal[0]
+    )
     assert now(sim).partial[0] == 2
     move_hand(sim, "right", hand_over(held, 0.060), opening_m=0.030)
     assert now(sim).goal[0]
@@ -204,7 +266,9 @@ def test_a_piece_on_the_rim_is_not_lost_while_a_hand_is_near(sim):
     on_rim = over_hole(sim, "triangle", ON_TRAY_M - 5e-5, aside_m=0.003)  # it touches
     put(sim, "triangle", on_rim)
     assert now(sim).failures["rim"][0]
-    move_hand(sim, "right", hand_over(on_rim, 0.0325 + 0.095), opening_m=0.06)  # the knob's middle is 32.5 mm up
+    move_hand(
+        sim, "right", hand_over(on_rim, 0.0325 + 0.095), opening_m=0.06
+    )  # the knob's middle is 32.5 mm up
     assert not now(sim).failures["rim"][0]
     move_hand(sim, "right", hand_over(on_rim, 0.0325 + 0.105), opening_m=0.06)
     assert now(sim).failures["rim"][0]
@@ -214,12 +278,16 @@ def hold_on_the_tray(sim: Simulation, height_m: float = ON_TRAY_M - 5e-5) -> np.
     """The right hand holds the triangle 3 mm beside its hole; its pose (4, 4)."""
     held = over_hole(sim, "triangle", height_m, aside_m=0.003)
     put(sim, "triangle", held)
-    move_hand(sim, "right", hand_over(held, 0.060), opening_m=0.0178)  # the knob is 18 mm wide
+    move_hand(
+        sim, "right", hand_over(held, 0.060), opening_m=0.0178
+    )  # the knob is 18 mm wide
     assert sim.pads_touching("triangle")[0].tolist() == [False, False, True, True]
     return held
 
 
-def test_a_piece_that_is_pressed_beside_its_hole_for_three_seconds_is_at_the_wrong_place(sim):
+def test_a_piece_that_is_pressed_beside_its_hole_for_three_seconds_is_at_the_wrong_place(
+    sim,
+):
     held = hold_on_the_tray(sim)
     seen = now(sim)
     assert seen.failures["wrong place"][0] and not seen.failures["rim"][0]
@@ -229,7 +297,9 @@ def test_a_piece_that_is_pressed_beside_its_hole_for_three_seconds_is_at_the_wro
     targets = sim.targets.copy()
     targets[0, 13] = 0.012  # grip; the arm presses down by 2 mm
     below = hand_over(held, 0.058)
-    targets[0, 7:13] = ArmKinematics("right", RobotConfig()).search(below, np.random.default_rng(0))
+    targets[0, 7:13] = ArmKinematics("right", RobotConfig()).search(
+        below, np.random.default_rng(0)
+    )
     stay(sim, 87, targets)
     assert sim.contact("triangle", "tray").force_n[0] > 1.0
     assert sim.judge.outcome.failure[0] == ""

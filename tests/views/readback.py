@@ -32,8 +32,14 @@ def read_rrd(path: Path) -> dict[str, dict[str, Column]]:
                 static.add(key)
                 rows[key] += [(-1, np.nan, v) for v in values]
                 continue
-            has_frames = "frame_index" in batch.schema.names  # not where two episodes share the time line
-            frames = batch.column("frame_index").to_pylist() if has_frames else [0] * len(values)
+            has_frames = (
+                "frame_index" in batch.schema.names
+            )  # not where two episodes share the time line
+            frames = (
+                batch.column("frame_index").to_pylist()
+                if has_frames
+                else [0] * len(values)
+            )
             times_s = batch.column("time").cast("int64").to_numpy() / 1e9
             rows[key] += zip(frames, times_s, values, strict=True)
     found: dict[str, dict[str, Column]] = defaultdict(dict)

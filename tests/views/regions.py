@@ -22,24 +22,47 @@ def view_regions(blueprint: rrb.Blueprint) -> dict[str, Box]:
             found[str(part.name)] = (left, top + TITLE, right, bottom)  # type: ignore[attr-defined]
             return
         contents = list(part.contents)
-        if isinstance(part, rrb.Tabs):  # the first is shown, below the bar of tabs, which is a view's title
-            walk(contents[0], (left, top + TITLE * isinstance(contents[0], rrb.Container), right, bottom))
+        if isinstance(
+            part, rrb.Tabs
+        ):  # the first is shown, below the bar of tabs, which is a view's title
+            walk(
+                contents[0],
+                (
+                    left,
+                    top + TITLE * isinstance(contents[0], rrb.Container),
+                    right,
+                    bottom,
+                ),
+            )
             return
         if isinstance(part, rrb.Grid):
             columns = int(part.grid_columns or len(contents))
-            width, height = (right - left) / columns, (bottom - top) / -(-len(contents) // columns)
+            width, height = (
+                (right - left) / columns,
+                (bottom - top) / -(-len(contents) // columns),
+            )
             for k, child in enumerate(contents):
                 x, y = left + k % columns * width, top + k // columns * height
                 walk(child, (x, y, x + width, y + height))
             return
         horizontal = isinstance(part, rrb.Horizontal)
-        shares = np.array((part.column_shares if horizontal else part.row_shares) or [1] * len(contents), dtype=float)
+        shares = np.array(
+            (part.column_shares if horizontal else part.row_shares)
+            or [1] * len(contents),
+            dtype=float,
+        )
         edges = np.concatenate([[0.0], np.cumsum(shares / shares.sum())])
         for child, a, b in zip(contents, edges[:-1], edges[1:], strict=True):
             if horizontal:
-                walk(child, (left + a * (right - left), top, left + b * (right - left), bottom))
+                walk(
+                    child,
+                    (left + a * (right - left), top, left + b * (right - left), bottom),
+                )
             else:
-                walk(child, (left, top + a * (bottom - top), right, top + b * (bottom - top)))
+                walk(
+                    child,
+                    (left, top + a * (bottom - top), right, top + b * (bottom - top)),
+                )
 
     walk(blueprint.root_container, (0.0, TOP_BAR, 1.0, 1.0 - TIME_PANEL))
     return found

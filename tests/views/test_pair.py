@@ -38,7 +38,10 @@ def slower(num_rows: int = 40, fps: int = 10) -> Episode:
     """B: another length and rate, the same features."""
     other = made_episode(num_rows, picture_size=64)
     return dataclasses.replace(
-        other, name="twin, episode 3", spec=dataclasses.replace(other.spec, fps=fps), origin=TWIN
+        other,
+        name="twin, episode 3",
+        spec=dataclasses.replace(other.spec, fps=fps),
+        origin=TWIN,
     )
 
 
@@ -54,21 +57,33 @@ def logged(pair: Pair, folder: Path, at_s: float | None = None) -> Logged:
 def test_row_0_or_the_first_contact_of_both_is_at_0_s(align: Align, tmp_path: Path):
     found = logged(Pair(A, B, align), tmp_path)
     for root, episode in (("a", A), ("b", B)):
-        contact_s = float(episode.time_s[np.flatnonzero(contact_gate(pads_of(episode)))[0]])
+        contact_s = float(
+            episode.time_s[np.flatnonzero(contact_gate(pads_of(episode)))[0]]
+        )
         assert contact_s > 0.9  # at 40 % of 3 s and of 4 s
         expected = episode.time_s - (contact_s if align == "contact" else 0.0)
-        for path in ("curves/observation/state/left_joint_1_rad", "observation/images/front", "touch/sum/left_a"):
+        for path in (
+            "curves/observation/state/left_joint_1_rad",
+            "observation/images/front",
+            "touch/sum/left_a",
+        ):
             column = next(c for c in found[f"/{root}/{path}"].values() if len(c.time_s))
             np.testing.assert_allclose(column.time_s, expected, atol=1e-8)
         gate = found[f"/{root}/events/contact_gate"]["StateChange:state"]
         opened = gate.time_s[[v[0] for v in gate.values].index("contact")]
-        assert opened == pytest.approx(0.0 if align == "contact" else contact_s, abs=1e-8)
+        assert opened == pytest.approx(
+            0.0 if align == "contact" else contact_s, abs=1e-8
+        )
 
 
 def test_difference_is_b_minus_a_at_the_newest_row_of_b(tmp_path: Path):
     """A: 10 counts everywhere. B: 10 + 20 · row on left_a, at a third of A's rate: 20 · ⌊row of A / 3⌋ is the difference."""
     counts_a = np.full((90, 4, 32, 12), 10, np.int16)
-    counts_b = np.repeat(np.repeat(10 + 20 * np.arange(8, dtype=np.int16)[:, None, None], 32, axis=1), 12, axis=2)
+    counts_b = np.repeat(
+        np.repeat(10 + 20 * np.arange(8, dtype=np.int16)[:, None, None], 32, axis=1),
+        12,
+        axis=2,
+    )
     counts_b = np.stack([counts_b, *[np.full((8, 32, 12), 10, np.int16)] * 3], axis=1)
     a = dataclasses.replace(A, arrays=A.arrays | {TOUCH: counts_a.reshape(90, -1)})
     b = slower(8)
@@ -76,29 +91,49 @@ def test_difference_is_b_minus_a_at_the_newest_row_of_b(tmp_path: Path):
     pair = Pair(a, b)
     assert pair.full_difference == 140.0  # row 7 of B
     images = logged(pair, tmp_path)["/difference/pads/left_a"]["Image:buffer"]
-    np.testing.assert_allclose(images.time_s, np.arange(24) / 30, atol=1e-8)  # B lasts 0.8 s
-    shown = np.array([np.array(v[0], np.uint8) for v in images.values]).reshape(24, 32, 12, 3)
+    np.testing.assert_allclose(
+        images.time_s, np.arange(24) / 30, atol=1e-8
+    )  # B lasts 0.8 s
+    shown = np.array([np.array(v[0], np.uint8) for v in images.values]).reshape(
+        24, 32, 12, 3
+    )
     for row, image in enumerate(shown):
-        np.testing.assert_array_equal(image, np.broadcast_to(difference_colors(np.array(row // 3 / 7)), (32, 12, 3)))
+        np.testing.assert_array_equal(
+            image,
+            np.broadcast_to(difference_colors(np.array(row // 3 / 7)), (32, 12, 3)),
+        )
     np.testing.assert_array_equal(shown[-1, 0, 0], PAIR_COLORS[1])
 
 
 def test_differences_have_the_colour_of_the_one_that_has_more():
     colors = difference_colors(np.array([-2.0, -1.0, 0.0, 0.5, 1.0]))
-    np.testing.assert_array_equal(colors[[0, 1, 4]], [PAIR_COLORS[0], PAIR_COLORS[0], PAIR_COLORS[1]])
-    np.testing.assert_allclose(colors[3], (colors[2] + np.array(PAIR_COLORS[1])) / 2, atol=0.5)
+    np.testing.assert_array_equal(
+        colors[[0, 1, 4]], [PAIR_COLORS[0], PAIR_COLORS[0], PAIR_COLORS[1]]
+    )
+    np.testing.assert_allclose(
+        colors[3], (colors[2] + np.array(PAIR_COLORS[1])) / 2, atol=0.5
+    )
 
 
 def test_every_joint_has_one_plot_with_state_and_action_of_both(tmp_path: Path):
     found = logged(Pair(A, B), tmp_path)
-    plots = {v.name: v for v in views(pair_blueprint(Pair(A, B)).root_container) if isinstance(v, rrb.TimeSeriesView)}
+    plots = {
+        v.name: v
+        for v in views(pair_blueprint(Pair(A, B)).root_container)
+        if isinstance(v, rrb.TimeSeriesView)
+    }
     for i, name in enumerate(("left_joint_1 [rad]", "left_joint_2 [rad]")):
         entities = [str(c) for c in plots[name].contents]
         assert len(entities) == 4
         for entity, episode, key in zip(
-            entities, (A, A, B, B), ("observation.state", "action", "observation.state", "action"), strict=True
+            entities,
+            (A, A, B, B),
+            ("observation.state", "action", "observation.state", "action"),
+            strict=True,
         ):
-            values = np.array(found[entity]["Scalars:scalars"].values, dtype=np.float32)[:, 0]
+            values = np.array(
+                found[entity]["Scalars:scalars"].values, dtype=np.float32
+            )[:, 0]
             np.testing.assert_array_equal(values, episode.arrays[key][:, i])
         names = [found[e]["SeriesLines:names"].values[0][0] for e in entities]
         assert names == ["A", "A action", "B", "B action"]
@@ -109,7 +144,9 @@ def test_every_joint_has_one_plot_with_state_and_action_of_both(tmp_path: Path):
 
 def test_what_one_lacks_is_said_and_the_rest_is_shown_together(tmp_path: Path):
     """B: no wrist cameras, no touch, the left arm in degrees and no right arm."""
-    bare = without(B, TOUCH, "observation.images.left_wrist", "observation.images.right_wrist")
+    bare = without(
+        B, TOUCH, "observation.images.left_wrist", "observation.images.right_wrist"
+    )
     state = dataclasses.replace(
         bare.spec.features["observation.state"],
         shape=(7,),
@@ -117,8 +154,13 @@ def test_what_one_lacks_is_said_and_the_rest_is_shown_together(tmp_path: Path):
         unit=("deg",) * 6 + ("m",),
         range=(-999.0, 999.0),
     )
-    spec = dataclasses.replace(bare.spec, features={**bare.spec.features, "observation.state": state, "action": state})
-    arrays = {key: np.ascontiguousarray(values[:, :7]) for key, values in bare.arrays.items()}
+    spec = dataclasses.replace(
+        bare.spec,
+        features={**bare.spec.features, "observation.state": state, "action": state},
+    )
+    arrays = {
+        key: np.ascontiguousarray(values[:, :7]) for key, values in bare.arrays.items()
+    }
     pair = Pair(A, dataclasses.replace(bare, spec=spec, arrays=arrays))
     names = assert_no_view_is_empty(logged(pair, tmp_path), pair_blueprint(pair))
     assert {
@@ -138,29 +180,50 @@ def test_what_one_lacks_is_said_and_the_rest_is_shown_together(tmp_path: Path):
         "only in B: curves left_joint_1 [deg]",
     ):
         assert words in page, words
-    assert str(ORIGIN) in page and str(TWIN) in page and "first contact at" in page and "no touch" in page
+    assert (
+        str(ORIGIN) in page
+        and str(TWIN) in page
+        and "first contact at" in page
+        and "no touch" in page
+    )
 
 
 def test_pads_of_another_layout_are_not_subtracted(tmp_path: Path):
     sensor = dataclasses.replace(B.spec.sensors[TOUCH], gain_per_count=0.5)
-    other = dataclasses.replace(B, spec=dataclasses.replace(B.spec, sensors={TOUCH: sensor}))
+    other = dataclasses.replace(
+        B, spec=dataclasses.replace(B.spec, sensors={TOUCH: sensor})
+    )
     pair = Pair(A, other)
-    assert not [path for path in logged(pair, tmp_path) if path.startswith("/difference")]
-    assert "no difference of right_b: A has 32 × 12, 0.01333 a count, B 32 × 12, 0.5 a count" in page_of(pair)
+    assert not [
+        path for path in logged(pair, tmp_path) if path.startswith("/difference")
+    ]
+    assert (
+        "no difference of right_b: A has 32 × 12, 0.01333 a count, B 32 × 12, 0.5 a count"
+        in page_of(pair)
+    )
 
 
 def test_alignment_at_contact_is_refused_where_one_has_none():
     with pytest.raises(TaccorlError, match=r"twin, episode 3.*--align=start"):
         Pair(A, without(B, TOUCH), "contact")
-    quiet = dataclasses.replace(B, arrays=B.arrays | {TOUCH: np.minimum(B.arrays[TOUCH], 30)})
-    with pytest.raises(TaccorlError, match=r"twin, episode 3: no taxel beyond 0\.4 \(30 counts\) in 40 rows"):
+    quiet = dataclasses.replace(
+        B, arrays=B.arrays | {TOUCH: np.minimum(B.arrays[TOUCH], 30)}
+    )
+    with pytest.raises(
+        TaccorlError,
+        match=r"twin, episode 3: no taxel beyond 0\.4 \(30 counts\) in 40 rows",
+    ):
         Pair(A, quiet, "contact")
 
 
 def test_a_still_picture_needs_one_row_of_pictures_and_pads(tmp_path: Path):
     found = logged(Pair(A, B), tmp_path, at_s=1.84)  # row 55 of A, 18 of B
     for root, row_s in (("a", 55 / 30), ("b", 1.8), ("difference/pads", 55 / 30)):
-        path = f"/{root}/left_a" if "pads" in root else f"/{root}/observation/tactile/left_a"
+        path = (
+            f"/{root}/left_a"
+            if "pads" in root
+            else f"/{root}/observation/tactile/left_a"
+        )
         (column,) = [c for name, c in found[path].items() if name.endswith("buffer")]
         np.testing.assert_allclose(column.time_s, [row_s], atol=1e-8)
     assert len(found["/a/observation/images/front"]["EncodedImage:blob"].values) == 1
@@ -177,10 +240,14 @@ def test_the_rerun_program_draws_both(tmp_path: Path):
     row = round(30 * pair.best_time_s)  # A grips firmly, B not yet
     patch = 20, 5  # a taxel of the left pads' patch
     (a, b), (rows_a, rows_b) = pair.shared_pads()[0], pair.common_rows()
-    difference = int(b.counts[rows_b[list(rows_a).index(row)]][patch]) - int(a.counts[row][patch])
+    difference = int(b.counts[rows_b[list(rows_a).index(row)]][patch]) - int(
+        a.counts[row][patch]
+    )
     assert difference < -40
     color = difference_colors(np.array(difference / pair.full_difference))
-    assert share(shown["touch: counts above baseline"], tuple(map(int, color)), 25) > 0.005
+    assert (
+        share(shown["touch: counts above baseline"], tuple(map(int, color)), 25) > 0.005
+    )
     for name in ("left_joint_1 [rad]", "right_gripper [m]"):
         for color in PAIR_COLORS:
             assert share(shown[name], color, 60) > 0.002, f"{name}: nothing in {color}"
@@ -201,7 +268,9 @@ def read(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
             continue
         times_s = batch.column("time").cast("int64").to_numpy() / 1e9
         values = [v[0] for v in batch.column("Scalars:scalars").to_pylist()]
-        found.setdefault(chunk.entity_path, []).extend(zip(times_s, values, strict=True))
+        found.setdefault(chunk.entity_path, []).extend(
+            zip(times_s, values, strict=True)
+        )
     return {name: tuple(np.array(sorted(rows)).T) for name, rows in found.items()}  # pyright: ignore[reportReturnType]
 
 
@@ -226,7 +295,11 @@ def pair() -> tuple[Comparison, Comparison]:
     fields = {"measured": measured, "recording": "sweep 1.mcap"}
     return (
         comparison(trace(LEFT, POSITION, **fields), touches=(touch(),)),
-        comparison(trace(0.1 * LEFT, POSITION, **fields), touches=(touch(),), twin="corrected twin"),
+        comparison(
+            trace(0.1 * LEFT, POSITION, **fields),
+            touches=(touch(),),
+            twin="corrected twin",
+        ),
     )
 
 
@@ -234,7 +307,10 @@ def test_lines_are_the_comparison_s_numbers(tmp_path: Path):
     before, after = pair()
     save_comparison(before, tmp_path / "x.rrd", after)
     found = read(tmp_path / "x.rrd")
-    path, known = "/sweep_1_mcap/left_joint5/position", np.isfinite(before.traces[0].measured)
+    path, known = (
+        "/sweep_1_mcap/left_joint5/position",
+        np.isfinite(before.traces[0].measured),
+    )
     for name, expected in (
         (f"{path}/command", POSITION),
         (f"{path}/measured", POSITION[known]),
@@ -245,8 +321,12 @@ def test_lines_are_the_comparison_s_numbers(tmp_path: Path):
         (f"{path}/residual/floor_high", [2e3 * FLOOR_RAD] * 2),
         (f"{path}/residual/floor_low", [-2e3 * FLOOR_RAD] * 2),
     ):
-        np.testing.assert_allclose(found[name][1], expected, rtol=1e-9, atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(found[f"{path}/measured"][0], before.traces[0].time_s[known], atol=1e-9)
+        np.testing.assert_allclose(
+            found[name][1], expected, rtol=1e-9, atol=1e-12, err_msg=name
+        )
+    np.testing.assert_allclose(
+        found[f"{path}/measured"][0], before.traces[0].time_s[known], atol=1e-9
+    )
 
 
 def test_file_says_where_its_data_is_from_and_shows_the_pads(tmp_path: Path):
@@ -259,13 +339,25 @@ def test_file_says_where_its_data_is_from_and_shows_the_pads(tmp_path: Path):
             text = batch.column("TextDocument:text").to_pylist()[0][0]
         if "DepthImage:buffer" in batch.schema.names:
             images[chunk.entity_path] = batch.column("DepthImage:buffer").to_pylist()
-    assert text.startswith(f"**data: {OF_TRACES}**") and "corrected twin" in text and "2 mrad" in text
-    assert set(images) == {f"/press_1_mcap/touch/{name}" for name in ("measured", "twin", "corrected")}
-    frame = np.array(images["/press_1_mcap/touch/measured"][20][0], np.uint8).view(np.uint16).reshape(32, 2 * 12 + 3)
+    assert (
+        text.startswith(f"**data: {OF_TRACES}**")
+        and "corrected twin" in text
+        and "2 mrad" in text
+    )
+    assert set(images) == {
+        f"/press_1_mcap/touch/{name}" for name in ("measured", "twin", "corrected")
+    }
+    frame = (
+        np.array(images["/press_1_mcap/touch/measured"][20][0], np.uint8)
+        .view(np.uint16)
+        .reshape(32, 2 * 12 + 3)
+    )
     np.testing.assert_array_equal(frame[:, 15:], touch().measured[20, 1])
 
 
 def test_many_recordings_are_spread_over_tabs():
-    traces = [trace(LEFT, POSITION, recording=f"sweep_{k}") for k in range(2 * MOST_ROWS + 1)]
+    traces = [
+        trace(LEFT, POSITION, recording=f"sweep_{k}") for k in range(2 * MOST_ROWS + 1)
+    ]
     tabs = comparison_blueprint(comparison(*traces)).root_container
     assert len(tabs.contents) == 3 + 1  # three tabs of curves and the provenance

@@ -17,9 +17,12 @@ from taccorl.views.viewer import ViewerError, picture_without_window
 from .made_episode import ORIGIN, in_dataset, made_episode
 from .regions import contents
 
-HAS_VULKAN = ctypes.util.find_library("vulkan") is not None and any(Path("/usr/share/vulkan/icd.d").glob("*.json"))
+HAS_VULKAN = ctypes.util.find_library("vulkan") is not None and any(
+    Path("/usr/share/vulkan/icd.d").glob("*.json")
+)
 needs_vulkan = pytest.mark.skipif(
-    not HAS_VULKAN, reason="no Vulkan for the Rerun program: apt-get install mesa-vulkan-drivers libvulkan1"
+    not HAS_VULKAN,
+    reason="no Vulkan for the Rerun program: apt-get install mesa-vulkan-drivers libvulkan1",
 )
 TABLE = (176, 158, 136)
 STRIP_SHADE = 0.785  # Rerun draws a lane's colours this much darker
@@ -42,21 +45,38 @@ def assert_every_view_shows_its_things(png: Path, episode: Episode) -> None:
     for name, pixels in shown.items():
         assert pixels.std(axis=(0, 1)).max() > 15, f"{name}: nearly one colour"
     for camera in ("front", "left_wrist", "right_wrist"):
-        assert share(shown[camera], TABLE) > 0.3, f"{camera}: no table (a video that was not decoded?)"
+        assert share(shown[camera], TABLE) > 0.3, (
+            f"{camera}: no table (a video that was not decoded?)"
+        )
     touch = shown["touch: counts above baseline, 0 … 255, fixed colours"]
-    for count in (80, 110):  # patch on the left pads, middle of the stripe on the right ones, at full grip
-        assert share(touch, tuple(int(c) for c in heat(np.array(count / 255))), 40) > 0.005, f"no taxel at {count}"
+    for count in (
+        80,
+        110,
+    ):  # patch on the left pads, middle of the stripe on the right ones, at full grip
+        assert (
+            share(touch, tuple(int(c) for c in heat(np.array(count / 255))), 40) > 0.005
+        ), f"no taxel at {count}"
     strip = shown[f"contact gate, outcome, stage · {ORIGIN}"]
     for color in (CONTACT_COLOR, SUCCESS, REACH, HOLD):
-        assert share(strip, tuple(STRIP_SHADE * c for c in color)) > 0.01, f"strip: nothing in {color}"
-    for name in ("touch sum of active taxels [counts above baseline]", "touch peak [counts above baseline]"):
-        for color in (PAD_COLORS[1], PAD_COLORS[3]):  # the pairs lie on one another, the later one on top
+        assert share(strip, tuple(STRIP_SHADE * c for c in color)) > 0.01, (
+            f"strip: nothing in {color}"
+        )
+    for name in (
+        "touch sum of active taxels [counts above baseline]",
+        "touch peak [counts above baseline]",
+    ):
+        for color in (
+            PAD_COLORS[1],
+            PAD_COLORS[3],
+        ):  # the pairs lie on one another, the later one on top
             assert share(shown[name], color, 60) > 0.001, f"{name}: no line in {color}"
     for name in ("left arm [rad]: action thin", "right arm [rad]: action thin"):
         for color in LINE_COLORS[:6]:
             assert share(shown[name], color, 60) > 0.0005, f"{name}: no line in {color}"
     assert share(shown["grippers [m]: action thin"], LINE_COLORS[1], 60) > 0.002
-    red, green, blue = np.moveaxis(shown["arms (schematic): joints in the plots' colours"], 2, 0)
+    red, green, blue = np.moveaxis(
+        shown["arms (schematic): joints in the plots' colours"], 2, 0
+    )
     assert (red - blue > 80).mean() > 0.005, "no orange right arm"
     assert (blue - red > 80).mean() > 0.005, "no blue left arm"
     assert (green - red > 80).mean() > 0.001, "no green elbow"
@@ -76,17 +96,35 @@ def test_the_rerun_program_draws_every_view(episode: Episode, tmp_path: Path):
 @needs_vulkan
 def test_a_viewer_without_data_does_not_pass(episode: Episode, tmp_path: Path):
     with rr.RecordingStream("taccorl_episode") as rec:
-        rec.save(tmp_path / "empty.rrd", default_blueprint=episode_blueprint(episode, at_s=1.8))
+        rec.save(
+            tmp_path / "empty.rrd",
+            default_blueprint=episode_blueprint(episode, at_s=1.8),
+        )
         rec.log("provenance", rr.TextDocument("nothing else"), static=True)
         rec.disconnect()
-    assert picture_without_window(tmp_path / "empty.rrd", tmp_path / "empty.png", WIDTH_PX, HEIGHT_PX) is None
+    assert (
+        picture_without_window(
+            tmp_path / "empty.rrd", tmp_path / "empty.png", WIDTH_PX, HEIGHT_PX
+        )
+        is None
+    )
     with pytest.raises(AssertionError):
         assert_every_view_shows_its_things(tmp_path / "empty.png", episode)
 
 
-def test_a_machine_without_vulkan_is_told_what_to_install(episode, tmp_path, monkeypatch):
-    monkeypatch.setenv("WGPU_BACKEND", "metal")  # what the Rerun program finds on Linux without Vulkan: nothing
+def test_a_machine_without_vulkan_is_told_what_to_install(
+    episode, tmp_path, monkeypatch
+):
+    monkeypatch.setenv(
+        "WGPU_BACKEND", "metal"
+    )  # what the Rerun program finds on Linux without Vulkan: nothing
     told: list[str] = []
-    with pytest.raises(ViewerError, match=r"apt-get install mesa-vulkan-drivers libvulkan1"):
+    with pytest.raises(
+        ViewerError, match=r"apt-get install mesa-vulkan-drivers libvulkan1"
+    ):
         screenshot(episode, tmp_path / "view.png", progress=told.append)
-    assert not list(tmp_path.iterdir()) and "90 rows" in told[0] and "Rerun program, at most 180 s" in told[1]
+    assert (
+        not list(tmp_path.iterdir())
+        and "90 rows" in told[0]
+        and "Rerun program, at most 180 s" in told[1]
+    )

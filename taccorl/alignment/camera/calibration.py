@@ -43,7 +43,10 @@ FEWEST_FRAMES = 4  # Least number of frames of a calibration
 _HOLD_OUT = 4  # one frame in so many is kept out of the fit
 _FEWEST_OUTLINES = 60  # points a frame: less is a fingertip
 _REACH_PX = 6.0  # a held-out outline without an edge within this counts as this far off
-_FOUND, _FAR = 0.5, 3.0  # of a fit that may be believed: share of held-out outlines with an edge, mean distance [px]
+_FOUND, _FAR = (
+    0.5,
+    3.0,
+)  # of a fit that may be believed: share of held-out outlines with an edge, mean distance [px]
 _ONE_POSE_RAD = 0.02  # joints that move less in all frames show one pose
 _VAGUE = 10.0  # times ``WANTED``, 3° or 40 mm: wider than the errors that calibration is to find
 
@@ -53,8 +56,12 @@ class CameraFrames:
     """Pictures of one camera, and the joint angles reported at their times. Raises TaccorlError: the shapes do not fit
     together."""
 
-    pictures: np.ndarray  # (F, rows, columns, 3) uint8 RGB pictures, as recorded or letterboxed by ingest
-    joints: np.ndarray  # (F, 14) joint angles [rad] and gripper openings [m], in the order of actions
+    pictures: (
+        np.ndarray
+    )  # (F, rows, columns, 3) uint8 RGB pictures, as recorded or letterboxed by ingest
+    joints: (
+        np.ndarray
+    )  # (F, 14) joint angles [rad] and gripper openings [m], in the order of actions
     stages: dict[str, int] = field(default_factory=dict)
     """"initial", "grasp", "insertion" → index of the frame. These frames are not used in the fit and are shown in the
     overlays."""
@@ -62,12 +69,19 @@ class CameraFrames:
     origin: Origin = UNSTATED  # Origin of the pictures
 
     def __post_init__(self) -> None:
-        if self.pictures.ndim != 4 or self.pictures.shape[-1] != 3 or self.pictures.dtype != np.uint8:
+        if (
+            self.pictures.ndim != 4
+            or self.pictures.shape[-1] != 3
+            or self.pictures.dtype != np.uint8
+        ):
             raise TaccorlError(
                 f"{self.name}: pictures are {self.pictures.dtype} {self.pictures.shape}; expected uint8 (F, rows, columns, 3), "
                 "all of one size"
             )
-        if self.joints.shape != (len(self.pictures), ROBOT.num_actions) or not np.isfinite(self.joints).all():
+        if (
+            self.joints.shape != (len(self.pictures), ROBOT.num_actions)
+            or not np.isfinite(self.joints).all()
+        ):
             raise TaccorlError(
                 f"{self.name}: joints are {self.joints.shape} for {len(self.pictures)} pictures; expected one row per picture, "
                 f"of {ROBOT.num_actions} finite numbers [rad, m], in the order of actions"
@@ -113,12 +127,21 @@ class CameraFit:
         """``config`` with the calibrated camera. The new offset contains the whole error of the mount. So ``camera_pose`` effects
         on this camera are removed. Raises TaccorlError: the calibration is not valid."""
         if self.problems:
-            raise TaccorlError(f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera")
-        cameras = [self.camera if camera.name == self.camera.name else camera for camera in config.cameras]
-        return dataclasses.replace(without_effects(config, self.camera.name, ("camera_pose",)), cameras=cameras)
+            raise TaccorlError(
+                f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera"
+            )
+        cameras = [
+            self.camera if camera.name == self.camera.name else camera
+            for camera in config.cameras
+        ]
+        return dataclasses.replace(
+            without_effects(config, self.camera.name, ("camera_pose",)), cameras=cameras
+        )
 
 
-def without_effects(config: TwinConfig, camera: str, names: Sequence[str]) -> TwinConfig:
+def without_effects(
+    config: TwinConfig, camera: str, names: Sequence[str]
+) -> TwinConfig:
     """Copy of ``config`` without the effects ``names`` on ``camera``; one that acts on several cameras stays on the others."""
     kept = []
     for effect in config.effects:
@@ -129,7 +152,9 @@ def without_effects(config: TwinConfig, camera: str, names: Sequence[str]) -> Tw
     return dataclasses.replace(config, effects=kept)
 
 
-def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> CameraFit:
+def calibrate_camera(
+    frames: CameraFrames, config: TwinConfig, camera: str
+) -> CameraFit:
     """Fit the pose of the twin's ``camera`` so that its arms match those in the pictures.
 
     Every fourth frame and the frames of the stages are held out: they are not used in the fit, and errors and overlays are
@@ -143,7 +168,9 @@ def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> C
     with TwinView(config, camera, frames.pictures.shape[1:3]) as view:
         inside = view.inside(frames.pictures)
         held = _held_out(frames)
-        fit, test = (levels(list(inside[rows]), view.intrinsics) for rows in (~held, held))
+        fit, test = (
+            levels(list(inside[rows]), view.intrinsics) for rows in (~held, held)
+        )
         drawn = outlines(view, frames.joints[~held], view.start, view.intrinsics)
         if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
             raise TaccorlError(
@@ -153,14 +180,26 @@ def calibrate_camera(frames: CameraFrames, config: TwinConfig, camera: str) -> C
             )
         solution = solve(view, frames.joints[~held], fit, view.start)
         sure = covariance(view, frames.joints[~held], fit[-1], solution)
-        before, after = (_judge(view, frames.joints[held], pose, test[-1]) for pose in (view.start, solution.offset))
+        before, after = (
+            _judge(view, frames.joints[held], pose, test[-1])
+            for pose in (view.start, solution.offset)
+        )
         problems = _problems(frames, solution, sure, before, after)
         shown = {
-            stage: overlay(view, inside[k], frames.joints[k], view.start, solution.offset, frames.origin)
+            stage: overlay(
+                view,
+                inside[k],
+                frames.joints[k],
+                view.start,
+                solution.offset,
+                frames.origin,
+            )
             for stage, k in frames.stages.items()
         }
         return CameraFit(
-            camera=view.camera if problems else dataclasses.replace(view.camera, offset=as_offset(solution.offset)),
+            camera=view.camera
+            if problems
+            else dataclasses.replace(view.camera, offset=as_offset(solution.offset)),
             start=view.start,
             offset=solution.offset,
             half_width=sure.half_width if sure else np.full(6, np.inf),
@@ -184,7 +223,9 @@ def _held_out(frames: CameraFrames) -> np.ndarray:
     return held
 
 
-def _judge(view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level) -> tuple[float, float]:
+def _judge(
+    view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level
+) -> tuple[float, float]:
     """Mean distance of the outlines at a pose from the edges [px of the pictures], and the share that has an edge at all."""
     drawn = outlines(view, joints, offset, level.intrinsics)
     if not len(drawn.points):
@@ -193,7 +234,9 @@ def _judge(view: TwinView, joints: np.ndarray, offset: np.ndarray, level: Level)
     seen = seen_from(view, offset, drawn.points)
     matches = match(drawn, seen, level, _REACH_PX * scale)
     apart = np.abs(distances(seen, matches, level.intrinsics)) / scale
-    return float((apart.sum() + _REACH_PX * (~matches.found).sum()) / len(seen)), float(matches.found.mean())
+    return float((apart.sum() + _REACH_PX * (~matches.found).sum()) / len(seen)), float(
+        matches.found.mean()
+    )
 
 
 def _problems(
@@ -220,7 +263,9 @@ def _problems(
             "not identifiable: the outlines in view do not fix all six numbers; record poses with more of the arms",
         )
     if (np.abs(solution.last_change) > sure.half_width).any():
-        found.append("not converged: the last render still moved it by more than its interval")
+        found.append(
+            "not converged: the last render still moved it by more than its interval"
+        )
     width, direction = sure.worst()
     spread = float(np.ptp(frames.joints, axis=0).max())
     if spread < _ONE_POSE_RAD:
@@ -229,7 +274,9 @@ def _problems(
             f"held out; worst known: {direction}. Record poses that differ"
         )
     elif width > _VAGUE:
-        found.append(f"not identifiable: {direction} can hardly be told; record poses that differ more")
+        found.append(
+            f"not identifiable: {direction} can hardly be told; record poses that differ more"
+        )
     return tuple(found)
 
 
@@ -238,7 +285,12 @@ _STRIP = 22  # rows for a panel's title
 
 
 def overlay(
-    view: TwinView, picture: np.ndarray, joints: np.ndarray, before: np.ndarray, after: np.ndarray, origin: Origin
+    view: TwinView,
+    picture: np.ndarray,
+    joints: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    origin: Origin,
 ) -> np.ndarray:
     """Figure of four panels side by side, (rows + 22, 4 · columns, 3) uint8 RGB: the picture; the twin after the calibration; the
     picture with the twin's outlines before, and after.
@@ -251,13 +303,22 @@ def overlay(
     """
     kind = f"{origin.domain} picture" if origin.domain else "picture"
     panels = [(kind, picture), ("twin, after", view.picture(joints, after))]
-    for title, pose, color in (("before", before, BEFORE_RGB), ("after", after, AFTER_RGB)):
-        panels.append((f"outlines {title}", _drawn_over(view, picture, joints, pose, color)))
+    for title, pose, color in (
+        ("before", before, BEFORE_RGB),
+        ("after", after, AFTER_RGB),
+    ):
+        panels.append(
+            (f"outlines {title}", _drawn_over(view, picture, joints, pose, color))
+        )
     return np.concatenate([_titled(title, image) for title, image in panels], axis=1)
 
 
 def _drawn_over(
-    view: TwinView, picture: np.ndarray, joints: np.ndarray, pose: np.ndarray, color: tuple[int, int, int]
+    view: TwinView,
+    picture: np.ndarray,
+    joints: np.ndarray,
+    pose: np.ndarray,
+    color: tuple[int, int, int],
 ) -> np.ndarray:
     at = view.intrinsics
     edges = twin_edges(*view.labels(joints, pose, at.rows, at.columns), at)
@@ -270,5 +331,14 @@ def _drawn_over(
 
 def _titled(title: str, image: np.ndarray) -> np.ndarray:
     strip = np.full((_STRIP, image.shape[1], 3), 255, np.uint8)
-    cv2.putText(strip, title, (4, _STRIP - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (20, 20, 20), 1, cv2.LINE_AA)
+    cv2.putText(
+        strip,
+        title,
+        (4, _STRIP - 7),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.42,
+        (20, 20, 20),
+        1,
+        cv2.LINE_AA,
+    )
     return np.concatenate([strip, image])

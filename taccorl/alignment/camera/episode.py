@@ -17,23 +17,31 @@ from taccorl.sim.robot import link_poses
 
 PICTURE = "observation.images."
 _SLOW = 0.5  # share of the rows, the slowest, that are taken from
-_GRIPPER_RAD = 0.5 / ROBOT.opening_max_m  # a gripper from end to end counts as half a radian
+_GRIPPER_RAD = (
+    0.5 / ROBOT.opening_max_m
+)  # a gripper from end to end counts as half a radian
 
 
-def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s: float = 0.0) -> CameraFrames:
+def camera_frames(
+    episode: Episode, camera: str, num_frames: int = 16, latency_s: float = 0.0
+) -> CameraFrames:
     """Select rows of an episode at which the arms are at rest in different poses, and the stages of the paper's figure.
     ``num_frames``: number of frames to select, without those of the stages. ``latency_s``: age of the scene in a picture relative
     to its row [s]; 0 if ingest has already corrected for it. Raises TaccorlError: there is no such camera, or the state does not
     hold the robot's joints and grippers."""
     joints = joint_rows(episode)
     time_s = episode.time_s
-    shown = np.column_stack([np.interp(time_s - latency_s, time_s, column) for column in joints.T])
+    shown = np.column_stack(
+        [np.interp(time_s - latency_s, time_s, column) for column in joints.T]
+    )
     stages = stage_rows(joints)
     rows = sorted({*stages.values(), *_different(joints, num_frames)})
     first = zip(range(rows[-1] + 1), all_pictures(episode, camera), strict=False)
     pictures = {row: picture for row, picture in first if row in rows}
     if len(pictures) < len(rows):
-        raise TaccorlError(f"{episode.name}: camera {camera} has {len(pictures)} of the {len(rows)} pictures requested")
+        raise TaccorlError(
+            f"{episode.name}: camera {camera} has {len(pictures)} of the {len(rows)} pictures requested"
+        )
     return CameraFrames(
         pictures=np.stack([pictures[row] for row in rows]),
         joints=shown[rows],
@@ -52,7 +60,9 @@ def joint_rows(episode: Episode) -> np.ndarray:
             f"{episode.name}: {STATE} has no {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}; camera "
             f"calibration needs all {ROBOT.num_actions} joints and grippers"
         )
-    return episode.arrays[STATE].astype(float)[:, [names.index(name) for name in ROBOT.action_names]]
+    return episode.arrays[STATE].astype(float)[
+        :, [names.index(name) for name in ROBOT.action_names]
+    ]
 
 
 def stage_rows(joints: np.ndarray) -> dict[str, int]:
@@ -61,10 +71,15 @@ def stage_rows(joints: np.ndarray) -> dict[str, int]:
     stages = {"initial": 0}
     openings = joints[:, ROBOT.gripper_indices]
     moved = np.ptp(openings, axis=0)
-    closed = (openings < openings.min(0) + 0.25 * moved) & (moved > 0.2 * ROBOT.opening_max_m)
+    closed = (openings < openings.min(0) + 0.25 * moved) & (
+        moved > 0.2 * ROBOT.opening_max_m
+    )
     if closed.any():
         stages["grasp"] = int(np.argmax(closed.any(1)))
-    hands = [link_poses(joints[:, ROBOT.joint_slice(arm)])[:, -1, :3, 3] for arm in ROBOT.arms]
+    hands = [
+        link_poses(joints[:, ROBOT.joint_slice(arm)])[:, -1, :3, 3]
+        for arm in ROBOT.arms
+    ]
     # Bases stand side by side, along y; how far apart does not change which row it is by much.
     apart = np.linalg.norm((hands[0] - hands[1]) + [0.0, 0.6, 0.0], axis=1)
     stages["insertion"] = int(len(apart) - 1 - np.argmin(apart[::-1]))
@@ -79,7 +94,9 @@ def _different(joints: np.ndarray, num_frames: int) -> list[int]:
     chosen = [int(slow[0])]
     distance = np.full(len(slow), np.inf)
     for _ in range(min(num_frames, len(slow)) - 1):
-        distance = np.minimum(distance, np.linalg.norm(scaled[slow] - scaled[chosen[-1]], axis=1))
+        distance = np.minimum(
+            distance, np.linalg.norm(scaled[slow] - scaled[chosen[-1]], axis=1)
+        )
         chosen.append(int(slow[np.argmax(distance)]))
     return chosen
 
@@ -90,6 +107,8 @@ def all_pictures(episode: Episode, camera: str) -> Iterator[np.ndarray]:
     key = PICTURE + camera
     if key not in episode.picture_keys:
         known = [k.removeprefix(PICTURE) for k in episode.picture_keys]
-        raise TaccorlError(f"{episode.name} has no camera {camera!r}; {nearest(camera, known)}")
+        raise TaccorlError(
+            f"{episode.name} has no camera {camera!r}; {nearest(camera, known)}"
+        )
     for pictures in episode.pictures():
         yield pictures[key]

@@ -19,11 +19,23 @@ from taccorl.sim.cameras import Intrinsics
 
 _POINTS = 800  # of a frame, drawn at random from its outlines
 _SMALLEST_ROWS = 100  # of a picture in which edges are looked for
-_REACH_PX = ((16.0, 12.0, 8.0, 6.0), (6.0, 5.0, 4.0), (4.0, 3.0, 3.0, 3.0))  # coarse to fine, render by render
+_REACH_PX = (
+    (16.0, 12.0, 8.0, 6.0),
+    (6.0, 5.0, 4.0),
+    (4.0, 3.0, 3.0, 3.0),
+)  # coarse to fine, render by render
 _MATCHES = 3  # times that points are matched anew between two renders
-_AROUND = np.r_[np.full(3, np.deg2rad(3.0)), np.full(3, 0.03)]  # of the start, searched before the first step
-_TRIED, _KEPT, _FOLLOWED = 256, 8, 2  # poses around the start; the best, refined in small pictures; in larger ones
-_SAME = np.r_[np.full(3, np.deg2rad(0.4)), np.full(3, 0.004)]  # poses closer than this will end in one
+_AROUND = np.r_[
+    np.full(3, np.deg2rad(3.0)), np.full(3, 0.03)
+]  # of the start, searched before the first step
+_TRIED, _KEPT, _FOLLOWED = (
+    256,
+    8,
+    2,
+)  # poses around the start; the best, refined in small pictures; in larger ones
+_SAME = np.r_[
+    np.full(3, np.deg2rad(0.4)), np.full(3, 0.004)
+]  # poses closer than this will end in one
 _FAR_PX = 6.0  # a point further from its edge counts no more
 _SOFT_PX = 1.0  # residuals beyond it count less (soft L1)
 
@@ -67,14 +79,26 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
     with fewer than 100 or more than 480 rows are left out."""
     found = []
     for factor in (4, 2, 1, 0.5):
-        rows, columns = round(intrinsics.rows / factor), round(intrinsics.columns / factor)
+        rows, columns = (
+            round(intrinsics.rows / factor),
+            round(intrinsics.columns / factor),
+        )
         if _SMALLEST_ROWS <= rows <= 480:
-            small = [cv2.resize(p, (columns, rows), interpolation=cv2.INTER_AREA) for p in pictures]
-            found.append(Level(intrinsics.scaled(rows, columns), [PictureEdges(p) for p in small]))
+            small = [
+                cv2.resize(p, (columns, rows), interpolation=cv2.INTER_AREA)
+                for p in pictures
+            ]
+            found.append(
+                Level(
+                    intrinsics.scaled(rows, columns), [PictureEdges(p) for p in small]
+                )
+            )
     return found
 
 
-def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics) -> Outlines:
+def outlines(
+    view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics
+) -> Outlines:
     """Outlines of the twin's arms in F frames, at most 800 points per frame. ``joints``: (F, 14) joint angles and gripper
     openings [rad, m]. ``offset``: (6,) camera pose at which they are rendered [rad, m]. ``at``: intrinsics, which state the size
     of the rendered pictures."""
@@ -87,7 +111,9 @@ def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrins
         if len(keep) > _POINTS:
             keep = np.sort(rng.choice(keep, _POINTS, replace=False))
         points = edges.points[keep] @ turn.T + position
-        parts.append((points, edges.normals[keep], np.full(len(keep), frame), edges.bodies[keep]))
+        parts.append(
+            (points, edges.normals[keep], np.full(len(keep), frame), edges.bodies[keep])
+        )
     return Outlines(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -101,7 +127,13 @@ def seen_from(view: TwinView, offset: np.ndarray, points: np.ndarray) -> np.ndar
 def pixels_of(seen: np.ndarray, at: Intrinsics) -> np.ndarray:
     """Project points ``seen`` (P, 3) [m] of the camera's frame to pixels (P, 2) as (u, v); NaN for points behind the camera."""
     depth = np.where(seen[:, 2] < 0, -seen[:, 2], np.nan)
-    return np.stack([at.cx_px + at.fx_px * seen[:, 0] / depth, at.cy_px - at.fy_px * seen[:, 1] / depth], axis=1)
+    return np.stack(
+        [
+            at.cx_px + at.fx_px * seen[:, 0] / depth,
+            at.cy_px - at.fy_px * seen[:, 1] / depth,
+        ],
+        axis=1,
+    )
 
 
 def match(drawn: Outlines, seen: np.ndarray, level: Level, reach_px: float) -> Matches:
@@ -112,7 +144,9 @@ def match(drawn: Outlines, seen: np.ndarray, level: Level, reach_px: float) -> M
     edges, across = np.zeros((len(pixels), 2)), np.zeros((len(pixels), 2))
     for frame, picture in enumerate(level.edges):
         mine = drawn.frames == frame
-        edges[mine], across[mine], found[mine] = picture.match(pixels[mine], drawn.normals[mine], reach_px)
+        edges[mine], across[mine], found[mine] = picture.match(
+            pixels[mine], drawn.normals[mine], reach_px
+        )
     return Matches(found, edges, across)
 
 
@@ -127,7 +161,14 @@ def space_slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarr
     """Derivatives (M, 3) of ``distances`` by the points' positions in the camera's frame [px/m]; ``seen`` (P, 3) as there."""
     x, y, z = seen[matches.found].T
     across = matches.across[matches.found] * [at.fx_px, at.fy_px]
-    return np.stack([-across[:, 0] / z, across[:, 1] / z, (across[:, 0] * x - across[:, 1] * y) / z**2], axis=1)
+    return np.stack(
+        [
+            -across[:, 0] / z,
+            across[:, 1] / z,
+            (across[:, 0] * x - across[:, 1] * y) / z**2,
+        ],
+        axis=1,
+    )
 
 
 def slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
@@ -141,18 +182,35 @@ def slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
 def moved(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Pose ``offset`` (6,) [rad, m] rotated and translated by ``step`` (6,) in its own frame; returns (6,)."""
     turn = Rotation.from_rotvec(offset[:3])
-    return np.r_[(turn * Rotation.from_rotvec(step[:3])).as_rotvec(), offset[3:] + turn.apply(step[3:])]
+    return np.r_[
+        (turn * Rotation.from_rotvec(step[:3])).as_rotvec(),
+        offset[3:] + turn.apply(step[3:]),
+    ]
 
 
-def solve(view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray) -> Solution:
+def solve(
+    view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray
+) -> Solution:
     """Fit the pose (6,) at which the outlines of the arms at ``joints`` (F, 14) [rad, m] coincide with the edges in ``levels``.
     ``start``: (6,) pose [rad, m]; many poses within 3° and 30 mm of it along each axis are compared first."""
-    reaches = _REACH_PX[-len(levels) :] if len(levels) > 1 else [_REACH_PX[0] + _REACH_PX[-1]]
-    tried = [_descend(view, joints, levels[0], reaches[0], one) for one in _starts(view, joints, levels[0], start)]
-    tried.sort(key=lambda solution: misfit(view, solution.offset, solution.outlines, levels[0]))
+    reaches = (
+        _REACH_PX[-len(levels) :] if len(levels) > 1 else [_REACH_PX[0] + _REACH_PX[-1]]
+    )
+    tried = [
+        _descend(view, joints, levels[0], reaches[0], one)
+        for one in _starts(view, joints, levels[0], start)
+    ]
+    tried.sort(
+        key=lambda solution: misfit(view, solution.offset, solution.outlines, levels[0])
+    )
     for level, reach_px in zip(levels[1:], reaches[1:], strict=True):
-        tried = [_descend(view, joints, level, reach_px, one.offset) for one in _distinct(tried)]
-        tried.sort(key=lambda solution: misfit(view, solution.offset, solution.outlines, level))
+        tried = [
+            _descend(view, joints, level, reach_px, one.offset)
+            for one in _distinct(tried)
+        ]
+        tried.sort(
+            key=lambda solution: misfit(view, solution.offset, solution.outlines, level)
+        )
     return tried[0]
 
 
@@ -160,7 +218,9 @@ def _distinct(tried: list[Solution]) -> list[Solution]:
     """The best few of solutions, best first, that are not one and the same: many starts end in one place."""
     chosen: list[Solution] = []
     for solution in tried:
-        if all((np.abs(solution.offset - other.offset) > _SAME).any() for other in chosen):
+        if all(
+            (np.abs(solution.offset - other.offset) > _SAME).any() for other in chosen
+        ):
             chosen.append(solution)
     return chosen[:_FOLLOWED]
 
@@ -171,10 +231,15 @@ def misfit(view: TwinView, offset: np.ndarray, drawn: Outlines, level: Level) ->
     seen = seen_from(view, offset, drawn.points)
     matches = match(drawn, seen, level, _FAR_PX)
     apart = np.abs(distances(seen, matches, level.intrinsics))
-    return float((np.minimum(apart / _FAR_PX, 1.0).sum() + (~matches.found).sum()) / max(len(seen), 1))
+    return float(
+        (np.minimum(apart / _FAR_PX, 1.0).sum() + (~matches.found).sum())
+        / max(len(seen), 1)
+    )
 
 
-def _starts(view: TwinView, joints: np.ndarray, level: Level, start: np.ndarray) -> list[np.ndarray]:
+def _starts(
+    view: TwinView, joints: np.ndarray, level: Level, start: np.ndarray
+) -> list[np.ndarray]:
     """``start`` and the best of many poses around it."""
     drawn = outlines(view, joints, start, level.intrinsics)
     spread = 2 * qmc.Sobol(6, rng=0).random(_TRIED) - 1
@@ -184,7 +249,11 @@ def _starts(view: TwinView, joints: np.ndarray, level: Level, start: np.ndarray)
 
 
 def _descend(
-    view: TwinView, joints: np.ndarray, level: Level, reaches_px: Sequence[float], start: np.ndarray
+    view: TwinView,
+    joints: np.ndarray,
+    level: Level,
+    reaches_px: Sequence[float],
+    start: np.ndarray,
 ) -> Solution:
     """Draw, match, move; the reach of matches shrinks from one drawing to the next."""
     offset = before = start
@@ -193,7 +262,10 @@ def _descend(
         drawn = outlines(view, joints, offset, level.intrinsics)
         for _ in range(_MATCHES):
             seen = seen_from(view, offset, drawn.points)
-            offset = moved(offset, _step(seen, match(drawn, seen, level, reach_px), level.intrinsics))
+            offset = moved(
+                offset,
+                _step(seen, match(drawn, seen, level, reach_px), level.intrinsics),
+            )
     drawn = outlines(view, joints, offset, level.intrinsics)
     matches = match(drawn, seen_from(view, offset, drawn.points), level, reaches_px[-1])
     return Solution(offset, offset - before, drawn, matches)

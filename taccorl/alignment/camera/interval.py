@@ -15,11 +15,27 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taccorl.alignment.camera.fit import Level, Solution, distances, moved, seen_from, slopes, space_slopes, weights
+from taccorl.alignment.camera.fit import (
+    Level,
+    Solution,
+    distances,
+    moved,
+    seen_from,
+    slopes,
+    space_slopes,
+    weights,
+)
 from taccorl.alignment.camera.view import TwinView
 from taccorl.robots import ROBOT
 
-AXES = ("turn about right", "turn about up", "turn about back", "shift right", "shift up", "shift back")
+AXES = (
+    "turn about right",
+    "turn about up",
+    "turn about back",
+    "shift right",
+    "shift up",
+    "shift back",
+)
 """Names of the six numbers of a pose: rotation vector [rad] about, and translation [m] along, the nominal camera's x, y, z."""
 SHAPE_M = 0.001
 """Standard deviation, along each axis, of the displacement of a body's outline from the twin's [m]. A choice: covers and fingers
@@ -59,13 +75,20 @@ class Covariance:
         components."""
         values, vectors = np.linalg.eigh(self.total / np.outer(WANTED, WANTED))
         along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
-        named = [k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE]
+        named = [
+            k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE
+        ]
         width = 1.96 * float(np.sqrt(values[-1]))
-        half = [f"{math.degrees(x):.2f}°" if k < 3 else f"{1e3 * x:.1f} mm" for k, x in enumerate(self.half_width)]
+        half = [
+            f"{math.degrees(x):.2f}°" if k < 3 else f"{1e3 * x:.1f} mm"
+            for k, x in enumerate(self.half_width)
+        ]
         return width, " together with ".join(f"{AXES[k]} (±{half[k]})" for k in named)
 
 
-def covariance(view: TwinView, joints: np.ndarray, level: Level, solution: Solution) -> Covariance | None:
+def covariance(
+    view: TwinView, joints: np.ndarray, level: Level, solution: Solution
+) -> Covariance | None:
     """Covariance of ``solution`` from the frames with joints (F, 14); None if the edges do not determine all six numbers."""
     seen = seen_from(view, solution.offset, solution.outlines.points)
     found = solution.matches.found
@@ -76,21 +99,42 @@ def covariance(view: TwinView, joints: np.ndarray, level: Level, solution: Solut
     if np.linalg.cond(information * np.outer(WANTED, WANTED)) > 1e10:
         return None
     frames, bodies = solution.outlines.frames[found], solution.outlines.bodies[found]
-    groups = np.unique(np.stack([frames, bodies], axis=1), axis=0, return_inverse=True)[1].ravel()
+    groups = np.unique(np.stack([frames, bodies], axis=1), axis=0, return_inverse=True)[
+        1
+    ].ravel()
     scores = np.zeros((groups.max() + 1, 6))
     np.add.at(scores, groups, weighted * apart[:, None])
     by_point = space_slopes(seen, solution.matches, level.intrinsics)
     shifts = _shifts(view, joints, solution.offset, seen[found], frames, bodies)
-    twin = np.stack([weighted.T @ (by_point * shift).sum(1) for shift in shifts])  # (sources, 6)
+    twin = np.stack(
+        [weighted.T @ (by_point * shift).sum(1) for shift in shifts]
+    )  # (sources, 6)
     few = len(scores) / max(len(scores) - 6, 1)
     # From a step in the camera's own frame to the pose's numbers.
-    bend = np.stack([moved(solution.offset, step) - solution.offset for step in 1e-6 * np.eye(6)], axis=1) / 1e-6
+    bend = (
+        np.stack(
+            [
+                moved(solution.offset, step) - solution.offset
+                for step in 1e-6 * np.eye(6)
+            ],
+            axis=1,
+        )
+        / 1e-6
+    )
     spread = bend @ np.linalg.inv(information)
-    return Covariance(noise=few * spread @ scores.T @ scores @ spread.T, twin=spread @ twin.T @ twin @ spread.T)
+    return Covariance(
+        noise=few * spread @ scores.T @ scores @ spread.T,
+        twin=spread @ twin.T @ twin @ spread.T,
+    )
 
 
 def _shifts(
-    view: TwinView, joints: np.ndarray, offset: np.ndarray, seen: np.ndarray, frames: np.ndarray, bodies: np.ndarray
+    view: TwinView,
+    joints: np.ndarray,
+    offset: np.ndarray,
+    seen: np.ndarray,
+    frames: np.ndarray,
+    bodies: np.ndarray,
 ) -> list[np.ndarray]:
     """How points ``seen`` (M, 3) of ``bodies`` (M,) in ``frames`` (M,) would move in the camera's frame [m], each
     source of error one standard deviation off: three axes of each body, then each joint."""
@@ -98,7 +142,9 @@ def _shifts(
     mount = model.body(view.camera.body).id
     position, turn = view.pose(offset)
     owners = np.unique(bodies)
-    found = np.zeros((3 * len(owners) + len(ROBOT.arms) * len(ROBOT.joints), len(seen), 3))
+    found = np.zeros(
+        (3 * len(owners) + len(ROBOT.arms) * len(ROBOT.joints), len(seen), 3)
+    )
     names = [f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints]
     for frame, row in enumerate(joints):
         view.place(row)
@@ -113,10 +159,17 @@ def _shifts(
         world = seen[here] @ world_from_camera.T + eye
         for j, name in enumerate(names):
             joint = model.joint(name).id
-            carried = np.array([_carries(model, joint, int(body)) for body in range(model.nbody)], float)
+            carried = np.array(
+                [_carries(model, joint, int(body)) for body in range(model.nbody)],
+                float,
+            )
             lever = np.cross(data.xaxis[joint], world - data.xanchor[joint])
-            relative = carried[bodies[here]] - carried[mount]  # a camera on the arm moves along
-            found[3 * len(owners) + j, here] = JOINT_RAD * (lever * relative[:, None]) @ world_from_camera
+            relative = (
+                carried[bodies[here]] - carried[mount]
+            )  # a camera on the arm moves along
+            found[3 * len(owners) + j, here] = (
+                JOINT_RAD * (lever * relative[:, None]) @ world_from_camera
+            )
     return list(found)
 
 

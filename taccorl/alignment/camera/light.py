@@ -21,7 +21,9 @@ from taccorl.sim.effects.cameras import toned
 from taccorl.sim.twin import TwinConfig
 
 _BLURS_PX = (1.0, 2.0)  # s₁, s₂
-_FROM_EDGE_PX = 4  # pixels closer to an edge of the twin are not compared: the fit is not perfect
+_FROM_EDGE_PX = (
+    4  # pixels closer to an edge of the twin are not compared: the fit is not perfect
+)
 _BINS = 24  # of the twin's grey values
 _FEWEST = 200  # pixels in a bin that counts
 _USED = (6.0, 249.0)  # grey values that are neither cut off nor noise alone
@@ -46,17 +48,28 @@ def camera_light(frames: CameraFrames, config: TwinConfig, camera: str) -> Light
     """Fit gain, gamma and blur of ``camera``, whose pose in the twin is already calibrated. Raises TaccorlError: there are fewer
     than three frames, the twin's or the given pictures have a single grey value, or no edge of the twin is in the pictures."""
     if len(frames.joints) < 3:
-        raise TaccorlError(f"{frames.name}: {len(frames.joints)} frames; brightness and blur need at least three")
+        raise TaccorlError(
+            f"{frames.name}: {len(frames.joints)} frames; brightness and blur need at least three"
+        )
     with TwinView(config, camera, frames.pictures.shape[1:3]) as view:
         inside = view.inside(frames.pictures)
         drawn = [view.picture(row, view.start) for row in frames.joints]
-        grey = [(_grey(one), _grey(other)) for one, other in zip(drawn, inside, strict=True)]
+        grey = [
+            (_grey(one), _grey(other)) for one, other in zip(drawn, inside, strict=True)
+        ]
         flat = [_flat(one) for one, _ in grey]
-        pairs = [(one[at], other[at]) for (one, other), at in zip(grey, flat, strict=True)]
-        tone = _over_frames(lambda chosen: _tone(*_joined(pairs, chosen), camera), len(pairs))
+        pairs = [
+            (one[at], other[at]) for (one, other), at in zip(grey, flat, strict=True)
+        ]
+        tone = _over_frames(
+            lambda chosen: _tone(*_joined(pairs, chosen), camera), len(pairs)
+        )
         widths = _widths(view, frames.joints, inside, drawn, camera)
         stream_px = view.camera.recording_size[1] / view.window.columns
-        blur = _over_frames(lambda chosen: np.array([_blur(widths, chosen)]), len(pairs)) * stream_px
+        blur = (
+            _over_frames(lambda chosen: np.array([_blur(widths, chosen)]), len(pairs))
+            * stream_px
+        )
     x, y = _joined(pairs, np.arange(len(pairs)))
     (gain, gamma), low, high = tone
     return LightFit(
@@ -77,12 +90,20 @@ def _grey(picture: np.ndarray) -> np.ndarray:
 
 def _flat(grey: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: away from every step in the twin's picture."""
-    steps = (cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, np.ones((3, 3))) > _LEAST_STEP).astype(np.uint8)
-    return cv2.dilate(steps, np.ones((2 * _FROM_EDGE_PX + 1, 2 * _FROM_EDGE_PX + 1))) == 0
+    steps = (
+        cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, np.ones((3, 3))) > _LEAST_STEP
+    ).astype(np.uint8)
+    return (
+        cv2.dilate(steps, np.ones((2 * _FROM_EDGE_PX + 1, 2 * _FROM_EDGE_PX + 1))) == 0
+    )
 
 
-def _joined(pairs: list[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.concatenate([pairs[k][0] for k in chosen]), np.concatenate([pairs[k][1] for k in chosen])
+def _joined(
+    pairs: list[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    return np.concatenate([pairs[k][0] for k in chosen]), np.concatenate(
+        [pairs[k][1] for k in chosen]
+    )
 
 
 def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
@@ -92,7 +113,9 @@ def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
     for k in np.unique(bin_of):
         mine = bin_of == k
         middle = float(np.median(x[mine])), float(np.median(y[mine]))
-        if mine.sum() >= _FEWEST and all(_USED[0] < value < _USED[1] for value in middle):
+        if mine.sum() >= _FEWEST and all(
+            _USED[0] < value < _USED[1] for value in middle
+        ):
             rows.append((*np.log(np.array(middle) / 255), mine.sum()))
     if len(rows) < 3:
         raise TaccorlError(
@@ -108,7 +131,11 @@ def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
 
 
 def _widths(
-    view: TwinView, joints: np.ndarray, pictures: np.ndarray, drawn: list[np.ndarray], camera: str
+    view: TwinView,
+    joints: np.ndarray,
+    pictures: np.ndarray,
+    drawn: list[np.ndarray],
+    camera: str,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """For each frame, of outlines that the picture has as edges: ratio of the gradients after two more blurs, in the picture
     and in the twin."""
@@ -121,7 +148,9 @@ def _widths(
     found = []
     for frame, (picture, twin) in enumerate(zip(pictures, drawn, strict=True)):
         mine = matches.found & (lines.frames == frame)
-        found.append((_flatter(picture, matches.edges[mine]), _flatter(twin, here[mine])))
+        found.append(
+            (_flatter(picture, matches.edges[mine]), _flatter(twin, here[mine]))
+        )
     if sum(len(one) for one, _ in found) < _FEWEST:
         none = "no edges of the arms are at their positions in the twin"
         raise TaccorlError(f"camera {camera}: {none}; fit the camera's pose first")
@@ -138,22 +167,35 @@ def _flatter(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         # The steepest of the pixels around: where exactly the edge runs need not be known.
         peak = cv2.dilate(size, np.ones((3, 3)))
         u, v = np.round(pixels).astype(int).T
-        sizes.append(peak[np.clip(v, 0, size.shape[0] - 1), np.clip(u, 0, size.shape[1] - 1)])
+        sizes.append(
+            peak[np.clip(v, 0, size.shape[0] - 1), np.clip(u, 0, size.shape[1] - 1)]
+        )
     strong = sizes[0] > _LEAST_STEP
     return sizes[0][strong] / sizes[1][strong]
 
 
 def _blur(widths: list[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray) -> float:
     """σ [px] of the pictures beyond the twin's, from how much edges flatten."""
-    flatter = (np.median(np.concatenate([widths[k][side] for k in chosen])) for side in (0, 1))
+    flatter = (
+        np.median(np.concatenate([widths[k][side] for k in chosen])) for side in (0, 1)
+    )
     first, second = (s**2 for s in _BLURS_PX)
-    picture, twin = ((second - r * first) / (r - 1) for r in (max(float(one), 1.001) ** 2 for one in flatter))
+    picture, twin = (
+        (second - r * first) / (r - 1)
+        for r in (max(float(one), 1.001) ** 2 for one in flatter)
+    )
     return float(np.sqrt(max(picture - twin, 0.0)))
 
 
-def _over_frames(estimate: Callable[[np.ndarray], np.ndarray], num_frames: int) -> np.ndarray:
+def _over_frames(
+    estimate: Callable[[np.ndarray], np.ndarray], num_frames: int
+) -> np.ndarray:
     """(3, numbers): the estimate from all frames, and its 95 % interval by a jackknife over them."""
     whole = estimate(np.arange(num_frames))
-    without = np.stack([estimate(np.delete(np.arange(num_frames), k)) for k in range(num_frames)])
-    error = np.sqrt((num_frames - 1) * np.mean((without - without.mean(0)) ** 2, axis=0))
+    without = np.stack(
+        [estimate(np.delete(np.arange(num_frames), k)) for k in range(num_frames)]
+    )
+    error = np.sqrt(
+        (num_frames - 1) * np.mean((without - without.mean(0)) ** 2, axis=0)
+    )
     return np.stack([whole, whole - 1.96 * error, whole + 1.96 * error])

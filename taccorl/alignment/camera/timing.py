@@ -24,7 +24,10 @@ from taccorl.sim.twin import TwinConfig
 EARLIEST_S, LATEST_S = -0.1, 0.3
 """Range of latencies that are searched [s]. A negative latency would mean pictures ahead of the joints: a clock error."""
 _STEP_S = 0.001
-_ROWS, _CELL = 60, 10  # pixels of the small pictures that are compared, and of the cells in which they are
+_ROWS, _CELL = (
+    60,
+    10,
+)  # pixels of the small pictures that are compared, and of the cells in which they are
 _BLOCK_S = 0.7  # of the bootstrap: longer than a movement's rise
 _DRAWS = 200
 _ALIKE = 0.5  # correlation below which two curves do not show the same motion
@@ -35,15 +38,23 @@ _FEWEST_S = 3.0
 class LatencyFit:
     """Estimated latency of a camera, with its interval."""
 
-    latency_s: float  # Latency [s]: a picture shows the scene at its time stamp minus this
-    interval_s: tuple[float, float]  # 95 % interval [s], by a bootstrap over blocks of pictures
+    latency_s: (
+        float  # Latency [s]: a picture shows the scene at its time stamp minus this
+    )
+    interval_s: tuple[
+        float, float
+    ]  # 95 % interval [s], by a bootstrap over blocks of pictures
     correlation: float
     """Correlation, at that latency, of the motion in the recorded pictures with the motion in the twin's pictures."""
     problems: tuple[str, ...]  # Reasons why the result is not valid; empty if it is
 
 
 def camera_latency(
-    pictures: Iterable[np.ndarray], time_s: np.ndarray, joints: np.ndarray, config: TwinConfig, camera: str
+    pictures: Iterable[np.ndarray],
+    time_s: np.ndarray,
+    joints: np.ndarray,
+    config: TwinConfig,
+    camera: str,
 ) -> LatencyFit:
     """Estimate the latency of ``camera`` from pictures T × (rows, columns, 3) uint8 with time stamps ``time_s`` (T,). ``joints``:
     (T, 14) rad, m, as reported at the same times. Raises TaccorlError: the pictures cover less than 3 s, times are not even, or
@@ -60,13 +71,22 @@ def camera_latency(
         )
     measured, twin = _changes(pictures, joints, config, camera)
     if len(measured) != len(time_s) - 1:
-        raise TaccorlError(f"camera {camera}: {len(measured) + 1} pictures for {len(time_s)} rows")
+        raise TaccorlError(
+            f"camera {camera}: {len(measured) + 1} pictures for {len(time_s)} rows"
+        )
     middle_s = (time_s[1:] + time_s[:-1]) / 2
-    shifts = np.arange(round(EARLIEST_S / _STEP_S), round(LATEST_S / _STEP_S) + 1) * _STEP_S
-    kept = (middle_s >= middle_s[0] + LATEST_S) & (middle_s <= middle_s[-1] + EARLIEST_S)
+    shifts = (
+        np.arange(round(EARLIEST_S / _STEP_S), round(LATEST_S / _STEP_S) + 1) * _STEP_S
+    )
+    kept = (middle_s >= middle_s[0] + LATEST_S) & (
+        middle_s <= middle_s[-1] + EARLIEST_S
+    )
     curve = CubicSpline(middle_s, twin)
     shifted = np.stack([curve(middle_s[kept] - shift) for shift in shifts])
-    one, other = measured[kept] - measured[kept].mean(0), shifted - shifted.mean(1, keepdims=True)
+    one, other = (
+        measured[kept] - measured[kept].mean(0),
+        shifted - shifted.mean(1, keepdims=True),
+    )
     moments = _Moments((other * one).sum(2), (other**2).sum(2), (one**2).sum(1))
     agree = _correlation(moments, np.ones(int(kept.sum())))
     best = int(np.argmax(agree))
@@ -90,8 +110,16 @@ def _changes(
     try:
         for picture, row in zip(pictures, joints, strict=False):
             if view is None:
-                view = TwinView(config, camera, (int(picture.shape[0]), int(picture.shape[1])))
-            now = [_small(image) for image in (view.inside(picture[None])[0], view.picture(row, view.start))]
+                view = TwinView(
+                    config, camera, (int(picture.shape[0]), int(picture.shape[1]))
+                )
+            now = [
+                _small(image)
+                for image in (
+                    view.inside(picture[None])[0],
+                    view.picture(row, view.start),
+                )
+            ]
             for changes, new, old in zip((measured, twin), now, before, strict=False):
                 changes.append(_cells(np.abs(new - old)))
             before = now
@@ -104,13 +132,17 @@ def _changes(
 def _small(picture: np.ndarray) -> np.ndarray:
     columns = round(_ROWS * picture.shape[1] / picture.shape[0])
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    return cv2.resize(gray, (columns, _ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.resize(gray, (columns, _ROWS), interpolation=cv2.INTER_AREA).astype(
+        np.float32
+    )
 
 
 def _cells(change: np.ndarray) -> np.ndarray:
     """(C,) mean of each whole cell of a picture."""
     rows, columns = (n // _CELL for n in change.shape)
-    cells = change[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
+    cells = change[: rows * _CELL, : columns * _CELL].reshape(
+        rows, _CELL, columns, _CELL
+    )
     return cells.mean(axis=(1, 3)).ravel()
 
 
@@ -136,11 +168,15 @@ def _bootstrap(moments: _Moments, block: int, shifts: np.ndarray) -> np.ndarray:
     best = []
     for _ in range(_DRAWS):
         drawn = np.bincount(rng.integers(0, num, num), minlength=num)
-        best.append(shifts[np.argmax(_correlation(moments, drawn[block_of].astype(float)))])
+        best.append(
+            shifts[np.argmax(_correlation(moments, drawn[block_of].astype(float)))]
+        )
     return np.array(best)
 
 
-def _problems(agree: np.ndarray, best: int, shifts: np.ndarray, twin: np.ndarray) -> tuple[str, ...]:
+def _problems(
+    agree: np.ndarray, best: int, shifts: np.ndarray, twin: np.ndarray
+) -> tuple[str, ...]:
     if np.ptp(twin, axis=0).max() < 0.5:
         return ("the arms hardly move in this view: record them going to and fro",)
     if agree[best] < _ALIKE:
@@ -149,5 +185,7 @@ def _problems(agree: np.ndarray, best: int, shifts: np.ndarray, twin: np.ndarray
             f"clock that is off by more than {LATEST_S:g} s, or something else moves in view",
         )
     if best in (0, len(shifts) - 1):
-        return (f"beyond {shifts[best]:g} s: the clocks of pictures and joints are not one; compare their stamps",)
+        return (
+            f"beyond {shifts[best]:g} s: the clocks of pictures and joints are not one; compare their stamps",
+        )
     return ()

@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
-from taccorl.sim.cameras import CameraConfig, CameraOffset, Window, add_cameras, letterbox_window, offset_pose
+from taccorl.sim.cameras import (
+    CameraConfig,
+    CameraOffset,
+    Window,
+    add_cameras,
+    letterbox_window,
+    offset_pose,
+)
 from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.rendering import Renderer, style
 from taccorl.sim.twin import TwinConfig, empty_bench
@@ -30,31 +37,51 @@ class TwinView:
     def __init__(self, config: TwinConfig, name: str, size: tuple[int, int]) -> None:
         cameras = {camera.name: camera for camera in config.cameras}
         if name not in cameras:
-            raise TaccorlError(f"camera {name!r} is not in the twin; {nearest(name, cameras)}")
+            raise TaccorlError(
+                f"camera {name!r} is not in the twin; {nearest(name, cameras)}"
+            )
         self.camera: CameraConfig = cameras[name]
         self.size = size
         self.window: Window = letterbox_window(self.camera.recording_size, size)
-        self.intrinsics = self.camera.recorded_intrinsics().scaled(self.window.rows, self.window.columns)
+        self.intrinsics = self.camera.recorded_intrinsics().scaled(
+            self.window.rows, self.window.columns
+        )
         """Intrinsics of the picture without its black bars."""
         spec = empty_bench(config)
         add_cameras(spec, [self.camera])
         style(spec)
         for effect in present(config.effects):
             if effect.slot == "camera" and name in effect.acts_on():
-                here = dataclasses.replace(effect, cameras=[name])  # it may act on cameras that this scene lacks
+                here = dataclasses.replace(
+                    effect, cameras=[name]
+                )  # it may act on cameras that this scene lacks
                 here.edit(spec, dataclasses.replace(config, cameras=[self.camera]))
         self.model = spec.compile()
-        self.model.cam_resolution[0] = 1  # not said: the view fills its frame, there are no bars
+        self.model.cam_resolution[0] = (
+            1  # not said: the view fills its frame, there are no bars
+        )
         self.data = mujoco.MjData(self.model)
-        self._encoder = AddedEffects(config.effects, self.data.time * np.ones(1)).encoder
-        self._joints = [self._qpos(f"{arm}_{joint}") for arm in ROBOT.arms for joint in ROBOT.joints]
-        self._fingers = [[self._qpos(f"{arm}_finger_{finger}") for finger in ROBOT.fingers] for arm in ROBOT.arms]
+        self._encoder = AddedEffects(
+            config.effects, self.data.time * np.ones(1)
+        ).encoder
+        self._joints = [
+            self._qpos(f"{arm}_{joint}") for arm in ROBOT.arms for joint in ROBOT.joints
+        ]
+        self._fingers = [
+            [self._qpos(f"{arm}_finger_{finger}") for finger in ROBOT.fingers]
+            for arm in ROBOT.arms
+        ]
         bare = dataclasses.replace(self.camera, offset=CameraOffset())
         self._nominal = bare.pose()
         turn = Rotation.from_quat(self.model.cam_quat[0], scalar_first=True).as_matrix()
         self.start = self.offset_of(self.model.cam_pos[0].copy(), turn)
         """(6,) camera pose in the twin: its offset, and the change by effects."""
-        self.robot = np.array([self.model.body(i).name.startswith(ROBOT.arms) for i in range(self.model.nbody)])
+        self.robot = np.array(
+            [
+                self.model.body(i).name.startswith(ROBOT.arms)
+                for i in range(self.model.nbody)
+            ]
+        )
         """(bodies,) bool: the body belongs to an arm."""
         self._renderers: dict[tuple[int, int], Renderer] = {}
 
@@ -77,7 +104,9 @@ class TwinView:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
 
-    def labels(self, joints: np.ndarray, offset: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    def labels(
+        self, joints: np.ndarray, offset: np.ndarray, rows: int, columns: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Body and depth of each pixel of a rendered picture. ``joints``: (14,) joint angles and gripper openings [rad, m].
         ``offset``: (6,) camera pose [rad, m]. Returns (rows, columns) int, index of the body that the pixel shows, 0 if it shows
         no arm; and (rows, columns), depth along the optical axis [m], infinite where nothing is shown."""
@@ -90,7 +119,9 @@ class TwinView:
         """Picture without bars, (rows, columns, 3) uint8 RGB, with the arms at ``joints`` (14,) [rad, m], the camera at
         ``offset`` (6,)."""
         self._turn(joints, offset)
-        return self._renderer(self.window.rows, self.window.columns).render([self.data])[0, 0]
+        return self._renderer(self.window.rows, self.window.columns).render(
+            [self.data]
+        )[0, 0]
 
     def inside(self, pictures: np.ndarray) -> np.ndarray:
         """The pictures (F, rows, columns, 3) without their black bars. Raises TaccorlError: the pictures have another size, or
@@ -105,7 +136,13 @@ class TwinView:
         bars = np.ones(self.size, dtype=bool)
         bars[cut[1:]] = False
         # Video blurs over the edge of a bar by a pixel or two.
-        bars = bars & np.roll(bars, 2, 0) & np.roll(bars, -2, 0) & np.roll(bars, 2, 1) & np.roll(bars, -2, 1)
+        bars = (
+            bars
+            & np.roll(bars, 2, 0)
+            & np.roll(bars, -2, 0)
+            & np.roll(bars, 2, 1)
+            & np.roll(bars, -2, 1)
+        )
         if bars.any() and np.percentile(pictures[:, bars], 95) > _BAR:
             stream = self.camera.recording_size
             raise TaccorlError(
@@ -129,7 +166,9 @@ class TwinView:
         self.close()
 
     def _turn(self, joints: np.ndarray, offset: np.ndarray) -> None:
-        self.model.cam_pos[0], self.model.cam_quat[0] = offset_pose(*self._nominal, as_offset(offset))
+        self.model.cam_pos[0], self.model.cam_quat[0] = offset_pose(
+            *self._nominal, as_offset(offset)
+        )
         self.place(joints)
         mujoco.mj_camlight(self.model, self.data)
 
@@ -138,10 +177,15 @@ class TwinView:
 
     def _renderer(self, rows: int, columns: int) -> Renderer:
         if (rows, columns) not in self._renderers:
-            self._renderers[rows, columns] = Renderer(self.model, [self.camera.name], rows, columns)
+            self._renderers[rows, columns] = Renderer(
+                self.model, [self.camera.name], rows, columns
+            )
         return self._renderers[rows, columns]
 
 
 def as_offset(offset: np.ndarray) -> CameraOffset:
     """The pose ``offset`` (6,) = (ω, t) [rad, m] as the ``CameraOffset`` of a ``CameraConfig``."""
-    return CameraOffset(rotation_rad=tuple(offset[:3].tolist()), translation_m=tuple(offset[3:].tolist()))
+    return CameraOffset(
+        rotation_rad=tuple(offset[:3].tolist()),
+        translation_m=tuple(offset[3:].tolist()),
+    )

@@ -27,7 +27,10 @@ SAME_WAY = 1.2
 LINEAR = 0.7
 """Correlation of load and reading from which on a recording's gain is known well enough for ``FACTOR``: noise of the load lowers
 a gain by the square of this at most."""
-PRESSED, REST = 0.3, 0.05  # Shares of a recording's largest load above which it is pressed, and below which it rests
+PRESSED, REST = (
+    0.3,
+    0.05,
+)  # Shares of a recording's largest load above which it is pressed, and below which it rests
 PIECES = 8  # Number of pieces into which the pressed rows of a recording are divided
 UNEVEN = 0.3
 """Change of the cells' shares of the load, RMS over cells in units of the mean share, from which on a load is not shared alike.
@@ -40,8 +43,15 @@ def dead_finding(s: CellSet) -> Iterator[Finding]:
     """Cells that hardly respond to a load that others respond to."""
     if not s.dead.any():
         return
-    named = [f"{s.config.names[k]} ({float(s.shares[k]):.1%})" for k in np.flatnonzero(s.dead)]
-    what = "dead, or not touched by the load that all cells share" if s.config.load.shared else "dead, or not connected"
+    named = [
+        f"{s.config.names[k]} ({float(s.shares[k]):.1%})"
+        for k in np.flatnonzero(s.dead)
+    ]
+    what = (
+        "dead, or not touched by the load that all cells share"
+        if s.config.load.shared
+        else "dead, or not connected"
+    )
     text = (
         f"{len(named)} of {s.config.num_cells} cells hardly respond: {listed(named, 12)} of the usual gain; {what}. They take no "
         "part in the search, and a corrected file has the gain 0 for them"
@@ -74,7 +84,11 @@ def exchanged_cells(s: CellSet) -> list[Exchanged]:
         cycle = []
         while k not in seen:
             seen.add(k)
-            cycle.append(Exchanged(k, load_of[k], float(remains[k, k]), float(remains[k, load_of[k]])))
+            cycle.append(
+                Exchanged(
+                    k, load_of[k], float(remains[k, k]), float(remains[k, load_of[k]])
+                )
+            )
             k = load_of[k]
         if all(e.own > EXCHANGED * e.other for e in cycle):
             found += cycle
@@ -87,11 +101,20 @@ def _remains(s: CellSet) -> np.ndarray:
     load = s.load - s.load.mean(axis=0)
     rows = s.free.T.astype(float)
     count = np.maximum(s.free.sum(axis=0), 1)
-    off = np.where(s.free, s.reading - np.where(s.free, s.reading, 0.0).sum(axis=0) / count, 0.0)
+    off = np.where(
+        s.free, s.reading - np.where(s.free, s.reading, 0.0).sum(axis=0) / count, 0.0
+    )
     power = rows @ np.square(load) - np.square(rows @ load) / count[:, None]
-    product, variance = s.config.sign * (off.T @ load), np.square(off).sum(axis=0)[:, None]
-    known = (power > 1e-9 * np.square(load).sum(axis=0)) & (variance > 0) & (product > 0)
-    explained = np.divide(np.square(product), power * variance, out=np.zeros(product.shape), where=known)
+    product, variance = (
+        s.config.sign * (off.T @ load),
+        np.square(off).sum(axis=0)[:, None],
+    )
+    known = (
+        (power > 1e-9 * np.square(load).sum(axis=0)) & (variance > 0) & (product > 0)
+    )
+    explained = np.divide(
+        np.square(product), power * variance, out=np.zeros(product.shape), where=known
+    )
     return np.maximum(1.0 - explained, 1e-9)
 
 
@@ -134,8 +157,13 @@ def other_gains(s: CellSet) -> Iterator[tuple[str, Finding]]:
     middle = min(order[(len(order) - 1) // 2], order[len(order) // 2])
     for n in known:
         ratio = gains[n] / gains[middle]
-        sizes = [float(np.log(r) * np.sign(np.log(ratio))) for r in _ratios(sums[n], sums[middle]) or [ratio]]
-        if min(abs(np.log(ratio)), max(sizes)) < np.log(FACTOR) or min(sizes) < np.log(SAME_WAY):
+        sizes = [
+            float(np.log(r) * np.sign(np.log(ratio)))
+            for r in _ratios(sums[n], sums[middle]) or [ratio]
+        ]
+        if min(abs(np.log(ratio)), max(sizes)) < np.log(FACTOR) or min(sizes) < np.log(
+            SAME_WAY
+        ):
             continue
         name, other = s.recordings[n].name, s.recordings[middle].name
         which = f"one of {name} and {other}" if len(known) == 2 else name
@@ -147,14 +175,29 @@ def other_gains(s: CellSet) -> Iterator[tuple[str, Finding]]:
         yield name, find("other_gain", "load", text)
 
 
-def _sums(config: CellsConfig, m: CellMeasurement, live: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sums(
+    config: CellsConfig, m: CellMeasurement, live: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(T, S) load, reading from rest, and usable rows. Under a shared load S is 1, the mean of all live cells: it does not depend
     on the place of a probe; else S is the number of live cells."""
-    load, reading, use = m.target[:, live], config.sign * m.measured[:, live], below_end(config, m)[:, live]
+    load, reading, use = (
+        m.target[:, live],
+        config.sign * m.measured[:, live],
+        below_end(config, m)[:, live],
+    )
     if config.load.shared:
-        load, reading, use = load[:, :1], reading.mean(axis=1, keepdims=True), np.all(use, axis=1, keepdims=True)
+        load, reading, use = (
+            load[:, :1],
+            reading.mean(axis=1, keepdims=True),
+            np.all(use, axis=1, keepdims=True),
+        )
     rest = np.where(use & (load <= REST * np.max(load, axis=0)), reading, np.nan)
-    level = np.array([np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else np.nan for c in rest.T])
+    level = np.array(
+        [
+            np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else np.nan
+            for c in rest.T
+        ]
+    )
     return load, reading - level, use
 
 
@@ -170,7 +213,9 @@ def _ratios(one: tuple, other: tuple) -> list[float]:
     """Ratios of the gains of two recordings in rows up to the same load, and up to the same reading; those that are known."""
     found = []
     for key in (0, 1):
-        highest = np.minimum(*(np.where(s[2], s[key], -np.inf).max(axis=0) for s in (one, other)))
+        highest = np.minimum(
+            *(np.where(s[2], s[key], -np.inf).max(axis=0) for s in (one, other))
+        )
         gains = [_gain(s[0], s[1], s[2] & (s[key] <= highest)) for s in (one, other)]
         found.append(gains[0] / gains[1])
     return [r for r in found if np.isfinite(r)]
@@ -179,7 +224,11 @@ def _ratios(one: tuple, other: tuple) -> list[float]:
 @check("warning", "uneven_load", needs="cells")
 def uneven_load(s: CellSet) -> Iterator[Finding]:
     """Cells' shares of a shared load that differ between recordings or within one; not where each cell has its own load."""
-    if not s.config.load.shared or s.config.num_cells < 2 or s.config.same_place_mm is not None:
+    if (
+        not s.config.load.shared
+        or s.config.num_cells < 2
+        or s.config.same_place_mm is not None
+    ):
         return
     pieces, of, noise = [], [], 0.0
     for m in s.recordings:
@@ -197,7 +246,9 @@ def uneven_load(s: CellSet) -> Iterator[Finding]:
     if not _change(shares) > least:
         return
     names = list(dict.fromkeys(of))
-    within = [name for name in names if _change(shares[[o == name for o in of]]) > least]
+    within = [
+        name for name in names if _change(shares[[o == name for o in of]]) > least
+    ]
     where = f"within {listed(within)}" if within else f"between {listed(names)}"
     text = (
         f"the load is not shared alike by the cells: their shares change {where}, by {_change(shares):.2g} of the mean share "
@@ -212,16 +263,25 @@ def _change(shares: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.square(shares - np.nanmean(shares, axis=0)))))
 
 
-def _patterns(config: CellsConfig, m: CellMeasurement) -> tuple[list[np.ndarray], float]:
+def _patterns(
+    config: CellsConfig, m: CellMeasurement
+) -> tuple[list[np.ndarray], float]:
     """(K,) mean reading from rest of every cell in each piece of the pressed rows, NaN for cells at an end of the converter, and
     the variation of the readings at rest as a share of the mean pattern. No pieces without rest or press."""
     load, use = m.target[:, 0], below_end(config, m)
-    pressed, rest = np.flatnonzero(load > PRESSED * load.max()), load < REST * load.max()
+    pressed, rest = (
+        np.flatnonzero(load > PRESSED * load.max()),
+        load < REST * load.max(),
+    )
     if len(pressed) < PIECES or rest.sum() < PIECES:
         return [], 0.0
     level = np.median(m.measured[rest], axis=0)
     found = [
-        np.where(use[rows].all(axis=0), config.sign * (m.measured[rows].mean(axis=0) - level), np.nan)
+        np.where(
+            use[rows].all(axis=0),
+            config.sign * (m.measured[rows].mean(axis=0) - level),
+            np.nan,
+        )
         for rows in np.array_split(pressed, PIECES)
     ]
     mean = float(np.nanmean(found)) if np.isfinite(found).any() else 0.0

@@ -26,18 +26,31 @@ def below_end(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
     """(T, K) bool: the reading is not at that end of the converter to which a load drives it. Readings without load may lie at
     the other end."""
     end = config.high if config.sign > 0 else config.low
-    return config.sign * (end - m.measured) > 0.5 * m.quantum + 1e-9 * np.abs(m.measured)
+    return config.sign * (end - m.measured) > 0.5 * m.quantum + 1e-9 * np.abs(
+        m.measured
+    )
 
 
-def slopes(x: np.ndarray, y: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def slopes(
+    x: np.ndarray, y: np.ndarray, use: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Least-squares slope of each column of ``y`` over that of ``x``, and their correlation, both (S,), in the rows that ``use``
     marks, all (T, S); NaN where nothing changes."""
     count = np.maximum(use.sum(axis=0), 1)
-    dx, dy = (np.where(use, v - np.where(use, v, 0.0).sum(axis=0) / count, 0.0) for v in (x, y))
+    dx, dy = (
+        np.where(use, v - np.where(use, v, 0.0).sum(axis=0) / count, 0.0)
+        for v in (x, y)
+    )
     xx, yy, xy = (dx * dx).sum(axis=0), (dy * dy).sum(axis=0), (dx * dy).sum(axis=0)
-    known = (xx > 1e-18 * np.square(x).sum(axis=0)) & (yy > 1e-18 * np.square(y).sum(axis=0)) & (count > 2)
+    known = (
+        (xx > 1e-18 * np.square(x).sum(axis=0))
+        & (yy > 1e-18 * np.square(y).sum(axis=0))
+        & (count > 2)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(known, xy / xx, np.nan), np.where(known, xy / np.sqrt(xx * yy), np.nan)
+        return np.where(known, xy / xx, np.nan), np.where(
+            known, xy / np.sqrt(xx * yy), np.nan
+        )
 
 
 @dataclass(frozen=True)
@@ -65,12 +78,17 @@ class CellSet:
     @cached_property
     def step_noise(self) -> np.ndarray:
         """(K,) standard deviation of the rounding of readings; above 0."""
-        return np.maximum(np.max([m.quantum for m in self.recordings], axis=0) / np.sqrt(12), 1e-12)
+        return np.maximum(
+            np.max([m.quantum for m in self.recordings], axis=0) / np.sqrt(12), 1e-12
+        )
 
     @cached_property
     def calibration(self) -> Calibration:
         """Least-squares gain and offset of each cell over all recordings, in rows below the end of the converter."""
-        pairs = [(loads(m), np.where(below_end(self.config, m), m.measured, np.nan)) for m in self.recordings]
+        pairs = [
+            (loads(m), np.where(below_end(self.config, m), m.measured, np.nan))
+            for m in self.recordings
+        ]
         return calibrated(self.config, pairs)
 
     @cached_property
@@ -81,10 +99,18 @@ class CellSet:
         than two cells are loaded or none responds."""
         sign = self.config.sign
         if self.config.same_place_mm is not None:
-            known = [np.where((m.place >= 0)[:, None], below_end(self.config, m), False) for m in self.recordings]
-            pairs = [(loads(m), np.where(k, m.measured, np.nan)) for m, k in zip(self.recordings, known, strict=True)]
+            known = [
+                np.where((m.place >= 0)[:, None], below_end(self.config, m), False)
+                for m in self.recordings
+            ]
+            pairs = [
+                (loads(m), np.where(k, m.measured, np.nan))
+                for m, k in zip(self.recordings, known, strict=True)
+            ]
             gain = np.max(sign * calibrated(self.config, pairs).gain, axis=1)
-            return gain / (float(np.median(gain[gain > 0])) if (gain > 0).any() else np.nan)
+            return gain / (
+                float(np.median(gain[gain > 0])) if (gain > 0).any() else np.nan
+            )
         stuck = np.ptp(self.reading, axis=0) == 0
         use = self.free | stuck  # a reading that never changes is no clipped one
         gain, correlation = slopes(self.load, self.reading, use)
@@ -95,9 +121,14 @@ class CellSet:
         if loaded.sum() < 2 or not responds.any():
             return np.full(len(gain), np.nan)
         usual = float(np.median(gain[responds]))
-        change, spread = (np.nanstd(np.where(use, v, np.nan), axis=0) for v in (self.load, self.reading))
+        change, spread = (
+            np.nanstd(np.where(use, v, np.nan), axis=0)
+            for v in (self.load, self.reading)
+        )
         rest = spread * np.sqrt(1 - np.square(np.nan_to_num(correlation)))
-        return np.where(loaded & (responds | (usual * change > CLEAR * rest)), gain / usual, np.nan)
+        return np.where(
+            loaded & (responds | (usual * change > CLEAR * rest)), gain / usual, np.nan
+        )
 
     @cached_property
     def dead(self) -> np.ndarray:

@@ -10,7 +10,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from taccorl.alignment.checks.cell_gains import dead_finding, exchanged_cells, exchanged_finding, other_gains
+from taccorl.alignment.checks.cell_gains import (
+    dead_finding,
+    exchanged_cells,
+    exchanged_finding,
+    other_gains,
+)
 from taccorl.alignment.checks.cell_set import DEAD, CellSet
 from taccorl.alignment.checks.registry import CHECKS, check, find, run
 from taccorl.alignment.machines.cell_model import loads, within_ends
@@ -34,33 +39,57 @@ TOO_MUCH, TOO_LITTLE = 3.0, 0.02
 
 
 def check_cells(
-    config: CellsConfig, measurements: Sequence[CellMeasurement], fit_names: Sequence[str]
+    config: CellsConfig,
+    measurements: Sequence[CellMeasurement],
+    fit_names: Sequence[str],
 ) -> dict[str, list[Finding]]:
     """Check the recordings of a sensor of cells. Returns recording → findings. A finding about all fit recordings together, and
     one about all recordings, is stored at the first of them. ``fit_names``: names of the fit recordings."""
-    found = {m.name: [*m.findings, *_of_recording(config, m), *place_findings(config, m)] for m in measurements}
-    fit, every = [m for m in measurements if m.name in fit_names], CellSet(config, measurements)
+    found = {
+        m.name: [*m.findings, *_of_recording(config, m), *place_findings(config, m)]
+        for m in measurements
+    }
+    fit, every = (
+        [m for m in measurements if m.name in fit_names],
+        CellSet(config, measurements),
+    )
     if not fit:
         return found
     first, *others = (m.name for m in fit)
     exchanged = list(exchanged_finding(every))
-    wrong = list(_together(CellSet(config, fit), {e.cell for e in exchanged_cells(every)}))
+    wrong = list(
+        _together(CellSet(config, fit), {e.cell for e in exchanged_cells(every)})
+    )
     found[first] += wrong
     together = f"all fit recordings together, see {first}"
     for name in others:
-        found[name] += [dataclasses.replace(f, text=f"{f.feature}: {together}") for f in wrong]
+        found[name] += [
+            dataclasses.replace(f, text=f"{f.feature}: {together}") for f in wrong
+        ]
     for name, finding in other_gains(every):
         found[name].append(finding)
     explained = {name for f in exchanged for name in CHECKS[f.check].explains}
-    found[first] += [*exchanged, *(f for f in warnings_of_all(config, fit, measurements) if f.check not in explained)]
+    found[first] += [
+        *exchanged,
+        *(
+            f
+            for f in warnings_of_all(config, fit, measurements)
+            if f.check not in explained
+        ),
+    ]
     return found
 
 
 def warnings_of_all(
-    config: CellsConfig, fit: Sequence[CellMeasurement], measurements: Sequence[CellMeasurement]
+    config: CellsConfig,
+    fit: Sequence[CellMeasurement],
+    measurements: Sequence[CellMeasurement],
 ) -> list[Finding]:
     """Warnings about the recordings together, of which the fit recordings show dead cells."""
-    return [*dead_finding(CellSet(config, fit)), *run("cells", CellSet(config, measurements))]
+    return [
+        *dead_finding(CellSet(config, fit)),
+        *run("cells", CellSet(config, measurements)),
+    ]
 
 
 @check("error", "other_rate", "load_held", "load_unit", "beyond_ends")
@@ -82,7 +111,9 @@ def _of_recording(config: CellsConfig, m: CellMeasurement) -> Iterator[Finding]:
             "unit? Write it in a columns file, or correct `rated`"
         )
         yield find("load_unit", "load", text)
-    over = (m.measured > config.high + m.quantum) | (m.measured < config.low - m.quantum)
+    over = (m.measured > config.high + m.quantum) | (
+        m.measured < config.low - m.quantum
+    )
     if over.any():
         k = int(np.argmax(over.any(axis=0)))
         own, name = m.measured[:, k], m.signals[k]
@@ -110,7 +141,9 @@ def _together(s: CellSet, exchanged: set[int]) -> Iterator[Finding]:
     if float(load.max()) < TOO_LITTLE * rated:
         text = f"the load reaches {load.max():.3g} {unit} of {rated:g} {unit} rated: is the column in another unit?"
         yield find("load_unit", "load", text)
-    if ((load < UNLOADED * rated).sum(axis=0) * s.recordings[0].period_s < REST_S).any():
+    if (
+        (load < UNLOADED * rated).sum(axis=0) * s.recordings[0].period_s < REST_S
+    ).any():
         text = (
             f"less than {REST_S:g} s without load (below {UNLOADED * rated:.3g} {unit}): offset and gain cannot be told apart. "
             "Record 2 s of nothing before and after each press; a load cell with an offset must be zeroed first"
@@ -129,14 +162,22 @@ def _together(s: CellSet, exchanged: set[int]) -> Iterator[Finding]:
             )
             yield find("saturated", name, text)
         elif use.sum() < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
-            if loaded.any() and not s.dead[k]:  # which is a warning where others respond
+            if (
+                loaded.any() and not s.dead[k]
+            ):  # which is a warning where others respond
                 text = (
                     f"{name}: the reading never changes under load: a broken wire, or the column of another channel; the search "
                     "leaves such a cell out with --accept=no_reading"
                 )
                 yield find("no_reading", name, text)
-        elif not weak[k] and k not in exchanged and config.sign * np.corrcoef(x, y)[0, 1] < WRONG_WAY:
-            way, write = ("rises", "false") if config.reading.falls else ("falls", "true")
+        elif (
+            not weak[k]
+            and k not in exchanged
+            and config.sign * np.corrcoef(x, y)[0, 1] < WRONG_WAY
+        ):
+            way, write = (
+                ("rises", "false") if config.reading.falls else ("falls", "true")
+            )
             text = f"{name}: the reading {way} under load; write `falls: {write}` below `reading:` in the cells file"
             yield find("wrong_sign", name, text)
 
@@ -148,7 +189,10 @@ def _held_rows(m: CellMeasurement) -> int:
         return 0
     steps = np.diff(changes)
     size = int(np.median(steps))
-    if size < FEWEST_HELD or np.mean(np.abs(steps / size - np.round(steps / size)) < 1e-9) < HELD:
+    if (
+        size < FEWEST_HELD
+        or np.mean(np.abs(steps / size - np.round(steps / size)) < 1e-9) < HELD
+    ):
         return 0
     return size if np.mean(steps == size) > 0.5 else 0
 
@@ -189,15 +233,24 @@ def other_offsets(s: CellSet) -> Iterator[Finding]:
         return
     rests = [_without_load(s, m)[rows] for m, rows in unloaded]
     offset = np.array([np.median(rest, axis=0) for rest in rests])  # (N, K)
-    step = np.maximum(np.max([m.quantum for m, _ in unloaded], axis=0) / np.sqrt(12), 1e-12)
-    noise = np.maximum(np.sqrt(np.mean([np.var(rest, axis=0) for rest in rests], axis=0)), step)
+    step = np.maximum(
+        np.max([m.quantum for m, _ in unloaded], axis=0) / np.sqrt(12), 1e-12
+    )
+    noise = np.maximum(
+        np.sqrt(np.mean([np.var(rest, axis=0) for rest in rests], axis=0)), step
+    )
     widest = int(np.argmax(np.ptp(offset, axis=0) / noise))
-    one, other = sorted((int(np.argmin(offset[:, widest])), int(np.argmax(offset[:, widest]))))
+    one, other = sorted(
+        (int(np.argmin(offset[:, widest])), int(np.argmax(offset[:, widest])))
+    )
     change = offset[other] - offset[one]
     differ = np.flatnonzero(np.abs(change) > OTHER_OFFSET * noise)
     if not len(differ):
         return
-    typical, floors = float(np.median(change[differ])), float(np.median(np.abs(change / noise)[differ]))
+    typical, floors = (
+        float(np.median(change[differ])),
+        float(np.median(np.abs(change / noise)[differ])),
+    )
     text = (
         f"the offset of {s.some(differ)} differs between recordings {unloaded[one][0].name} and {unloaded[other][0].name}, by "
         f"{typical:+.3g} {s.config.reading.unit}, {floors:.3g} times the noise at rest (medians of these cells). The model has "
@@ -213,22 +266,34 @@ def falls_below_rest(s: CellSet) -> Iterator[Finding]:
     then act below rest. Not where the cells file says so (``below_rest``)."""
     if s.config.reading.below_rest:
         return
-    falls: list[np.ndarray] = []  # (K,) of every release, in standard deviations of the noise
-    returns: list[np.ndarray] = []  # (K,) share of each fall that is gone at the end of the rest
+    falls: list[
+        np.ndarray
+    ] = []  # (K,) of every release, in standard deviations of the noise
+    returns: list[
+        np.ndarray
+    ] = []  # (K,) share of each fall that is gone at the end of the rest
     for m in s.recordings:
         first = _first_unloaded(s, m)
         if not len(first):
             continue
         rest = _without_load(s, m)
         off = s.config.sign * (rest - np.median(rest[first], axis=0))
-        noise = np.maximum(np.std(off[first], axis=0), np.maximum(m.quantum / np.sqrt(12), 1e-12))
-        for begin, end in runs(np.asarray((m.target < UNLOADED * s.config.load.rated).all(axis=1))):
+        noise = np.maximum(
+            np.std(off[first], axis=0), np.maximum(m.quantum / np.sqrt(12), 1e-12)
+        )
+        for begin, end in runs(
+            np.asarray((m.target < UNLOADED * s.config.load.rated).all(axis=1))
+        ):
             early, late = (begin + round(seconds * m.rate_hz) for seconds in RELEASED_S)
             if begin == 0 or end - begin < LONG_S * m.rate_hz or late == early:
                 continue
             fall = -np.mean(off[early:late], axis=0)
             falls.append(fall / noise)
-            returns.append(1 + np.mean(off[end - (late - early) : end], axis=0) / np.maximum(fall, noise))
+            returns.append(
+                1
+                + np.mean(off[end - (late - early) : end], axis=0)
+                / np.maximum(fall, noise)
+            )
     if not falls:
         return
     fall, back = np.median(falls, axis=0), np.median(returns, axis=0)
@@ -252,8 +317,14 @@ def _without_load(s: CellSet, m: CellMeasurement) -> np.ndarray:
 def _first_unloaded(s: CellSet, m: CellMeasurement) -> np.ndarray:
     """Numbers of the rows of the first ``FIRST_S`` before any load; empty if they are less than ``LEAST_S``."""
     loaded = np.flatnonzero((m.target > UNLOADED * s.config.load.rated).any(axis=1))
-    end_s = min(FIRST_S, float(m.time_s[loaded[0]] - m.time_s[0]) if len(loaded) else FIRST_S)
-    return np.flatnonzero(m.time_s - m.time_s[0] < end_s) if end_s >= LEAST_S else np.empty(0, dtype=int)
+    end_s = min(
+        FIRST_S, float(m.time_s[loaded[0]] - m.time_s[0]) if len(loaded) else FIRST_S
+    )
+    return (
+        np.flatnonzero(m.time_s - m.time_s[0] < end_s)
+        if end_s >= LEAST_S
+        else np.empty(0, dtype=int)
+    )
 
 
 @check("warning", "plateau", needs="cells")
@@ -264,8 +335,12 @@ def plateaus(s: CellSet) -> Iterator[Finding]:
     if s.config.same_place_mm is not None:
         return
     second = np.concatenate([np.diff(m.measured, n=2, axis=0) for m in s.recordings])
-    noise = np.maximum(1.4826 * np.median(np.abs(second), axis=0) / np.sqrt(6), s.step_noise)
-    found: list[tuple[int, np.ndarray, float, float]] = []  # cell, its readings and first and last load on the plateau
+    noise = np.maximum(
+        1.4826 * np.median(np.abs(second), axis=0) / np.sqrt(6), s.step_noise
+    )
+    found: list[
+        tuple[int, np.ndarray, float, float]
+    ] = []  # cell, its readings and first and last load on the plateau
     for k in range(s.config.num_cells):
         x, y = s.load[s.free[:, k], k], s.config.sign * s.reading[s.free[:, k], k]
         if len(y) < 2 * LEAST_ROWS:
@@ -277,15 +352,25 @@ def plateaus(s: CellSet) -> Iterator[Finding]:
         first, last = np.quantile(x[on], (0.05, 0.95))
         gain = float(np.polyfit(x[~on], y[~on], 1)[0])
         flat = np.mean(y[on] < level + WIDTH * noise[k]) > ALL
-        if flat and gain * (last - first) > LONG * 2 * WIDTH * noise[k] and np.mean(on[x >= first]) > ALL:
+        if (
+            flat
+            and gain * (last - first) > LONG * 2 * WIDTH * noise[k]
+            and np.mean(on[x >= first]) > ALL
+        ):
             found.append((k, s.config.sign * y[on], float(first), float(last)))
     if not found:
         return
     unit, of_load = s.config.reading.unit, s.config.load.unit
     levels = [float(np.median(y)) for _, y, _, _ in found]
-    first, last = (float(np.median(x)) for x in ([f[2] for f in found], [f[3] for f in found]))
-    one = len(set(levels)) == 1 and all(np.mean(y == levels[0]) > ALL for _, y, _, _ in found)
-    key, end = ("highest", s.config.high) if s.config.sign > 0 else ("lowest", s.config.low)
+    first, last = (
+        float(np.median(x)) for x in ([f[2] for f in found], [f[3] for f in found])
+    )
+    one = len(set(levels)) == 1 and all(
+        np.mean(y == levels[0]) > ALL for _, y, _, _ in found
+    )
+    key, end = (
+        ("highest", s.config.high) if s.config.sign > 0 else ("lowest", s.config.low)
+    )
     at = f"{min(levels):.5g}" if one else f"{min(levels):.5g} … {max(levels):.5g}"
     way = (
         f"write `{key}: {levels[0]:.7g}` below `reading:` in the cells file"
@@ -312,18 +397,31 @@ def shifted_loads(s: CellSet) -> Iterator[Finding]:
     rows, columns = s.config.shape
     if s.config.load.shared or min(rows, columns) < 3:
         return
-    rate = np.concatenate([np.gradient(loads(m), m.period_s, axis=0) for m in s.recordings])
-    f, gain, offset = s.load.reshape(-1, rows, columns), s.calibration.gain, s.calibration.offset
+    rate = np.concatenate(
+        [np.gradient(loads(m), m.period_s, axis=0) for m in s.recordings]
+    )
+    f, gain, offset = (
+        s.load.reshape(-1, rows, columns),
+        s.calibration.gain,
+        s.calibration.offset,
+    )
     terms = []
     for k in np.flatnonzero(~s.dead & (s.config.sign * gain > 0)):
         i, j = divmod(int(k), columns)
         if not (0 < i < rows - 1 and 0 < j < columns - 1):
             continue
-        above, below, before, after = f[:, i - 1, j], f[:, i + 1, j], f[:, i, j - 1], f[:, i, j + 1]
+        above, below, before, after = (
+            f[:, i - 1, j],
+            f[:, i + 1, j],
+            f[:, i, j - 1],
+            f[:, i, j + 1],
+        )
         blur = (above + below + before + after) / 4 - f[:, i, j]
         rest = (s.reading[:, k] - offset[k]) / gain[k] - s.load[:, k]
         own = np.column_stack([np.ones(len(f)), s.load[:, k], rate[:, k]])[s.free[:, k]]
-        both = np.column_stack([(above - below) / 2, (before - after) / 2, blur, rest])[s.free[:, k]]
+        both = np.column_stack([(above - below) / 2, (before - after) / 2, blur, rest])[
+            s.free[:, k]
+        ]
         terms.append(both - own @ np.linalg.lstsq(own, both, rcond=None)[0])
     given, rest = np.split(np.concatenate([np.empty((0, 4)), *terms]), [3], axis=1)
     power = float(np.square(rest).sum())

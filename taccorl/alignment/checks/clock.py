@@ -17,7 +17,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from taccorl.alignment.checks import first_order
-from taccorl.alignment.checks.first_order import REST_S, Shift, delay_between, fit_first_order
+from taccorl.alignment.checks.first_order import (
+    REST_S,
+    Shift,
+    delay_between,
+    fit_first_order,
+)
 from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
@@ -40,7 +45,9 @@ EXCHANGED_COLUMNS = "exchanged_target"
 """Check whose findings state that the columns of target and position are exchanged."""
 SURE = 4.0  # Number of standard deviations above which an offset is significant
 HALF_ROW_MOST = 0.75  # A lead below this [rows] can arise because the replay holds targets that the drive interpolated
-LEAD_ROWS = 0.3  # Least lead that is reported [rows]; a smaller one can be an error of the fit
+LEAD_ROWS = (
+    0.3  # Least lead that is reported [rows]; a smaller one can be an error of the fit
+)
 HIDDEN = 3.0
 """A shift is ignored if it alone would leave so many times what measurement and replay differ by: other numbers would have to
 hide it. A choice."""
@@ -62,7 +69,9 @@ FITTING = 3.0
 FITTING_ROWS = 0.05
 """A first-order lag also describes a joint if its residual is below this share of that of an offset of one row; the delay is
 then wrong by a sixth of a row at most."""
-STEP_FLOORS = 8.0  # Least motion in the first row after a step for judging it [noise floors]
+STEP_FLOORS = (
+    8.0  # Least motion in the first row after a step for judging it [noise floors]
+)
 EXCHANGED = 0.7
 """Columns of target and position are exchanged if the residual of a lag fitted from position to target is below this share of
 that from target to position."""
@@ -84,7 +93,11 @@ def check_clock(t: Trial) -> Iterator[Finding]:
     m, even = t.m, t.even
     stepped = _early_steps(t)
     for name, rows in stepped.items():
-        where = "before the row of its step" if t.early_rows(name) else "where its step is only commanded"
+        where = (
+            "before the row of its step"
+            if t.early_rows(name)
+            else "where its step is only commanded"
+        )
         text = (
             f"{name} has moved at row {rows[0]} ({m.time_s[rows[0]]:.3f} s), {where} ({len(rows)} such "
             f"steps): one row or more too early. {_earlier_targets(m, m.period_s)}, or log both by one clock"
@@ -101,13 +114,34 @@ def check_clock(t: Trial) -> Iterator[Finding]:
         judged = True
         if name in stepped:
             continue
-        lag = find_lag(target[:, None] * factor, measured[:, None] * factor, max(1, round(even.rate_hz)))
-        delay, early_s = f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms", t.early_rows(name) * row_s
-        if lag.correlation >= LAG_SURE and lag.lag_s < -0.5 * row_s - early_s:  # velocities of steps hardly correlate
-            if _exchanged(target, measured, even.period_s, -lag.lag_s, find_quantum(m.target[:, j]), m.quantum[j]):
+        lag = find_lag(
+            target[:, None] * factor,
+            measured[:, None] * factor,
+            max(1, round(even.rate_hz)),
+        )
+        delay, early_s = (
+            f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms",
+            t.early_rows(name) * row_s,
+        )
+        if (
+            lag.correlation >= LAG_SURE and lag.lag_s < -0.5 * row_s - early_s
+        ):  # velocities of steps hardly correlate
+            if _exchanged(
+                target,
+                measured,
+                even.period_s,
+                -lag.lag_s,
+                find_quantum(m.target[:, j]),
+                m.quantum[j],
+            ):
                 yield _exchange(name, -lag.lag_s, m)
             else:
-                yield _lead(name, -lag.lag_s, m, "its movement correlates best with a later command")
+                yield _lead(
+                    name,
+                    -lag.lag_s,
+                    m,
+                    "its movement correlates best with a later command",
+                )
         elif far := first_order.far_delay(even.target[:, j], measured, even.period_s):
             text = (
                 f"{name} answers its target {far.delay_s:.2f} s late ({far.delay_s / row_s:.0f} rows, then a lag of "
@@ -118,9 +152,16 @@ def check_clock(t: Trial) -> Iterator[Finding]:
             yield find("late_answer", name, text, severity="warning", topic=FAR)
         elif not fit.rms < max(FITTING * t.floor[name], FITTING_ROWS * fit.row_rms):
             why = f"it shows in steps; {_steps_wanted(m, name, t.floor[name])}"
-            yield not_judged(name, f"an offset of one row ({row_s * 1e3:.1f} ms)", why, CLOCK)
+            yield not_judged(
+                name, f"an offset of one row ({row_s * 1e3:.1f} ms)", why, CLOCK
+            )
         elif fit.delay_s + SURE * fit.delay_sd_s < -LEAD_ROWS * row_s - early_s:
-            yield _lead(name, -fit.delay_s, m, f"lag {fit.time_constant_s * 1e3:.1f} ms, delay {delay}")
+            yield _lead(
+                name,
+                -fit.delay_s,
+                m,
+                f"lag {fit.time_constant_s * 1e3:.1f} ms, delay {delay}",
+            )
         elif fit.delay_s - SURE * fit.delay_sd_s > LATE_ROWS * row_s:
             text = (
                 f"{name} answers its target after a delay of {delay} ({fit.delay_s / row_s:.1f} rows), then with a lag "
@@ -130,17 +171,32 @@ def check_clock(t: Trial) -> Iterator[Finding]:
             )
             yield find("late_answer", name, text)
     if not judged:
-        yield not_judged("", "clock of command and measurement", "no joint moves enough to tell")
+        yield not_judged(
+            "", "clock of command and measurement", "no joint moves enough to tell"
+        )
 
 
 @check("error", "late_recording")
-def check_late_recordings(recordings: Sequence[Measurement], found: dict[str, list[Finding]]) -> None:
+def check_late_recordings(
+    recordings: Sequence[Measurement], found: dict[str, list[Finding]]
+) -> None:
     """Turn far delays of signals that answer at once in at least as many other recordings into errors: a robot's own delay is in
     all of them. Changes ``found``, name of a recording → its findings."""
-    far = {(m.name, f.feature): f for m in recordings for f in found[m.name] if f.topic == FAR}
+    far = {
+        (m.name, f.feature): f
+        for m in recordings
+        for f in found[m.name]
+        if f.topic == FAR
+    }
     for signal in {feature for _, feature in far}:
         late = [m for m in recordings if (m.name, signal) in far]
-        sound = [m for m in recordings if signal in m.signals and m not in late and m.column(signal) in Trial(m).moving]
+        sound = [
+            m
+            for m in recordings
+            if signal in m.signals
+            and m not in late
+            and m.column(signal) in Trial(m).moving
+        ]
         if len(late) > len(sound) or not sound:
             continue
         for m in late:
@@ -149,7 +205,10 @@ def check_late_recordings(recordings: Sequence[Measurement], found: dict[str, li
                 f"{old.text.partition(': positions')[0]}, and not in {len(sound)} other recordings ({sound[0].name} …): the "
                 f"clock of this one is off, or columns are shifted. {_earlier_positions(m).capitalize()}, or leave this one out"
             )
-            found[m.name] = [find("late_recording", signal, text) if f is old else f for f in found[m.name]]
+            found[m.name] = [
+                find("late_recording", signal, text) if f is old else f
+                for f in found[m.name]
+            ]
 
 
 def _until_stopped(m: Measurement, j: int) -> np.ndarray:
@@ -157,10 +216,16 @@ def _until_stopped(m: Measurement, j: int) -> np.ndarray:
 
     A joint is stopped where it stands within ``BLOCKED_RAD`` / 5 for ``BLOCKED_S`` while its target is ``BLOCKED_RAD`` (a tenth
     of it in m) or more beyond; friction and lag leave less of a joint that stands."""
-    target, measured = m.target[:, j].copy(), np.nan_to_num(m.measured[:, j], nan=np.inf)
+    target, measured = (
+        m.target[:, j].copy(),
+        np.nan_to_num(m.measured[:, j], nan=np.inf),
+    )
     beyond, rows = BLOCKED_RAD / scale(m, j), max(2, round(BLOCKED_S / m.period_s))
     with np.errstate(invalid="ignore"):
-        still = maximum_filter1d(measured, rows) - minimum_filter1d(measured, rows) < 0.2 * beyond
+        still = (
+            maximum_filter1d(measured, rows) - minimum_filter1d(measured, rows)
+            < 0.2 * beyond
+        )
     for side in (1.0, -1.0):
         for first, end in runs(still & (side * (target - measured) > beyond)):
             at = float(np.median(measured[first:end]))
@@ -180,8 +245,17 @@ def _early_steps(t: Trial) -> dict[str, list[int]]:
     for j in t.moving:
         floor, first = t.floor[m.signals[j]], t.early_rows(m.signals[j])
         large = np.flatnonzero(np.abs(changes[:, j]) > _least_step(m, floor)) + 1
-        steps = [int(k) for k in large if k > before and still[k - 1 - before : k - 1].all()]
-        seen = [(k - first, m.measured[k - 1 - before : k + 1 - first, j], changes[k - 1, j]) for k in steps]
+        steps = [
+            int(k) for k in large if k > before and still[k - 1 - before : k - 1].all()
+        ]
+        seen = [
+            (
+                k - first,
+                m.measured[k - 1 - before : k + 1 - first, j],
+                changes[k - 1, j],
+            )
+            for k in steps
+        ]
         early = [k for k, values, step in seen if _moved(values, settle, step, floor)]
         if early and len(early) >= len(steps) / 2:
             found[m.signals[j]] = early
@@ -200,8 +274,12 @@ def _moved(values: np.ndarray, settle: int, step: float, floor: float) -> bool:
     if not np.isfinite(values).all() or len(past) < 5:
         return False
     line = np.polynomial.polynomial.polyfit(past, rest, 1)
-    noise = max(floor, float(np.std(rest - np.polynomial.polynomial.polyval(past, line))))
-    gone = (values[-1] - np.polynomial.polynomial.polyval(len(values) - 1, line)) * np.sign(step)
+    noise = max(
+        floor, float(np.std(rest - np.polynomial.polynomial.polyval(past, line)))
+    )
+    gone = (
+        values[-1] - np.polynomial.polynomial.polyval(len(values) - 1, line)
+    ) * np.sign(step)
     return bool(gone > (SURE + 1) * 1.5 * noise)
 
 
@@ -232,7 +310,13 @@ def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
     return find(EXCHANGED_COLUMNS, signal, text)
 
 
-def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s: float, *steps: float) -> bool:
+def _exchanged(
+    target: np.ndarray,
+    measured: np.ndarray,
+    period_s: float,
+    lead_s: float,
+    *steps: float,
+) -> bool:
     """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
 
     Noise of one beside none of the other decides (``steps``: of both encoders). Else a lag is fitted both ways, without the lead.
@@ -256,13 +340,19 @@ def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s
 def _earlier_positions(m: Measurement) -> str:
     """Text: the correction for positions that are late."""
     otherwise = "correct `latency_s` of the state's channel in the recording spec"
-    return write(m, "shift the position columns against time, or log both by one clock", otherwise)
+    return write(
+        m,
+        "shift the position columns against time, or log both by one clock",
+        otherwise,
+    )
 
 
 def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> str:
     """Text: the correction for positions that are ``lead_s`` [s] ahead of their targets.
     ``whole``: the joint's own lag is not in ``lead_s``. Otherwise it hides a part of the offset, and rows are rounded up."""
-    rows = max(1, round(lead_s / m.period_s)) if whole else math.ceil(lead_s / m.period_s)
+    rows = (
+        max(1, round(lead_s / m.period_s)) if whole else math.ceil(lead_s / m.period_s)
+    )
     if is_table(m):
         return f"Write `target_rows_late: {rows}`{'' if whole else ' (or more)'} into the columns file"
     if (m.source / "meta" / "info.json").is_file():
@@ -307,29 +397,54 @@ def check_against_twin(
                 shift = delay_between(*rows, period_s, changed(name))
             plain = first_order.pure_shift(*rows[1:], period_s)
         except TaccorlError as error:
-            findings.append(not_judged(name, "its offset in time from the twin", str(error), CLOCK))
+            findings.append(
+                not_judged(name, "its offset in time from the twin", str(error), CLOCK)
+            )
             continue
-        is_plain = plain.rms <= SAME_FIT * shift.rms  # nothing else is needed beside a shift
+        is_plain = (
+            plain.rms <= SAME_FIT * shift.rms
+        )  # nothing else is needed beside a shift
         if is_plain and plain.delay_s > 0:
             shift = plain
-        elif _is_late(shift, period_s) and not _is_late(delay_between(*rows, period_s, changed(name)), period_s):
-            shift = dataclasses.replace(plain, row_rms=0.0)  # other numbers explain it without a delay
+        elif _is_late(shift, period_s) and not _is_late(
+            delay_between(*rows, period_s, changed(name)), period_s
+        ):
+            shift = dataclasses.replace(
+                plain, row_rms=0.0
+            )  # other numbers explain it without a delay
         hidden = HIDDEN * np.nanstd(rows[1] - rows[2])
-        contrary = _leads(shift, period_s) and _is_late(plain, period_s)  # so friction looks beside a longer lag
-        if contrary or shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
+        contrary = _leads(shift, period_s) and _is_late(
+            plain, period_s
+        )  # so friction looks beside a longer lag
+        if contrary or shift.rms > max(
+            FITTING * floor[name], FITTING_ROWS * shift.row_rms
+        ):
             why = f"look for the missing effect first, which leaves {plain.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
             findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
-        elif name not in uncertain and abs(shift.delay_s) / period_s * shift.row_rms > hidden:
+        elif (
+            name not in uncertain
+            and abs(shift.delay_s) / period_s * shift.row_rms > hidden
+        ):
             continue
         elif _leads(shift, period_s):
             effects = {} if name in uncertain else rivals(name)
             rival = _rival(*rows[1:], plain, effects)
-            findings.append(_led(m, name, plain if is_plain and plain.delay_s < 0 else shift, rival, name in uncertain))
+            findings.append(
+                _led(
+                    m,
+                    name,
+                    plain if is_plain and plain.delay_s < 0 else shift,
+                    rival,
+                    name in uncertain,
+                )
+            )
         elif _is_late(shift, period_s):
             if shift.delay_s > NOT_A_SHIFT * max(plain.delay_s, period_s):
                 why = f"more lag explains its {plain.delay_s * 1e3:.0f} ms; of steps, {_steps_wanted(m, name, floor[name])}"
-                findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
+                findings.append(
+                    not_judged(name, "its offset in time from the twin", why, CLOCK)
+                )
                 continue
             late[name] = shift.delay_s, shift.delay_sd_s
             text = (
@@ -341,12 +456,20 @@ def check_against_twin(
     return _with_common_delay(findings, late, period_s)
 
 
-def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Finding, ...]]:
+def beside_onsets(
+    clock: Mapping[str, Sequence[Finding]],
+) -> dict[str, tuple[Finding, ...]]:
     """Findings of ``check_against_twin``, recording → findings. If a joint leads its replay in two or more recordings, but starts
     its steps on time in another (``same_onset``), clocks agree: errors become warnings that name gains; ``UNDECIDED`` goes."""
     all_of = [f for own in clock.values() for f in own]
-    leads = Counter(f.feature for f in all_of if f.check == UNDECIDED or (f.check == SHIFTED and f.severity == "error"))
-    same = {f.feature for f in all_of if f.check == "same_onset" and leads[f.feature] > 1}
+    leads = Counter(
+        f.feature
+        for f in all_of
+        if f.check == UNDECIDED or (f.check == SHIFTED and f.severity == "error")
+    )
+    same = {
+        f.feature for f in all_of if f.check == "same_onset" and leads[f.feature] > 1
+    }
     why = (
         "though its steps begin on one clock: gains that are not the stated ones (`gains: fitted` fits them) or a missing effect "
         "look like this"
@@ -355,9 +478,14 @@ def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Fin
     def said(f: Finding) -> Finding:
         if f.check != SHIFTED or f.severity != "error" or f.feature not in same:
             return f
-        return dataclasses.replace(f, severity="warning", text=f"{f.text.partition('): ')[0]}), {why}")
+        return dataclasses.replace(
+            f, severity="warning", text=f"{f.text.partition('): ')[0]}), {why}"
+        )
 
-    return {n: tuple(said(f) for f in own if f.check != UNDECIDED or f.feature not in same) for n, own in clock.items()}
+    return {
+        n: tuple(said(f) for f in own if f.check != UNDECIDED or f.feature not in same)
+        for n, own in clock.items()
+    }
 
 
 def _size(shift: Shift, period_s: float) -> str:
@@ -365,16 +493,22 @@ def _size(shift: Shift, period_s: float) -> str:
     return f"{abs(shift.delay_s) * 1e3:.1f} ± {shift.delay_sd_s * 1e3:.1f} ms ({rows:.1f} rows)"
 
 
-def _led(m: Measurement, name: str, shift: Shift, rival: str, uncertain: bool) -> Finding:
+def _led(
+    m: Measurement, name: str, shift: Shift, rival: str, uncertain: bool
+) -> Finding:
     """Finding that a measurement leads the twin's replay, which the effect ``rival`` explains as well if there is one."""
-    text = f"{name}: the measurement leads the twin's replay by {_size(shift, m.period_s)}"
+    text = (
+        f"{name}: the measurement leads the twin's replay by {_size(shift, m.period_s)}"
+    )
     if rival:
         text += (
             f", which the effect {rival} explains as well as a shift: the search decides. Recordings of steps and of fast motion "
             "tell them apart; if the search does not add it, compare the clocks"
         )
         return find(UNDECIDED, name, text)
-    numbers = "the drive's numbers in the file are off (diagnose fits them), or " * uncertain
+    numbers = (
+        "the drive's numbers in the file are off (diagnose fits them), or " * uncertain
+    )
     text += f": {numbers}positions stamped too early or commands too late, or paired one row off. "
     text += _earlier_targets(m, -shift.delay_s, whole=True)
     if uncertain:
@@ -409,7 +543,9 @@ def _with_common_delay(
 
 
 @check("note", "same_onset")
-def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -> Finding | None:
+def _by_steps(
+    m: Measurement, signal: str, reported: np.ndarray, floor: float
+) -> Finding | None:
     """Finding on the onsets after steps, where effects are missing; None if the recording has no steps that show them."""
     onset = first_order.onset_delay(m, signal, reported, floor)
     if onset is None:
@@ -432,11 +568,19 @@ def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -
     return find(SHIFTED, signal, text, severity="warning")
 
 
-def _rival(measured: np.ndarray, replay: np.ndarray, plain: Shift, rivals: Mapping[str, np.ndarray]) -> str:
+def _rival(
+    measured: np.ndarray,
+    replay: np.ndarray,
+    plain: Shift,
+    rivals: Mapping[str, np.ndarray],
+) -> str:
     """Name of the effect with which the replay comes as near to the measurement as by a shift alone; empty if none does. No other
     number is adjusted: with another K_d and inertia, too, velocity feedforward and a lead are alike.
     ``rivals``: name of an effect → the replay (T,) with a little of it."""
-    left = {name: first_order.left_by_change(measured, replay, changed) for name, changed in rivals.items()}
+    left = {
+        name: first_order.left_by_change(measured, replay, changed)
+        for name, changed in rivals.items()
+    }
     best = min(left, key=lambda name: left[name], default="")
     return best if best and plain.rms >= BETTER * left[best] else ""
 

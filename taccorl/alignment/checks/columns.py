@@ -42,14 +42,22 @@ SURELY = 0.2
 can look like it. A choice."""
 AS_GOOD = 1.2
 """Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
-SMOOTH_S = 0.1  # Window of the quadratics whose slopes are velocity and acceleration [s]
+SMOOTH_S = (
+    0.1  # Window of the quadratics whose slopes are velocity and acceleration [s]
+)
 MOST_ROWS = 400  # Rows of one recording at which the model is evaluated
-FREE = "a weight or spring"  # key of what is left beside the free numbers of such effects
+FREE = (
+    "a weight or spring"  # key of what is left beside the free numbers of such effects
+)
 COLUMNS = ("measured", "target", "velocity", "effort")  # Arrays (T, J) of a measurement
-_Moved = Mapping[str, Sequence[Measurement]]  # Joint → recordings that move it, with all signals
+_Moved = Mapping[
+    str, Sequence[Measurement]
+]  # Joint → recordings that move it, with all signals
 
 
-def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
+def check_columns(
+    robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]
+) -> None:
     """Add errors to ``found`` (recording → findings)."""
     for pair in itertools.combinations(recordings, 2):
         if robot.units[pair[0]] == robot.units[pair[1]]:
@@ -57,32 +65,68 @@ def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Findin
     _turned(robot, recordings, found)
 
 
-def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
+def _exchanged(
+    robot: Robot,
+    pair: tuple[str, str],
+    recordings: _Moved,
+    found: dict[str, list[Finding]],
+) -> None:
     """With the columns of the two exchanged the replay, far off as it is, is right in all that decide it, or far better at both
     joints; or the efforts of both follow the law of the other. Of one joint that moved alone both must hold."""
     other, rows = dict(zip(pair, reversed(pair), strict=True)), []
     for name in pair:
         for m in recordings[name]:
-            laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
-            if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
+            laws = {
+                kind
+                for n in pair
+                for kind in (m.target_kind(n), robot.config.joints[n].target_kind)
+            }
+            if (
+                laws != {"position"}
+                or not np.isfinite(m.measured[:, [m.column(n) for n in pair]])
+                .any(axis=0)
+                .all()
+            ):
                 return
             swapped = _swapped(m, *pair)
             limits = {n: robot.rigid.joints[n].limits for n in pair}
-            if any(beyond_limits(swapped, n, limits[n], "") for n in pair):  # it is their unit that is wrong
+            if any(
+                beyond_limits(swapped, n, limits[n], "") for n in pair
+            ):  # it is their unit that is wrong
                 return
-            old, new = _replay_error(robot, m, name), _replay_error(robot, swapped, other[name])
+            old, new = (
+                _replay_error(robot, m, name),
+                _replay_error(robot, swapped, other[name]),
+            )
             rows.append((name, m.name, _noise(m, name), old, new))
-    deciding = [row for row in rows if row[3] >= FAR * row[2]]  # a slow motion may not: any joint follows its target
-    near = [max(0.0 if old >= FAR * noise else old, NEAR * noise) >= new for _, _, noise, old, new in rows]
-    right = bool(deciding) and all(any(row[0] == n for row in deciding) or not recordings[n] for n in pair)
+    deciding = [
+        row for row in rows if row[3] >= FAR * row[2]
+    ]  # a slow motion may not: any joint follows its target
+    near = [
+        max(0.0 if old >= FAR * noise else old, NEAR * noise) >= new
+        for _, _, noise, old, new in rows
+    ]
+    right = bool(deciding) and all(
+        any(row[0] == n for row in deciding) or not recordings[n] for n in pair
+    )
     right = right and all(near)
     # Also a motion that only the exchange leaves far off decides: against it.
-    far = [(row[0], *np.maximum(row[3:], row[2])) for row in rows if max(row[3:]) >= FAR * row[2]]
+    far = [
+        (row[0], *np.maximum(row[3:], row[2]))
+        for row in rows
+        if max(row[3:]) >= FAR * row[2]
+    ]
     logs = [[math.log(new / old) for name, old, new in far if name == n] for n in pair]
-    replay = np.array([math.exp(sum(own) / len(own)) if own else math.nan for own in logs])
+    replay = np.array(
+        [math.exp(sum(own) / len(own)) if own else math.nan for own in logs]
+    )
     by_law, law, has_effort = _law_ratios(robot, pair, recordings)
     sides = [k for k, n in enumerate(pair) if recordings[n]]
-    both = (replay, by_law) if len(sides) == 2 else [np.array([replay[k], by_law[k]]) for k in sides]
+    both = (
+        (replay, by_law)
+        if len(sides) == 2
+        else [np.array([replay[k], by_law[k]]) for k in sides]
+    )
     if not (right or any(map(_far_better, both))):
         return
     told = deciding if right or _far_better(replay) else rows
@@ -96,21 +140,34 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
     )
     topic = " ↔ ".join(sorted(pair))
     for name, feature in itertools.product(sorted({row[1] for row in told}), pair):
-        found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
+        found[name].append(
+            find("swapped_joints", feature, text, severity="error", topic=topic)
+        )
 
 
-def _exchange(moved: Sequence[Measurement], pair: tuple[str, str], has_effort: bool) -> str:
+def _exchange(
+    moved: Sequence[Measurement], pair: tuple[str, str], has_effort: bool
+) -> str:
     """Text: the columns file that exchanges the two, with velocities if they follow their own positions, and efforts if asked."""
     j, k = at = [moved[0].column(name) for name in pair]
     own, other = (
-        sum(velocity_gain(m, *p) is not None for m in moved for p in ps) for ps in (((j, j), (k, k)), ((j, k), (k, j)))
+        sum(velocity_gain(m, *p) is not None for m in moved for p in ps)
+        for ps in (((j, j), (k, k)), ((j, k), (k, j)))
     )
     extra = {"qd": ("velocity", own >= other), "tau": ("effort", has_effort)}
-    keys = [n for n, (of, use) in extra.items() if use and all(np.isfinite(getattr(m, of)[:, at]).all() for m in moved)]
-    sides = [(a, b, key) for key in ("q", "q_target", *keys) for a, b in (pair, pair[::-1])]
+    keys = [
+        n
+        for n, (of, use) in extra.items()
+        if use and all(np.isfinite(getattr(m, of)[:, at]).all() for m in moved)
+    ]
+    sides = [
+        (a, b, key) for key in ("q", "q_target", *keys) for a, b in (pair, pair[::-1])
+    ]
     changes = ", ".join(f"{a}.{key}: {{column: {b}.{key}}}" for a, b, key in sides)
     file = f"Write `changes: {{{changes}}}` into a columns file; in one with signals: exchange the same columns there"
-    return write(moved[0], file, "Exchange the channels of the two in the recording spec")
+    return write(
+        moved[0], file, "Exchange the channels of the two in the recording spec"
+    )
 
 
 def _far_better(ratios: np.ndarray) -> bool:
@@ -119,19 +176,28 @@ def _far_better(ratios: np.ndarray) -> bool:
     return bool(np.sqrt(np.prod(ratios)) < BETTER and ratios.max() < 1.0)
 
 
-def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tuple[np.ndarray, str, bool]:
+def _law_ratios(
+    robot: Robot, pair: tuple[str, str], recordings: _Moved
+) -> tuple[np.ndarray, str, bool]:
     """(2,) what the law of the other joint leaves of each one's efforts over what its own leaves, whatever friction or load there
     is; NaN where they are not known, or near their own law. A text on both, and whether efforts are exchanged, too."""
     joints = robot.config.joints
     gains = [(k, p) for p in pair for k in joints[p].gain_names]
-    used = [[m for m in recordings[n] if all(p in getattr(m, k) for k, p in gains)] for n in pair]
+    used = [
+        [m for m in recordings[n] if all(p in getattr(m, k) for k, p in gains)]
+        for n in pair
+    ]
 
     def shares(names: tuple[str, ...], columns: Sequence[str]) -> np.ndarray:
         """(2,) shares of the efforts that the laws of ``names`` leave; NaN if they are not known."""
         found = []
         for name, own in zip(names, used, strict=True):
-            left = [law_left(joints[name], _swapped(m, *pair, columns), name) for m in own]
-            error, effort = np.square([x for x in left if x] or [(math.nan, 1.0)]).sum(axis=0)
+            left = [
+                law_left(joints[name], _swapped(m, *pair, columns), name) for m in own
+            ]
+            error, effort = np.square([x for x in left if x] or [(math.nan, 1.0)]).sum(
+                axis=0
+            )
             found.append(math.sqrt(error / max(effort, 1e-300)))
         return np.array(found)
 
@@ -149,24 +215,35 @@ def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tupl
     return new / as_is, words, has_effort
 
 
-def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS) -> Measurement:
+def _swapped(
+    m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS
+) -> Measurement:
     order = list(range(len(m.signals)))
     j, k = m.column(a), m.column(b)
     order[j], order[k] = k, j
-    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] for name in columns})
+    return dataclasses.replace(
+        m, **{name: getattr(m, name)[:, order] for name in columns}
+    )
 
 
 def _replay_error(robot: Robot, m: Measurement, name: str) -> float:
     """RMS [rad, m]."""
     model = JointModel(robot, name)
-    left = m.measured[:, m.column(name)] - model.simulate(motion_of(m, name, model.joint), model.gains).reported
+    left = (
+        m.measured[:, m.column(name)]
+        - model.simulate(motion_of(m, name, model.joint), model.gains).reported
+    )
     return float(np.sqrt(np.nanmean(left**2)))
 
 
 def _noise(m: Measurement, name: str) -> float:
     j = m.column(name)
     q = m.measured[np.isfinite(m.measured[:, j]), j]
-    return max(noise_of_rows(q), float(m.quantum[j]), INEXACT * float(np.nanstd(m.measured[:, j] - m.target[:, j])))
+    return max(
+        noise_of_rows(q),
+        float(m.quantum[j]),
+        INEXACT * float(np.nanstd(m.measured[:, j] - m.target[:, j])),
+    )
 
 
 def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
@@ -181,23 +258,50 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
     for name, own in parts.items():
         if own:
             keys = [k for k in own[0].asked if all(k in p.asked for p in own)]
-            effort, others = np.concatenate([p.effort for p in own]), np.concatenate([p.others for p in own])
+            effort, others = (
+                np.concatenate([p.effort for p in own]),
+                np.concatenate([p.others for p in own]),
+            )
             asked = {k: np.concatenate([p.asked[k] for p in own]) for k in keys}
-            left[name] = {k: _left(effort, torque, others) for k, torque in asked.items()}
+            left[name] = {
+                k: _left(effort, torque, others) for k, torque in asked.items()
+            }
             free = np.column_stack([others, np.concatenate([p.place for p in own])])
             left[name][FREE] = _left(effort, asked[""], free)
 
     def explains(k: str) -> bool:
-        with_it = [(errors[k], errors[""], errors[FREE]) for errors in left.values() if k in errors]
-        clear = any(other < TURNED * as_it_is and other < AS_GOOD * free for other, as_it_is, free in with_it)
-        return clear and all(other < AS_GOOD * as_it_is for other, as_it_is, _ in with_it)
+        with_it = [
+            (errors[k], errors[""], errors[FREE])
+            for errors in left.values()
+            if k in errors
+        ]
+        clear = any(
+            other < TURNED * as_it_is and other < AS_GOOD * free
+            for other, as_it_is, free in with_it
+        )
+        return clear and all(
+            other < AS_GOOD * as_it_is for other, as_it_is, _ in with_it
+        )
 
     better = [k for k in robot.config.joints if explains(k)]
-    total = {k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e) for k in better}
+    total = {
+        k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e)
+        for k in better
+    }
     k = min(total, key=lambda k: total[k], default="")
     if k:
-        turned = [k, *(other for other in total if other != k and total[other] < AS_GOOD * total[k])]
-        name = min((n for n in left if k in left[n]), key=lambda n: left[n][k] / max(left[n][""], 1e-300))
+        turned = [
+            k,
+            *(
+                other
+                for other in total
+                if other != k and total[other] < AS_GOOD * total[k]
+            ),
+        ]
+        name = min(
+            (n for n in left if k in left[n]),
+            key=lambda n: left[n][k] / max(left[n][""], 1e-300),
+        )
         errors, unit = left[name], UNITS[robot.units[name]][1]
         sure = errors[k] < SURELY * errors[""]
         text = (
@@ -210,7 +314,9 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
         )
         severity = "error" if sure else "warning"
         for m in recordings[name]:
-            found[m.name].append(find("wrong_sign", name, text, severity=severity, topic=f"sign of {k}"))
+            found[m.name].append(
+                find("wrong_sign", name, text, severity=severity, topic=f"sign of {k}")
+            )
 
 
 def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:
@@ -227,7 +333,9 @@ class _Torques(NamedTuple):
     """One joint in one recording, at every few rows."""
 
     effort: np.ndarray  # (T,)
-    asked: dict[str, np.ndarray]  # Turned joint, "" for none → (T,) torque that the rigid model asks of this one
+    asked: dict[
+        str, np.ndarray
+    ]  # Turned joint, "" for none → (T,) torque that the rigid model asks of this one
     others: np.ndarray  # (T, 3) speed, its sign, 1
     place: np.ndarray  # (T, 3) position, its sine and cosine
 
@@ -237,13 +345,23 @@ def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
     window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     known = [bool(np.isfinite(column).any()) for column in m.measured.T]
     q = np.where(known, m.measured, m.target)
-    names = [n for n in robot.config.joints if np.isfinite(m.effort[:, m.column(n)]).all()]
+    names = [
+        n for n in robot.config.joints if np.isfinite(m.effort[:, m.column(n)]).all()
+    ]
     if m.num_rows < 4 * window or not np.isfinite(q).all() or not names:
         return {}
     rows = slice(window, -window, max(1, m.num_rows // MOST_ROWS))
-    state = np.array([savgol_filter(q, window, 2, deriv=d, delta=m.period_s, axis=0)[rows] for d in range(3)])
+    state = np.array(
+        [
+            savgol_filter(q, window, 2, deriv=d, delta=m.period_s, axis=0)[rows]
+            for d in range(3)
+        ]
+    )
     turned = [k for k in robot.config.joints if known[m.column(k)]]
-    signs = {k: np.array([1.0 - 2.0 * (signal == k) for signal in m.signals]) for k in ("", *turned)}
+    signs = {
+        k: np.array([1.0 - 2.0 * (signal == k) for signal in m.signals])
+        for k in ("", *turned)
+    }
     asked = {k: sign * _rigid(robot, m, state * sign) for k, sign in signs.items()}
     found = {}
     for name in names:
@@ -252,17 +370,30 @@ def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
         others = np.column_stack([speed, np.sign(speed), np.ones_like(speed)])
         effort = savgol_filter(m.effort[:, j], window, 2)[rows]
         place = np.column_stack([at, np.sin(at), np.cos(at)])
-        found[name] = _Torques(effort, {k: torques[:, j] for k, torques in asked.items()}, others, place)
+        found[name] = _Torques(
+            effort, {k: torques[:, j] for k, torques in asked.items()}, others, place
+        )
     return found
 
 
 def _rigid(robot: Robot, m: Measurement, state: np.ndarray) -> np.ndarray:
     """(T, J) torques [N·m, N] that positions, speeds and accelerations, ``state`` (3, T, J), ask: links and rotors."""
-    rotors = [robot.config.joints[n].armature if n in robot.config.joints else 0.0 for n in m.signals]
+    rotors = [
+        robot.config.joints[n].armature if n in robot.config.joints else 0.0
+        for n in m.signals
+    ]
     asked = np.array(rotors) * state[2]
-    with under_gravity(robot.rigid.model, robot.rigid.model.opt.gravity + robot.more_gravity) as model:
-        data, joints = mujoco.MjData(model), [model.joint(signal) for signal in m.signals]
-        q_at, v_at = ([int(getattr(joint, key)[0]) for joint in joints] for key in ("qposadr", "dofadr"))
+    with under_gravity(
+        robot.rigid.model, robot.rigid.model.opt.gravity + robot.more_gravity
+    ) as model:
+        data, joints = (
+            mujoco.MjData(model),
+            [model.joint(signal) for signal in m.signals],
+        )
+        q_at, v_at = (
+            [int(getattr(joint, key)[0]) for joint in joints]
+            for key in ("qposadr", "dofadr")
+        )
         for t in range(len(asked)):
             data.qpos[q_at], data.qvel[v_at], data.qacc[v_at] = state[:, t]
             for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):

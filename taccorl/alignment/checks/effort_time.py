@@ -49,7 +49,10 @@ ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
 """Choices for gains that are fitted to each recording alone: largest residual of such a fit, as a share of the RMS effort; ratio
 of the gains of two recordings from which on they are of two machines (one of 7 effects made at most 1.34); and, where efforts are
 computed from accelerations, least ratio of the fitted K_p to the stated one that is reported."""
-LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)  # Lags and delays of targets that are tried
+LAGS_S, DELAYS_S = (
+    (0.0, 0.01, 0.03),
+    np.linspace(0.0, 0.025, 6),
+)  # Lags and delays of targets that are tried
 ALIKE = 1e-3
 """Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
 BLOCK_S = 0.5  # Length of stretches that count as independent [s]
@@ -73,18 +76,38 @@ def check_effort_time(
     if law.law == "effort":  # there is no drive
         return
     of_it = ("effort_unit", signal, "")
-    wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
+    wrong = {
+        n
+        for n, own in found.items()
+        for f in own
+        if f.severity == "error" and {f.check, f.feature} & {*of_it}
+    }
     every = [m for m in recordings if m.name not in wrong]
-    used = [m for m in every if all(signal in getattr(m, gain) for gain in law.gain_names)]
+    used = [
+        m for m in every if all(signal in getattr(m, gain) for gain in law.gain_names)
+    ]
 
-    def tell(check: str, text: str, severity: Severity = "error", told: Sequence[Measurement] = used) -> None:
+    def tell(
+        check: str,
+        text: str,
+        severity: Severity = "error",
+        told: Sequence[Measurement] = used,
+    ) -> None:
         for m in told:
             found[m.name].append(find(check, signal, text, severity=severity))
 
     moved = [_moved(m, signal, inertia(m)) for m in every]
     # Accelerations of other joints act on this one, and ``_moved`` does not know them.
-    alone = [m for m in moved if not (np.ptp(np.delete(m.target, m.column(signal), axis=1), axis=0) > MOVING).any()]
-    if text := _two_machines(law, every, signal) or _two_machines(law, alone, signal, unseen=True):
+    alone = [
+        m
+        for m in moved
+        if not (
+            np.ptp(np.delete(m.target, m.column(signal), axis=1), axis=0) > MOVING
+        ).any()
+    ]
+    if text := _two_machines(law, every, signal) or _two_machines(
+        law, alone, signal, unseen=True
+    ):
         tell("other_gains", text, "warning", every)
         return
     unseen = not any(m.has_effort()[m.column(signal)] for m in recordings)
@@ -95,14 +118,28 @@ def check_effort_time(
     if early := _early(law, used, signal):
         tell("effort_time", early)
         return
-    if used and (getattr(law, "command_hz", None) or 0.0) > used[0].rate_hz:  # its target moves within the row, too
+    if (
+        used and (getattr(law, "command_hz", None) or 0.0) > used[0].rate_hz
+    ):  # its target moves within the row, too
         return
     share, sd = target_share(law, used, signal) or (0.0, math.inf)
     after = abs(share - 1.0) < NEAR
-    if sd > SURE or after == law.effort_after_target or not (after or abs(share) < NEAR):
+    if (
+        sd > SURE
+        or after == law.effort_after_target
+        or not (after or abs(share) < NEAR)
+    ):
         return
-    way = "answers the row's own target already" if after else "was taken before the row's target acts"
-    line = f"Write `effort_after_target: true` for {signal}" if after else f"Remove effort_after_target of {signal}"
+    way = (
+        "answers the row's own target already"
+        if after
+        else "was taken before the row's target acts"
+    )
+    line = (
+        f"Write `effort_after_target: true` for {signal}"
+        if after
+        else f"Remove effort_after_target of {signal}"
+    )
     text = (
         f"effort of {signal} {way} (it holds {share:.2f} ± {sd:.2f} of what the target moves in one row, by {len(used)} "
         f"recordings), and {file} says otherwise. {line} in {file}. If its driver is sure of the instant, a velocity feedforward "
@@ -114,17 +151,27 @@ def check_effort_time(
 def _moved(m: Measurement, signal: str, inertia: float) -> Measurement:
     """``m`` with the torque that accelerates the joint in place of its effort."""
     effort, j = np.full_like(m.measured, np.nan), m.column(signal)
-    effort[:, j] = inertia * np.gradient(np.gradient(m.measured[:, j], m.period_s), m.period_s)
+    effort[:, j] = inertia * np.gradient(
+        np.gradient(m.measured[:, j], m.period_s), m.period_s
+    )
     return dataclasses.replace(m, effort=effort)
 
 
-def _two_machines(law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool = False) -> str:
+def _two_machines(
+    law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool = False
+) -> str:
     """Text if recordings determine, each alone, gains that no single machine has; else empty. ``unseen``: as in ``_other_gains``;
     K_d then contains what friction takes, which may differ."""
-    alone = [(m.name, law_fit(law, [m], signal)) for m in recordings if law.kp and law.kd]
+    alone = [
+        (m.name, law_fit(law, [m], signal)) for m in recordings if law.kp and law.kd
+    ]
     fits = {name: fit for name, fit in alone if fit and fit.left < ALONE_LEFT}
     for gain, place in (("kp", 0), ("kd", 1))[: 2 - unseen]:
-        values = {n: getattr(f, gain) for n, f in fits.items() if getattr(f, gain) > 20.0 * f.sd[place]}
+        values = {
+            n: getattr(f, gain)
+            for n, f in fits.items()
+            if getattr(f, gain) > 20.0 * f.sd[place]
+        }
         order = sorted(values, key=lambda name: values[name])
         apart = [values[b] / values[a] for a, b in itertools.pairwise(order)]
         if apart and max(apart) > APART:
@@ -139,7 +186,11 @@ def _two_machines(law: DriveLaw, recordings: Sequence[Measurement], signal: str,
 
 
 def _other_gains(
-    law: DriveLaw, recordings: Sequence[Measurement], signal: str, file: str, unseen: bool
+    law: DriveLaw,
+    recordings: Sequence[Measurement],
+    signal: str,
+    file: str,
+    unseen: bool,
 ) -> tuple[str, str] | None:
     """Check and text on efforts that follow the law with other gains than stated; None: they do not, or do not determine it.
     ``unseen``: efforts are inertia times acceleration, so that both gains off alike may be another inertia."""
@@ -158,9 +209,18 @@ def _other_gains(
     fit = first
     for delay_s in DELAYS_S:
         later = law_fit(law, [_late(m, delay_s) for m in recordings], signal)
-        fit = later if later is not None and later.left < min(fit.left, EARLY * first.left) else fit
+        fit = (
+            later
+            if later is not None and later.left < min(fit.left, EARLY * first.left)
+            else fit
+        )
     sure = min(fit.kp - 10 * fit.sd[0], fit.kd - 10 * fit.sd[1]) > 0.0
-    if not sure or fit.left > GAINS_LEFT or near(fit) or not SHARES[0] < fit.share / fit.kp < SHARES[1]:
+    if (
+        not sure
+        or fit.left > GAINS_LEFT
+        or near(fit)
+        or not SHARES[0] < fit.share / fit.kp < SHARES[1]
+    ):
         return None
     m, (kp, kd) = recordings[0], times(fit)
     if unseen and (max(kp, 1 / kp) < MOVED or max(kp / kd, kd / kp) < GAINS_OFF):
@@ -182,22 +242,42 @@ def _other_gains(
 
 def _late(m: Measurement, delay_s: float, lag_s: float = 0.0) -> Measurement:
     """``m`` with targets that act after a delay and a first-order lag."""
-    rows, start, decay = round(delay_s / m.period_s), m.target[:1], math.exp(-m.period_s / lag_s) if lag_s else 0.0
-    late = np.concatenate([np.repeat(start, rows, axis=0), m.target[: m.num_rows - rows]])
-    return dataclasses.replace(m, target=lfilter([1 - decay], [1, -decay], late, axis=0, zi=decay * start)[0])
+    rows, start, decay = (
+        round(delay_s / m.period_s),
+        m.target[:1],
+        math.exp(-m.period_s / lag_s) if lag_s else 0.0,
+    )
+    late = np.concatenate(
+        [np.repeat(start, rows, axis=0), m.target[: m.num_rows - rows]]
+    )
+    return dataclasses.replace(
+        m, target=lfilter([1 - decay], [1, -decay], late, axis=0, zi=decay * start)[0]
+    )
 
 
-def _stated_left(law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool) -> float:
+def _stated_left(
+    law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool
+) -> float:
     """Share of the effort that the stated gains leave beside any b and integral of the position error and any r (0.5 for
     accelerations, ``unseen``), with the delay and lag of targets at which they leave least."""
     least = math.inf
     for delay_s, lag_s in itertools.product(DELAYS_S, LAGS_S):
-        if found := _all_equations(law, [_late(m, delay_s, lag_s) for m in recordings], signal, smooth=True):
+        if found := _all_equations(
+            law, [_late(m, delay_s, lag_s) for m in recordings], signal, smooth=True
+        ):
             columns, effort, *_ = found
-            more, left = columns[:, [0, 2, 4][unseen:]], effort - columns[:, 3] + columns[:, 1]
+            more, left = (
+                columns[:, [0, 2, 4][unseen:]],
+                effort - columns[:, 3] + columns[:, 1],
+            )
             left = left - 0.5 * unseen * columns[:, 0]
             left = left - more @ np.linalg.lstsq(more, left, rcond=None)[0]
-            least = min(least, float(np.linalg.norm(left) / max(float(np.linalg.norm(effort)), 1e-300)))
+            least = min(
+                least,
+                float(
+                    np.linalg.norm(left) / max(float(np.linalg.norm(effort)), 1e-300)
+                ),
+            )
     return least
 
 
@@ -208,16 +288,25 @@ def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str
     def left(rows: int, law: DriveLaw = law) -> float:
         own = []
         for m in recordings:
-            effort = np.concatenate([np.repeat(m.effort[:1], rows, axis=0), m.effort[: m.num_rows - rows]])
+            effort = np.concatenate(
+                [np.repeat(m.effort[:1], rows, axis=0), m.effort[: m.num_rows - rows]]
+            )
             own.append(law_left(law, dataclasses.replace(m, effort=effort), signal))
         known = np.square([x for x in own if x is not None] or [(1.0, 1.0)]).sum(axis=0)
         return math.sqrt(known[0] / max(known[1], 1e-300))
 
-    as_is = min(left(0), left(0, dataclasses.replace(law, effort_after_target=not law.effort_after_target)))
+    as_is = min(
+        left(0),
+        left(
+            0, dataclasses.replace(law, effort_after_target=not law.effort_after_target)
+        ),
+    )
     best = min(range(MOST_EARLY + 1), key=left)
     if best == 0 or left(best) > min(EARLY * as_is, SIGN_SURE):
         return ""
-    rows = f"{best} row{'s' * (best > 1)} ({best * recordings[0].period_s * 1e3:.3g} ms)"
+    rows = (
+        f"{best} row{'s' * (best > 1)} ({best * recordings[0].period_s * 1e3:.3g} ms)"
+    )
     return (
         f"effort of {signal} stands {rows} too early: its law leaves {as_is:.0%} of it at position and target of its row, and "
         f"{left(best):.0%} at those {rows} later. Move the column {signal}.tau by as much, or leave it out; "
@@ -230,19 +319,31 @@ def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) ->
     speed that the drive knows ``speed_age_s`` late: an error of the drive's numbers alone, whatever the joint lacks. inf if the
     recording does not determine it."""
     j, late = m.column(signal), 0 if law.effort_after_target else 1
-    if law.law in ("pwm", "effort", "torque") or not m.has_effort()[j] or m.num_rows < 4:
+    if (
+        law.law in ("pwm", "effort", "torque")
+        or not m.has_effort()[j]
+        or m.num_rows < 4
+    ):
         return math.inf
     kp, kd, torque_ff = law.loop_gains
     kp_scale, kd_scale = law.gain_scales(signal, m)
     q, target = m.measured[:, j], np.roll(m.target[:, j], late)
     speed = np.interp(m.time_s - speed_age_s, m.time_s, np.gradient(q, m.period_s))
-    asked = kp * kp_scale * (target - q) if law.target_kind == "position" else kd * kd_scale * target
+    asked = (
+        kp * kp_scale * (target - q)
+        if law.target_kind == "position"
+        else kd * kd_scale * target
+    )
     error = m.effort[:, j] - asked + kd * kd_scale * speed - torque_ff
     if m.torque_ff.size:
         error = error - np.roll(m.torque_ff[:, j], late)
     rows = _of_law(law, m, j)
     rows[: late + 1 + math.ceil(speed_age_s / m.period_s)] = False
-    return float(np.sqrt(np.mean(error[rows] ** 2))) if rows.any() and np.isfinite(error[rows]).all() else math.inf
+    return (
+        float(np.sqrt(np.mean(error[rows] ** 2)))
+        if rows.any() and np.isfinite(error[rows]).all()
+        else math.inf
+    )
 
 
 def law_left(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
@@ -251,7 +352,12 @@ def law_left(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] 
     if law.law == "torque" or (found := _equations(law, m, signal)) is None:
         return None
     columns, effort, _, _ = found
-    left = effort - columns[:, 3] - float(law.effort_after_target) * columns[:, 0] + columns[:, 1]
+    left = (
+        effort
+        - columns[:, 3]
+        - float(law.effort_after_target) * columns[:, 0]
+        + columns[:, 1]
+    )
     return float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(effort**2)))
 
 
@@ -263,7 +369,9 @@ def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
     return rows & (m.enabled[:, j] != 0.0) if m.enabled.size else rows
 
 
-def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> tuple[float, float] | None:
+def target_share(
+    law: DriveLaw, recordings: Sequence[Measurement], signal: str
+) -> tuple[float, float] | None:
     """r (see the module; 0: measured before the target acts, 1: after) and its standard error, from the scatter of half seconds;
     None if the recordings do not determine them."""
     if (found := _all_equations(law, recordings, signal)) is None:
@@ -287,24 +395,45 @@ class LawFit(NamedTuple):
     def sign(self) -> int:
         """Sign of ``kp``; 0 if the efforts do not determine it."""
         least = max(3.0 * self.sd[0], abs(self.share) / MOST_SHARE)
-        return 0 if self.left > SIGN_SURE or abs(self.kp) < least else (1 if self.kp > 0.0 else -1)
+        return (
+            0
+            if self.left > SIGN_SURE or abs(self.kp) < least
+            else (1 if self.kp > 0.0 else -1)
+        )
 
 
-def law_fit(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:
+def law_fit(
+    law: DriveLaw, recordings: Sequence[Measurement], signal: str
+) -> LawFit | None:
     """The law of recorded efforts, by the equation of the module with K_p free and b = 0; None if they do not determine it."""
     if (found := _all_equations(law, recordings, signal, smooth=True)) is None:
         return None
     columns, effort, *more = found
     columns = columns[:, [0, 1, 3]]
     size, solved = np.linalg.norm(columns, axis=0), _solved(columns, effort, *more)
-    if solved is None or not size.all() or np.linalg.svd(columns / size, compute_uv=False)[-1] < ALIKE:
+    if (
+        solved is None
+        or not size.all()
+        or np.linalg.svd(columns / size, compute_uv=False)[-1] < ALIKE
+    ):
         return None
     solution, sd = solved
-    share = float(np.linalg.norm(effort - columns @ solution) / max(float(np.linalg.norm(effort)), 1e-300))
-    return LawFit(float(solution[2]), -float(solution[1]), (float(sd[2]), float(sd[1])), share, float(solution[0]))
+    share = float(
+        np.linalg.norm(effort - columns @ solution)
+        / max(float(np.linalg.norm(effort)), 1e-300)
+    )
+    return LawFit(
+        float(solution[2]),
+        -float(solution[1]),
+        (float(sd[2]), float(sd[1])),
+        share,
+        float(solution[0]),
+    )
 
 
-def law_of_all(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:
+def law_of_all(
+    law: DriveLaw, recordings: Sequence[Measurement], signal: str
+) -> LawFit | None:
     """``law_fit`` of all recordings together. If that leaves the sign open, but at least two recordings have a sure sign each and
     all of these signs are reversed: the fit of the recording that leaves least."""
     whole = law_fit(law, recordings, signal)
@@ -319,14 +448,26 @@ _Equations = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def _all_equations(
-    law: DriveLaw, recordings: Sequence[Measurement], signal: str, *, smooth: bool = False
+    law: DriveLaw,
+    recordings: Sequence[Measurement],
+    signal: str,
+    *,
+    smooth: bool = False,
 ) -> _Equations | None:
     """``_equations`` of all recordings; in place of half seconds (N, 2) numbers of recording and half second."""
-    parts = [part for m in recordings if (part := _equations(law, m, signal, smooth=smooth)) is not None]
+    parts = [
+        part
+        for m in recordings
+        if (part := _equations(law, m, signal, smooth=smooth)) is not None
+    ]
     if not parts:
         return None
-    columns, effort, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
-    blocks = np.column_stack([np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]), half_s])
+    columns, effort, noise, half_s = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
+    blocks = np.column_stack(
+        [np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]), half_s]
+    )
     return columns, effort, noise, blocks
 
 
@@ -354,7 +495,9 @@ def _solved(
     return solution / scale, np.sqrt(variance) / scale
 
 
-def _equations(law: DriveLaw, m: Measurement, signal: str, *, smooth: bool = False) -> _Equations | None:
+def _equations(
+    law: DriveLaw, m: Measurement, signal: str, *, smooth: bool = False
+) -> _Equations | None:
     """(N, 5) what r, − a, b and K_p multiply, the last in torques of the law's, and the integral of that; (N,) the effort, all
     without what the other terms explain in this recording; (N,) squared noise of the second column; (N,) number of the half
     second. None if it cannot be judged. ``smooth``: all are filtered alike, which takes noise off and keeps the law."""
@@ -373,21 +516,39 @@ def _equations(law: DriveLaw, m: Measurement, signal: str, *, smooth: bool = Fal
     kp, kd, _ = law.loop_gains
     kp_scale, kd_scale = law.gain_scales(signal, m)
     damping = kd * kd_scale or 1.0  # of law torque a is the damping itself
-    gain = {"position": kp * kp_scale, "velocity": kd * kd_scale, "torque": 1.0}[law.target_kind]
-    v, a = np.gradient(q, m.period_s)[1:], savgol_filter(q, window, 2, deriv=2, delta=m.period_s)[1:]
+    gain = {"position": kp * kp_scale, "velocity": kd * kd_scale, "torque": 1.0}[
+        law.target_kind
+    ]
+    v, a = (
+        np.gradient(q, m.period_s)[1:],
+        savgol_filter(q, window, 2, deriv=2, delta=m.period_s)[1:],
+    )
     speed, angle = savgol_filter(q, window, 2, deriv=1, delta=m.period_s)[1:], q[1:]
     asked = gain * (target[:-1] - (angle if law.target_kind == "position" else 0.0))
-    others = np.column_stack([np.sign(speed), np.sin(angle), np.cos(angle), np.ones_like(v)])
+    others = np.column_stack(
+        [np.sign(speed), np.sin(angle), np.cos(angle), np.ones_like(v)]
+    )
     rows = _of_law(law, m, j)[1:]
     integral = np.cumsum(asked) * m.period_s
-    every = np.column_stack([gain * np.diff(target), damping * v, damping * a, asked, integral, effort[1:]])
+    every = np.column_stack(
+        [gain * np.diff(target), damping * v, damping * a, asked, integral, effort[1:]]
+    )
     noise = 0.5 * (damping * noise_of_rows(q) / m.period_s) ** 2
     inner = minimum_filter1d(rows, window, mode="constant")
-    if smooth and 2 * inner.sum() >= len(rows):  # few of efforts in another unit are below the limit
-        every, others = (savgol_filter(terms, window, 2, axis=0) for terms in (every, others))
+    if smooth and 2 * inner.sum() >= len(
+        rows
+    ):  # few of efforts in another unit are below the limit
+        every, others = (
+            savgol_filter(terms, window, 2, axis=0) for terms in (every, others)
+        )
         rows, noise = inner, 0.0
     every, others = every[rows], others[rows]
     if len(every) < 4 * window:
         return None
     every -= others @ np.linalg.lstsq(others, every, rcond=None)[0]
-    return every[:, :5], every[:, 5], np.full(len(every), noise), np.flatnonzero(rows) * m.period_s // BLOCK_S
+    return (
+        every[:, :5],
+        every[:, 5],
+        np.full(len(every), noise),
+        np.flatnonzero(rows) * m.period_s // BLOCK_S,
+    )

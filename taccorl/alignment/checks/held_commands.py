@@ -27,7 +27,16 @@ from scipy.signal import cont2discrete, lfilter
 from taccorl.alignment.checks.first_order import beside
 from taccorl.alignment.measurements.measurement import Measurement
 
-HOLDS = (1, 2, 3, 4, 6, 8, 12, 16)  # Lengths of a hold that are searched [command periods]
+HOLDS = (
+    1,
+    2,
+    3,
+    4,
+    6,
+    8,
+    12,
+    16,
+)  # Lengths of a hold that are searched [command periods]
 AR_ORDER = 6  # Order of the whitening filter A(q)
 PASSES = 4  # Number of fits of response and noise, each without the events found so far: events bend both
 LEAD_ROWS = 4  # Rows of the response before the impulse: a delay of part of a row spreads it to both sides
@@ -36,7 +45,9 @@ LEAST_GAIN = 12.0  # Least score of an event: noise alone causes one in about 10
 LOCAL_S = 0.5  # Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
 """Ranges of the parameters of the fitted response: natural frequency [rad/s], damping ratio, delay [rows]."""
-STOOD_S = 0.075  # A target that begins to move after it stood for so long turns there [s]
+STOOD_S = (
+    0.075  # A target that begins to move after it stood for so long turns there [s]
+)
 MOVES = 2e-3  # Least motion of a target that can show a dropped command [rad, m]
 LEAST_EVENTS, MIRRORED = 6, 4
 """Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
@@ -71,7 +82,10 @@ class Dropped:
     def certain(self) -> bool:
         """True if pulses of the right sign clearly outnumber those of the opposite sign and do not gather at one place between
         the turns of the target, so that commands were dropped. Play and sticking hold a joint once after each turn."""
-        return self.found >= LEAST_EVENTS + MIRRORED * self.mirrored and _uniform(np.array(self.ranks)) >= BY_CHANCE
+        return (
+            self.found >= LEAST_EVENTS + MIRRORED * self.mirrored
+            and _uniform(np.array(self.ranks)) >= BY_CHANCE
+        )
 
     @property
     def rate(self) -> float:
@@ -86,8 +100,17 @@ def find_dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
     for m in measurements:
         target, measured = m.target[:, j], m.measured[:, j]
         changed = np.flatnonzero(np.diff(target) != 0) + 1
-        followed = m.pressed is None and m.target_kind(m.signals[j]) == "position" and np.isfinite(target).all()
-        if not followed or np.ptp(target) < MOVES or len(changed) < 50 or np.isfinite(measured).sum() < 200:
+        followed = (
+            m.pressed is None
+            and m.target_kind(m.signals[j]) == "position"
+            and np.isfinite(target).all()
+        )
+        if (
+            not followed
+            or np.ptp(target) < MOVES
+            or len(changed) < 50
+            or np.isfinite(measured).sum() < 200
+        ):
             continue
         events, others, visible = _events(target, measured, changed, m.period_s)
         commands, mirrored = commands + len(changed), mirrored + len(others)
@@ -102,7 +125,13 @@ def find_dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
             ranks.append(before + equal * rng.random())
     if not commands:
         return None
-    return Dropped(times_s=times_s, commands=commands, held=held, mirrored=mirrored, ranks=tuple(ranks))
+    return Dropped(
+        times_s=times_s,
+        commands=commands,
+        held=held,
+        mirrored=mirrored,
+        ranks=tuple(ranks),
+    )
 
 
 def _phase(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarray:
@@ -110,7 +139,9 @@ def _phase(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarr
     the time between two such turns."""
     way = np.sign(target[changed] - target[changed - 1])
     stood = np.diff(changed, prepend=-len(target)) * period_s > STOOD_S
-    turned = np.append(changed[stood | (np.diff(way, prepend=way[0]) != 0)], len(target))
+    turned = np.append(
+        changed[stood | (np.diff(way, prepend=way[0]) != 0)], len(target)
+    )
     last = np.searchsorted(turned, changed, side="right") - 1
     return (changed - turned[last]) / (turned[last + 1] - turned[last])
 
@@ -118,10 +149,16 @@ def _phase(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarr
 def _uniform(ranks: np.ndarray) -> float:
     """Probability that numbers drawn evenly from 0 to 1 gather as much anywhere: Kuiper's test (Stephens 1970)."""
     at, n = np.sort(ranks), len(ranks)
-    gathered = float(np.max(np.arange(1, n + 1) / n - at) + np.max(at - np.arange(n) / n))
+    gathered = float(
+        np.max(np.arange(1, n + 1) / n - at) + np.max(at - np.arange(n) / n)
+    )
     x = (math.sqrt(n) + 0.155 + 0.24 / math.sqrt(n)) * gathered
     k = np.arange(1, 30)
-    return min(1.0, float(2 * np.sum((4 * (k * x) ** 2 - 1) * np.exp(-2 * (k * x) ** 2)))) if x > 0.4 else 1.0
+    return (
+        min(1.0, float(2 * np.sum((4 * (k * x) ** 2 - 1) * np.exp(-2 * (k * x) ** 2))))
+        if x > 0.4
+        else 1.0
+    )
 
 
 def _events(
@@ -142,14 +179,20 @@ def _events(
         whiten = _whitening(clean)
         sigma = _local_sigma(_filtered(whiten, clean), round(LOCAL_S / period_s))
         w, before = lfilter(whiten, [1.0], response), len(found)
-        found, others, visible = _pursued(target, _filtered(whiten, left), sigma, w, changed)
+        found, others, visible = _pursued(
+            target, _filtered(whiten, left), sigma, w, changed
+        )
         if len(found) == before:
             break
     return found, others, visible
 
 
 def _pursued(
-    target: np.ndarray, e: np.ndarray, sigma: np.ndarray, w: np.ndarray, changed: np.ndarray
+    target: np.ndarray,
+    e: np.ndarray,
+    sigma: np.ndarray,
+    w: np.ndarray,
+    changed: np.ndarray,
 ) -> tuple[Events, Events, dict[int, np.ndarray]]:
     """Find lost and late commands by matching pursuit, in the order of rows; the commands fix each one's amplitude. ``e``: (T,)
     whitened residual, ``sigma``: its standard deviation, ``w``: (L,) response of ``e`` to the applied target."""
@@ -161,26 +204,45 @@ def _pursued(
     energy = []
     for length in lengths:
         at = np.minimum(changed[:, None] + np.arange(length), last - 1)
-        pulse = (held[:, None] - target[at]) * (changed[:, None] + np.arange(length) < last)
-        energy.append(np.einsum("ri,ri->r", pulse @ toeplitz(auto[:length]), pulse) / sigma[changed] ** 2)
+        pulse = (held[:, None] - target[at]) * (
+            changed[:, None] + np.arange(length) < last
+        )
+        energy.append(
+            np.einsum("ri,ri->r", pulse @ toeplitz(auto[:length]), pulse)
+            / sigma[changed] ** 2
+        )
     reach, taken = len(w) + int(lengths[-1]), np.zeros(len(changed), dtype=bool)
     found: dict[bool, Events] = {True: [], False: []}
     while True:
-        score = np.correlate(np.append(e / sigma**2, np.zeros(len(w) - 1)), w, "valid")  # Σ_i w_i e(t + i) / σ²
-        sums, moments = (np.concatenate([[0.0], np.cumsum(x)]) for x in (score, score * target))
+        score = np.correlate(
+            np.append(e / sigma**2, np.zeros(len(w) - 1)), w, "valid"
+        )  # Σ_i w_i e(t + i) / σ²
+        sums, moments = (
+            np.concatenate([[0.0], np.cumsum(x)]) for x in (score, score * target)
+        )
         cross = held * (sums[ends] - sums[changed]) - (moments[ends] - moments[changed])
         gains = np.abs(cross) - 0.5 * np.array(energy)
         best = np.argmax(gains, axis=0)
         gain = np.where(taken, -np.inf, np.max(gains, axis=0))
         around = np.full(last, -np.inf)
         around[changed] = gain
-        peaks = np.flatnonzero((gain > LEAST_GAIN) & (gain == maximum_filter1d(around, 2 * reach + 1)[changed]))
+        peaks = np.flatnonzero(
+            (gain > LEAST_GAIN)
+            & (gain == maximum_filter1d(around, 2 * reach + 1)[changed])
+        )
         if not len(peaks):
-            visible = {int(rows): 0.5 * own > LEAST_GAIN for rows, own in zip(lengths, energy, strict=True)}
+            visible = {
+                int(rows): 0.5 * own > LEAST_GAIN
+                for rows, own in zip(lengths, energy, strict=True)
+            }
             return sorted(found[True]), sorted(found[False]), visible
         change = np.zeros(last)
         for k in peaks:
-            row, length, backwards = int(changed[k]), int(lengths[best[k]]), bool(cross[best[k], k] > 0)
+            row, length, backwards = (
+                int(changed[k]),
+                int(lengths[best[k]]),
+                bool(cross[best[k], k] > 0),
+            )
             found[backwards].append((row, length))
             own = held[k] - target[row : row + length]
             change[row : row + length] += own if backwards else -own
@@ -198,22 +260,44 @@ def _fitted(
     impulse[LEAD_ROWS] = 1.0  # a delay of part of a row spreads it to both sides
 
     def answer(x: np.ndarray, drive: np.ndarray) -> np.ndarray:
-        late = np.interp(np.arange(len(drive)) - x[2], np.arange(len(drive)), drive, left=drive[0] * (x[2] <= 0))
+        late = np.interp(
+            np.arange(len(drive)) - x[2],
+            np.arange(len(drive)),
+            drive,
+            left=drive[0] * (x[2] <= 0),
+        )
         omega, zeta = math.exp(x[0]), math.exp(x[1])
-        numerator, denominator, _ = cont2discrete(([omega**2], [1.0, 2.0 * zeta * omega, omega**2]), period_s)
+        numerator, denominator, _ = cont2discrete(
+            ([omega**2], [1.0, 2.0 * zeta * omega, omega**2]), period_s
+        )
         return np.asarray(lfilter(np.ravel(numerator), denominator, late))
 
     def residual(x: np.ndarray) -> np.ndarray:
         return beside(measured[seen], answer(x, u)[seen])[0]
 
-    low, high = (np.array([math.log(OMEGA_RAD_PER_S[k]), math.log(ZETA[k]), DELAY_ROWS[k]]) for k in (0, 1))
-    starts = [(math.log(w), math.log(z), 0.5) for w, z in ((12.0, 1.0), (30.0, 1.0), (60.0, 3.0), (15.0, 1.5))]
+    low, high = (
+        np.array([math.log(OMEGA_RAD_PER_S[k]), math.log(ZETA[k]), DELAY_ROWS[k]])
+        for k in (0, 1)
+    )
+    starts = [
+        (math.log(w), math.log(z), 0.5)
+        for w, z in ((12.0, 1.0), (30.0, 1.0), (60.0, 3.0), (15.0, 1.5))
+    ]
     start = min(starts, key=lambda x: float((residual(np.array(x)) ** 2).sum()))
-    best = least_squares(residual, start, bounds=(low, high), x_scale=(0.1, 0.1, 0.5), max_nfev=15, ftol=1e-4).x
+    best = least_squares(
+        residual,
+        start,
+        bounds=(low, high),
+        x_scale=(0.1, 0.1, 0.5),
+        max_nfev=15,
+        ftol=1e-4,
+    ).x
     design = np.column_stack([answer(best, u), np.ones(len(u))])
     solution = np.linalg.lstsq(design[seen], measured[seen], rcond=None)[0]
     commanded = np.column_stack([answer(best, target - target[0]), np.ones(len(u))])
-    return measured - commanded @ solution, solution[0] * answer(best, impulse)[LEAD_ROWS:]
+    return measured - commanded @ solution, solution[0] * answer(best, impulse)[
+        LEAD_ROWS:
+    ]
 
 
 def _whitening(left: np.ndarray) -> np.ndarray:
@@ -236,6 +320,8 @@ def _local_sigma(e: np.ndarray, window: int) -> np.ndarray:
     """(T,) standard deviation of e: robust, of the whole and of the neighbourhood, whichever is larger."""
     edges = np.linspace(0, len(e), max(1, len(e) // window) + 1).astype(int)
     whole = 1.4826 * float(np.median(np.abs(e[e != 0]))) if (e != 0).any() else 1.0
-    levels = [1.4826 * float(np.median(np.abs(e[a:b]))) for a, b in itertools.pairwise(edges)]
+    levels = [
+        1.4826 * float(np.median(np.abs(e[a:b]))) for a, b in itertools.pairwise(edges)
+    ]
     middles = 0.5 * (edges[:-1] + edges[1:])
     return np.maximum(np.interp(np.arange(len(e)), middles, levels), max(whole, 1e-12))

@@ -7,7 +7,14 @@ import numpy as np
 
 from taccorl.alignment.checks.first_order import LEAST_ROWS, fit_first_order
 from taccorl.alignment.checks.registry import check, find
-from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, without, write
+from taccorl.alignment.checks.trial import (
+    Trial,
+    least_motion,
+    place,
+    scale,
+    without,
+    write,
+)
 from taccorl.alignment.checks.wiring import in_other_unit
 from taccorl.alignment.controller.joint_motion import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
@@ -35,7 +42,10 @@ REST_SHARE = 0.1
 ``ANSWER_S``, it counts as standing still until then."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
 """Time at the furthest reading [s], and distance of the command beyond it [rad; a tenth of it in m], for a blocked joint."""
-START_S, START_ROWS = 0.15, (8, 30)  # Time and number of rows from which the speed at row 0 is estimated
+START_S, START_ROWS = (
+    0.15,
+    (8, 30),
+)  # Time and number of rows from which the speed at row 0 is estimated
 START_SPEED = {"rad": 0.03, "m": 0.003}
 """Largest speed at row 0 [rad/s]: a twin that starts at rest then errs by 0.1 s times it, 3 mrad."""
 START_OFFSET_RAD = 0.1
@@ -89,7 +99,11 @@ def check_values(t: Trial) -> Iterator[Finding]:
             )
             yield find("not_finite", name, text, (int(bad[0]), int(bad[-1]) + 1))
     for name, unit, values in zip(m.signals, m.units, m.measured.T, strict=True):
-        turns = np.flatnonzero(np.abs(np.abs(np.diff(values)) - 2 * np.pi) < WRAPPED) if unit == "rad" else []
+        turns = (
+            np.flatnonzero(np.abs(np.abs(np.diff(values)) - 2 * np.pi) < WRAPPED)
+            if unit == "rad"
+            else []
+        )
         if len(turns):
             text = (
                 f"{name} jumps by a full turn in {len(turns)} rows, first after row {turns[0]} ({m.time_s[turns[0]]:.3f} s): its "
@@ -103,17 +117,28 @@ def check_values(t: Trial) -> Iterator[Finding]:
             )
             yield find("not_finite", name, text, (row, row + 1))
     known = np.asarray(np.isfinite(m.measured))
-    compared = np.asarray(known.any(axis=0))  # a signal that was never measured is not compared
+    compared = np.asarray(
+        known.any(axis=0)
+    )  # a signal that was never measured is not compared
     holes = runs(np.asarray(~known[:, compared].all(axis=1)))
     if not holes:
         return
     first, end = max(holes, key=lambda r: r[1] - r[0])
     # Short gaps of a table were judged where it was brought to an even grid.
-    if any(f.check == "resampled" for f in m.findings) and (end - first) * m.period_s <= LONGEST_GAP_S:
+    if (
+        any(f.check == "resampled" for f in m.findings)
+        and (end - first) * m.period_s <= LONGEST_GAP_S
+    ):
         return
-    names = [m.signals[j] for j in np.flatnonzero(compared & ~known[first:end].all(axis=0))]
+    names = [
+        m.signals[j] for j in np.flatnonzero(compared & ~known[first:end].all(axis=0))
+    ]
     damaged = any(f.check == "damaged" for f in m.findings)
-    again = "The file is damaged: copy it again" if damaged else "Record again with less load on the logger"
+    again = (
+        "The file is damaged: copy it again"
+        if damaged
+        else "Record again with less load on the logger"
+    )
     text = (
         f"{listed(names)}: nothing was measured in {place(m, first, end)}, {len(holes)} such holes: no row "
         f"there can be compared. {again}, or {without(m, first)}"
@@ -126,13 +151,23 @@ def check_values(t: Trial) -> Iterator[Finding]:
 def check_length(t: Trial) -> Iterator[Finding]:
     """Motion, from the first change of a command to the last, that is too short for a fit."""
     changed = np.flatnonzero(np.any(np.diff(t.m.target, axis=0) != 0, axis=1))
-    seconds = float(t.m.time_s[changed[-1] + 1] - t.m.time_s[changed[0]]) if len(changed) else 0.0
+    seconds = (
+        float(t.m.time_s[changed[-1] + 1] - t.m.time_s[changed[0]])
+        if len(changed)
+        else 0.0
+    )
     if 0.0 <= seconds < SHORT_S and t.moves.any():  # negative: time_backwards
         text = (
             f"{seconds:.2f} s of motion in {t.m.num_rows} rows: three parameters of a joint want 10 s that sweep it "
             "from slow to fast"
         )
-        yield find("too_short" if seconds < TOO_SHORT_S and not _comes_to_rest(t.m) else "short", "", text)
+        yield find(
+            "too_short"
+            if seconds < TOO_SHORT_S and not _comes_to_rest(t.m)
+            else "short",
+            "",
+            text,
+        )
 
 
 def _comes_to_rest(m: Measurement) -> bool:
@@ -141,7 +176,11 @@ def _comes_to_rest(m: Measurement) -> bool:
     known = np.isfinite(m.measured).all(axis=0)
     last = [np.ptp(values[-rows:, known], axis=0) for values in (m.target, m.measured)]
     span = np.ptp(m.measured[:, known], axis=0)
-    return bool(known.any() and (last[0] == 0.0).all() and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all())
+    return bool(
+        known.any()
+        and (last[0] == 0.0).all()
+        and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all()
+    )
 
 
 @check("error", "no_motion", "dead_channel", needs="position")
@@ -149,7 +188,10 @@ def check_motion(t: Trial) -> Iterator[Finding]:
     """Joints that do not move, do not answer, or stop answering."""
     m = t.m
     if not t.moves.any():
-        few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
+        few, more = (
+            list(zip(m.signals, m.units, strict=True))[:2],
+            " …" * (len(m.signals) > 2),
+        )
         way_out = ""
         for name, own, target in zip(m.signals, m.measured.T, m.target.T, strict=True):
             known = own[np.isfinite(own)]
@@ -168,7 +210,11 @@ def check_motion(t: Trial) -> Iterator[Finding]:
         if len(known) and np.ptp(known) < DEAD_SHARE * np.ptp(target):
             if in_other_unit(t, int(j)):
                 continue  # check_wiring says so
-            still = "the same number all the time" if np.ptp(known) == 0 else f"within {np.ptp(known):.2g} {m.units[j]}"
+            still = (
+                "the same number all the time"
+                if np.ptp(known) == 0
+                else f"within {np.ptp(known):.2g} {m.units[j]}"
+            )
             text = (
                 f"{name} stays {still} while its command moves by {np.ptp(target):.3g} {m.units[j]} over "
                 f"{m.time_s[-1]:.1f} s: motor off, brake on, its driver repeats one value, or its columns of target and position "
@@ -192,7 +238,9 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
         rows = (first - 1, end)
         held_s = m.time_s[end - 1] - m.time_s[first - 1]
         moved = np.ptp(target[rows[0] : end])
-        before_answer = np.ptp(target[rows[0] : max(end - max(round(ANSWER_S / m.period_s), 1), first)])
+        before_answer = np.ptp(
+            target[rows[0] : max(end - max(round(ANSWER_S / m.period_s), 1), first)]
+        )
         if held_s < FROZEN_S or moved < least or before_answer < REST_SHARE * moved:
             continue
         if (sign := _stop_side(m, j, rows)) is not None:
@@ -224,7 +272,9 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
         return
     for sign in (1.0, -1.0):
         furthest = np.nanmax(sign * measured)
-        at_stop = (sign * measured > furthest - 0.1 * beyond) & (sign * target > furthest + beyond)
+        at_stop = (sign * measured > furthest - 0.1 * beyond) & (
+            sign * target > furthest + beyond
+        )
         for first, end in runs(at_stop):
             if m.time_s[end - 1] - m.time_s[first] >= BLOCKED_S:
                 yield _blocked(m, j, sign, (first, end))
@@ -253,7 +303,11 @@ def _stop_side(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
     for sign in (1.0, -1.0):
         at_end = sign * measured[first] > np.nanmax(sign * measured) - near
         beyond = np.max(sign * (target[first:end] - measured[first])) > least
-        if at_end and beyond and stood_at_stop(target, measured, m.period_s, rows, sign, near):
+        if (
+            at_end
+            and beyond
+            and stood_at_stop(target, measured, m.period_s, rows, sign, near)
+        ):
             return sign
     return None
 
@@ -270,7 +324,9 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
     steps, still = np.abs(np.diff(measured)), np.diff(target) == 0
     moving = steps[np.isfinite(steps) & (steps > 0.5 * quantum)]
     # Of a joint that is at rest; one that still follows its command is not.
-    flickers = still & (np.abs(np.diff(measured, n=2, append=measured[-1])) > 1.5 * quantum)
+    flickers = still & (
+        np.abs(np.diff(measured, n=2, append=measured[-1])) > 1.5 * quantum
+    )
     if quantum == 0.0:
         flickers &= steps > 0.0
     most = 0.05 if quantum > 0.0 else 0.9
@@ -284,9 +340,15 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
     grows = float(np.max(side * (target[first:end] - target[first])))
     # Not for a hold from row 0 on: a joint may begin at any angle, and dry friction keeps it there until the torque exceeds it.
     extreme = first > 0 and side * measured[first] == np.nanmax(side * measured)
-    goes_away = grows > max(2.0 * quantum, STICK_GROWS * float(np.ptp(target[first:end])))
+    goes_away = grows > max(
+        2.0 * quantum, STICK_GROWS * float(np.ptp(target[first:end]))
+    )
     # Further out than the joint came: its readings end there, unless it stood as far off elsewhere.
-    if (extreme or ends) and goes_away and (not ends or float(np.max(far[first:end])) > STICK_ERRORS * usual):
+    if (
+        (extreme or ends)
+        and goes_away
+        and (not ends or float(np.max(far[first:end])) > STICK_ERRORS * usual)
+    ):
         return ""
     if ends:
         return "the recording ends there"
@@ -306,7 +368,9 @@ def check_start(t: Trial) -> Iterator[Finding]:
     past = m.time_s[:rows] - m.time_s[0]
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
         measured, target = m.measured[:rows, j], m.target[:rows, j]
-        if not (np.isfinite(measured).all() and np.isfinite(target).all()) or steps_at_once(m, j):
+        if not (
+            np.isfinite(measured).all() and np.isfinite(target).all()
+        ) or steps_at_once(m, j):
             continue
         speed, sd = _speed_at_start(past, measured)
         # The second part: what the answer to a command that begins at once looks like in a parabola.
@@ -318,7 +382,12 @@ def check_start(t: Trial) -> Iterator[Finding]:
             )
             yield find("not_at_rest", name, text, (0, rows))
         off = float(measured[0] - target[0])
-        if unit == "rad" and abs(off) > START_OFFSET_RAD and np.ptp(target) < 1e-3 and speed <= allowed:
+        if (
+            unit == "rad"
+            and abs(off) > START_OFFSET_RAD
+            and np.ptp(target) < 1e-3
+            and speed <= allowed
+        ):
             text = (
                 f"{name} stands {off:+.3f} rad from its command at row 0 (0.000 s) and stays there: switched off, "
                 "blocked, or a zero point that differs between the two (`zero:` of a column in a columns file is its number "
@@ -333,7 +402,11 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
         design = np.vander(past_s, order + 1, increasing=True)
         solution = np.linalg.lstsq(design, measured, rcond=None)[0]
         left = measured - design @ solution
-        covariance = float(left @ left) / max(len(left) - order - 1, 1) * np.linalg.inv(design.T @ design)
+        covariance = (
+            float(left @ left)
+            / max(len(left) - order - 1, 1)
+            * np.linalg.inv(design.T @ design)
+        )
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         if abs(solution[-1]) > 5 * sd[-1]:
             break
@@ -345,23 +418,36 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
 def check_effort(t: Trial) -> Iterator[Finding]:
     """Efforts that are constant while the joint moves, or stop at a limit that is not the one stated in ``limits``."""
     m = t.m
-    recorded = m.has_effort() if m.pressed is not None else np.isfinite(m.effort).any(axis=0)  # presses need none
+    recorded = (
+        m.has_effort() if m.pressed is not None else np.isfinite(m.effort).any(axis=0)
+    )  # presses need none
     for j in np.flatnonzero(t.moves & recorded):
         name, effort = m.signals[j], m.effort[:, j]
         known = effort[np.isfinite(effort)]
         largest = float(np.abs(known).max())
         if np.ptp(known) == 0:
-            use = f"so no diagnosis uses efforts of {name}" if known[0] == 0.0 else "of no use for a fit"
+            use = (
+                f"so no diagnosis uses efforts of {name}"
+                if known[0] == 0.0
+                else "of no use for a fit"
+            )
             text = f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured, {use}"
             yield find("dead_effort", name, f"{text}; {_without_effort(m, name)}")
             continue
         yield from _frozen_effort(m, int(j))
         at = np.flatnonzero(np.abs(effort) == largest)
-        value, level, least = largest, f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
+        value, level, least = (
+            largest,
+            f"exactly ±{largest:.3g}",
+            max(3, int(AT_LIMIT_SHARE * len(known))) + 1,
+        )
         if len(at) < least:
             at, value, sd = plateau(m, int(j))
             level, least = f"±{value:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
-        if len(at) >= least and abs(value - t.limits.get(name, math.inf)) > STATED_LIMIT * value:
+        if (
+            len(at) >= least
+            and abs(value - t.limits.get(name, math.inf)) > STATED_LIMIT * value
+        ):
             text = (
                 f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} ({m.time_s[at[0]]:.2f} s): the drive's "
                 "limit (effect torque_saturation) or the end of the report's range"
@@ -380,11 +466,19 @@ def _frozen_effort(m: Measurement, j: int) -> Iterator[Finding]:
     inside = inside[np.isfinite(inside)]
     at_limit = abs(effort[first]) == np.nanmax(np.abs(effort))
     outside = np.delete(same, np.s_[first:end])
-    rises, falls = inside - np.minimum.accumulate(inside), np.maximum.accumulate(inside) - inside
+    rises, falls = (
+        inside - np.minimum.accumulate(inside),
+        np.maximum.accumulate(inside) - inside,
+    )
     short = end - first < FROZEN_EFFORT_S / m.period_s
     move = FROZEN_MOVE / scale(m, j)
     coarse = outside.size and outside.mean() > 0.5
-    if at_limit or short or coarse or min(rises.max(initial=0.0), falls.max(initial=0.0)) < move:
+    if (
+        at_limit
+        or short
+        or coarse
+        or min(rises.max(initial=0.0), falls.max(initial=0.0)) < move
+    ):
         return
     text = (
         f"{name}: its effort reads {effort[first]:.4g} in all of {place(m, first, end + 1)}, while the joint goes to and fro by "
@@ -408,7 +502,9 @@ def plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
     if not np.isfinite([target, q, effort]).all():
         return nothing
     before = np.concatenate([target[:1], target[:-1]])
-    columns = np.column_stack([target, before, q, np.gradient(q, m.period_s), np.ones_like(q)])
+    columns = np.column_stack(
+        [target, before, q, np.gradient(q, m.period_s), np.ones_like(q)]
+    )
     columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     size = np.abs(effort)
     below = size < PLATEAU_FROM * np.quantile(size, 1.0 - PLATEAU_ROWS / len(size))
@@ -421,7 +517,9 @@ def plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
         return nothing
     level = float(np.median(size[rows]))
     sd = 1.4826 * float(np.median(np.abs(size[rows] - level)))
-    if np.std(law[rows] * np.sign(effort[rows])) < 5.0 * sd or size.max() > level + 6.0 * max(sd, 1e-12):
+    if np.std(
+        law[rows] * np.sign(effort[rows])
+    ) < 5.0 * sd or size.max() > level + 6.0 * max(sd, 1e-12):
         return nothing
     return rows, level, sd
 
@@ -444,7 +542,12 @@ fitted."""
 
 
 def stood_at_stop(
-    target: np.ndarray, measured: np.ndarray, period_s: float, rows: tuple[int, int], sign: float, near: float
+    target: np.ndarray,
+    measured: np.ndarray,
+    period_s: float,
+    rows: tuple[int, int],
+    sign: float,
+    near: float,
 ) -> bool:
     """True if the end of the hold shows a joint at a stop; False if it does not, or is unclear.
 
@@ -473,12 +576,20 @@ def stood_at_stop(
     at = np.arange(len(up))
     answer = fit.response(up, period_s)
     offset = float(np.mean((seen - answer)[free]))
-    command, answer = fit.gain * np.interp(at - fit.delay_s / period_s, at, up - up[0]) + offset, answer + offset
+    command, answer = (
+        fit.gain * np.interp(at - fit.delay_s / period_s, at, up - up[0]) + offset,
+        answer + offset,
+    )
     steps = np.abs(np.diff(seen[np.isfinite(seen)]))
-    below = held - 0.5 * float(np.min(steps[steps > 0]))  # a reading changes half a step from the held one
+    below = held - 0.5 * float(
+        np.min(steps[steps > 0])
+    )  # a reading changes half a step from the held one
     stopped = np.full(len(up), held)
     for k in range(first, len(up) - 1):
         stopped[k + 1] = min(held, command[k] + (stopped[k] - command[k]) * keep)
     beyond = first + int(np.argmax(command[first:end]))  # both come back after this row
-    back = [np.append(np.flatnonzero(own[beyond:] < below) + beyond, len(up))[0] for own in (answer, stopped)]
+    back = [
+        np.append(np.flatnonzero(own[beyond:] < below) + beyond, len(up))[0]
+        for own in (answer, stopped)
+    ]
     return bool(abs(back[1] - end) < abs(back[0] - end))

@@ -21,10 +21,14 @@ class Check:
     """A name in the list."""
 
     severity: Severity  # Severity of its findings, unless one states another
-    explains: tuple[str, ...] = ()  # Checks whose findings about the same signal may follow from this one
+    explains: tuple[
+        str, ...
+    ] = ()  # Checks whose findings about the same signal may follow from this one
 
 
-CHECKS: dict[str, Check] = {}  # Name of every check of measurements. Thresholds stand beside the functions.
+CHECKS: dict[
+    str, Check
+] = {}  # Name of every check of measurements. Thresholds stand beside the functions.
 _FUNCTIONS: dict[str, list[Callable[..., Any]]] = {}
 
 
@@ -67,13 +71,19 @@ def check_names(accept: Sequence[str]) -> None:
     errors = [name for name, listed in CHECKS.items() if listed.severity == "error"]
     for name in accept:
         if name not in errors:
-            raise TaccorlError(f"--accept={name}: no check with this name reports errors; {nearest(name, errors)}")
+            raise TaccorlError(
+                f"--accept={name}: no check with this name reports errors; {nearest(name, errors)}"
+            )
 
 
 def accepted(findings: Sequence[Finding], accept: Sequence[str]) -> list[Finding]:
     """Copy of ``findings`` in which errors of the checks named in ``accept`` are warnings that state the acceptance."""
     return [
-        dataclasses.replace(f, severity="warning", text=f"{f.text}. An error, accepted by --accept={f.check}")
+        dataclasses.replace(
+            f,
+            severity="warning",
+            text=f"{f.text}. An error, accepted by --accept={f.check}",
+        )
         if f.severity == "error" and f.check in accept
         else f
         for f in findings

@@ -19,7 +19,9 @@ from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.data.finding import Finding, listed
 
-BEYOND = 0.02  # Share of a joint's range by which a measured position may exceed its limits
+BEYOND = (
+    0.02  # Share of a joint's range by which a measured position may exceed its limits
+)
 DEGREES, NEAR_DEGREES = math.pi / 180, 0.3
 """Radians in a degree. Where the fitted inertia over the stated one is this number, within a factor of exp(0.3) (a choice), the
 positions are in degrees."""
@@ -31,7 +33,9 @@ which a reversed effort must be explained better than the effort as it is."""
 REVERSED_LEFT = 0.2
 """Share that a reversed effort leaves at most of what the effort as it is leaves, where no law shows its sign: a centre of mass
 on the other side of the axis leaves more. A choice."""
-SMOOTH_S = 0.05  # Window of the quadratic whose second derivative is the acceleration [s]
+SMOOTH_S = (
+    0.05  # Window of the quadratic whose second derivative is the acceleration [s]
+)
 
 
 def check_robot(
@@ -45,16 +49,29 @@ def check_robot(
     signals of the robot. ``moved``: joints of the robot file that the recording moves. ``fits``: joint → law of its efforts in
     all recordings; by default in this one."""
     if fits is None:
-        fits = {name: law_fit(robot.config.joints[name], [whole], name) for name in moved if name in m.signals}
-    found = pose_unknown([name for name in robot.units if name not in m.signals], "at the model's zero pose")
+        fits = {
+            name: law_fit(robot.config.joints[name], [whole], name)
+            for name in moved
+            if name in m.signals
+        }
+    found = pose_unknown(
+        [name for name in robot.units if name not in m.signals],
+        "at the model's zero pose",
+    )
     factors: dict[str, float] = {}
     of_efforts: list[Finding] = []
     for name in robot.config.joints:
         if name in m.signals:
-            wrong = beyond_limits(m, name, robot.rigid.joints[name].limits, robot.rigid.path.name)
+            wrong = beyond_limits(
+                m, name, robot.rigid.joints[name].limits, robot.rigid.path.name
+            )
             fit = fits[name] if name in moved else None
             known = _factor(robot.config.joints[name], whole, name, fit)
-            if known is not None and not wrong and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
+            if (
+                known is not None
+                and not wrong
+                and not 1 / INERTIA_OFF <= known <= INERTIA_OFF
+            ):
                 factors[name] = known
                 continue
             wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
@@ -62,9 +79,13 @@ def check_robot(
                 model = JointModel(robot, name)
                 words = partial(_inertia_words, robot, whole, model)
                 wrong = wrong_inertia(model, whole, fit, words, known or 1.0)
-            of_efforts += [f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")]
+            of_efforts += [
+                f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")
+            ]
             found += [f for f in wrong if f not in of_efforts]
-    if len(factors) > 1:  # one cause: what is left of these comes back once the unit is written
+    if (
+        len(factors) > 1
+    ):  # one cause: what is left of these comes back once the unit is written
         of_efforts = []
     return [*found, *_effort_unit(m, factors), *of_efforts]
 
@@ -76,7 +97,11 @@ def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
         return []
     low, high = min(factors.values()), max(factors.values())
     times = f"{low:.3g} times" if len(factors) == 1 else f"{low:.3g} … {high:.3g} times"
-    unit = "another unit: mA, or the torque before the gear?" if low > 1 else "another unit, such as A?"
+    unit = (
+        "another unit: mA, or the torque before the gear?"
+        if low > 1
+        else "another unit, such as A?"
+    )
     numbers = ", ".join(f"{name}: {1 / factor:.3g}" for name, factor in factors.items())
     scales = "as `effort_scale:` of the recording in measurements.yaml"
     where = write(m, "as `factor:` of their .tau in a columns file", scales)
@@ -93,9 +118,13 @@ def _beside(x: np.ndarray, others: np.ndarray) -> np.ndarray:
     return x - others @ np.linalg.lstsq(others, x, rcond=None)[0]
 
 
-def _factor(law: DriveLaw, m: Measurement, name: str, fit: LawFit | None) -> float | None:
+def _factor(
+    law: DriveLaw, m: Measurement, name: str, fit: LawFit | None
+) -> float | None:
     """Reported effort over the torque of the law; None without commanded gains, or if the recordings do not show it."""
-    stated = law.law in ("impedance", "cascade") and all(name in getattr(m, gain) for gain in law.gain_names)
+    stated = law.law in ("impedance", "cascade") and all(
+        name in getattr(m, gain) for gain in law.gain_names
+    )
     return fit.kp if fit is not None and stated and fit.sign > 0 else None
 
 
@@ -110,7 +139,9 @@ def pose_unknown(lacking: Sequence[str], pose: str, feature: str = "") -> list[F
 
 
 @check("error", "beyond_limits")
-def beyond_limits(m: Measurement, name: str, limits: tuple[float, float] | None, file: str) -> list[Finding]:
+def beyond_limits(
+    m: Measurement, name: str, limits: tuple[float, float] | None, file: str
+) -> list[Finding]:
     """Finding on positions beyond ``limits`` of signal ``name``, which ``file`` states [rad, m]; empty if there are none."""
     j = m.column(name)
     (low, high), q, unit = limits or (-math.inf, math.inf), m.measured[:, j], m.units[j]
@@ -120,7 +151,9 @@ def beyond_limits(m: Measurement, name: str, limits: tuple[float, float] | None,
         return []
     if unit == "rad" and abs(q[row]) > 2 * np.pi:
         speed = velocity_gain(m, j, j)
-        has_speed = np.isfinite(m.velocity[:, j]).any() and (speed is None or speed > DEGREES**0.5)
+        has_speed = np.isfinite(m.velocity[:, j]).any() and (
+            speed is None or speed > DEGREES**0.5
+        )
         qd = f" (`deg/s` for {name}.qd)" * bool(has_speed)
         way_out = f"Write `unit: deg` for {name}.q and {name}.q_target{qd} in a columns file; of ticks, rad of one as `factor:`"
     else:
@@ -153,12 +186,16 @@ def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[F
 def _line(m: Measurement, name: str, factor: str = "…") -> str:
     """Place at which a user writes the factor that converts recorded efforts to N·m or N: a columns file for tables,
     measurements.yaml for recordings."""
-    scale = f"`effort_scale: {{{name}: {factor}}}` of the recording in measurements.yaml"
+    scale = (
+        f"`effort_scale: {{{name}: {factor}}}` of the recording in measurements.yaml"
+    )
     return write(m, f"`factor: {factor}` for {name}.tau in a columns file", scale)
 
 
 @check("error", "reversed_effort", explains=("effort_time",))
-def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) -> list[Finding]:
+def reversed_effort(
+    m: Measurement, name: str, left: float, fit: LawFit | None
+) -> list[Finding]:
     """Finding on an effort with the wrong sign: by its law, which no mass changes, or where no law shows the sign by inertia.
     ``left``: share that the effort with the opposite sign leaves of what it leaves as it is."""
     sign = 0 if fit is None else fit.sign
@@ -172,7 +209,14 @@ def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) 
     way = f"Its sign is reversed; write {line}"
     if not sure:
         way = f"Weight or centre of mass of what moves are not the model's, or its sign is reversed, which {line} mends"
-    return [find("reversed_effort", name, f"effort of {name} {why}. {way}", severity="error" if sure else "warning")]
+    return [
+        find(
+            "reversed_effort",
+            name,
+            f"effort of {name} {why}. {way}",
+            severity="error" if sure else "warning",
+        )
+    ]
 
 
 def in_degrees(ratio: float, signal: str, unit: str) -> str:
@@ -201,9 +245,17 @@ def wrong_inertia(
     """
     name = model.signal
     j = m.column(name)
-    q, torque, is_off = m.measured[:, j], m.effort[:, j] / factor, m.enabled.size and not m.enabled[:, j].all()
+    q, torque, is_off = (
+        m.measured[:, j],
+        m.effort[:, j] / factor,
+        m.enabled.size and not m.enabled[:, j].all(),
+    )
     rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
-    known = m.has_effort()[j] and np.isfinite([q, torque, m.target[:, j]]).all() and not is_off
+    known = (
+        m.has_effort()[j]
+        and np.isfinite([q, torque, m.target[:, j]]).all()
+        and not is_off
+    )
     if not known or m.num_rows < 4 * rows:
         return []
     motion = motion_of(m, name, model.joint)
@@ -214,8 +266,13 @@ def wrong_inertia(
     coupling = motion.coupling_nm[:: len(motion.coupling_nm) // m.num_rows]
     asked = {sign: savgol_filter(sign * torque - coupling, rows, 2) for sign in (1, -1)}
     left = {sign: _beside(own, others) for sign, own in asked.items()}
-    seen = {sign: float(a @ own) / max(float(a @ a), 1e-300) for sign, own in left.items()}
-    remains = {sign: float(np.linalg.norm(own - max(seen[sign], 0.0) * a)) for sign, own in left.items()}
+    seen = {
+        sign: float(a @ own) / max(float(a @ a), 1e-300) for sign, own in left.items()
+    }
+    remains = {
+        sign: float(np.linalg.norm(own - max(seen[sign], 0.0) * a))
+        for sign, own in left.items()
+    }
     against = remains[-1] / max(remains[1], 1e-300) if seen[-1] > 0.0 else 1.0
     if reversed_ := reversed_effort(m, name, against, fit):
         return reversed_
@@ -229,12 +286,27 @@ def wrong_inertia(
 
 
 def _inertia_words(
-    robot: Robot, m: Measurement, model: JointModel, motion: JointMotion, seen: float, known: float
+    robot: Robot,
+    m: Measurement,
+    model: JointModel,
+    motion: JointMotion,
+    seen: float,
+    known: float,
 ) -> str:
     name = model.signal
-    nearest = min(robot.rigid.joints.values(), key=lambda f: abs(np.log(max(f.inertia + f.armature, 1e-9) / seen))).name
-    hint = f" That is the size of {nearest}: are columns exchanged?" if nearest != name else ""
-    unit, rotor = "kg·m²" if model.unit == "rad" else "kg", model.joint.rigid(motion, []).rotor_inertia
+    nearest = min(
+        robot.rigid.joints.values(),
+        key=lambda f: abs(np.log(max(f.inertia + f.armature, 1e-9) / seen)),
+    ).name
+    hint = (
+        f" That is the size of {nearest}: are columns exchanged?"
+        if nearest != name
+        else ""
+    )
+    unit, rotor = (
+        "kg·m²" if model.unit == "rad" else "kg",
+        model.joint.rigid(motion, []).rotor_inertia,
+    )
     if seen > known and rotor == 0.0:  # a small joint is mostly rotor
         hint = f" It has no rotor: a motor behind a gear adds its own, here `rotor_inertia: {seen - known:.3g}`.{hint}"
     return (

@@ -16,8 +16,22 @@ from functools import partial
 
 import numpy as np
 
-from taccorl.alignment.checks import cells, clock, effort_time, robot, time_stamps, wiring
-from taccorl.alignment.checks.registry import CHECKS, accepted, check, check_names, find, run
+from taccorl.alignment.checks import (
+    cells,
+    clock,
+    effort_time,
+    robot,
+    time_stamps,
+    wiring,
+)
+from taccorl.alignment.checks.registry import (
+    CHECKS,
+    accepted,
+    check,
+    check_names,
+    find,
+    run,
+)
 from taccorl.alignment.checks.trial import MOVED, Trial, least_motion
 from taccorl.alignment.checks.unrepeated import check_repeatability
 from taccorl.alignment.measurements.folder import copies
@@ -42,7 +56,12 @@ LISTED = cells, clock, effort_time, robot, time_stamps, wiring
 DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
 ORDER = ("error", "warning", "note")
-NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")  # With these nothing else can be judged
+NO_MORE = (
+    "time_backwards",
+    "time_unit",
+    "not_finite",
+    "too_short",
+)  # With these nothing else can be judged
 
 
 def check_measurement(
@@ -66,11 +85,17 @@ def check_measurement(
     if not any(f.check in NO_MORE for f in findings):
         progress("checking efforts, motion and wiring")
         findings += accepted(run("effort", whole), accept)
-        followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
+        followed = [
+            s for s in m.signals if m.target_kind(s) == "position"
+        ]  # a velocity or a torque is not followed
         if followed:
             trial = Trial(m.only(followed), limits or {}, rates or {})
             findings += accepted(run("position", trial), accept)
-            if not any(f.severity == "error" and f.check not in ("lost_samples", "dead_channel") for f in findings):
+            if not any(
+                f.severity == "error"
+                and f.check not in ("lost_samples", "dead_channel")
+                for f in findings
+            ):
                 progress("checking its clock")
                 findings += accepted(run("clock", trial), accept)
                 findings = [_held_and_exchanged(m, f, findings) for f in findings]
@@ -91,10 +116,14 @@ def check_measurements(
     for k, m in enumerate(measurements, 1):
         place = f"recording {k} of {len(measurements)}, "
         trial = partial(check_measurement, m, accept=accept, limits=limits, rates=rates)
-        found[m.name] = trial(progress=lambda text, m=m, place=place: progress(m.name, place + text))
+        found[m.name] = trial(
+            progress=lambda text, m=m, place=place: progress(m.name, place + text)
+        )
     clock.check_late_recordings(measurements, found)
     found = {m.name: accepted(found[m.name], accept) for m in measurements}
-    sound = [m for m in measurements if not any(f.severity == "error" for f in found[m.name])]
+    sound = [
+        m for m in measurements if not any(f.severity == "error" for f in found[m.name])
+    ]
     moves = {m.name: {*np.flatnonzero(np.ptp(m.target, axis=0))} for m in sound}
     for name, finding in _slower_rows(sound, rates or {}):
         found[name].append(finding)
@@ -103,7 +132,11 @@ def check_measurements(
     for a, b in itertools.combinations([m for m in sound if m.name not in copied], 2):
         if not moves[a.name] & moves[b.name]:
             continue  # other joints: of a hundred recordings most pairs
-        told = b.name in (a.name, a.repeat_of) or a.name == b.repeat_of or (a.repeat_of and a.repeat_of == b.repeat_of)
+        told = (
+            b.name in (a.name, a.repeat_of)
+            or a.name == b.repeat_of
+            or (a.repeat_of and a.repeat_of == b.repeat_of)
+        )
         if not told:
             try:
                 found[b.name].append(_same_commands(a, b, overlay(a, b)))
@@ -113,31 +146,57 @@ def check_measurements(
         progress(m.name, f"checking what {len(sound)} recordings do not repeat")
     for name, finding in check_repeatability(sound):
         found[name].append(finding)
-    late = {m.name: {f.feature for f in found[m.name] if f.check == "late_answer"} for m in measurements}
-    for m in measurements:  # one motion has one delay: what a repeat does not show is chance
+    late = {
+        m.name: {f.feature for f in found[m.name] if f.check == "late_answer"}
+        for m in measurements
+    }
+    for m in (
+        measurements
+    ):  # one motion has one delay: what a repeat does not show is chance
         first = m.repeat_of or m.name
-        always = set.intersection(*(late[x.name] for x in measurements if (x.repeat_of or x.name) == first))
-        found[m.name] = [f for f in found[m.name] if f.check != "late_answer" or f.topic or f.feature in always]
+        always = set.intersection(
+            *(late[x.name] for x in measurements if (x.repeat_of or x.name) == first)
+        )
+        found[m.name] = [
+            f
+            for f in found[m.name]
+            if f.check != "late_answer" or f.topic or f.feature in always
+        ]
     return found
 
 
-def _held_and_exchanged(m: Measurement, f: Finding, findings: Sequence[Finding]) -> Finding:
+def _held_and_exchanged(
+    m: Measurement, f: Finding, findings: Sequence[Finding]
+) -> Finding:
     """A dead channel beside exchanged columns: of a joint that is held, the target stands still and the position is shaken."""
     exchanged = [other for other in findings if other.check == clock.EXCHANGED_COLUMNS]
-    if f.check != "dead_channel" or not exchanged or np.ptp(m.measured[:, m.column(f.feature)]) > 0.0:
+    if (
+        f.check != "dead_channel"
+        or not exchanged
+        or np.ptp(m.measured[:, m.column(f.feature)]) > 0.0
+    ):
         return f
     text = f"{f.feature}: its position is one number and its target moves; as with {exchanged[0].feature}, the two are exchanged"
     return find(clock.EXCHANGED_COLUMNS, f.feature, text)
 
 
 @check("warning", "slower_rows")
-def _slower_rows(sound: Sequence[Measurement], rates: Mapping[str, float]) -> Iterator[tuple[str, Finding]]:
+def _slower_rows(
+    sound: Sequence[Measurement], rates: Mapping[str, float]
+) -> Iterator[tuple[str, Finding]]:
     """Find recordings with fewer rows a second than targets changed in another one; ``rates``: joint → stated command_hz or 0."""
     trials = [Trial(m) for m in sound]
     for signal in (signal for signal, hz in rates.items() if hz == 0.0):
         moved = [t.m for t in trials if signal in {t.m.signals[j] for j in t.moving}]
-        rows = [(m, np.diff(np.flatnonzero(np.diff(m.target[:, m.column(signal)])))) for m in moved]
-        many = [(m.rate_hz / float(np.median(own)), m.name) for m, own in rows if len(own) > 20]  # a choice, as is 1.5
+        rows = [
+            (m, np.diff(np.flatnonzero(np.diff(m.target[:, m.column(signal)]))))
+            for m in moved
+        ]
+        many = [
+            (m.rate_hz / float(np.median(own)), m.name)
+            for m, own in rows
+            if len(own) > 20
+        ]  # a choice, as is 1.5
         hz, fastest = max(many, default=(0.0, ""))
         for m in (m for m in moved if 1.5 * m.rate_hz < hz):
             text = (
@@ -154,7 +213,10 @@ def check_copies(measurements: Sequence[Measurement]) -> dict[str, list[Finding]
     why = "number for number: nothing new, and no repeat for the noise floor. Remove it, and its entry in measurements.yaml if it"
     end = "has one (a simulation without noise repeats so as well)"
     of = copies(measurements)
-    return {name: [find("copied_recording", "", f"{name} is {first}, {why} {end}")] for name, first in of.items()}
+    return {
+        name: [find("copied_recording", "", f"{name} is {first}, {why} {end}")]
+        for name, first in of.items()
+    }
 
 
 @check("note", "same_motion")
@@ -188,12 +250,16 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
 
 
 def _turned(m: Measurement, f: Finding) -> Measurement:
-    return dataclasses.replace(m, measured=np.where(np.array(m.signals) == f.feature, -1.0, 1.0) * m.measured)
+    return dataclasses.replace(
+        m, measured=np.where(np.array(m.signals) == f.feature, -1.0, 1.0) * m.measured
+    )
 
 
 def _exchanged(m: Measurement, f: Finding) -> Measurement:
     own, q, target = np.array(m.signals) == f.feature, m.measured, m.target
-    return dataclasses.replace(m, measured=np.where(own, target, q), target=np.where(own, q, target))
+    return dataclasses.replace(
+        m, measured=np.where(own, target, q), target=np.where(own, q, target)
+    )
 
 
 def _of_other(m: Measurement, f: Finding) -> Measurement:
@@ -213,7 +279,9 @@ corrected."""
 
 
 def one_cause(
-    found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measurement], rates: Mapping[str, float] | None = None
+    found: Mapping[str, Sequence[Finding]],
+    recordings: Sequence[Measurement],
+    rates: Mapping[str, float] | None = None,
 ) -> dict[str, list[Finding]]:
     """Findings of a set with one cause for each signal whose column is wrong in every recording: it looks reversed in one and
     late in another.
@@ -223,28 +291,65 @@ def one_cause(
     that any other error of the signal explains.
     ``found``: name of a recording → its findings. ``rates``: as in ``Trial``."""
     every = [f for own in found.values() for f in own if f.severity == "error"]
-    explained = {(e, f.feature) for f in every if f.check not in CORRECTED for e in CHECKS[f.check].explains}
-    result = {name: [f for f in own if (f.check, f.feature) not in explained] for name, own in found.items()}
-    wrong = {f.feature for own in result.values() for f in own if f.check in CORRECTED and f.severity == "error"}
+    explained = {
+        (e, f.feature)
+        for f in every
+        if f.check not in CORRECTED
+        for e in CHECKS[f.check].explains
+    }
+    result = {
+        name: [f for f in own if (f.check, f.feature) not in explained]
+        for name, own in found.items()
+    }
+    wrong = {
+        f.feature
+        for own in result.values()
+        for f in own
+        if f.check in CORRECTED and f.severity == "error"
+    }
     for signal in sorted(wrong):
-        of_signal = {n: [f for f in own if f.feature == signal and f.severity == "error"] for n, own in result.items()}
+        of_signal = {
+            n: [f for f in own if f.feature == signal and f.severity == "error"]
+            for n, own in result.items()
+        }
         errors = {n: {f.check: f for f in own} for n, own in of_signal.items()}
-        of = {cause: [name for name, own in errors.items() if cause in own] for cause in CORRECTED}
+        of = {
+            cause: [name for name, own in errors.items() if cause in own]
+            for cause in CORRECTED
+        }
         cause = max(of, key=lambda c: len(of[c]))
         follow = {*CORRECTED, *CHECKS[cause].explains}
-        others = [name for name, own in errors.items() if own.keys() & follow and name not in of[cause]]
+        others = [
+            name
+            for name, own in errors.items()
+            if own.keys() & follow and name not in of[cause]
+        ]
         if len(of[cause]) <= len(others):
             continue
         first = errors[of[cause][0]][cause]
-        corrected = (CORRECTED[cause](m, first).only([signal]) for m in recordings if m.name in others)
-        again = [(m.name, f) for m in corrected for f in check_measurement(m, rates=rates)]
-        fails = {name for name, f in again if f.severity == "error" and f.check in follow}
-        if cause == "reversed" and any("reversed_effort" in own for own in errors.values()):
+        corrected = (
+            CORRECTED[cause](m, first).only([signal])
+            for m in recordings
+            if m.name in others
+        )
+        again = [
+            (m.name, f) for m in corrected for f in check_measurement(m, rates=rates)
+        ]
+        fails = {
+            name for name, f in again if f.severity == "error" and f.check in follow
+        }
+        if cause == "reversed" and any(
+            "reversed_effort" in own for own in errors.values()
+        ):
             more = f". Its effort pushes against its acceleration as well: it is {signal}.q"
-            errors[of[cause][0]][cause] = dataclasses.replace(first, text=first.text + more)
+            errors[of[cause][0]][cause] = dataclasses.replace(
+                first, text=first.text + more
+            )
         text = f"{first.text}. So in {of[cause][0]}; with that corrected this recording passes"
         for name in result.keys() - fails:  # these have a cause of their own
-            kept = [f for f in result[name] if f.feature != signal or f.check not in follow]
+            kept = [
+                f for f in result[name] if f.feature != signal or f.check not in follow
+            ]
             if name in others:
                 kept.append(find(cause, signal, text, topic=first.topic))
             elif cause in errors[name]:

@@ -10,7 +10,10 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding
 
-RATE_HZ = (5.0, 5000.0)  # Range of plausible row rates [Hz]; outside it the times are probably in another unit
+RATE_HZ = (
+    5.0,
+    5000.0,
+)  # Range of plausible row rates [Hz]; outside it the times are probably in another unit
 GAP, JITTER = 1.5, 0.1
 """Steps above the first [median periods] are lost rows; at most a twentieth of the steps may deviate by more than the second."""
 RATE_SHARE = 0.8  # Least rate, as a share of the rate that the spec states
@@ -28,7 +31,10 @@ def check_time(t: Trial) -> Iterator[Finding]:
         how = f"goes from {m.time_s[row]:.6f} to {m.time_s[row + 1]:.6f} s"
         ways = "sort the table by time, leave repeated rows out, or log the driver's own stamps"
         if (steps[bad] == 0).all():
-            how, ways = f"stands still at {m.time_s[row]:.6f} s", "leave repeated rows out, or log stamps of their own"
+            how, ways = (
+                f"stands still at {m.time_s[row]:.6f} s",
+                "leave repeated rows out, or log stamps of their own",
+            )
         elif bad.all():
             how, ways = f"{how}, backwards as all through,", "sort the table by time"
         text = f"time {how} at row {row + 1}, {int(bad.sum())} such rows: {ways}"
@@ -68,7 +74,9 @@ def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
         yield find("dropped_rows", "time", text, (worst, worst + 2), severity=severity)
     off = np.abs(steps - period)[steps <= GAP * period] / period
     if len(off) and np.quantile(off, 0.95) > JITTER:
-        worst = int(np.argmax(np.where(steps <= GAP * period, np.abs(steps - period), 0.0)))
+        worst = int(
+            np.argmax(np.where(steps <= GAP * period, np.abs(steps - period), 0.0))
+        )
         text = (
             f"steps between rows vary by ±{np.quantile(off, 0.95) * period * 1e3:.2f} ms (95 %) about "
             f"{period * 1e3:.2f} ms, worst at row {worst + 1} ({m.time_s[worst + 1]:.3f} s): times of a busy "
@@ -87,7 +95,9 @@ def _channels(m: Measurement) -> Iterator[Finding]:
                 "lost; correct the driver"
             )
             yield find("low_rate", t.channel, text)
-        if t.duplicates > (1.0 - RATE_SHARE) * t.rate_hz * (m.time_s[-1] - m.time_s[0]):  # a few are usual
+        if t.duplicates > (1.0 - RATE_SHARE) * t.rate_hz * (
+            m.time_s[-1] - m.time_s[0]
+        ):  # a few are usual
             text = f"{t.duplicates} samples of {t.channel} repeat the stamp of another; the first of each was kept"
             yield find("duplicates", t.channel, text, topic="stamps")
         if t.out_of_order:
@@ -96,7 +106,11 @@ def _channels(m: Measurement) -> Iterator[Finding]:
                 "check its clock"
             )
             yield find("out_of_order", t.channel, text)
-        if t.align == "line" and t.age_median_s > JITTER / t.rate_hz and t.age_median_s > JITTER * m.period_s:
+        if (
+            t.align == "line"
+            and t.age_median_s > JITTER / t.rate_hz
+            and t.age_median_s > JITTER * m.period_s
+        ):
             text = (
                 f"samples of {t.channel} lie {t.age_median_s * 1e3:.2f} ms (median) beside the rows: they were brought to the "
                 "rows in straight lines, which smooths their noise. Let one loop send commands and read positions"

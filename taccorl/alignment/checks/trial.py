@@ -15,7 +15,10 @@ from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.robots import ROBOT
 
-MOVED = {"rad": 0.02, "m": 0.002}  # Least range of a command that counts as motion [rad; a tenth of it in m]
+MOVED = {
+    "rad": 0.02,
+    "m": 0.002,
+}  # Least range of a command that counts as motion [rad; a tenth of it in m]
 MOVED_STEPS = 100.0
 """A command of a machine other than the PiPER also counts as motion if its range is so many encoder steps (± 1 mm on a stage)."""
 
@@ -55,10 +58,16 @@ def write(m: Measurement, columns_file: str, otherwise: str) -> str:
 def without(m: Measurement, first: int) -> str:
     """The way to leave out row ``first`` and those after it: a command for a CSV file whose rows are as they were written."""
     is_changed = any(f.check == "resampled" for f in m.findings)
-    if is_changed or not (m.source.suffix == ".csv" and m.source.is_file()) or first * m.period_s < 1.0:
+    if (
+        is_changed
+        or not (m.source.suffix == ".csv" and m.source.is_file())
+        or first * m.period_s < 1.0
+    ):
         return "leave this recording out"
     with m.source.open(encoding="utf-8", errors="replace") as file:
-        head = 1 + sum(1 for _ in itertools.takewhile(lambda line: line.startswith("#"), file))
+        head = 1 + sum(
+            1 for _ in itertools.takewhile(lambda line: line.startswith("#"), file)
+        )
     cut, name = shlex.quote(f"{m.source.stem}_cut.csv"), shlex.quote(m.source.name)
     return f"keep the rows before: `head -n {head + first} {name} > {cut}`, and move {name} out of the folder"
 
@@ -81,7 +90,10 @@ class Trial:
     def floor(self) -> Mapping[str, float]:
         """Signal → noise floor of positions [rad, m]; infinite for one that was not measured."""
         known = noise_floor([dataclasses.replace(self.m, repeat_of=None)])
-        return {name: known[name].value if name in known else math.inf for name in self.m.signals}
+        return {
+            name: known[name].value if name in known else math.inf
+            for name in self.m.signals
+        }
 
     @cached_property
     def even(self) -> Measurement:
@@ -93,11 +105,18 @@ class Trial:
         """(J,) bool: the signal is commanded to move. A command that stands still moves a joint that starts away from it and
         comes: more than its least motion off at the start, and less than half as far at the end."""
         found = []
-        for j, (name, target) in enumerate(zip(self.m.signals, self.m.target.T, strict=True)):
+        for j, (name, target) in enumerate(
+            zip(self.m.signals, self.m.target.T, strict=True)
+        ):
             known, least = target[np.isfinite(target)], least_motion(self.m, name)
             off = np.abs(target - self.m.measured[:, j])
             off = off[np.isfinite(off)]
-            comes = len(off) and self.m.target_kind(name) == "position" and off[0] > least and off[-1] < 0.5 * off[0]
+            comes = (
+                len(off)
+                and self.m.target_kind(name) == "position"
+                and off[0] > least
+                and off[-1] < 0.5 * off[0]
+            )
             found.append(bool(len(known) and (np.ptp(known) > least or comes)))
         return np.array(found)
 
@@ -106,7 +125,14 @@ class Trial:
         """Column indices of the signals whose command and measurement both move enough to correlate: by 0.02 rad (2 mm) and 5
         mrad (0.5 mm)."""
         m = self.even
-        spans = [np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in m.measured.T]
+        spans = [
+            np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0
+            for c in m.measured.T
+        ]
         least = [MOVED["rad"] / scale(m, j) for j in range(len(m.signals))]
         commanded = np.ptp(m.target, axis=0)
-        return [j for j, low in enumerate(least) if commanded[j] > low and spans[j] > low / 4]
+        return [
+            j
+            for j, low in enumerate(least)
+            if commanded[j] > low and spans[j] > low / 4
+        ]

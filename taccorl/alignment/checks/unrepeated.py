@@ -32,7 +32,9 @@ from taccorl.alignment.measurements.noise_floor import (
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
 
-BLOCK_S = 0.5  # Length of a block in which the difference of two repeats is measured [s]
+BLOCK_S = (
+    0.5  # Length of a block in which the difference of two repeats is measured [s]
+)
 MOST_TIMES = 5  # Most times that a text lists
 
 
@@ -59,13 +61,25 @@ class Pair(NamedTuple):
         rows = max(2, round(BLOCK_S / float(np.median(np.diff(self.time_s)))))
         for k in range(0, len(self.time_s) - rows + 1, rows):
             own = self.difference[k : k + rows]
-            rms = float(np.sqrt(0.5 * np.nanmean(own**2))) if np.isfinite(own).any() else 0.0
-            yield Block(rms, self.first, self.second, float(self.time_s[k]), float(self.time_s[k + rows - 1]))
+            rms = (
+                float(np.sqrt(0.5 * np.nanmean(own**2)))
+                if np.isfinite(own).any()
+                else 0.0
+            )
+            yield Block(
+                rms,
+                self.first,
+                self.second,
+                float(self.time_s[k]),
+                float(self.time_s[k + rows - 1]),
+            )
 
 
 @check("warning", "dropped_commands", "does_not_repeat")
 @check("note", "not_judged")
-def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[str, Finding]]:
+def check_repeatability(
+    measurements: Sequence[Measurement],
+) -> Iterator[tuple[str, Finding]]:
     """Recordings with dropped commands, and those that differ by far more than their noise from one that they repeat: name, and
     finding; each signal's under the recording that shows it most. A note under the first one if there are no repeats."""
     groups: dict[tuple[str, ...], list[Measurement]] = {}
@@ -79,15 +93,28 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
             yield name, not_judged("", what, str(error))
             continue
         # Without logged targets the measured position is the input: repeats with other positions were another motion.
-        moved = [s for s in floors if any(np.ptp(m.target[:, m.column(s)]) > 0 for m in group)]
+        moved = [
+            s
+            for s in floors
+            if any(np.ptp(m.target[:, m.column(s)]) > 0 for m in group)
+        ]
         moved = [s for s in moved if group[0].target_kind(s) != "effort"]
         differences: dict[str, list[Pair]] = {signal: [] for signal in moved}
         for a, b, laid in pairs:
             later = without_beginning(laid.difference["position"], a.rate_hz)
             for signal, own in differences.items():
-                own.append(Pair(a.name, b.name, laid.time_s, later[:, a.column(signal)]))
-        if moved and not any(np.isfinite(pair.difference).any() for own in differences.values() for pair in own):
-            held = "; until then models of torque targets are held near the measured position" * group[0].held
+                own.append(
+                    Pair(a.name, b.name, laid.time_s, later[:, a.column(signal)])
+                )
+        if moved and not any(
+            np.isfinite(pair.difference).any()
+            for own in differences.values()
+            for pair in own
+        ):
+            held = (
+                "; until then models of torque targets are held near the measured position"
+                * group[0].held
+            )
             why = "of the recordings without errors none repeats another (repeat_of). Record one motion twice"
             yield name, not_judged("", what, why + held)
         for signal, own in differences.items():
@@ -121,21 +148,33 @@ def _unrepeated(
     of its position. ``certain``: dropped commands explain it."""
     quiet = floor.quiet
     squares = np.concatenate([np.empty(0), *(pair.difference**2 for pair in pairs)])
-    repeats = float(np.sqrt(np.nanmean(squares) / 2)) if np.isfinite(squares).any() else 0.0
+    repeats = (
+        float(np.sqrt(np.nanmean(squares) / 2)) if np.isfinite(squares).any() else 0.0
+    )
     odd = dict(next((e.left_out for e in floor.estimates if e.method == "repeats"), ()))
     if repeats <= DISAGREE * quiet and not odd:
         return
     blocks = sorted((block for pair in pairs for block in pair.blocks()), reverse=True)
     worst = blocks[0] if blocks else pairs[0]
     power = np.cumsum([block.rms**2 for block in blocks])
-    count = int(np.searchsorted(power, BURST_POWER * power[-1])) + 1 if len(power) and power[-1] > 0 else 0
+    count = (
+        int(np.searchsorted(power, BURST_POWER * power[-1])) + 1
+        if len(power) and power[-1] > 0
+        else 0
+    )
     share = count / len(blocks) if count else 1.0
     bursts = [block for block in blocks[:count] if block.rms > DISAGREE * quiet]
     if odd:
-        each = (f"{p.second} from {p.first} {odd[p.second]:.0f} times" for p in pairs if p.second in odd)
+        each = (
+            f"{p.second} from {p.first} {odd[p.second]:.0f} times"
+            for p in pairs
+            if p.second in odd
+        )
         how = f"{', '.join(each)} as much as the other repeats, so that the noise floor is {floor.words()}"
     elif share < BURST_SHARE and bursts:
-        some = ", ".join(f"{b.begin_s:.2f} to {b.end_s:.2f} s" for b in bursts[:MOST_TIMES])
+        some = ", ".join(
+            f"{b.begin_s:.2f} to {b.end_s:.2f} s" for b in bursts[:MOST_TIMES]
+        )
         how = (
             f"in bursts: {share:.0%} of the time holds {BURST_POWER:.0%} of it ({bursts[0].first} against {bursts[0].second}: "
             f"{some}; up to {bursts[0].rms * 1e3:.3g} {unit}). The noise floor leaves the bursts out"

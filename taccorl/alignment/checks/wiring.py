@@ -20,14 +20,23 @@ from taccorl.data.finding import Finding, listed
 from taccorl.robots import ROBOT
 
 USUAL_LAG_S = 0.1  # Lag of a joint behind its command that is assumed here [s]
-FOLLOWS, FOLLOWS_NOT = 0.8, 0.5  # Correlation above which a joint follows a command, and below which it does not
+FOLLOWS, FOLLOWS_NOT = (
+    0.8,
+    0.5,
+)  # Correlation above which a joint follows a command, and below which it does not
 REVERSED = -0.6  # Correlation below which a joint moves against its command
 ALIKE = 0.02  # Least difference of correlations for choosing between two joints
-GAIN = (0.2, 5.0)  # Gain above which neither controller nor physics can explain the motion
+GAIN = (
+    0.2,
+    5.0,
+)  # Gain above which neither controller nor physics can explain the motion
 SAME_FACTOR = 1.5
 """A joint that hardly moves is in another unit if it follows its command and its gain is a known factor, within so many times of
 it either way: a lag other than ``USUAL_LAG_S`` changes gains. A choice."""
-BEYOND = {"rad": 0.5, "m": 0.05}  # Distance beyond the robot's limits above which a position is impossible
+BEYOND = {
+    "rad": 0.5,
+    "m": 0.05,
+}  # Distance beyond the robot's limits above which a position is impossible
 SMOOTH_S = 0.03  # Window over which velocities are averaged [s]
 KNOWN_FACTORS = {
     57.2958: "in degrees where it should be in rad",
@@ -48,31 +57,64 @@ VELOCITY_GAIN = (0.8, 1.25)  # Range of that ratio that is accepted
 
 
 FOLLOWS_FROM = (
-    *("measured_before_command", "reversed_effort", "wrong_inertia", "effort_time", "sticking_joint", "blocked"),
-    *("dropped_commands", "does_not_repeat", "late_answer", "not_judged", "start_offset", "beyond_limits"),
+    *(
+        "measured_before_command",
+        "reversed_effort",
+        "wrong_inertia",
+        "effort_time",
+        "sticking_joint",
+        "blocked",
+    ),
+    *(
+        "dropped_commands",
+        "does_not_repeat",
+        "late_answer",
+        "not_judged",
+        "start_offset",
+        "beyond_limits",
+    ),
 )
 """Checks whose findings about a signal may follow from a column that is wrong."""
 OF_ANOTHER_JOINT = (
-    *("dead_channel", "frozen_channel", "saturated_channel", "not_at_rest", "unit", "velocity_unit", "effort_unit"),
+    *(
+        "dead_channel",
+        "frozen_channel",
+        "saturated_channel",
+        "not_at_rest",
+        "unit",
+        "velocity_unit",
+        "effort_unit",
+    ),
     *("beyond_effort", "exchanged_target", "reversed"),
 )
 """Checks whose findings about a signal may also follow from a column that is another joint's."""
 
 
 @check("error", "reversed", explains=FOLLOWS_FROM)
-@check("error", "swapped_joints", needs="position", explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT))
+@check(
+    "error",
+    "swapped_joints",
+    needs="position",
+    explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT),
+)
 def check_wiring(t: Trial) -> Iterator[Finding]:
     """Swapped joints and arms, reversed signs, and wrong units."""
     m, even = t.m, t.even
     yield from (beyond := list(_beyond_range(m)))
-    commanded = [j for j in range(len(m.signals)) if np.ptp(even.target[:, j]) * scale(m, j) > MOVED["rad"]]
+    commanded = [
+        j
+        for j in range(len(m.signals))
+        if np.ptp(even.target[:, j]) * scale(m, j) > MOVED["rad"]
+    ]
     if not commanded:
         return
     lagged = _lagged(even.target, even.period_s)
     follows, gains = _follows(even, lagged, commanded)
     follows[gains < 0.05] = np.nan
     answers = _lagged(np.nan_to_num(even.measured), even.period_s)
-    backwards = np.diag(_follows(dataclasses.replace(even, measured=even.target), answers, commanded)[0])
+    backwards = np.diag(
+        _follows(dataclasses.replace(even, measured=even.target), answers, commanded)[0]
+    )
     swapped: dict[str, str] = {}
     for j in commanded:
         own, name = follows[j, j], m.signals[j]
@@ -80,7 +122,9 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             continue
         # Also of one that does not move (NaN), or only as others shake it; other checks say that where no other joint follows.
         other = _follower(m, np.where(gains >= GAIN[0], follows, np.nan), j)
-        if other is not None and not backwards[j] > follows[other, j]:  # else target and position are exchanged
+        if (
+            other is not None and not backwards[j] > follows[other, j]
+        ):  # else target and position are exchanged
             swapped[name] = m.signals[other]
         elif own < REVERSED:
             way_out = write(
@@ -104,7 +148,10 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
 def in_other_unit(t: Trial, j: int) -> bool:
     """Whether joint ``j`` follows its command with a gain near a known ratio of two units, as of rad to degrees: 1 / 57.3."""
     one = t.even.only([t.m.signals[j]])
-    follows, gain = (float(found[0, 0]) for found in _follows(one, _lagged(one.target, one.period_s), [0]))
+    follows, gain = (
+        float(found[0, 0])
+        for found in _follows(one, _lagged(one.target, one.period_s), [0])
+    )
     near = (1 / SAME_FACTOR < gain / f < SAME_FACTOR for f in KNOWN_FACTORS)
     return j in t.moving and follows > FOLLOWS and any(near)
 
@@ -115,13 +162,26 @@ def _lagged(target: np.ndarray, period_s: float) -> np.ndarray:
 
 
 def _velocity(values: np.ndarray, period_s: float) -> np.ndarray:
-    filled = np.where(np.isfinite(values), values, np.nanmean(values, axis=0) if np.isfinite(values).any() else 0.0)
-    return uniform_filter1d(np.gradient(filled, period_s, axis=0), max(3, round(SMOOTH_S / period_s)), axis=0)
+    filled = np.where(
+        np.isfinite(values),
+        values,
+        np.nanmean(values, axis=0) if np.isfinite(values).any() else 0.0,
+    )
+    return uniform_filter1d(
+        np.gradient(filled, period_s, axis=0),
+        max(3, round(SMOOTH_S / period_s)),
+        axis=0,
+    )
 
 
-def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def _follows(
+    m: Measurement, lagged: np.ndarray, commanded: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
     """(J, J) correlation of measured i with command j, NaN where one of them rests; and the (J, J) gain by their ranges."""
-    v_measured, v_command = _velocity(m.measured, m.period_s), _velocity(lagged, m.period_s)
+    v_measured, v_command = (
+        _velocity(m.measured, m.period_s),
+        _velocity(lagged, m.period_s),
+    )
     found, gains = np.full((2, len(m.signals), len(m.signals)), np.nan)
     span = np.ptp(np.nan_to_num(m.measured), axis=0)
     for i in range(len(m.signals)):
@@ -135,7 +195,11 @@ def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> tuple[
 
 def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
     """Another joint that follows command j and not its own; of several alike the other arm's same joint."""
-    free = [i for i in range(len(m.signals)) if i != j and follows[i, j] > FOLLOWS and not follows[i, i] > FOLLOWS]
+    free = [
+        i
+        for i in range(len(m.signals))
+        if i != j and follows[i, j] > FOLLOWS and not follows[i, i] > FOLLOWS
+    ]
     if not free:
         return None
     best = max(follows[i, j] for i in free)
@@ -155,16 +219,18 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> Iterator[Finding]:
         yield find("swapped_arms", across[0], text)
         return
     for name, other in swapped.items():
-        changes = ", ".join(f"{a}.q: {{column: {b}.q}}" for a, b in ((name, other), (other, name)))
-        file = (
-            f"Write `changes: {{{changes}}}` into a columns file, .qd and .tau (or .q_target) likewise where they are"
+        changes = ", ".join(
+            f"{a}.q: {{column: {b}.q}}" for a, b in ((name, other), (other, name))
         )
+        file = f"Write `changes: {{{changes}}}` into a columns file, .qd and .tau (or .q_target) likewise where they are"
+        text = f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are exchanged"
         text = (
-            f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are exchanged"
+            f"{text}. {write(m, file, 'Pick elements by name in the recording spec')}"
         )
-        text = f"{text}. {write(m, file, 'Pick elements by name in the recording spec')}"
         for one in (name, *({other} - swapped.keys())):
-            yield find("swapped_joints", one, text, topic=" ↔ ".join(sorted((name, other))))
+            yield find(
+                "swapped_joints", one, text, topic=" ↔ ".join(sorted((name, other)))
+            )
 
 
 def _unit_way_out(m: Measurement, *columns: str) -> str:
@@ -181,8 +247,13 @@ def _beyond_range(m: Measurement) -> Iterator[Finding]:
         if name not in ROBOT.action_names:
             continue
         k = ROBOT.action_names.index(name)
-        for what, values in (("measured", m.measured[:, j]), ("commanded", m.target[:, j])):
-            beyond = np.nan_to_num(np.maximum(values - ROBOT.action_high[k], ROBOT.action_low[k] - values))
+        for what, values in (
+            ("measured", m.measured[:, j]),
+            ("commanded", m.target[:, j]),
+        ):
+            beyond = np.nan_to_num(
+                np.maximum(values - ROBOT.action_high[k], ROBOT.action_low[k] - values)
+            )
             row = int(np.argmax(beyond))
             if beyond[row] > BEYOND[unit]:
                 text = (
@@ -194,9 +265,14 @@ def _beyond_range(m: Measurement) -> Iterator[Finding]:
                 break
 
 
-def _gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -> Iterator[Finding]:
+def _gain(
+    m: Measurement, even: Measurement, lagged: np.ndarray, j: int
+) -> Iterator[Finding]:
     name, rows = m.signals[j], np.isfinite(even.measured[:, j])
-    x, y = lagged[rows, j] - lagged[rows, j].mean(), even.measured[rows, j] - even.measured[rows, j].mean()
+    x, y = (
+        lagged[rows, j] - lagged[rows, j].mean(),
+        even.measured[rows, j] - even.measured[rows, j].mean(),
+    )
     gain = float(x @ y / (x @ x))
     if GAIN[0] < gain < GAIN[1]:
         return
@@ -232,4 +308,8 @@ def velocity_gain(even: Measurement, j: int, k: int) -> float | None:
         return None
     slope = _velocity(even.measured[:, [k]], even.period_s)[rows, 0]
     seen = uniform_filter1d(reported[rows], max(3, round(SMOOTH_S / even.period_s)))
-    return float(slope @ seen / (slope @ slope)) if abs(np.corrcoef(slope, seen)[0, 1]) >= FOLLOWS else None
+    return (
+        float(slope @ seen / (slope @ slope))
+        if abs(np.corrcoef(slope, seen)[0, 1]) >= FOLLOWS
+        else None
+    )

@@ -20,7 +20,13 @@ from taccorl.alignment.controller.joint_motion import (
     moved_by_others,
     resting,
 )
-from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, rigid_terms, torque_along
+from taccorl.alignment.controller.rigid_joint import (
+    Gains,
+    Rigid,
+    RigidJoint,
+    rigid_terms,
+    torque_along,
+)
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -36,10 +42,17 @@ def split_signal(signal: str) -> tuple[str, str]:
     an arm; grippers have no one-joint model."""
     arm, _, joint = signal.partition("_")
     if arm in ROBOT.arms and joint == "gripper":
-        raise TaccorlError(f"{signal}: there is no one-joint model of a gripper; choose a joint")
+        raise TaccorlError(
+            f"{signal}: there is no one-joint model of a gripper; choose a joint"
+        )
     if arm not in ROBOT.arms or joint not in ROBOT.joints:
-        first, last = (ROBOT.action_names[k] for k in (ROBOT.joint_indices[0], ROBOT.joint_indices[-1]))
-        raise TaccorlError(f"{signal!r} is not a joint of the arms; their joints are {first} … {last}")
+        first, last = (
+            ROBOT.action_names[k]
+            for k in (ROBOT.joint_indices[0], ROBOT.joint_indices[-1])
+        )
+        raise TaccorlError(
+            f"{signal!r} is not a joint of the arms; their joints are {first} … {last}"
+        )
     return arm, joint
 
 
@@ -49,11 +62,25 @@ def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
     own: list[Effect] = []
     for effect in present(effects):
         if isinstance(effect, JointEffect) and signal in effect.acts_on():
-            is_alone = effect.arm == arm and effect.joints == [joint]  # as in every hypothesis of a search
-            own.append(effect if is_alone else dataclasses.replace(effect, arm=arm, joints=[joint]))
-        elif isinstance(effect, ArmEffect) and not isinstance(effect, JointEffect) and arm in effect.acts_on():
+            is_alone = effect.arm == arm and effect.joints == [
+                joint
+            ]  # as in every hypothesis of a search
+            own.append(
+                effect
+                if is_alone
+                else dataclasses.replace(effect, arm=arm, joints=[joint])
+            )
+        elif (
+            isinstance(effect, ArmEffect)
+            and not isinstance(effect, JointEffect)
+            and arm in effect.acts_on()
+        ):
             own.append(dataclasses.replace(effect, arm=arm))
-        elif not isinstance(effect, ArmEffect) and effect.slot == "robot" and {arm, signal} & {*effect.acts_on()}:
+        elif (
+            not isinstance(effect, ArmEffect)
+            and effect.slot == "robot"
+            and {arm, signal} & {*effect.acts_on()}
+        ):
             own.append(effect)
     return own
 
@@ -97,10 +124,14 @@ def arm_spec(
         joint.limited = False
     position, of_joint = mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtObj.mjOBJ_JOINT
     for name in names:
-        spec.add_sensor(name=f"{name}_pos", type=position, objtype=of_joint, objname=name)
+        spec.add_sensor(
+            name=f"{name}_pos", type=position, objtype=of_joint, objname=name
+        )
     if payload_kg > 0:
         held_payload(arm, payload_kg, payload_at_m).edit(spec, config)
-        spec.body(f"{arm}_payload").name = f"{arm}_held"  # so that the arm may have another, hidden one
+        spec.body(
+            f"{arm}_payload"
+        ).name = f"{arm}_held"  # so that the arm may have another, hidden one
     return spec
 
 
@@ -121,10 +152,17 @@ def rigid(
     """Inertia and weight of joint ``signal`` with the others held at ``pose`` (7,) [rad, m], which is that of ``arm_spec``; of
     ``effects`` only those that change bodies are used."""
     arm, joint = split_signal(signal)
-    return rigid_of(arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m), config, signal, effects)
+    return rigid_of(
+        arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m),
+        config,
+        signal,
+        effects,
+    )
 
 
-def rigid_of(spec: mujoco.MjSpec, config: TwinConfig, signal: str, effects: Sequence[Effect]) -> Rigid:
+def rigid_of(
+    spec: mujoco.MjSpec, config: TwinConfig, signal: str, effects: Sequence[Effect]
+) -> Rigid:
     """``rigid`` of the arm ``spec``, which is changed."""
     for effect in effects:
         effect.edit(spec, config)
@@ -146,7 +184,11 @@ class HasJoints(Protocol):
 def joint_of(machine: TwinConfig | HasJoints, signal: str) -> RigidJoint:
     """The joint ``signal`` of the PiPER's twin ``machine``, or of another machine, for the one-joint model. Raises TaccorlError:
     there is no such joint, or it is a gripper of the PiPER."""
-    return ArmJoint(machine, signal) if isinstance(machine, TwinConfig) else machine.joint(signal)
+    return (
+        ArmJoint(machine, signal)
+        if isinstance(machine, TwinConfig)
+        else machine.joint(signal)
+    )
 
 
 class ArmJoint(RigidJoint):
@@ -158,22 +200,30 @@ class ArmJoint(RigidJoint):
         k = ROBOT.joints.index(joint)
         control = config.controller_of(arm)
         self.signal, self._config = signal, config
-        self.gains = Gains(control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k])
+        self.gains = Gains(
+            control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k]
+        )
         self._own = of_joint(config.effects, signal)
         # Cached: building a MuJoCo MjSpec takes about 10 ms, compiling it about 0.1 ms.
-        self._specified = lru_cache(lambda pose, *held: arm_spec(config, arm, np.array(pose), [joint], *held))
+        self._specified = lru_cache(
+            lambda pose, *held: arm_spec(config, arm, np.array(pose), [joint], *held)
+        )
 
     def timestep_s(self, motion: JointMotion) -> float:
         return self._config.physics.timestep_s
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        spec = self._specified(tuple(motion.pose), motion.payload_kg, motion.payload_at_m).copy()
+        spec = self._specified(
+            tuple(motion.pose), motion.payload_kg, motion.payload_at_m
+        ).copy()
         return rigid_of(spec, self._config, self.signal, bodies)
 
     def surroundings(self, m: Measurement) -> Surroundings:
         arm, _ = split_signal(self.signal)
         names = ROBOT.action_names[ROBOT.arm_slice(arm)]
-        pose = np.array([resting(m, m.column(name)) if name in m.signals else 0.0 for name in names])
+        pose = np.array(
+            [resting(m, m.column(name)) if name in m.signals else 0.0 for name in names]
+        )
         known = Surroundings(
             coupling_nm=np.zeros(m.num_rows),
             pose=pose,
@@ -188,7 +238,9 @@ class ArmJoint(RigidJoint):
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
         names = {effect.name for effect in more}
-        return of_joint([*(e for e in self._own if e.name not in names), *more], self.signal)
+        return of_joint(
+            [*(e for e in self._own if e.name not in names), *more], self.signal
+        )
 
     def freed(self, held: Collection[str] = ()) -> "tuple[list[Effect], ArmJoint]":
         effects = self._config.effects
@@ -196,7 +248,9 @@ class ArmJoint(RigidJoint):
         mine = [e for e in effects if isinstance(e, ArmEffect) and on & {*e.acts_on()}]
         own: list[Effect] = [e for e in mine if e.fitted and e.name not in held]
         others = [e for e in effects if not any(e is mine for mine in own)]
-        return own, ArmJoint(dataclasses.replace(self._config, effects=others), self.signal)
+        return own, ArmJoint(
+            dataclasses.replace(self._config, effects=others), self.signal
+        )
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         return selectors(cls, self.signal)
@@ -209,8 +263,18 @@ class ArmJoint(RigidJoint):
             return np.zeros(m.num_rows)
         angles |= moved_by_others(m, [self.signal], still=-1.0)
         both = []
-        for free in ([name for name in ROBOT.joints if f"{arm}_{name}" in angles], [joint]):
-            model = arm_spec(self._config, arm, known.pose, free, known.payload_kg, known.payload_at_m).compile()
+        for free in (
+            [name for name in ROBOT.joints if f"{arm}_{name}" in angles],
+            [joint],
+        ):
+            model = arm_spec(
+                self._config,
+                arm,
+                known.pose,
+                free,
+                known.payload_kg,
+                known.payload_at_m,
+            ).compile()
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
             q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
             needed, carried, _ = torque_along(model, q, m.period_s)

@@ -15,7 +15,15 @@ import numba
 import numpy as np
 
 from taccorl.alignment.controller.drive_numbers import Drive
-from taccorl.alignment.controller.lanes import LANES, compiled, decayed, holds, load, store, where
+from taccorl.alignment.controller.lanes import (
+    LANES,
+    compiled,
+    decayed,
+    holds,
+    load,
+    store,
+    where,
+)
 from taccorl.sim.effects import command
 
 _PLACES = ("midpoint", "dropped_commands__seed", "command_delay__delay_s")
@@ -26,17 +34,29 @@ _mixed, _STRIDE = numba.njit(command.mixed), command.STRIDE
 @compiled
 def _uniform(seed: float, count: int) -> float:
     """``effects.command.uniform`` of one command, in episode 0."""
-    bits = _mixed(_mixed(np.uint64(seed) << np.uint64(32)) + np.uint64(count + 1) * np.uint64(_STRIDE))
+    bits = _mixed(
+        _mixed(np.uint64(seed) << np.uint64(32))
+        + np.uint64(count + 1) * np.uint64(_STRIDE)
+    )
     return (bits >> np.uint64(11)) * 2.0**-53
 
 
 @compiled
-def arriving(p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float) -> np.ndarray:
+def arriving(
+    p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float
+) -> np.ndarray:
     """(S hold, LANES) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
     held_s, count = hold * step_s, sent.size * hold
-    lag_s, likely, apart = p.command_lag__time_constant_s, p.dropped_commands__probability, 1.0 / p.kp
+    lag_s, likely, apart = (
+        p.command_lag__time_constant_s,
+        p.dropped_commands__probability,
+        1.0 / p.kp,
+    )
     reached = where(lag_s > 0.0, 1.0 - decayed(held_s / max(lag_s, 1e-9))[0], 1.0)
-    furthest, share = p.slew_limit__speed_rad_per_s * held_s, p.velocity_feedforward__share
+    furthest, share = (
+        p.slew_limit__speed_rad_per_s * held_s,
+        p.velocity_feedforward__share,
+    )
     share = where((share != 0.0) & (p.kp > 0.0), share * p.kd * apart, 0.0)
     lagging = goal = at = before = 0.0 * share + sent[0]
     commands, chance = np.empty((count, LANES)), np.ones((1, LANES))
@@ -54,7 +74,10 @@ def arriving(p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: f
     for lane in range(LANES):
         if numbers[_DELAY, lane] > 0.0:
             # MuJoCo reads its delay buffer before it writes the new value: the shortest delay is one physics step.
-            late = max(numbers[_DELAY, lane] / step_s, 0.0 if numbers[_MIDPOINT, lane] > 0.0 else 1.0)
+            late = max(
+                numbers[_DELAY, lane] / step_s,
+                0.0 if numbers[_MIDPOINT, lane] > 0.0 else 1.0,
+            )
             whole = math.floor(late)
             own = commands[:, lane].copy()
             for n in range(count):
@@ -69,14 +92,34 @@ def late_speed(p: Any) -> Any:
     """Times and factors of ``Drive`` p: b [s]; 1 + l / b; lead of the speed [s], where its delay is below 0; inertia [s²] that
     each N·m/rad takes off. And of the effort that a row shows, one output that is older by ``effort_age``: the factor on q̇ − w,
     and the time [s] by which the speed's change is later than that."""
-    smoothed, sampled = max(p.speed_delay__delay_s, 0.0), p.speed_age + min(p.speed_delay__delay_s, 0.0)
+    smoothed, sampled = (
+        max(p.speed_delay__delay_s, 0.0),
+        p.speed_age + min(p.speed_delay__delay_s, 0.0),
+    )
     sampled, lead_s = max(sampled, 0.0), min(sampled, 0.0)
     late_s = smoothed + sampled
-    slow_s = (smoothed * late_s + 7.0 / 12.0 * sampled * sampled) / where(late_s > 0.0, late_s, 1.0)
+    slow_s = (smoothed * late_s + 7.0 / 12.0 * sampled * sampled) / where(
+        late_s > 0.0, late_s, 1.0
+    )
     turned = where(slow_s > 0.0, late_s / where(slow_s > 0.0, slow_s, 1.0), 1.0)
-    old_s = min(max(0.5 * sampled + p.effort_age, 0.0), 2.0 * sampled)  # of the mean speed of a period
+    old_s = min(
+        max(0.5 * sampled + p.effort_age, 0.0), 2.0 * sampled
+    )  # of the mean speed of a period
     both_s = 0.5 * sampled + old_s
-    second = smoothed * (smoothed + both_s) + sampled * (sampled / 6.0 + 0.5 * old_s) + 0.5 * old_s * old_s
-    shown = where(sampled > 0.0, second / where(sampled > 0.0, slow_s * slow_s, 1.0), turned)
+    second = (
+        smoothed * (smoothed + both_s)
+        + sampled * (sampled / 6.0 + 0.5 * old_s)
+        + 0.5 * old_s * old_s
+    )
+    shown = where(
+        sampled > 0.0, second / where(sampled > 0.0, slow_s * slow_s, 1.0), turned
+    )
     stiff = sampled * (0.5 * late_s - sampled / 6.0)
-    return slow_s, turned, lead_s, stiff, shown, late_s + lead_s + p.effort_age - shown * slow_s
+    return (
+        slow_s,
+        turned,
+        lead_s,
+        stiff,
+        shown,
+        late_s + lead_s + p.effort_age - shown * slow_s,
+    )

@@ -43,10 +43,17 @@ STEP_SHARE = 0.05
 """Physics step as a share of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
 WINDING_WITHIN = 3.0
 """Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's; data sheets are no better."""
-GAIN_UNITS: Mapping[Law, tuple[str, str]] = {"cascade": ("1/s", "N·m·s/rad"), "pwm": ("1/rad", "s/rad")}
+GAIN_UNITS: Mapping[Law, tuple[str, str]] = {
+    "cascade": ("1/s", "N·m·s/rad"),
+    "pwm": ("1/rad", "s/rad"),
+}
 """Law → units of ``kp`` and ``kd``; of other laws N·m/rad and N·m·s/rad."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
-_KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque", "effort": "effort"}
+_KINDS: Mapping[Law, TargetKind] = {
+    "velocity": "velocity",
+    "torque": "torque",
+    "effort": "effort",
+}
 FOLLOW_HZ = 10.0
 """Rate of the spring and damper that hold a model of law effort at the measured position [Hz]: K and 2 K / ω. A choice: with
 K = ω² J, noise of 0.1 mrad is an effort of 0.4 N·m for each kg·m²."""
@@ -70,50 +77,96 @@ class DriveLaw:
     """Control law and numbers of one drive. Units are for a hinge; for a sliding joint read N for N·m and m for rad."""
 
     law: Law = "impedance"  # Control law, a row of the table in ``docs/your_robot.md``
-    kp: float | None = None  # Gain in the law's unit divided by ``kp_factor``; None for laws without it
-    kd: float | None = None  # Gain in the law's unit divided by ``kd_factor``; None for laws without it
+    kp: float | None = (
+        None  # Gain in the law's unit divided by ``kp_factor``; None for laws without it
+    )
+    kd: float | None = (
+        None  # Gain in the law's unit divided by ``kd_factor``; None for laws without it
+    )
     kp_factor: float = 1.0
     """Factor from ``kp``, here and in measurements.yaml, to the law's unit: the value of one step of a gain's register."""
     kd_factor: float = 1.0  # The same for ``kd``
     torque_ff: float = 0.0  # Constant torque of the controller [N·m]
     supply_v: float | None = None  # Voltage of the motor's supply [V]; law pwm
     resistance_ohm: float | None = None  # Resistance of the winding [Ω]; law pwm
-    torque_nm_per_a: float | None = None  # k_t at the axis or joint, gear included [N·m/A], law pwm
+    torque_nm_per_a: float | None = (
+        None  # k_t at the axis or joint, gear included [N·m/A], law pwm
+    )
     emf_v_s_per_rad: float | None = None
     """k_e at the axis or joint [V·s/rad], law pwm; k_t if not given (both are equal in SI units)."""
-    effort_limit: float | None = None  # Torque at which the drive's output is clipped [N·m]; None: not clipped
+    effort_limit: float | None = (
+        None  # Torque at which the drive's output is clipped [N·m]; None: not clipped
+    )
     effort_after_target: bool = False
     """True: the logged effort of a row already responds to the row's target. False: it was measured before that target acts."""
     known: tuple[str, ...] = ()
     """What ``diagnose`` leaves as the file has it: names of numbers that it fits otherwise (``FITTED``), ``EFFECT.PARAMETER`` of
     an effect of the file, or an effect: all of its parameters, or that it is absent where the file does not have it."""
-    FITTED: ClassVar[tuple[str, ...]] = ("kp", "kd", "torque_ff", "stall_nm", "back_emf")
+    FITTED: ClassVar[tuple[str, ...]] = (
+        "kp",
+        "kd",
+        "torque_ff",
+        "stall_nm",
+        "back_emf",
+    )
     """Numbers of the drive that ``diagnose`` fits for some law or recordings; subclasses add theirs."""
 
     def check_law(self, owner: str) -> None:
         """Check that the numbers fit the law. Raises TaccorlError, which begins with ``OWNER.KEY``: a number is wrong, is missing
         for the law, or is not used by it."""
-        stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
-        unused = {"velocity": ("kp",), "torque": ("kp", "kd"), "effort": ("kp", "kd", "effort_limit")}
+        stated = [
+            name
+            for name in ("kp", "kd", *WINDING, "effort_limit")
+            if getattr(self, name) is not None
+        ]
+        unused = {
+            "velocity": ("kp",),
+            "torque": ("kp", "kd"),
+            "effort": ("kp", "kd", "effort_limit"),
+        }
         foreign = (() if self.law == "pwm" else WINDING) + unused.get(self.law, ())
         for name in (name for name in foreign if name in stated):
             raise TaccorlError(
                 f"{owner}.{name}: law {self.law} does not use this number; remove it, or correct the law"
             )
-        positive = ["kp_factor", "kd_factor", *(name for name in stated if name != "kd")]
-        check_numbers(owner, self, finite=("torque_ff",), not_negative=["kd"] * ("kd" in stated), positive=positive)
+        positive = [
+            "kp_factor",
+            "kd_factor",
+            *(name for name in stated if name != "kd"),
+        ]
+        check_numbers(
+            owner,
+            self,
+            finite=("torque_ff",),
+            not_negative=["kd"] * ("kd" in stated),
+            positive=positive,
+        )
         for name in NEEDED[self.law]:
-            if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
-                raise TaccorlError(f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`")
+            if getattr(self, name) is None or (
+                self.law != "impedance" and not getattr(self, name)
+            ):
+                raise TaccorlError(
+                    f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`"
+                )
         if self.law == "effort":
-            for name in ("loop_hz", "command_hz", "target_late_s", "effort_after_target"):
+            for name in (
+                "loop_hz",
+                "command_hz",
+                "target_late_s",
+                "effort_after_target",
+            ):
                 if getattr(self, name, None):
-                    raise TaccorlError(f"{owner}.{name}: law effort has no drive; remove it")
+                    raise TaccorlError(
+                        f"{owner}.{name}: law effort has no drive; remove it"
+                    )
 
     def check_known(self, owner: str, effects: Mapping[str, Sequence[str]]) -> None:
         """Check the names in ``known``; ``effects``: effect of the file → its parameters. Raises TaccorlError, which begins with
         ``OWNER.known``: a name is none of a number that ``diagnose`` moves."""
-        numbers = [*self.FITTED, *(f"{name}.{p}" for name, own in effects.items() for p in own)]
+        numbers = [
+            *self.FITTED,
+            *(f"{name}.{p}" for name, own in effects.items() for p in own),
+        ]
         for name in self.known:
             if name in numbers or name in registry:
                 continue
@@ -138,13 +191,23 @@ class DriveLaw:
     @property
     def stall_nm(self) -> float:
         """Torque at rest and full duty, V k_t / R, of law pwm [N·m]."""
-        return (self.supply_v or 0.0) * (self.torque_nm_per_a or 0.0) / (self.resistance_ohm or 1.0)
+        return (
+            (self.supply_v or 0.0)
+            * (self.torque_nm_per_a or 0.0)
+            / (self.resistance_ohm or 1.0)
+        )
 
     @property
     def back_emf(self) -> float:
         """Torque per speed that the back-EMF takes, k_t k_e / R, of law pwm [N·m·s/rad]; 0 for other laws."""
-        emf = self.torque_nm_per_a if self.emf_v_s_per_rad is None else self.emf_v_s_per_rad
-        return (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
+        emf = (
+            self.torque_nm_per_a
+            if self.emf_v_s_per_rad is None
+            else self.emf_v_s_per_rad
+        )
+        return (
+            (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
+        )
 
     @property
     def following(self) -> Gains:
@@ -167,7 +230,10 @@ class DriveLaw:
     @property
     def facts(self) -> dict[str, float]:
         """Fields of ``drive_numbers.Drive`` that follow from the law and its numbers: field → value."""
-        found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
+        found: dict[str, float] = {
+            "command": _COMMANDS.get(self.law, POSITION),
+            "midpoint": 1.0,
+        }
         found["effort_after"] = float(self.effort_after_target)
         found["commands_speed"] = float(self.law in ("cascade", "velocity"))
         if self.law == "pwm":
@@ -176,7 +242,9 @@ class DriveLaw:
             found["torque_saturation__torque_max_nm"] = self.effort_limit
         return found
 
-    def timestep_s(self, rate_hz: float, inertia: float, held: float, loop_hz: float | None) -> float:
+    def timestep_s(
+        self, rate_hz: float, inertia: float, held: float, loop_hz: float | None
+    ) -> float:
         """Physics step of the one-joint model [s], of which a whole number fits between two rows of a recording.
 
         Args:
@@ -186,8 +254,13 @@ class DriveLaw:
             loop_hz: rate of the drive's loop that the file states; None if it states none. A step is at most one period long,
                 so that a target that arrives between two rows acts in the right period.
         """
-        damping = self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
-        wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
+        damping = (
+            self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
+        )
+        wanted = min(
+            LONGEST_STEP_S,
+            max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)),
+        )
         wanted = min(wanted, max(1.0 / loop_hz, OF_LOOP_S)) if loop_hz else wanted
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
@@ -195,15 +268,25 @@ class DriveLaw:
         """Whether an effect of this name is possible under this control law: ``integral_action`` is not under law torque."""
         if self.law == "effort":
             needs = {*registry.get(effect).needs}
-            return effect == "payload" or (bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS)
+            return effect == "payload" or (
+                bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS
+            )
         return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
 
     @property
     def numbers(self) -> dict[str, tuple[float, str]]:
         """Field → (value, unit) of the numbers that a fit can change (``law_numbers``). The unit of a gain for which the file
         states a factor (``kp_factor``, ``kd_factor``) is that of the drive's own setting."""
-        units = dict(zip(("kp", "kd"), GAIN_UNITS.get(self.law, ("N·m/rad", "N·m·s/rad")), strict=True))
-        units |= {name: "steps" for name in units if getattr(self, f"{name}_factor") != 1.0}
+        units = dict(
+            zip(
+                ("kp", "kd"),
+                GAIN_UNITS.get(self.law, ("N·m/rad", "N·m·s/rad")),
+                strict=True,
+            )
+        )
+        units |= {
+            name: "steps" for name in units if getattr(self, f"{name}_factor") != 1.0
+        }
         units |= {
             "supply_v": "V",
             "resistance_ohm": "Ω",
@@ -211,19 +294,27 @@ class DriveLaw:
             "torque_nm_per_a": "N·m/A",
             "emf_v_s_per_rad": "V·s/rad",
         }
-        return {name: (getattr(self, name), unit) for name, unit in units.items() if getattr(self, name) is not None}
+        return {
+            name: (getattr(self, name), unit)
+            for name, unit in units.items()
+            if getattr(self, name) is not None
+        }
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
         """Convert fitted values, by parameter name, into values of this class's fields. ``base``: those of ``torque_ff`` [N·m],
         ``kp`` and ``kd`` (as in ``loop_gains``), ``stall_nm`` and ``back_emf``, or of fields of the motor in place of these two.
         Returns field → value in the unit of the file; only fields that follow from ``base``."""
         new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
-        if self.law == "pwm" and (of_motor := {name: base[name] for name in WINDING if name in base}):
+        if self.law == "pwm" and (
+            of_motor := {name: base[name] for name in WINDING if name in base}
+        ):
             return new | of_motor
         if self.law == "pwm" and {"stall_nm", "back_emf"} & {*base}:
             volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
             new["torque_nm_per_a"] = base.get("stall_nm", self.stall_nm) * ohms / volts
-            new["emf_v_s_per_rad"] = base.get("back_emf", self.back_emf) * ohms / new["torque_nm_per_a"]
+            new["emf_v_s_per_rad"] = (
+                base.get("back_emf", self.back_emf) * ohms / new["torque_nm_per_a"]
+            )
             return new
         if "kd" in base:
             new["kd"] = base["kd"] / self.kd_factor
@@ -243,7 +334,9 @@ class DriveLaw:
                     f"{m.name}: {name} of {signal} is stated, but the file of the joint, with law {self.law}, has no {name}; "
                     "remove it from measurements.yaml, or add it to the file"
                 )
-            scales[name] = m.gain_scale.get(signal, 1.0) if stated is None else stated / own
+            scales[name] = (
+                m.gain_scale.get(signal, 1.0) if stated is None else stated / own
+            )
         # Of a cascade K_p is the product of both gains.
         product = scales["kd"] if self.law == "cascade" and signal in m.kd else 1.0
         return scales["kp"] * product, scales["kd"]
@@ -252,7 +345,11 @@ class DriveLaw:
         """(T,) supply voltage divided by that of the file; None if the recording has none. The voltage from a row on is the one
         measured at the next row, because the current that its target causes makes the supply sag. Raises TaccorlError: the
         recording has a voltage, which the law does not use."""
-        volts = m.supply_v[:, m.column(signal)] if m.supply_v.size else np.full(m.num_rows, np.nan)
+        volts = (
+            m.supply_v[:, m.column(signal)]
+            if m.supply_v.size
+            else np.full(m.num_rows, np.nan)
+        )
         if not np.isfinite(volts).any():
             return None
         if self.supply_v is None:
@@ -268,15 +365,26 @@ class DriveJoint(RigidJoint):
     follows_line: ClassVar[bool] = True
 
     def __init__(
-        self, law: DriveLaw, signal: str, unit: Literal["rad", "m"], loop_hz: float | None, command_hz: float | None
+        self,
+        law: DriveLaw,
+        signal: str,
+        unit: Literal["rad", "m"],
+        loop_hz: float | None,
+        command_hz: float | None,
     ) -> None:
         self.law, self.signal, self.unit, self.gains = law, signal, unit, law.following
-        self.gain_names, self.target_kind, self.known_names = law.gain_names, law.target_kind, law.known
+        self.gain_names, self.target_kind, self.known_names = (
+            law.gain_names,
+            law.target_kind,
+            law.known,
+        )
         self.command_hz = math.inf if law.law == "effort" else command_hz or 0.0
         # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
         # the output that a row shows before its own target acts. After it acts, the output is new.
         loop_s = 1.0 / loop_hz if loop_hz else 0.0
-        self.facts = law.facts | {"effort_age": (-0.5 if law.effort_after_target else 0.5) * loop_s}
+        self.facts = law.facts | {
+            "effort_age": (-0.5 if law.effort_after_target else 0.5) * loop_s
+        }
         self.position_age_s, self.speed_delay_s = 0.5 * loop_s, loop_s
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
@@ -285,8 +393,15 @@ class DriveJoint(RigidJoint):
     def surroundings(self, m: Measurement) -> Surroundings:
         """What the recording states of the drive: known load, added torque, the motor's supply, and whether it is on. Raises
         TaccorlError: there is a supply voltage that the law does not use."""
-        on, added = (values[:, m.column(self.signal)] if values.size else None for values in (m.enabled, m.torque_ff))
-        known = {"supply": self.law.supply(self.signal, m), "on": on, "torque_ff_nm": added}
+        on, added = (
+            values[:, m.column(self.signal)] if values.size else None
+            for values in (m.enabled, m.torque_ff)
+        )
+        known = {
+            "supply": self.law.supply(self.signal, m),
+            "on": on,
+            "torque_ff_nm": added,
+        }
         return Surroundings(coupling_nm=-m.known_load(self.signal), **known)
 
 
@@ -295,5 +410,7 @@ def with_gains(m: Measurement, laws: Mapping[str, DriveLaw]) -> Measurement:
     stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
     for name, law in laws.items():
         for key in law.gain_names:
-            stated[key].setdefault(name, m.gain_scale.get(name, 1.0) * getattr(law, key))
+            stated[key].setdefault(
+                name, m.gain_scale.get(name, 1.0) * getattr(law, key)
+            )
     return dataclasses.replace(m, kp=stated["kp"], kd=stated["kd"])

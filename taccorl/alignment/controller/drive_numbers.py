@@ -8,7 +8,14 @@ from taccorl.alignment.controller.rigid_joint import Gains, Rigid
 from taccorl.sim.effects import command, drive, encoder, friction, gear, load
 from taccorl.sim.effects.effect import JOINT_SLOTS, ArmEffect
 
-FAMILIES = (command, drive, encoder, friction, gear, load)  # Modules of the effects that the model has
+FAMILIES = (
+    command,
+    drive,
+    encoder,
+    friction,
+    gear,
+    load,
+)  # Modules of the effects that the model has
 POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
 """Values of ``Drive.command``: which quantity of the joint commands set, its position, velocity or torque."""
 
@@ -24,7 +31,9 @@ class _Own(NamedTuple):
     duty_torque: float = math.inf
     """Torque of the whole supply voltage at rest [N·m], V k_t / R, to which the controller's torque is clipped
     before the back-EMF is subtracted."""
-    back_emf: float = 0.0  # Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]
+    back_emf: float = (
+        0.0  # Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]
+    )
     effort_after: float = 0.0
     """1: the reported effort of a row was measured after the row's command acted; 1 + n: after a command that acts n parts of the
     row late; 0: before."""
@@ -45,15 +54,28 @@ class _Own(NamedTuple):
 def _numbers() -> dict[str, float]:
     """``EFFECT__PARAMETER`` → value that does nothing, of all effects that this model has: what ``Effect.drive`` gives."""
     families = [vars(family).values() for family in FAMILIES]
-    own = {cls for members in families for cls in members if isinstance(cls, type) and issubclass(cls, ArmEffect)}
+    own = {
+        cls
+        for members in families
+        for cls in members
+        if isinstance(cls, type) and issubclass(cls, ArmEffect)
+    }
     absent = [cls() for cls in own if cls.slot in JOINT_SLOTS]
-    return dict(sorted(pair for effect in absent for pair in (effect.drive() or {}).items()))
+    return dict(
+        sorted(pair for effect in absent for pair in (effect.drive() or {}).items())
+    )
 
 
 _BODY = [name for name in Rigid._fields if name != "weight_n"]
-_DEFAULTS = {name: Rigid._field_defaults[name] for name in _BODY[1:]} | _Own._field_defaults
-_DEFAULTS |= {name: value for name, value in _numbers().items() if name not in _DEFAULTS}
-Drive = namedtuple("Drive", (*Gains._fields, _BODY[0], *_DEFAULTS), defaults=_DEFAULTS.values())
+_DEFAULTS = {
+    name: Rigid._field_defaults[name] for name in _BODY[1:]
+} | _Own._field_defaults
+_DEFAULTS |= {
+    name: value for name, value in _numbers().items() if name not in _DEFAULTS
+}
+Drive = namedtuple(
+    "Drive", (*Gains._fields, _BODY[0], *_DEFAULTS), defaults=_DEFAULTS.values()
+)
 """One joint with its drive: the fields of ``Gains``, ``Rigid`` and ``_Own``, and ``EFFECT__PARAMETER`` of the effects, which do
 nothing by default.
 

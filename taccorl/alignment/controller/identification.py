@@ -25,14 +25,20 @@ from taccorl.errors import TaccorlError
 
 PAPER_BOUNDS = {"kp": (10.0, 1e5), "kd": (1.0, 1e3), "torque_ff": (-8.0, 8.0)}
 """Bounds of K_p, K_d and T_ref [N·m/rad, N·m·s/rad, N·m] (App. B.1)."""
-REFERENCE = Gains(500.0, 50.0, 0.0)  # Gains of the paper's reference simulator, at which a search starts
+REFERENCE = Gains(
+    500.0, 50.0, 0.0
+)  # Gains of the paper's reference simulator, at which a search starts
 _NORMAL_95 = 1.96
 _AT_BOUND = 1e-3  # so near to a bound, as a share of the value or of the span, is at it
 _LEAST_MOTION = 5e-3  # rad, m
 _LEAST_SECONDS = 2.0
 _MOST_ROUNDS = 4  # of weighing positions and torques against each other
 _MOST_LOG = 50.0
-_STEPS = {"kp": 1e-3, "kd": 1e-4, "torque_ff": 1e-6}  # of log K_p, log K_d / K_p and T_ref / K_p [rad], for derivatives
+_STEPS = {
+    "kp": 1e-3,
+    "kd": 1e-4,
+    "torque_ff": 1e-6,
+}  # of log K_p, log K_d / K_p and T_ref / K_p [rad], for derivatives
 _LATE_STEP_S, _MOST_LATE_S = 1e-4, 0.5
 _DIVERGED = 1e3
 
@@ -54,7 +60,9 @@ class MotionError:
     """Error of the model on one recording, before (gains of the twin's configuration) and after the fit."""
 
     name: str
-    use: Literal["fit", "validation"]  # Whether the gains were fitted to the recording, or not (validation)
+    use: Literal[
+        "fit", "validation"
+    ]  # Whether the gains were fitted to the recording, or not (validation)
     rmse_before: float  # RMS error before the fit [rad]
     rmse_after: float  # RMS error after the fit [rad]
 
@@ -95,30 +103,55 @@ def identify_controller(
     Raises TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a
     parameter is unknown."""
     if not motions_fit:
-        raise TaccorlError(f"{model.signal}: no recording to fit; give at least one sweep of this joint")
+        raise TaccorlError(
+            f"{model.signal}: no recording to fit; give at least one sweep of this joint"
+        )
     for motion in (*motions_fit, *validation):
         _check_usable(motion, model)
     if free is None:
-        known = {"kp": all(m.kp_known for m in motions_fit), "kd": all(m.kd_known for m in motions_fit)}
+        known = {
+            "kp": all(m.kp_known for m in motions_fit),
+            "kd": all(m.kd_known for m in motions_fit),
+        }
         free = [name for name in PAPER_BOUNDS if not known.get(name, False)]
     if not free or not set(free) <= set(PAPER_BOUNDS):
-        raise TaccorlError(f"{model.signal}: free parameters {list(free)}; choose among {', '.join(PAPER_BOUNDS)}")
-    search = _GainSearch(motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free))
+        raise TaccorlError(
+            f"{model.signal}: free parameters {list(free)}; choose among {', '.join(PAPER_BOUNDS)}"
+        )
+    search = _GainSearch(
+        motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free)
+    )
     x, unfinished = _by_least_squares(search)
     estimates, ridge = _estimates(search, x, search.covariance(x))
-    later = search.solve(np.append(x, 1e-6), most=30).x  # with a delay of the rows as a further unknown
+    later = search.solve(
+        np.append(x, 1e-6), most=30
+    ).x  # with a delay of the rows as a further unknown
     late, error = float(later[-1]), math.sqrt(search.covariance(later)[-1, -1])
-    estimates["late"] = Estimate(value=late, low=late - _NORMAL_95 * error, high=late + _NORMAL_95 * error, unit="s")
+    estimates["late"] = Estimate(
+        value=late,
+        low=late - _NORMAL_95 * error,
+        high=late + _NORMAL_95 * error,
+        unit="s",
+    )
     at_bound = [name for name in search.free if estimates[name].at_bound]
     if at_bound:
-        unfinished = [*unfinished, f"{' and '.join(at_bound)} ended at a bound of the search"]
+        unfinished = [
+            *unfinished,
+            f"{' and '.join(at_bound)} ended at a bound of the search",
+        ]
     return ControllerFit(
         gains=search.gains(x),
         estimates=estimates,
         ridge=ridge,
-        errors=(*_errors(search, motions_fit, "fit", x), *_errors(search, validation, "validation", x)),
+        errors=(
+            *_errors(search, motions_fit, "fit", x),
+            *_errors(search, validation, "validation", x),
+        ),
         converged=not unfinished,
-        remarks=(*(f"not converged, because {why}" for why in unfinished), *_remarks(search, estimates, ridge)),
+        remarks=(
+            *(f"not converged, because {why}" for why in unfinished),
+            *_remarks(search, estimates, ridge),
+        ),
     )
 
 
@@ -130,10 +163,14 @@ def _by_least_squares(search: "_GainSearch") -> tuple[np.ndarray, list[str]]:
         for _ in range(_MOST_ROUNDS):
             search.weigh(found.x)
             found = search.solve(found.x)
-    return found.x, [] if found.status > 0 else [f"{found.nfev} steps of the solver were not enough"]
+    return found.x, [] if found.status > 0 else [
+        f"{found.nfev} steps of the solver were not enough"
+    ]
 
 
-def _estimates(search: "_GainSearch", x: np.ndarray, spread: np.ndarray) -> tuple[dict[str, Estimate], float]:
+def _estimates(
+    search: "_GainSearch", x: np.ndarray, spread: np.ndarray
+) -> tuple[dict[str, Estimate], float]:
     """Intervals of the gains and of their ratios to K_p, and the correlation of log K_p and log K_d.
 
     Each number's (or its logarithm's) derivative by x, with x = log K_p, log K_d / K_p, T_ref / K_p: to first order its variance
@@ -158,18 +195,25 @@ def _estimates(search: "_GainSearch", x: np.ndarray, spread: np.ndarray) -> tupl
     for name, (value, by_x, is_log, text) in numbers.items():
         reach = _NORMAL_95 * math.sqrt(max(float(by_x @ spread @ by_x), 0.0))
         factor = math.exp(min(reach, _MOST_LOG))
-        low, high = (value / factor, value * factor) if is_log else (value - reach, value + reach)
+        low, high = (
+            (value / factor, value * factor)
+            if is_log
+            else (value - reach, value + reach)
+        )
         estimates[name] = Estimate(
             value=value,
             low=low,
             high=high,
             unit=text,
             fixed=name in PAPER_BOUNDS and name not in unit,
-            at_bound=name in unit and _is_at_bound(value, *PAPER_BOUNDS[name], is_log=is_log),
+            at_bound=name in unit
+            and _is_at_bound(value, *PAPER_BOUNDS[name], is_log=is_log),
         )
     if "kp" not in unit or "kd" not in unit:
         return estimates, math.nan
-    return estimates, float(kp @ spread @ kd / np.sqrt((kp @ spread @ kp) * (kd @ spread @ kd)))
+    return estimates, float(
+        kp @ spread @ kd / np.sqrt((kp @ spread @ kp) * (kd @ spread @ kd))
+    )
 
 
 def _is_at_bound(value: float, low: float, high: float, *, is_log: bool) -> bool:
@@ -178,7 +222,9 @@ def _is_at_bound(value: float, low: float, high: float, *, is_log: bool) -> bool
     return min(value - low, high - value) < _AT_BOUND * (high - low)
 
 
-def _remarks(search: "_GainSearch", estimates: dict[str, Estimate], ridge: float) -> list[str]:
+def _remarks(
+    search: "_GainSearch", estimates: dict[str, Estimate], ridge: float
+) -> list[str]:
     remarks = []
     kp, lag, late = estimates["kp"], estimates["lag"], estimates["late"]
     stated = [motion.name for motion in search.motions if motion.kp_known]
@@ -204,23 +250,38 @@ def _remarks(search: "_GainSearch", estimates: dict[str, Estimate], ridge: float
 
 
 def _errors(
-    search: "_GainSearch", motions: Sequence[JointMotion], use: Literal["fit", "validation"], x: np.ndarray
+    search: "_GainSearch",
+    motions: Sequence[JointMotion],
+    use: Literal["fit", "validation"],
+    x: np.ndarray,
 ) -> list[MotionError]:
     errors = []
     for motion in motions:
-        both = [search.simulate(search.scaled(motion), g)[0] for g in (search.model.gains, search.gains(x))]
-        before, after = (float(np.sqrt(np.nanmean((q - motion.measured) ** 2))) for q in both)
-        errors.append(MotionError(name=motion.name, use=use, rmse_before=before, rmse_after=after))
+        both = [
+            search.simulate(search.scaled(motion), g)[0]
+            for g in (search.model.gains, search.gains(x))
+        ]
+        before, after = (
+            float(np.sqrt(np.nanmean((q - motion.measured) ** 2))) for q in both
+        )
+        errors.append(
+            MotionError(name=motion.name, use=use, rmse_before=before, rmse_after=after)
+        )
     return errors
 
 
 def _check_usable(motion: JointMotion, model: JointModel) -> None:
     signal, unit = model.signal, model.unit
-    span, seconds = float(np.ptp(motion.target)), float(motion.time_s[-1] - motion.time_s[0])
+    span, seconds = (
+        float(np.ptp(motion.target)),
+        float(motion.time_s[-1] - motion.time_s[0]),
+    )
     seen = np.isfinite(motion.measured)
     advice = "record a sweep of this joint: ± 0.2 rad, 0.1 to 2 Hz, 10 s"
     if seconds < _LEAST_SECONDS:
-        raise TaccorlError(f"{motion.name}: {seconds:.2f} s of {signal} are too short for K_p, K_d and T_ref; {advice}")
+        raise TaccorlError(
+            f"{motion.name}: {seconds:.2f} s of {signal} are too short for K_p, K_d and T_ref; {advice}"
+        )
     if span < _LEAST_MOTION:
         raise TaccorlError(
             f"{motion.name}: the targets of {signal} move by {span:.2g} {unit} only, which does not determine the gains; "
@@ -245,13 +306,17 @@ class _GainSearch:
     clipped. Gains are those in force in the first recording; the other recordings' gains are in proportion, if they were
     commanded so. A coordinate beyond P is the time by which the rows' positions are older than their times [s]."""
 
-    def __init__(self, motions: Sequence[JointMotion], model: JointModel, free: tuple[str, ...]) -> None:
+    def __init__(
+        self, motions: Sequence[JointMotion], model: JointModel, free: tuple[str, ...]
+    ) -> None:
         first = motions[0]
         self._kp_scale, self._kd_scale = first.kp_scale, first.kd_scale
         self.motions = [self.scaled(motion) for motion in motions]
         self.model, self.free = model, free
         own = model.gains
-        self.given = Gains(own.kp * self._kp_scale, own.kd * self._kd_scale, own.torque_ff)
+        self.given = Gains(
+            own.kp * self._kp_scale, own.kd * self._kd_scale, own.torque_ff
+        )
         """Values of the gains that are not free: commanded in the first recording, or the twin's own."""
         self.sigma_rad = 1e-4  # near to what an encoder has: keeps the solver's tolerances meaningful
         self.sigma_effort: float | None = None
@@ -259,14 +324,30 @@ class _GainSearch:
 
     def scaled(self, motion: JointMotion) -> JointMotion:
         """``motion`` with gain scales relative to those of the first recording."""
-        return replace(motion, kp_scale=motion.kp_scale / self._kp_scale, kd_scale=motion.kd_scale / self._kd_scale)
+        return replace(
+            motion,
+            kp_scale=motion.kp_scale / self._kp_scale,
+            kd_scale=motion.kd_scale / self._kd_scale,
+        )
 
     def gains(self, x: np.ndarray) -> Gains:
         """Gains at coordinates ``x`` (P,), clipped to the bounds; gains that are not free have the values of ``given``."""
         at = dict(zip(self.free, x, strict=False))
-        kp = self._within("kp", math.exp(min(at["kp"], _MOST_LOG))) if "kp" in at else self.given.kp
-        kd = self._within("kd", kp * math.exp(min(at["kd"], _MOST_LOG))) if "kd" in at else self.given.kd
-        torque_ff = self._within("torque_ff", kp * at["torque_ff"]) if "torque_ff" in at else self.given.torque_ff
+        kp = (
+            self._within("kp", math.exp(min(at["kp"], _MOST_LOG)))
+            if "kp" in at
+            else self.given.kp
+        )
+        kd = (
+            self._within("kd", kp * math.exp(min(at["kd"], _MOST_LOG)))
+            if "kd" in at
+            else self.given.kd
+        )
+        torque_ff = (
+            self._within("torque_ff", kp * at["torque_ff"])
+            if "torque_ff" in at
+            else self.given.torque_ff
+        )
         return Gains(float(kp), float(kd), float(torque_ff))
 
     def at(self, gains: Gains) -> np.ndarray:
@@ -275,15 +356,25 @@ class _GainSearch:
         every = {"kp": math.log(kp), "kd": math.log(self._within("kd", gains.kd) / kp)}
         every["torque_ff"] = self._within("torque_ff", gains.torque_ff) / kp
         low, high = self.x_bounds()
-        return np.clip(np.array([every[name] for name in self.free]), low + 1e-9, high - 1e-9)
+        return np.clip(
+            np.array([every[name] for name in self.free]), low + 1e-9, high - 1e-9
+        )
 
     def x_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest (P,) and highest (P,) coordinates x."""
-        (kp_low, kp_high), (kd_low, kd_high), (least, most) = (PAPER_BOUNDS[name] for name in Gains._fields)
+        (kp_low, kp_high), (kd_low, kd_high), (least, most) = (
+            PAPER_BOUNDS[name] for name in Gains._fields
+        )
         every = {
             "kp": (math.log(kp_low), math.log(kp_high)),
-            "kd": (math.log(kd_low / max(kp_high, self.given.kp)), math.log(kd_high / min(kp_low, self.given.kp))),
-            "torque_ff": (least / min(kp_low, self.given.kp), most / min(kp_low, self.given.kp)),
+            "kd": (
+                math.log(kd_low / max(kp_high, self.given.kp)),
+                math.log(kd_high / min(kp_low, self.given.kp)),
+            ),
+            "torque_ff": (
+                least / min(kp_low, self.given.kp),
+                most / min(kp_low, self.given.kp),
+            ),
         }
         low, high = np.array([every[name] for name in self.free]).T
         return low, high
@@ -292,7 +383,9 @@ class _GainSearch:
         low, high = PAPER_BOUNDS[name]
         return min(max(value, low), high)
 
-    def simulate(self, motion: JointMotion, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(
+        self, motion: JointMotion, gains: Gains
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(T,) reported positions [rad] and (T,) efforts [N·m]; after a divergence both are far from any measurement."""
         done = self.model.simulate(motion, gains)
         return _finite(done.reported), _finite(done.effort)
@@ -304,7 +397,9 @@ class _GainSearch:
         for motion in self.motions:
             reported, effort = self.simulate(motion, self.gains(x))
             if late_s:
-                reported = CubicSpline(motion.time_s, reported)(np.maximum(motion.time_s - late_s, motion.time_s[0]))
+                reported = CubicSpline(motion.time_s, reported)(
+                    np.maximum(motion.time_s - late_s, motion.time_s[0])
+                )
             seen = np.isfinite(motion.measured)
             parts.append((reported - motion.measured)[seen] / self.sigma_rad)
             if self.sigma_effort is not None:
@@ -319,31 +414,63 @@ class _GainSearch:
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Derivatives (R, P) of the residuals by ``x``, by central differences."""
         steps = [*(_STEPS[name] for name in self.free), _LATE_STEP_S][: len(x)]
-        ends = [[self.residual(x + sign * step) for sign in (1, -1)] for step in np.diag(steps)]
-        return np.column_stack([(a - b) / (2 * step) for (a, b), step in zip(ends, steps, strict=True)])
+        ends = [
+            [self.residual(x + sign * step) for sign in (1, -1)]
+            for step in np.diag(steps)
+        ]
+        return np.column_stack(
+            [(a - b) / (2 * step) for (a, b), step in zip(ends, steps, strict=True)]
+        )
 
     def solve(self, start: np.ndarray, most: int = 100) -> OptimizeResult:
         """Least squares from ``start``, a point within the bounds, in at most so many evaluations; returns SciPy's result."""
         late_s = np.full(len(start) - len(self.free), _MOST_LATE_S)
-        bounds = tuple(np.append(end, sign * late_s) for end, sign in zip(self.x_bounds(), (-1, 1), strict=True))
+        bounds = tuple(
+            np.append(end, sign * late_s)
+            for end, sign in zip(self.x_bounds(), (-1, 1), strict=True)
+        )
         jac: Any = self.jacobian
-        return least_squares(self.residual, start, jac, bounds, x_scale="jac", max_nfev=most, xtol=1e-10, ftol=1e-12)
+        return least_squares(
+            self.residual,
+            start,
+            jac,
+            bounds,
+            x_scale="jac",
+            max_nfev=most,
+            xtol=1e-10,
+            ftol=1e-12,
+        )
 
     def covariance(self, x: np.ndarray) -> np.ndarray:
         """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, and σ² that of the residuals times their number for each
         independent one (``independent_rows``); very large where J is singular."""
         parts, jacobian = self.parts(x), self.jacobian(x)
-        residual, norms = np.concatenate(parts), np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30)
+        residual, norms = (
+            np.concatenate(parts),
+            np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30),
+        )
         _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
         half = right / np.maximum(singular, 1e-12)[:, None] / norms
         variance = float(residual @ residual) / max(len(residual) - len(norms), 1)
-        return half.T @ half * variance * len(residual) / independent_rows([part[:, None] for part in parts])
+        return (
+            half.T
+            @ half
+            * variance
+            * len(residual)
+            / independent_rows([part[:, None] for part in parts])
+        )
 
     def weigh(self, x: np.ndarray) -> None:
         """Set the noise of both channels to the RMS residuals at ``x`` (P,)."""
-        left = [(self.simulate(motion, self.gains(x)), motion) for motion in self.motions]
-        positions = np.concatenate([reported - motion.measured for (reported, _), motion in left])
-        efforts = np.concatenate([effort - motion.effort for (_, effort), motion in left])
+        left = [
+            (self.simulate(motion, self.gains(x)), motion) for motion in self.motions
+        ]
+        positions = np.concatenate(
+            [reported - motion.measured for (reported, _), motion in left]
+        )
+        efforts = np.concatenate(
+            [effort - motion.effort for (_, effort), motion in left]
+        )
         self.sigma_rad = max(float(np.sqrt(np.nanmean(positions**2))), 1e-12)
         self.sigma_effort = max(float(np.sqrt(np.nanmean(efforts**2))), 1e-12)
 

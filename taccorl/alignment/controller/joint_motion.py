@@ -45,9 +45,15 @@ class Surroundings:
     still. Where ``carrying_nm`` is given, all weight is included."""
     carrying_nm: np.ndarray | None = None
     """(T · F,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
-    torque_ff_nm: np.ndarray | None = None  # (T,) known torque that the controller adds to its law [N·m]; None: none
-    supply: np.ndarray | None = None  # (T,) supply voltage of the motor divided by that of its file; None: 1
-    on: np.ndarray | None = None  # (T,) 0 while the motor is off, else 1; None: always 1
+    torque_ff_nm: np.ndarray | None = (
+        None  # (T,) known torque that the controller adds to its law [N·m]; None: none
+    )
+    supply: np.ndarray | None = (
+        None  # (T,) supply voltage of the motor divided by that of its file; None: 1
+    )
+    on: np.ndarray | None = (
+        None  # (T,) 0 while the motor is off, else 1; None: always 1
+    )
     moment_kgm: float = 0.0
     """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m]."""
     mounted_kgm2: float = 0.0  # Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]
@@ -57,7 +63,9 @@ class Surroundings:
     positions: np.ndarray | None = None
     """(T · F, N) positions of all joints [rad, m]; None: the others are held, or no mass depends on them."""
     payload_kg: float = 0.0  # Mass of the payload in the gripper, as the recording states it [kg]; 0: none
-    payload_at_m: Position = AT_TCP  # Centre of mass of the payload in link 6's frame [m]
+    payload_at_m: Position = (
+        AT_TCP  # Centre of mass of the payload in link 6's frame [m]
+    )
     payload_at_known: bool = False  # True if the recording states that position
 
 
@@ -73,7 +81,9 @@ class JointMotion(Surroundings):
     effort: np.ndarray  # (T,) efforts [N·m]; NaN where not recorded
     start: float  # Position reported at rest before the first command [rad]
     start_nm: float = math.inf  # Effort reported there [N·m]; inf: not recorded
-    start_speed: float = 0.0  # Speed at the first row of a recording that begins in motion [rad/s]
+    start_speed: float = (
+        0.0  # Speed at the first row of a recording that begins in motion [rad/s]
+    )
     kp_scale: float = 1.0
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other
     recordings (``Measurement.gain_scale``)."""
@@ -87,14 +97,24 @@ class JointMotion(Surroundings):
     """(T,) arrival time of each target [s], on the clock of ``time_s``; None: the time of its row."""
 
 
-@lru_cache(maxsize=32)  # the same object for the same rows, so that what is kept for it is found again
+@lru_cache(
+    maxsize=32
+)  # the same object for the same rows, so that what is kept for it is found again
 def first_rows(motion: JointMotion, rows: int) -> JointMotion:
     """``motion`` without the rows from row ``rows`` on; ``motion`` itself if it has no more."""
     whole = len(motion.time_s)
     if rows >= whole:
         return motion
-    columns = {f.name: getattr(motion, f.name) for f in dataclasses.fields(motion) if f.name != "pose"}
-    own = {name: a[: rows * (len(a) // whole)] for name, a in columns.items() if isinstance(a, np.ndarray)}
+    columns = {
+        f.name: getattr(motion, f.name)
+        for f in dataclasses.fields(motion)
+        if f.name != "pose"
+    }
+    own = {
+        name: a[: rows * (len(a) // whole)]
+        for name, a in columns.items()
+        if isinstance(a, np.ndarray)
+    }
     return dataclasses.replace(motion, **own)
 
 
@@ -104,7 +124,10 @@ def resting(m: Measurement, j: int) -> float:
     the signal was never measured: the first position that its targets plan. Raises TaccorlError: nothing was measured before the
     targets change."""
     changed = np.flatnonzero(m.target[:, j] != m.target[0, j])
-    rest = min(changed[0] + 1 if len(changed) else m.num_rows, max(1, round(_START_S * m.rate_hz)))
+    rest = min(
+        changed[0] + 1 if len(changed) else m.num_rows,
+        max(1, round(_START_S * m.rate_hz)),
+    )
     if m.target_kind(m.signals[j]) != "position" and m.target[0, j] != 0.0:
         rest = 1
     rows = m.measured[:rest, j]
@@ -114,7 +137,9 @@ def resting(m: Measurement, j: int) -> float:
         return float(np.nanmean(rows))
     if np.isfinite(m.measured[:, j]).any():
         name = f"{m.name}: {m.signals[j]}"
-        raise TaccorlError(f"{name} was not measured in its first {rest} rows; cut the recording there")
+        raise TaccorlError(
+            f"{name} was not measured in its first {rest} rows; cut the recording there"
+        )
     return float(_planned(m, j)[0])
 
 
@@ -122,7 +147,11 @@ def steps_at_once(m: Measurement, j: int) -> bool:
     """Whether the target of signal ``j`` stands at its new value in the first row and never changes, and the joint, which starts
     elsewhere, moves at once."""
     rows = m.measured[: max(2, round(_START_S * m.rate_hz)), j]
-    if m.target_kind(m.signals[j]) != "position" or np.ptp(m.target[:, j]) != 0.0 or not np.isfinite(rows).all():
+    if (
+        m.target_kind(m.signals[j]) != "position"
+        or np.ptp(m.target[:, j]) != 0.0
+        or not np.isfinite(rows).all()
+    ):
         return False
     return bool(np.ptp(rows) > STEP_FROM_START * abs(m.target[0, j] - rows[0]) > 0.0)
 
@@ -130,15 +159,23 @@ def steps_at_once(m: Measurement, j: int) -> bool:
 def _planned(m: Measurement, j: int) -> np.ndarray:
     """(T,) targets of a signal that was not measured. Raises TaccorlError: they are no positions."""
     if (kind := m.target_kind(m.signals[j])) != "position":
-        why = f"{m.signals[j]} is commanded by {kind}, and its position was not measured"
+        why = (
+            f"{m.signals[j]} is commanded by {kind}, and its position was not measured"
+        )
         raise TaccorlError(f"{m.name}: {why}; log the position, or remove the signal")
     return m.target[:, j]
 
 
-def moved_by_others(m: Measurement, signals: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:
+def moved_by_others(
+    m: Measurement, signals: Sequence[str], still: float = STILL
+) -> dict[str, np.ndarray]:
     """Signal → (T,) motion [rad, m] of those ``signals`` that move by more than ``still``: measured, or planned where nothing
     was measured, and low-pass filtered."""
-    motions = {name: _smooth(_seen(m, name), m.rate_hz, _BANDS_HZ) for name in signals if name in m.signals}
+    motions = {
+        name: _smooth(_seen(m, name), m.rate_hz, _BANDS_HZ)
+        for name in signals
+        if name in m.signals
+    }
     return {name: motion for name, motion in motions.items() if np.ptp(motion) > still}
 
 
@@ -152,7 +189,9 @@ def beside_model(m: Measurement, signal: str, modelled: np.ndarray) -> np.ndarra
     if not fast[0] < fast[1]:
         left, modelled = seen, np.zeros(len(modelled))
     smooth = _smooth(left, m.rate_hz, _LEFT_HZ if modelled.any() else _BANDS_HZ)
-    return modelled + CubicSpline(np.arange(m.num_rows), smooth)(np.arange(len(modelled)) / fine)
+    return modelled + CubicSpline(np.arange(m.num_rows), smooth)(
+        np.arange(len(modelled)) / fine
+    )
 
 
 def _seen(m: Measurement, signal: str) -> np.ndarray:
@@ -160,20 +199,40 @@ def _seen(m: Measurement, signal: str) -> np.ndarray:
     return m.measured[:, j] if np.isfinite(m.measured[:, j]).any() else _planned(m, j)
 
 
-def _smooth(angles: np.ndarray, rate_hz: float, bands_hz: Sequence[float]) -> np.ndarray:
+def _smooth(
+    angles: np.ndarray, rate_hz: float, bands_hz: Sequence[float]
+) -> np.ndarray:
     """(T,) ``angles`` below the first frequency, and up to the last one where there is more than noise, as after a step."""
     seen = np.isfinite(angles)
     rows = np.arange(len(angles))
-    whole = np.interp(rows, rows[seen], angles[seen]) if seen.any() else np.zeros(len(angles))
+    whole = (
+        np.interp(rows, rows[seen], angles[seen])
+        if seen.any()
+        else np.zeros(len(angles))
+    )
     one = np.eye(1, len(rows), len(rows) // 2)[0]
     filters = [butter(2, min(f / (rate_hz / 2), 0.8), output="sos") for f in bands_hz]
-    ends, beyond = ("even", round(rate_hz / bands_hz[0])) if bands_hz == _LEFT_HZ else ("odd", 9)
+    ends, beyond = (
+        ("even", round(rate_hz / bands_hz[0])) if bands_hz == _LEFT_HZ else ("odd", 9)
+    )
     beyond = min(beyond, len(rows) - 1)
-    below, passed = ([sosfiltfilt(sos, x, padtype=ends, padlen=beyond) for sos in filters] for x in (whole, one))
+    below, passed = (
+        [sosfiltfilt(sos, x, padtype=ends, padlen=beyond) for sos in filters]
+        for x in (whole, one)
+    )
     found, white = below[0], -1.0
     for k in reversed(range(1, len(filters))):
-        band, share = below[k] - below[k - 1], float(np.sum((passed[k] - passed[k - 1]) ** 2))
+        band, share = (
+            below[k] - below[k - 1],
+            float(np.sum((passed[k] - passed[k - 1]) ** 2)),
+        )
         power = uniform_filter1d(band**2, max(3, round(_FAST_S * rate_hz)))
         white = float(np.median(power)) / max(share, 1e-12) if white < 0.0 else white
-        found = found + np.clip(1.0 - _FAST_TIMES * white * share / np.maximum(power, 1e-30), 0.0, 1.0) * band
+        found = (
+            found
+            + np.clip(
+                1.0 - _FAST_TIMES * white * share / np.maximum(power, 1e-30), 0.0, 1.0
+            )
+            * band
+        )
     return found

@@ -11,7 +11,11 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_law import FOLLOW_HZ
-from taccorl.alignment.controller.joint_motion import JointMotion, resting, steps_at_once
+from taccorl.alignment.controller.joint_motion import (
+    JointMotion,
+    resting,
+    steps_at_once,
+)
 from taccorl.alignment.controller.rigid_joint import RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import NUMBER, noise_floor
@@ -31,7 +35,9 @@ MOST_YIELD = 0.05
 """Largest share of a recording's span by which the standard deviation of its effort may move a model of law effort (a choice)."""
 
 
-def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints, signal: str) -> JointMotion:
+def joint_motion(
+    measurement: Measurement, machine: TwinConfig | HasJoints, signal: str
+) -> JointMotion:
     """``motion_of`` a joint of ``machine``."""
     return motion_of(measurement, signal, joint_of(machine, signal))
 
@@ -42,7 +48,9 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
     m, j = measurement, measurement.column(signal)
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:
-        raise TaccorlError(f"{m.name}: {m.num_rows} rows are too few for a motion of {signal}; record some seconds")
+        raise TaccorlError(
+            f"{m.name}: {m.num_rows} rows are too few for a motion of {signal}; record some seconds"
+        )
     kind, wanted = m.target_kind(signal), joint.target_kind
     if kind != wanted:
         what, way_out = f"is commanded by {kind}", "correct the law in its file"
@@ -53,7 +61,9 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
         raise TaccorlError(f"{m.name}: {signal} {text}")
     if not np.isfinite(target).all():
         row = int(np.flatnonzero(~np.isfinite(target))[0])
-        raise TaccorlError(f"{m.name}: {signal} has no target at {m.time_s[row]:.3f} s; cut the recording there")
+        raise TaccorlError(
+            f"{m.name}: {signal} has no target at {m.time_s[row]:.3f} s; cut the recording there"
+        )
     gaps = np.diff(m.time_s)
     if not (np.abs(gaps - m.period_s) < 0.1 * m.period_s).all():
         row = int(np.argmax(np.abs(gaps - m.period_s)))
@@ -64,7 +74,11 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
             "stamps, or cut the recording at the gap"
         )
     rest = joint.surroundings(m)
-    effort = m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan)
+    effort = (
+        m.effort[:, j].astype(float)
+        if m.has_effort()[j]
+        else np.full(m.num_rows, np.nan)
+    )
     added = rest.torque_ff_nm
     kp_scale, kd_scale = joint.gain_scales(m)
     if wanted == "effort":
@@ -87,7 +101,9 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint) -> Joint
         measured=measured,
         effort=effort,
         **vars(dataclasses.replace(rest, torque_ff_nm=added)),
-        command_s=m.command_s if m.command_s.size and joint.keeps_times and joint.target_kind != "effort" else None,
+        command_s=m.command_s
+        if m.command_s.size and joint.keeps_times and joint.target_kind != "effort"
+        else None,
         start=start,
         start_speed=start_speed,
         start_nm=float(np.nan_to_num(np.mean(effort[:START_ROWS]), nan=np.inf)),
@@ -119,7 +135,9 @@ def starting(measured: np.ndarray, rate_hz: float) -> tuple[float, float] | None
     return float(fit.coef[0]), speed * rate_hz
 
 
-def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _followed(
+    m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(T,) targets q + K_d / K_p q̇ of law effort, with which K_p (q* − q) − K_d q̇ holds the model at the measured position and
     speed, and (T,) efforts that drive it, each the mean of its row and the next. Raises TaccorlError: position or effort were not
     measured throughout."""
@@ -141,13 +159,21 @@ def _held(m: Measurement, j: int, stiffness: float) -> np.ndarray:
     seen = np.isfinite(m.measured[:, j])
     q = np.interp(m.time_s, m.time_s[seen], m.measured[seen, j])
     later = np.append(q[1:], q[-1])
-    return stiffness * (0.5 * (q + later) + (later - q) * m.rate_hz / (math.pi * FOLLOW_HZ))
+    return stiffness * (
+        0.5 * (q + later) + (later - q) * m.rate_hz / (math.pi * FOLLOW_HZ)
+    )
 
 
 def _smooth(m: Measurement, signal: str, deriv: int = 0) -> np.ndarray:
     """(T,) measured position, or a time derivative of it, of the quadratic over ``SMOOTH_S``; its first derivative would lack a
     share of the speed, ω² ``SMOOTH_S``² / 40 of a sine."""
-    return savgol_filter(m.measured[:, m.column(signal)].astype(float), _window(m), 2, deriv=deriv, delta=m.period_s)
+    return savgol_filter(
+        m.measured[:, m.column(signal)].astype(float),
+        _window(m),
+        2,
+        deriv=deriv,
+        delta=m.period_s,
+    )
 
 
 def _window(m: Measurement) -> int:
@@ -168,10 +194,16 @@ def holding_stiffness(m: Measurement, signal: str) -> float:
     if size == 0.0 or span == 0.0:  # a joint that rests, or is pushed evenly
         size, span = max(float(np.abs(effort).max()), NUMBER), span or 1.0
     omega, window = 2.0 * math.pi * FOLLOW_HZ, _window(m)
-    found = omega**2 * size / max(float(np.sqrt(np.mean(_smooth(m, signal, 2) ** 2))), NUMBER)
+    found = (
+        omega**2
+        * size
+        / max(float(np.sqrt(np.mean(_smooth(m, signal, 2) ** 2))), NUMBER)
+    )
     noise = [noise_floor([one], kind)[signal] for kind in ("effort", "position")]
     if all(f.used.method != "number" for f in noise):
         weights = np.pad(savgol_coeffs(window, 2), 1)
         weights = weights + 2.0 / omega * np.gradient(weights, m.period_s)
-        found = min(found, noise[0].value / (noise[1].value * float(np.linalg.norm(weights))))
+        found = min(
+            found, noise[0].value / (noise[1].value * float(np.linalg.norm(weights)))
+        )
     return max(found, size / (MOST_YIELD * span))

@@ -18,7 +18,10 @@ from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.sim.effects.effect import Effect
 
-NEED_ROTOR = ("backlash", "joint_compliance")  # Effects in a gear, which need the inertia on the motor's side
+NEED_ROTOR = (
+    "backlash",
+    "joint_compliance",
+)  # Effects in a gear, which need the inertia on the motor's side
 
 
 class Gains(NamedTuple):
@@ -33,7 +36,9 @@ class Rigid(NamedTuple):
     """Inertia and weight of one joint with the others held, in N·m and rad (for a sliding joint N and m)."""
 
     inertia: float  # Inertia about the joint, with the rotor [kg·m²]
-    rotor_inertia: float = 0.0  # Part of ``inertia`` that is on the motor's side of the gear [kg·m²]
+    rotor_inertia: float = (
+        0.0  # Part of ``inertia`` that is on the motor's side of the gear [kg·m²]
+    )
     gravity_sin: float = 0.0  # S [N·m] in S sin q + C cos q, the torque that holds the weight at position q
     gravity_cos: float = 0.0  # C [N·m] in the same torque
     compensation_sin: float = 0.0  # S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity
@@ -48,7 +53,9 @@ class PointMass(NamedTuple):
     mass_kg: float
     body: int  # Id of the body
     place_m: tuple[float, float, float]  # Place of its centre in the body's frame [m]
-    spread_m2: np.ndarray = np.zeros((3, 3))  # (3, 3) mean of r rᵀ [m²], r from its centre, body frame; 0: a point
+    spread_m2: np.ndarray = np.zeros(
+        (3, 3)
+    )  # (3, 3) mean of r rᵀ [m²], r from its centre, body frame; 0: a point
 
 
 class MassTorque(NamedTuple):
@@ -72,7 +79,9 @@ class RigidJoint(ABC):
     influences; subclasses override its methods."""
 
     signal: str
-    unit: Literal["rad", "m"] = "rad"  # Unit of its position: a hinge has rad, a slide m
+    unit: Literal["rad", "m"] = (
+        "rad"  # Unit of its position: a hinge has rad, a slide m
+    )
     gains: Gains  # Gains for recordings that state none
     command_hz: float = 150.0
     """Rate at which its drive receives targets [Hz]. Rows at a lower rate are interpolated linearly at this rate; at a higher
@@ -98,9 +107,14 @@ class RigidJoint(ABC):
     target_late_s: float = 0.0
     """Delay from a target's arrival (see ``keeps_times``) until it acts in the controller [s]."""
 
-    gain_names: tuple[str, ...] = ("kp", "kd")  # Gains that a recording can state and a fit can determine
+    gain_names: tuple[str, ...] = (
+        "kp",
+        "kd",
+    )  # Gains that a recording can state and a fit can determine
     holds_torque_ff: bool = False  # True: ``torque_ff`` stays as the file states it. False: it is always fitted.
-    known_names: tuple[str, ...] = ()  # Numbers and effects that the file marks as known (``DriveLaw.known``)
+    known_names: tuple[
+        str, ...
+    ] = ()  # Numbers and effects that the file marks as known (``DriveLaw.known``)
 
     @property
     def winding(self) -> Mapping[str, float]:
@@ -110,13 +124,21 @@ class RigidJoint(ABC):
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
         """Convert fitted values, by parameter name. Returns gains, with those of ``gains`` where ``values`` has none; and field →
         value of ``drive_numbers.Drive`` that replace ``facts``."""
-        return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}
+        return self.gains._replace(
+            **{name: values[name] for name in Gains._fields if name in values}
+        ), {}
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         """Ratios of a recording's gains to ``gains``: (for the position error, for the velocity); 1 if the recording states
         none."""
-        factor, both = m.gain_scale.get(self.signal, 1.0), ((m.kp, self.gains.kp), (m.kd, max(self.gains.kd, 1e-9)))
-        kp, kd = (stated[self.signal] / own if self.signal in stated else factor for stated, own in both)
+        factor, both = (
+            m.gain_scale.get(self.signal, 1.0),
+            ((m.kp, self.gains.kp), (m.kd, max(self.gains.kd, 1e-9))),
+        )
+        kp, kd = (
+            stated[self.signal] / own if self.signal in stated else factor
+            for stated, own in both
+        )
         return kp, kd
 
     def timestep_s(self, motion: JointMotion) -> float:
@@ -129,7 +151,9 @@ class RigidJoint(ABC):
         on the joint; those that change masses, such as ``payload``, are included, others ignored."""
         raise NotImplementedError
 
-    def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
+    def moving_masses_nm(
+        self, motion: JointMotion, bodies: Sequence[Effect]
+    ) -> np.ndarray | float:
         """(T,) torque [N·m] because other joints move the masses that ``bodies`` add, beyond ``rigid``.
         ``bodies``: as for ``rigid``."""
         return 0.0
@@ -159,7 +183,9 @@ class RigidJoint(ABC):
         return None
 
 
-def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = None) -> Rigid:
+def rigid_terms(
+    model: mujoco.MjModel, joint: str, pose: np.ndarray | None = None
+) -> Rigid:
     """Inertia and weight of a hinge with the other joints held at ``pose`` (nq,), qpos0 if not given.
 
     The weight's torque of a hinge is S sin q + C cos q: two angles determine it. The weight of a slide is constant and not
@@ -184,7 +210,11 @@ def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = Non
 
 
 def with_masses(
-    terms: Rigid, model: mujoco.MjModel, joint: str, pose: np.ndarray, masses: Sequence[PointMass]
+    terms: Rigid,
+    model: mujoco.MjModel,
+    joint: str,
+    pose: np.ndarray,
+    masses: Sequence[PointMass],
 ) -> Rigid:
     """``terms`` of one joint with the inertia m r² and the weight of ``masses``, the other joints held at ``pose`` (nq,)."""
     hinge = model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_HINGE
@@ -194,16 +224,28 @@ def with_masses(
         own = np.sum(turning[1] @ one.spread_m2 * turning[1])
         inertia = terms.inertia + one.mass_kg * float(lever[1] @ lever[1] + own)
         first, last = map(float, -one.mass_kg * lever @ model.opt.gravity)
-        sine, cosine = (terms.gravity_sin + first, terms.gravity_cos + last) if hinge else terms[2:4]
+        sine, cosine = (
+            (terms.gravity_sin + first, terms.gravity_cos + last)
+            if hinge
+            else terms[2:4]
+        )
         weight = terms.weight_n + last * (not hinge)
-        terms = terms._replace(inertia=inertia, gravity_sin=sine, gravity_cos=cosine, weight_n=weight)
+        terms = terms._replace(
+            inertia=inertia, gravity_sin=sine, gravity_cos=cosine, weight_n=weight
+        )
     return terms
 
 
 @lru_cache(maxsize=1024)
-def _levers(model: mujoco.MjModel, joint: str, pose: bytes, body: int) -> tuple[np.ndarray, np.ndarray]:
+def _levers(
+    model: mujoco.MjModel, joint: str, pose: bytes, body: int
+) -> tuple[np.ndarray, np.ndarray]:
     """(2, 3) j and (2, 3, 3) L of the lever j + L c of a point at c (3,) in a body, with the joint at π / 2 and at 0."""
-    data, jac, levers = mujoco.MjData(model), np.zeros((2, 3, model.nv)), np.zeros((2, 4, 3))
+    data, jac, levers = (
+        mujoco.MjData(model),
+        np.zeros((2, 3, model.nv)),
+        np.zeros((2, 4, 3)),
+    )
     data.qpos[:] = np.frombuffer(pose)
     for k, angle in enumerate((0.5 * np.pi, 0.0)):
         data.qpos[model.joint(joint).qposadr[0]] = angle
@@ -221,10 +263,18 @@ def torque_along(
     """Inverse dynamics without armature for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart, at rest at both
     ends (``still``: everywhere). Returns (T, nv) torques [N·m] at all joints, (T, nv) the part of them that the gravity
     compensation supplies, and (T, nv, nv) the mass matrix [kg·m²]."""
-    data, (velocities, accelerations) = mujoco.MjData(model), rates(positions, np.inf if still else period_s)
+    data, (velocities, accelerations) = (
+        mujoco.MjData(model),
+        rates(positions, np.inf if still else period_s),
+    )
     torque, carried = np.empty((2, len(positions), model.nv))
-    masses, mass = np.empty((len(positions), model.nv, model.nv), np.float32), np.empty((model.nv, model.nv))
-    for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
+    masses, mass = (
+        np.empty((len(positions), model.nv, model.nv), np.float32),
+        np.empty((model.nv, model.nv)),
+    )
+    for row, (q, v, a) in enumerate(
+        zip(positions, velocities, accelerations, strict=True)
+    ):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
         data.qacc[:] = a
@@ -236,7 +286,12 @@ def torque_along(
 
 
 def mass_torque_along(
-    model: mujoco.MjModel, joint: str, body: int, positions: np.ndarray, period_s: float, gravity_mps2: np.ndarray
+    model: mujoco.MjModel,
+    joint: str,
+    body: int,
+    positions: np.ndarray,
+    period_s: float,
+    gravity_mps2: np.ndarray,
 ) -> MassTorque:
     """Torque at one joint for a mass in one body, along a motion as that of ``torque_along``.
 

@@ -35,20 +35,40 @@ class Calibration(NamedTuple):
     offset: np.ndarray  # (K,) offsets in the reading's unit
 
 
-def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()) -> np.ndarray:
+def responses(
+    config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()
+) -> np.ndarray:
     """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``, which acts at its row's time and
     follows a straight line between rows. If ``m`` has places, (T, P): a column for each place, with the load while it is pressed.
     ``effects``: effects besides the config's; one of the same name replaces the config's. Raises TaccorlError: an effect is given
     twice."""
-    acting = present([*(e for e in config.effects if e.name not in {effect.name for effect in effects}), *effects])
+    acting = present(
+        [
+            *(
+                e
+                for e in config.effects
+                if e.name not in {effect.name for effect in effects}
+            ),
+            *effects,
+        ]
+    )
     if config.reading.below_rest:
-        acting = [dataclasses.replace(e, below_rest=True) if isinstance(e, CreepingEffect) else e for e in acting]
+        acting = [
+            dataclasses.replace(e, below_rest=True)
+            if isinstance(e, CreepingEffect)
+            else e
+            for e in acting
+        ]
     load, shape = loads(m), (1, m.num_places) if m.place.size else config.shape
     reading = (load / config.load_of_reading).astype(np.float32).reshape(-1, 1, *shape)
     dt_s = np.diff(m.time_s, prepend=m.time_s[0])
     for effect in acting:
         if isinstance(effect, TaxelTemperature):
-            effect = effect.at(m.temperature_c if m.temperature_c.size else np.full(m.num_rows, NOMINAL_C))
+            effect = effect.at(
+                m.temperature_c
+                if m.temperature_c.size
+                else np.full(m.num_rows, NOMINAL_C)
+            )
         memory = effect.memory(1, shape)
         if isinstance(effect, RememberingEffect) and effect.holds_scan:
             reading = _along_lines(effect, reading, memory, dt_s)
@@ -59,10 +79,16 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
 
 def loads(m: CellMeasurement) -> np.ndarray:
     """(T, K) load of each cell, in the unit of the cells file. If ``m`` has places, (T, P): the load while each is pressed."""
-    return m.target[:, :1] * (m.place[:, None] == np.arange(m.num_places)) if m.place.size else m.target
+    return (
+        m.target[:, :1] * (m.place[:, None] == np.arange(m.num_places))
+        if m.place.size
+        else m.target
+    )
 
 
-def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+def _along_lines(
+    effect: RememberingEffect, reading: np.ndarray, memory: Memory, dt_s: np.ndarray
+) -> np.ndarray:
     """(T, 1, R, C) after an effect that holds its input since the scan before, of readings on straight lines between rows.
 
     A row is ``STEPS_OF_ROW`` equal steps, each at the mean of its piece of the line, and a step of 0 s at the row's own reading.
@@ -70,15 +96,22 @@ def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory,
     share = (np.arange(STEPS_OF_ROW + 1) + 0.5) / STEPS_OF_ROW
     share[-1] = 1.0
     before = np.concatenate([reading[:1], reading[:-1]])
-    fine = before[:, None] + share.astype(np.float32)[:, None, None, None] * (reading - before)[:, None]
+    fine = (
+        before[:, None]
+        + share.astype(np.float32)[:, None, None, None] * (reading - before)[:, None]
+    )
     fine_dt_s = np.repeat(dt_s[:, None] / STEPS_OF_ROW, STEPS_OF_ROW + 1, axis=1)
     fine_dt_s[:, -1] = 0.0
     times_s = np.cumsum(fine_dt_s.ravel())
-    out = through(effect, fine.reshape(-1, *reading.shape[1:]), memory, times_s, fine_dt_s.ravel())
+    out = through(
+        effect, fine.reshape(-1, *reading.shape[1:]), memory, times_s, fine_dt_s.ravel()
+    )
     return out[STEPS_OF_ROW :: STEPS_OF_ROW + 1]
 
 
-def readings(config: CellsConfig, response: np.ndarray, calibration: Calibration) -> np.ndarray:
+def readings(
+    config: CellsConfig, response: np.ndarray, calibration: Calibration
+) -> np.ndarray:
     """(T, K) readings in the unit of the file: g r + o for the ``response`` r (T, K) in the unit ``reading``, limited to the ends
     of the converter. With places Σ g r + o over them, for r (T, P)."""
     gain = calibration.gain
@@ -92,7 +125,9 @@ def within_ends(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
     return (m.measured > config.low + half) & (m.measured < config.high - half)
 
 
-def calibrated(config: CellsConfig, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Calibration:
+def calibrated(
+    config: CellsConfig, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> Calibration:
     """Fit gain and offset of every cell by least squares over pairs (response, reading), each (T, K), with NaN in rows that are
     not used. Cells that were never loaded get the median gain of the others.
 
@@ -125,7 +160,10 @@ def _calibrated_by_place(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Cali
     common = finite.any(axis=1)
     solved = np.zeros((given.shape[1], reading.shape[1]))
     alike = finite[common].all(axis=0)
-    for rows, cells in [(common, np.flatnonzero(alike)), *((finite[:, k], [k]) for k in np.flatnonzero(~alike))]:
+    for rows, cells in [
+        (common, np.flatnonzero(alike)),
+        *((finite[:, k], [k]) for k in np.flatnonzero(~alike)),
+    ]:
         if np.sum(rows) and len(cells):
             own = given[rows]
             # Normal equations: (P + 1)² numbers in place of T (P + 1); a place without a row gets the gain 0.
@@ -138,21 +176,34 @@ def of_file(config: CellsConfig) -> Calibration | None:
     """Gain and offset of the cells file; None if it states none."""
     if not config.gain:
         return None
-    return Calibration(np.array(config.gain) * config.load_of_reading, np.array(config.offset))
+    return Calibration(
+        np.array(config.gain) * config.load_of_reading, np.array(config.offset)
+    )
 
 
-def by_cell(config: CellsConfig, numbers: Mapping[str, Sequence[float]]) -> dict[str, float]:
+def by_cell(
+    config: CellsConfig, numbers: Mapping[str, Sequence[float]]
+) -> dict[str, float]:
     """``KEY_CELL`` → number of each cell; ``numbers``: ``gain`` or ``offset`` → K numbers, or none."""
-    return {f"{key}_{cell}": x for key, own in numbers.items() for cell, x in zip(config.names, own, strict=False)}
+    return {
+        f"{key}_{cell}": x
+        for key, own in numbers.items()
+        for cell, x in zip(config.names, own, strict=False)
+    }
 
 
-def file_numbers(config: CellsConfig, calibration: Calibration) -> dict[str, list[float]]:
+def file_numbers(
+    config: CellsConfig, calibration: Calibration
+) -> dict[str, list[float]]:
     """Keys ``gain`` and ``offset`` of a cells file, each with K numbers; gains are per unit of the load. With places the gain is
     that of the place where the cell responds most."""
     gain = calibration.gain
     if gain.ndim > 1:
         gain = config.sign * np.max(config.sign * gain, axis=1)
-    return {"gain": (gain / config.load_of_reading).tolist(), "offset": calibration.offset.tolist()}
+    return {
+        "gain": (gain / config.load_of_reading).tolist(),
+        "offset": calibration.offset.tolist(),
+    }
 
 
 def thinned(m: CellMeasurement) -> CellMeasurement:

@@ -21,22 +21,31 @@ from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
 PRESSED = 0.05  # Share of the rated load above which a row is part of a press
-MOST_PLACES = 200  # Most places of a sensor: each is a number a cell, and a column of every fit
+MOST_PLACES = (
+    200  # Most places of a sensor: each is a number a cell, and a column of every fit
+)
 
 
 def with_places(config: CellsConfig, measurements: Measurements) -> Measurements:
     """``measurements`` with the place of every row; unchanged if the cells file has no ``same_place_mm``, or they have places.
     Raises TaccorlError: a recording has no position, no press of the fit recordings stays at its place, or there are more than
     ``MOST_PLACES`` places."""
-    if config.same_place_mm is None or all(m.place.size for m in cells_of(measurements.all)):
+    if config.same_place_mm is None or all(
+        m.place.size for m in cells_of(measurements.all)
+    ):
         return measurements
     lacking = [m.name for m in cells_of(measurements.all) if not m.position_mm.size]
     if lacking:
-        raise TaccorlError(f"{lacking[0]}: has no position of the probe, but {config.name} has same_place_mm")
+        raise TaccorlError(
+            f"{lacking[0]}: has no position of the probe, but {config.name} has same_place_mm"
+        )
     places: list[np.ndarray] = []
     found = [press for m in cells_of(measurements.fit) for press in presses(config, m)]
     for _, _, at, moved in found:
-        if moved <= config.same_place_mm and _nearest(at, places, config.same_place_mm) < 0:
+        if (
+            moved <= config.same_place_mm
+            and _nearest(at, places, config.same_place_mm) < 0
+        ):
             places.append(at)
     if found and not places:
         raise TaccorlError(
@@ -49,7 +58,9 @@ def with_places(config: CellsConfig, measurements: Measurements) -> Measurements
             f"several times, or write a larger same_place_mm than {config.same_place_mm:g} mm in the cells file"
         )
     sides = {
-        side: tuple(_placed(config, m, places) for m in cells_of(getattr(measurements, side)))
+        side: tuple(
+            _placed(config, m, places) for m in cells_of(getattr(measurements, side))
+        )
         for side in ("fit", "validation", "test")
     }
     for m in (m for side in sides.values() for m in side if (m.place < 0).all()):
@@ -60,7 +71,9 @@ def with_places(config: CellsConfig, measurements: Measurements) -> Measurements
     return dataclasses.replace(measurements, **sides)
 
 
-def presses(config: CellsConfig, m: CellMeasurement) -> list[tuple[int, int, np.ndarray, float]]:
+def presses(
+    config: CellsConfig, m: CellMeasurement
+) -> list[tuple[int, int, np.ndarray, float]]:
     """Every press: first row, last row + 1, place (2,) [mm], and its largest distance from that place [mm]."""
     found = []
     for first, end in runs(m.target[:, 0] > PRESSED * config.load.rated):
@@ -74,10 +87,19 @@ def place_findings(config: CellsConfig, m: CellMeasurement) -> list[Finding]:
     """A warning that names the presses of ``m``, which has places, that are not used; empty if there are none."""
     if not m.place.size:
         return []
-    unused = [(first, at, moved) for first, _, at, moved in presses(config, m) if m.place[first] < 0]
+    unused = [
+        (first, at, moved)
+        for first, _, at, moved in presses(config, m)
+        if m.place[first] < 0
+    ]
     if not unused:
         return []
-    which = listed([f"at {m.time_s[first]:.4g} s ({at[0]:.4g}, {at[1]:.4g} mm)" for first, at, _ in unused])
+    which = listed(
+        [
+            f"at {m.time_s[first]:.4g} s ({at[0]:.4g}, {at[1]:.4g} mm)"
+            for first, at, _ in unused
+        ]
+    )
     slid = sum(moved > (config.same_place_mm or 0.0) for _, _, moved in unused)
     text = (
         f"{len(unused)} presses are not used: {which}; {slid} of them move by more than same_place_mm {config.same_place_mm:g} "
@@ -86,7 +108,9 @@ def place_findings(config: CellsConfig, m: CellMeasurement) -> list[Finding]:
     return [Finding("other_places", "warning", "position", text)]
 
 
-def _placed(config: CellsConfig, m: CellMeasurement, places: Sequence[np.ndarray]) -> CellMeasurement:
+def _placed(
+    config: CellsConfig, m: CellMeasurement, places: Sequence[np.ndarray]
+) -> CellMeasurement:
     found = presses(config, m)
     place = np.full(m.num_rows, 0 if not found else -1)
     for k, (first, end, at, moved) in enumerate(found):

@@ -75,11 +75,19 @@ class ArrayColumns(CellColumns):
 class CellTableSpec(ColumnsFile):
     """Names and units of a table's columns."""
 
-    cells: dict[str, CellColumns] = field(default_factory=dict)  # Name of the cell → its columns; empty with ``array``
-    array: ArrayColumns | None = None  # Pattern of the column names of all cells; given instead of ``cells``
-    load: Column | None = None  # Column of the load of all cells; None if each cell has its own
+    cells: dict[str, CellColumns] = field(
+        default_factory=dict
+    )  # Name of the cell → its columns; empty with ``array``
+    array: ArrayColumns | None = (
+        None  # Pattern of the column names of all cells; given instead of ``cells``
+    )
+    load: Column | None = (
+        None  # Column of the load of all cells; None if each cell has its own
+    )
     temperature: TemperatureColumn | None = None  # None if the table has no temperature
-    position: PositionColumns | None = None  # Position of the probe; None if all presses are at one place
+    position: PositionColumns | None = (
+        None  # Position of the probe; None if all presses are at one place
+    )
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
@@ -116,13 +124,25 @@ def _rules(spec: CellTableSpec, config: CellsConfig) -> Rules:
     for key, column in (("x", at.x), ("y", at.y)) if at else ():
         lengths = [unit for unit, (of, _) in POSITION.items() if of == "m"]
         no_length = f"{column.unit!r} is not a length; {nearest(column.unit, lengths)}"
-        yield POSITION.get(column.unit, ("",))[0] != "m", f"position/{key}/unit", no_length
+        yield (
+            POSITION.get(column.unit, ("",))[0] != "m",
+            f"position/{key}/unit",
+            no_length,
+        )
     shared = config.load.shared
     stated = {f"cells/{name}": cell for name, cell in spec.cells.items()}
-    for place, cell in (stated if spec.array is None else {"array": spec.array}).items():
-        yield _other_kind(cell.reading, READINGS, config.reading.unit, f"{place}/reading")
+    for place, cell in (
+        stated if spec.array is None else {"array": spec.array}
+    ).items():
+        yield _other_kind(
+            cell.reading, READINGS, config.reading.unit, f"{place}/reading"
+        )
         load, key = (spec.load, "load") if shared else (cell.load, f"{place}/load")
-        states = "all cells share one load" if shared else "each cell has a load of its own (shared: false)"
+        states = (
+            "all cells share one load"
+            if shared
+            else "each cell has a load of its own (shared: false)"
+        )
         yield load is None, key, f"is missing: the cells file states that {states}"
         assert load is not None
         yield _other_kind(load, LOADS, config.load.unit, key)
@@ -132,10 +152,14 @@ def _rules(spec: CellTableSpec, config: CellsConfig) -> Rules:
             yield column.if_missing is not None, f"{where}/if_missing", always
 
 
-def _other_kind(column: Column, units: Mapping[str, tuple[str, float]], unit: str, key: str) -> tuple[bool, str, str]:
+def _other_kind(
+    column: Column, units: Mapping[str, tuple[str, float]], unit: str, key: str
+) -> tuple[bool, str, str]:
     """Rule: the unit of a column has the kind of the cells file's ``unit``."""
     kind = units[unit][0]
-    alike = nearest(column.unit, [other for other, (of, _) in units.items() if of == kind])
+    alike = nearest(
+        column.unit, [other for other, (of, _) in units.items() if of == kind]
+    )
     text = f"{column.unit!r} is not of the same kind as the cells file's unit {unit}; {alike}"
     return units.get(column.unit, ("",))[0] != kind, f"{key}/unit", text
 
@@ -155,10 +179,16 @@ def _rules_of_array(array: ArrayColumns, config: CellsConfig) -> Rules:
         ordered, order = "index" in found and not config.cells, "array/order"
         missing = "is missing: write `order: row by row` or `order: column by column` of a grid"
         yield ordered and array.order is None, order, missing
-        yield not ordered and array.order is not None, order, "is only for {index} of a grid"
+        yield (
+            not ordered and array.order is not None,
+            order,
+            "is only for {index} of a grid",
+        )
 
 
-def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config: CellsConfig) -> CellTableSpec:
+def columns_of_cells(
+    path: Path, header: list[str], spec: CellTableSpec, config: CellsConfig
+) -> CellTableSpec:
     """``spec`` with the columns of each cell in place of the pattern of an array. ``path``: the table, for messages. ``header``:
     names of its columns. Raises RecordingError: no column fits the pattern, a cell has none or two, or a column fits and has no
     cell."""
@@ -166,7 +196,11 @@ def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config:
     if array is None:
         return spec
     reading = _matched(path, header, array.reading, array, config)
-    load = [None] * config.num_cells if array.load is None else _matched(path, header, array.load, array, config)
+    load = (
+        [None] * config.num_cells
+        if array.load is None
+        else _matched(path, header, array.load, array, config)
+    )
     cells = {
         name: CellColumns(reading=own, load=pressed)
         for name, own, pressed in zip(config.names, reading, load, strict=True)
@@ -174,19 +208,33 @@ def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config:
     return dataclasses.replace(spec, cells=cells, array=None)
 
 
-def _matched(path: Path, header: list[str], pattern: Column, array: ArrayColumns, config: CellsConfig) -> list[Column]:
+def _matched(
+    path: Path,
+    header: list[str],
+    pattern: Column,
+    array: ArrayColumns,
+    config: CellsConfig,
+) -> list[Column]:
     """The columns that fit ``pattern``, in the order of the cells."""
     text, first = pattern.column, array.first
     parts = _PLACE.split(text)  # text, placeholder, text, …
-    form = re.compile("".join(f"(?P<{p}>[0-9]+)" if k % 2 else re.escape(p) for k, p in enumerate(parts)))
+    form = re.compile(
+        "".join(
+            f"(?P<{p}>[0-9]+)" if k % 2 else re.escape(p) for k, p in enumerate(parts)
+        )
+    )
     rows, columns = config.shape
     if "index" in parts:
         numbers = [{"index": k} for k in range(config.num_cells)]
         if array.order == "column by column":
-            numbers = [{"index": j * rows + i} for i in range(rows) for j in range(columns)]
+            numbers = [
+                {"index": j * rows + i} for i in range(rows) for j in range(columns)
+            ]
     else:
         numbers = [{"row": i, "column": j} for i in range(rows) for j in range(columns)]
-    wanted = {tuple(n + first for n in cell.values()): k for k, cell in enumerate(numbers)}
+    wanted = {
+        tuple(n + first for n in cell.values()): k for k, cell in enumerate(numbers)
+    }
     found: dict[int, str] = {}
     for name in header:
         match = form.fullmatch(name)
@@ -194,17 +242,25 @@ def _matched(path: Path, header: list[str], pattern: Column, array: ArrayColumns
             continue
         k = wanted.get(tuple(int(match[key]) for key in numbers[0]))
         if k is None:
-            shape = f"{config.num_cells} cells" if config.cells else f"{rows} × {columns} cells"
+            shape = (
+                f"{config.num_cells} cells"
+                if config.cells
+                else f"{rows} × {columns} cells"
+            )
             raise RecordingError(
                 f"{path}: column {name!r} fits {text!r}, but is none of {shape} counted from {first}; correct `first` in the "
                 "columns file, or the cells of the cells file"
             )
         if k in found:
-            raise RecordingError(f"{path}: columns {found[k]!r} and {name!r} are the same cell of {text!r}; keep one")
+            raise RecordingError(
+                f"{path}: columns {found[k]!r} and {name!r} are the same cell of {text!r}; keep one"
+            )
         found[k] = name
     if not found:
         shown = ", ".join(header[:6]) + (" …" if len(header) > 6 else "")
-        raise RecordingError(f"{path}: no column fits the pattern {text!r} of the columns file; the table has {shown}")
+        raise RecordingError(
+            f"{path}: no column fits the pattern {text!r} of the columns file; the table has {shown}"
+        )
     lacking = [
         _PLACE.sub(lambda m, cell=cell: str(cell[m[1]] + first), text)
         for k, cell in enumerate(numbers)
@@ -215,16 +271,22 @@ def _matched(path: Path, header: list[str], pattern: Column, array: ArrayColumns
             f"{path}: {len(lacking)} of {config.num_cells} cells have no column: {listed(lacking, 6)}; correct `first` in the "
             "columns file, or the cells of the cells file"
         )
-    return [dataclasses.replace(pattern, column=found[k]) for k in range(config.num_cells)]
+    return [
+        dataclasses.replace(pattern, column=found[k]) for k in range(config.num_cells)
+    ]
 
 
-def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
+def own_cell_columns(
+    path: Path, header: list[str], config: CellsConfig
+) -> CellTableSpec:
     """Columns of a table with taccorl's own names. ``header``: names of its columns. Raises RecordingError: a column is missing
     or unknown; the message names file, column and remedy."""
     load = LOADS[config.load.unit][0]
     known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
     place = ["x_mm", "y_mm"] if config.same_place_mm is not None else []
-    loads = [load] if config.load.shared else [f"{name}.{load}" for name in config.names]
+    loads = (
+        [load] if config.load.shared else [f"{name}.{load}" for name in config.names]
+    )
     for column in header:
         if column not in (*known, *place, *loads):
             raise RecordingError(
@@ -242,7 +304,9 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
     own = {
         name: CellColumns(
             reading=Column(column=f"{name}.reading", unit=config.reading.unit),
-            load=None if config.load.shared else Column(column=f"{name}.{load}", unit=unit),
+            load=None
+            if config.load.shared
+            else Column(column=f"{name}.{load}", unit=unit),
         )
         for name in config.names
     }
@@ -250,8 +314,12 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
         time=Column(column="t", unit="s"),
         cells=own,
         load=Column(column=load, unit=unit) if config.load.shared else None,
-        temperature=TemperatureColumn(column="temperature_c") if "temperature_c" in header else None,
-        position=PositionColumns(x=Column(column="x_mm", unit="mm"), y=Column(column="y_mm", unit="mm"))
+        temperature=TemperatureColumn(column="temperature_c")
+        if "temperature_c" in header
+        else None,
+        position=PositionColumns(
+            x=Column(column="x_mm", unit="mm"), y=Column(column="y_mm", unit="mm")
+        )
         if place
         else None,
     )
@@ -277,7 +345,14 @@ class CellMeasurement(Measurement):
 
     @property
     def columns(self) -> list[str]:
-        return [*super().columns, *(name for name in ("temperature_c", "position_mm") if getattr(self, name).size)]
+        return [
+            *super().columns,
+            *(
+                name
+                for name in ("temperature_c", "position_mm")
+                if getattr(self, name).size
+            ),
+        ]
 
 
 def cells_of(measurements: Iterable[Measurement]) -> list[CellMeasurement]:
@@ -285,7 +360,9 @@ def cells_of(measurements: Iterable[Measurement]) -> list[CellMeasurement]:
     return [m for m in measurements if isinstance(m, CellMeasurement)]
 
 
-def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:
+def read_cell_table(
+    path: Path, config: CellsConfig, spec: CellTableSpec | None = None
+) -> CellMeasurement:
     """Read a table as a measurement of the sensor, in the units of the cells file. Raises RecordingError: a column is missing, a
     cell of the table is empty or no number, time does not increase; the message names file, line or row, and column."""
     path = Path(path)
@@ -305,14 +382,18 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
     steps = np.diff(time_s)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 2
-        raise RecordingError(f"{path}: time does not increase at row {row}: {time_s[row - 1]:.6g} s; remove such rows")
+        raise RecordingError(
+            f"{path}: time does not increase at row {row}: {time_s[row - 1]:.6g} s; remove such rows"
+        )
     load_factor = LOADS[config.load.unit][1]
     load, reading = np.empty((2, len(time_s), config.num_cells))
     for k, name in enumerate(config.names):
         cell = own.cells[name]
         column = own.load if config.load.shared else cell.load
         assert column is not None
-        load[:, k] = column.quantity(columns[column.column]) * (LOADS[column.unit][1] / load_factor)
+        load[:, k] = column.quantity(columns[column.column]) * (
+            LOADS[column.unit][1] / load_factor
+        )
         reading[:, k] = cell.reading.quantity(columns[cell.reading.column]) * (
             READINGS[cell.reading.unit][1] / READINGS[config.reading.unit][1]
         )
@@ -331,7 +412,9 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
         source=path,
         origin=table_origin(path, own),
         start_ns=round(time_s[0] * 1e9),
-        temperature_c=columns[own.temperature.column] if own.temperature else np.empty(0),
+        temperature_c=columns[own.temperature.column]
+        if own.temperature
+        else np.empty(0),
         position_mm=np.column_stack(position) if position else np.empty(0),
     )
     return _even(found)
@@ -339,7 +422,11 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
 
 def _wanted(spec: CellTableSpec) -> list[str]:
     names = [spec.time.column, *(c.reading.column for c in spec.cells.values())]
-    names += [c.column for c in (spec.load, *(cell.load for cell in spec.cells.values())) if c is not None]
+    names += [
+        c.column
+        for c in (spec.load, *(cell.load for cell in spec.cells.values()))
+        if c is not None
+    ]
     names += [spec.temperature.column] if spec.temperature else []
     names += [spec.position.x.column, spec.position.y.column] if spec.position else []
     return list(dict.fromkeys(names))
@@ -361,4 +448,6 @@ def _even(m: CellMeasurement) -> CellMeasurement:
         "straight lines. Log the driver's own stamps to avoid it"
     )
     finding = Finding("resampled", "warning", "time", text)
-    return dataclasses.replace(m.resampled(1.0 / period), findings=(*m.findings, finding))
+    return dataclasses.replace(
+        m.resampled(1.0 / period), findings=(*m.findings, finding)
+    )

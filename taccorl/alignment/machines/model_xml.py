@@ -27,7 +27,13 @@ MOST_FILES = 20  # Most files that a model includes
 BALANCE = '<mujoco><compiler balanceinertia="true"/></mujoco>'
 _SIZES = ("nrow", "ncol", "width", "height", "size", "dim")
 _BODIES = ("body", "worldbody")
-_NAMED = {"joint": "joint", "freejoint": "joint", "body": "body", "link": "body", "actuator": "actuator"}
+_NAMED = {
+    "joint": "joint",
+    "freejoint": "joint",
+    "body": "body",
+    "link": "body",
+    "actuator": "actuator",
+}
 
 
 @dataclass(eq=False)
@@ -89,19 +95,32 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
         if not stat.S_ISREG(found.st_mode):
             raise TaccorlError(f"{path}: is no regular file; give an MJCF or URDF file")
         if found.st_size > MOST_BYTES:
-            raise TaccorlError(f"{path}: is larger than {MOST_BYTES:,} bytes; is it a model file?")
+            raise TaccorlError(
+                f"{path}: is larger than {MOST_BYTES:,} bytes; is it a model file?"
+            )
         content = path.read_bytes()
     except OSError as error:
-        raise TaccorlError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise TaccorlError(
+            f"{path}: cannot be read: {error.strerror or error}"
+        ) from error
     parser = expat.ParserCreate()
     top: list[Element] = []
     inside: list[Element] = []
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         parent = inside[-1] if inside else None
-        one = Element(tag, attributes, path, parser.CurrentLineNumber, parent, parser.CurrentByteIndex)
+        one = Element(
+            tag,
+            attributes,
+            path,
+            parser.CurrentLineNumber,
+            parent,
+            parser.CurrentByteIndex,
+        )
         if len(inside) >= MOST_DEEP:
-            raise TaccorlError(f"{one.place}: <{tag}> is nested deeper than {MOST_DEEP} elements; is it a model file?")
+            raise TaccorlError(
+                f"{one.place}: <{tag}> is nested deeper than {MOST_DEEP} elements; is it a model file?"
+            )
         (parent.children if parent is not None else top).append(one)
         inside.append(one)
 
@@ -112,7 +131,9 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        raise TaccorlError(f"{path}:{error.lineno}: is not XML: {error}; give an MJCF or URDF file") from error
+        raise TaccorlError(
+            f"{path}:{error.lineno}: is not XML: {error}; give an MJCF or URDF file"
+        ) from error
     return top[0], content
 
 
@@ -126,7 +147,9 @@ def _include(root: Element) -> None:
             continue
         files += 1
         if files > MOST_FILES:
-            raise TaccorlError(f"{one.place}: includes more than {MOST_FILES} files; does one include itself?")
+            raise TaccorlError(
+                f"{one.place}: includes more than {MOST_FILES} files; does one include itself?"
+            )
         try:
             # MuJoCo looks beside the first file.
             included, _ = _parsed(root.path.parent / one.get("file"))
@@ -143,7 +166,11 @@ def _refuse_large(root: Element) -> None:
     waiting = [(root, 1)]
     while waiting:
         one, times = waiting.pop()
-        own = {key: _whole(value) for key, value in one.attributes.items() if key in (*_SIZES, "count")}
+        own = {
+            key: _whole(value)
+            for key, value in one.attributes.items()
+            if key in (*_SIZES, "count")
+        }
         counts = [n for key, n in own.items() if key == "count" for n in n]
         if one.tag == "replicate":
             times *= max(1, *counts, 1)
@@ -155,7 +182,9 @@ def _refuse_large(root: Element) -> None:
                 f"{one.place}: <{one.tag}> makes more than {MOST_ELEMENTS:,} elements of this file; give the model that it "
                 "makes, or smaller counts"
             )
-        values = math.prod(max(n, 1) for key, all_n in own.items() if key != "count" for n in all_n)
+        values = math.prod(
+            max(n, 1) for key, all_n in own.items() if key != "count" for n in all_n
+        )
         if one.tag in ("hfield", "texture", "numeric") and values > MOST_VALUES:
             raise TaccorlError(
                 f"{one.place}: <{one.tag}> has {values:,} values, more than {MOST_VALUES:,}; it is not used: remove it"
@@ -163,11 +192,15 @@ def _refuse_large(root: Element) -> None:
         if one.tag == "size":
             for key, value in one.attributes.items():
                 if key != "memory" and any(n > MOST_VALUES for n in _whole(value)):
-                    raise TaccorlError(f'{one.place}: <size {key}="{value}">: more than {MOST_VALUES:,}; remove it')
+                    raise TaccorlError(
+                        f'{one.place}: <size {key}="{value}">: more than {MOST_VALUES:,}; remove it'
+                    )
         waiting += [(child, times) for child in one.children]
     joints = root.all("joint")
     if len(joints) > MOST_JOINTS:
-        raise TaccorlError(f"{root.path}: has {len(joints):,} joints, more than {MOST_JOINTS:,}; is it one robot?")
+        raise TaccorlError(
+            f"{root.path}: has {len(joints):,} joints, more than {MOST_JOINTS:,}; is it one robot?"
+        )
 
 
 def _whole(text: str) -> list[int]:
@@ -198,9 +231,13 @@ def ends_of(joint: Element) -> tuple[str, str]:
     around = []
     one = joint.parent
     while one is not None and len(around) < 2:
-        around += ["world" if one.tag == "worldbody" else one.get("name") or "(no name)"] * (one.tag in _BODIES)
+        around += [
+            "world" if one.tag == "worldbody" else one.get("name") or "(no name)"
+        ] * (one.tag in _BODIES)
         one = one.parent
-    return (around[1] if len(around) > 1 else "world", around[0]) if around else ("", "")
+    return (
+        (around[1] if len(around) > 1 else "world", around[0]) if around else ("", "")
+    )
 
 
 def joints_of(root: Element) -> dict[str, Element]:
@@ -208,7 +245,13 @@ def joints_of(root: Element) -> dict[str, Element]:
     found = {}
     for one in root.all("joint"):
         around = one.parent.tag if one.parent is not None else ""
-        if one.get("name") and around in ("robot", "body", "worldbody", "frame", "replicate"):
+        if one.get("name") and around in (
+            "robot",
+            "body",
+            "worldbody",
+            "frame",
+            "replicate",
+        ):
             found.setdefault(one.get("name"), one)
     return found
 
@@ -222,7 +265,13 @@ def _refuse_names(root: Element) -> None:
         plain_name(name, f"{one.place}: <{one.tag}>")
         around = one.parent.tag if one.parent is not None else ""
         kind = _NAMED.get(one.tag)
-        if kind is None or around not in ("robot", "body", "worldbody", "frame", "replicate"):
+        if kind is None or around not in (
+            "robot",
+            "body",
+            "worldbody",
+            "frame",
+            "replicate",
+        ):
             continue
         first = seen.setdefault((kind, name), one)
         if first is one:
@@ -232,7 +281,9 @@ def _refuse_names(root: Element) -> None:
             between = f"between {ends[0]} (line {first.line}) and between {ends[1]}"
         else:
             between = f"in line {first.line} and here"
-        raise TaccorlError(f"{one.place}: two <{one.tag}> have the name {name!r}, {between}; rename one")
+        raise TaccorlError(
+            f"{one.place}: two <{one.tag}> have the name {name!r}, {between}; rename one"
+        )
 
 
 def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
@@ -244,20 +295,29 @@ def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
             if shape.tag not in ("visual", "collision"):
                 continue
             shapes += 1
-            later = link.children[k + 1].begin if k + 1 < len(link.children) else link.end
+            later = (
+                link.children[k + 1].begin if k + 1 < len(link.children) else link.end
+            )
             end = content.index(b">", shape.end) + 1 if shape.end < later else later
-            text[shape.begin : end] = bytes(b if b in b"\r\n" else 0x20 for b in text[shape.begin : end])
+            text[shape.begin : end] = bytes(
+                b if b in b"\r\n" else 0x20 for b in text[shape.begin : end]
+            )
     try:
         return text.decode("utf-8-sig"), shapes
     except UnicodeDecodeError as error:
-        raise TaccorlError(f"{root.path}: is not a text in UTF-8: {error}; save it as UTF-8") from error
+        raise TaccorlError(
+            f"{root.path}: is not a text in UTF-8: {error}; save it as UTF-8"
+        ) from error
 
 
 def unbalanced(root: Element) -> str:
     """Text on the first link whose inertia no body can have: place, link, principal moments, and what to write; empty: none."""
     for inertia in root.all("inertia"):
         try:
-            full = [[float(inertia.get(f"i{min(a, b)}{max(a, b)}", "0")) for a in "xyz"] for b in "xyz"]
+            full = [
+                [float(inertia.get(f"i{min(a, b)}{max(a, b)}", "0")) for a in "xyz"]
+                for b in "xyz"
+            ]
             moments = np.linalg.eigvalsh(np.array(full))
         except (ValueError, np.linalg.LinAlgError):
             continue

@@ -41,8 +41,15 @@ class OmittedActuator:
     @property
     def text(self) -> str:
         """Sentence that names the actuator, its transmission, and the joints that it moves."""
-        moved = [name if lever is None else f"{name} ({lever:g})" for name, lever in self.levers.items()]
-        where = f"moves {listed(moved, len(moved))}" if moved else "moves no hinge or slide by itself"
+        moved = [
+            name if lever is None else f"{name} ({lever:g})"
+            for name, lever in self.levers.items()
+        ]
+        where = (
+            f"moves {listed(moved, len(moved))}"
+            if moved
+            else "moves no hinge or slide by itself"
+        )
         return f"actuator {self.name} is left out: it acts on {self.transmission}, which {where}"
 
 
@@ -51,35 +58,56 @@ def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
     actuator acts on something that the file does not have."""
     omitted = []
     for k, actuator in enumerate(spec.actuators):
-        name, kind = actuator.name or f"{k} (no name)", _KIND.get(actuator.trntype, str(actuator.trntype))
+        name, kind = (
+            actuator.name or f"{k} (no name)",
+            _KIND.get(actuator.trntype, str(actuator.trntype)),
+        )
         gear = float(actuator.gear[0])
         if actuator.trntype in ON_JOINT:
             joint = spec.joint(actuator.target)
             if joint is None or _moves(joint):
                 continue
-            transmission, levers = f"joint {joint.name}, a ball or free joint that is held fixed", {}
+            transmission, levers = (
+                f"joint {joint.name}, a ball or free joint that is held fixed",
+                {},
+            )
         elif actuator.trntype == _TRN.mjTRN_TENDON:
             transmission = f"{kind} {actuator.target}"
-            pairs = _of_tendon(_present(spec.tendon(actuator.target), f"actuator {name}", transmission))
-            levers = {joint: None if lever is None else gear * lever for joint, lever in pairs}
+            pairs = _of_tendon(
+                _present(spec.tendon(actuator.target), f"actuator {name}", transmission)
+            )
+            levers = {
+                joint: None if lever is None else gear * lever for joint, lever in pairs
+            }
         else:
             second = actuator.refsite or actuator.slidersite
-            transmission = f"{kind} {actuator.target}" + (f" and {second}" if second else "")
+            transmission = f"{kind} {actuator.target}" + (
+                f" and {second}" if second else ""
+            )
             if actuator.trntype == _TRN.mjTRN_BODY:
                 _present(spec.body(actuator.target), f"actuator {name}", transmission)
-                bodies: list[mujoco.MjsBody] = []  # adhesion pulls at what the body touches
+                bodies: list[
+                    mujoco.MjsBody
+                ] = []  # adhesion pulls at what the body touches
             else:
                 of = [at for at in (actuator.target, second) if at]
-                bodies = [_present(spec.site(at), f"actuator {name}", f"site {at}").parent for at in of]
+                bodies = [
+                    _present(spec.site(at), f"actuator {name}", f"site {at}").parent
+                    for at in of
+                ]
             # A lone site is pushed against the world.
-            levers = dict.fromkeys(_between(bodies if second else [*bodies, spec.worldbody]))
+            levers = dict.fromkeys(
+                _between(bodies if second else [*bodies, spec.worldbody])
+            )
         affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
         kp, kd = (-float(actuator.biasprm[p]) if affine else 0.0 for p in (1, 2))
         omitted.append(OmittedActuator(name, transmission, levers, kp + 0.0, kd + 0.0))
     return omitted
 
 
-def joint_gains(omitted: list[OmittedActuator], joint: str) -> tuple[float, float, dict[str, float]] | None:
+def joint_gains(
+    omitted: list[OmittedActuator], joint: str
+) -> tuple[float, float, dict[str, float]] | None:
     """kp and kd with which all of ``omitted`` together hold one joint [N·m/rad, N·m·s/rad; N/m, N·s/m], and other joint → kp that
     couples it with that joint. None if no actuator holds it, or if the lever of one that does depends on the pose."""
     own = [a for a in omitted if joint in a.levers]
@@ -91,11 +119,17 @@ def joint_gains(omitted: list[OmittedActuator], joint: str) -> tuple[float, floa
         at = actuator.levers[joint] or 0.0
         damping += actuator.kd * at * at
         for other, lever in actuator.levers.items():
-            stiffness[other] = stiffness.get(other, 0.0) + actuator.kp * at * (lever or 0.0)
+            stiffness[other] = stiffness.get(other, 0.0) + actuator.kp * at * (
+                lever or 0.0
+            )
     held = stiffness.pop(joint)
     if held <= 0.0:
         return None
-    return held, damping, {name: kp for name, kp in stiffness.items() if abs(kp) > _NOTHING * held}
+    return (
+        held,
+        damping,
+        {name: kp for name, kp in stiffness.items() if abs(kp) > _NOTHING * held},
+    )
 
 
 def remarks_on(omitted: list[OmittedActuator]) -> list[str]:
@@ -111,10 +145,16 @@ def remarks_on(omitted: list[OmittedActuator]) -> list[str]:
         found = joint_gains(omitted, name)
         if found and found[2]:
             beside = ", ".join(f"{kp:g} with {other}" for other, kp in found[2].items())
-            gains.append(f"{name}: kp {found[0]:g}, kd {found[1]:g}, and kp {beside}, which no robot file holds")
+            gains.append(
+                f"{name}: kp {found[0]:g}, kd {found[1]:g}, and kp {beside}, which no robot file holds"
+            )
         elif found:
-            gains.append(f"{name}: kp {found[0]:g}, kd {found[1]:g}, not coupled with another joint")
-    shared = list(dict.fromkeys(name for a in omitted if len(a.levers) > 1 for name in a.levers))
+            gains.append(
+                f"{name}: kp {found[0]:g}, kd {found[1]:g}, not coupled with another joint"
+            )
+    shared = list(
+        dict.fromkeys(name for a in omitted if len(a.levers) > 1 for name in a.levers)
+    )
     said.append(
         "a robot file gives each joint a drive of its own and states no other transmission. "
         + (f"Together these actuators hold {'; '.join(gains)}. " if gains else "")
@@ -137,7 +177,9 @@ def _moves(joint: mujoco.MjsJoint) -> bool:
 def _present[ThingT](thing: ThingT | None, which: str, on: str) -> ThingT:
     """``thing``, which ``which`` acts on, if the file has it."""
     if thing is None:
-        raise TaccorlError(f"{which} acts on {on}, which the file does not have; correct the name there")
+        raise TaccorlError(
+            f"{which} acts on {on}, which the file does not have; correct the name there"
+        )
     return thing
 
 
@@ -146,12 +188,18 @@ def _of_tendon(tendon: mujoco.MjsTendon) -> Iterator[tuple[str, float | None]]:
     [m/rad, m/m]; None for a spatial tendon, whose coefficients depend on the pose."""
     path = [wrap for wrap in tendon.path if wrap.type != mujoco.mjtWrap.mjWRAP_PULLEY]
     for k, wrap in enumerate(path):
-        _present(wrap.target, f"tendon {tendon.name}", f"a joint, site or geom at its place {k}, counted from 0")
+        _present(
+            wrap.target,
+            f"tendon {tendon.name}",
+            f"a joint, site or geom at its place {k}, counted from 0",
+        )
     fixed = [wrap for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
     for wrap in fixed:
         yield wrap.target.name, float(wrap.coef)
     if not fixed:
-        yield from ((joint, None) for joint in _between([wrap.target.parent for wrap in path]))
+        yield from (
+            (joint, None) for joint in _between([wrap.target.parent for wrap in path])
+        )
 
 
 def _between(bodies: list[mujoco.MjsBody]) -> list[str]:
@@ -171,7 +219,9 @@ def _chain(body: mujoco.MjsBody) -> list[str]:
     return names
 
 
-def held_by(omitted: list[OmittedActuator], joint: str) -> tuple[str, float, float] | None:
+def held_by(
+    omitted: list[OmittedActuator], joint: str
+) -> tuple[str, float, float] | None:
     """(names of the actuators, kp, kd) of a joint that actuators hold together and without coupling; else None."""
     found = joint_gains(omitted, joint)
     if found is None or found[2]:

@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from taccorl.alignment.machines.robot_file import TODO
-from taccorl.alignment.machines.robot_model import JointFacts, RobotModel, load_robot_model
+from taccorl.alignment.machines.robot_model import (
+    JointFacts,
+    RobotModel,
+    load_robot_model,
+)
 from taccorl.alignment.measurements.dataset_rows import TIME, dataset_columns
 from taccorl.data.dataset import Dataset
 from taccorl.data.spec import ACTION, STATE
@@ -34,7 +38,9 @@ def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
     path of the robot file, which is not written here; the text names the model relative to it. Raises TaccorlError: the model
     cannot be used (``load_robot_model``)."""
     robot = load_robot_model(model)
-    relative = Path(os.path.relpath(Path(model).resolve(), Path(out).resolve().parent)).as_posix()
+    relative = Path(
+        os.path.relpath(Path(model).resolve(), Path(out).resolve().parent)
+    ).as_posix()
     lines = [_HEADER.format(model=Path(model).name, name=Path(out).name).rstrip()]
     lines += [f"# Of the model: {remark}." for remark in robot.remarks]
     lines += [
@@ -53,8 +59,16 @@ def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
 def _joint(facts: JointFacts) -> list[str]:
     turn, torque = ("rad", "N·m") if facts.unit == "rad" else ("m", "N")
     inertia = "kg·m²" if facts.unit == "rad" else "kg"
-    per_gear = "turns of the motor for one of the joint" if facts.unit == "rad" else "rad of the motor for one m"
-    limits = "no limits" if facts.limits is None else f"{facts.limits[0]:.4g} … {facts.limits[1]:.4g} {turn}"
+    per_gear = (
+        "turns of the motor for one of the joint"
+        if facts.unit == "rad"
+        else "rad of the motor for one m"
+    )
+    limits = (
+        "no limits"
+        if facts.limits is None
+        else f"{facts.limits[0]:.4g} … {facts.limits[1]:.4g} {turn}"
+    )
     servo = next((a for a in facts.actuators if a.kp > 0), None)
     speed = next((a for a in facts.actuators if a.kd > 0), None)
     lines = [
@@ -63,15 +77,22 @@ def _joint(facts: JointFacts) -> list[str]:
     ]
     if servo:
         source = f"   # {torque}/{turn}, of actuator {servo.name}; is it what the drive runs?"
-        lines += [f"    kp: {servo.kp:.6g}{source}", f"    kd: {servo.kd:.6g}   # {torque}·s/{turn}"]
+        lines += [
+            f"    kp: {servo.kp:.6g}{source}",
+            f"    kd: {servo.kd:.6g}   # {torque}·s/{turn}",
+        ]
     elif speed:
-        lines += [f"    kd: {speed.kd:.6g}   # {torque}·s/{turn}, of actuator {speed.name}; is it what the drive runs?"]
+        lines += [
+            f"    kd: {speed.kd:.6g}   # {torque}·s/{turn}, of actuator {speed.name}; is it what the drive runs?"
+        ]
     else:
         lines += [
             f"    kp: {TODO}                   # {torque}/{turn}: position gain of the drive; a guess where nobody knows it",
             f"    kd: {TODO}                   # {torque}·s/{turn}: damping gain",
         ]
-    lines += [f"    gains: {TODO}                # commanded: the drive runs kp and kd; fitted: nobody knows them"]
+    lines += [
+        f"    gains: {TODO}                # commanded: the drive runs kp and kd; fitted: nobody knows them"
+    ]
     if facts.armature > 0:
         lines += [
             f"    rotor_inertia: {facts.armature:.6g}   # {inertia}: the model's armature, already at the joint, so gear is 1"
@@ -82,9 +103,13 @@ def _joint(facts: JointFacts) -> list[str]:
             "    # rotor_inertia: 1.0e-5    # kg·m² of the motor; without it no effect in the gear is looked for",
             f"    # gear: 100.0              # {per_gear}",
         ]
-    limit = facts.effort_limit or next((a.effort_limit for a in facts.actuators if a.effort_limit), None)
+    limit = facts.effort_limit or next(
+        (a.effort_limit for a in facts.actuators if a.effort_limit), None
+    )
     if limit:
-        lines += [f"    effort_limit: {limit:.6g}   # {torque}; torques beyond are clipped"]
+        lines += [
+            f"    effort_limit: {limit:.6g}   # {torque}; torques beyond are clipped"
+        ]
     else:
         lines += [f"    # effort_limit: 10.0       # {torque}; the model names none"]
     lines += [
@@ -95,7 +120,9 @@ def _joint(facts: JointFacts) -> list[str]:
     ]
     effects = []
     if facts.damping > 0:
-        effects.append(f"{{effect: viscous_friction, damping_nms_per_rad: {facts.damping:.6g}}}")
+        effects.append(
+            f"{{effect: viscous_friction, damping_nms_per_rad: {facts.damping:.6g}}}"
+        )
     if facts.friction > 0:
         effects.append(f"{{effect: coulomb_friction, torque_nm: {facts.friction:.6g}}}")
     if facts.stiffness > 0:
@@ -125,8 +152,13 @@ def columns_draft(root: Path, robot: RobotModel) -> tuple[str, list[str]]:
     ``robot``. Raises TaccorlError: it is no dataset, or no element of its state and action has the name of a joint."""
     dataset = Dataset(root)
     known = dataset_columns(dataset)
-    rows = dataset.values(0, [key for key in (STATE, ACTION) if key in dataset.spec.features])
-    lines, spare = [_HEADER_OF_COLUMNS.format(dataset=dataset.root.name, time=TIME).rstrip()], []
+    rows = dataset.values(
+        0, [key for key in (STATE, ACTION) if key in dataset.spec.features]
+    )
+    lines, spare = (
+        [_HEADER_OF_COLUMNS.format(dataset=dataset.root.name, time=TIME).rstrip()],
+        [],
+    )
     for column, (key, j) in known.items():
         if key != STATE:
             continue
@@ -145,14 +177,20 @@ def columns_draft(root: Path, robot: RobotModel) -> tuple[str, list[str]]:
 
 
 def _signal(facts: JointFacts, element: str, numbers: np.ndarray) -> list[str]:
-    lines = [f"  {facts.name}:   # {np.nanmin(numbers):.4g} … {np.nanmax(numbers):.4g} in episode 0"]
+    lines = [
+        f"  {facts.name}:   # {np.nanmin(numbers):.4g} … {np.nanmax(numbers):.4g} in episode 0"
+    ]
     if facts.limits is not None:
         low, high = facts.limits
         lines[0] += f"; the model allows {low:.4g} … {high:.4g} {facts.unit}"
         for first, last in ((-100.0, 100.0), (0.0, 100.0)):
             factor = (high - low) / (last - first)
-            numbers_of = f"factor: {factor:.6g}, zero: {round(first - low / factor, 4) + 0.0:g}"
-            lines.append(f"    # of a range {first:g} … {last:g}: unit: {facts.unit}, {numbers_of}")
+            numbers_of = (
+                f"factor: {factor:.6g}, zero: {round(first - low / factor, 4) + 0.0:g}"
+            )
+            lines.append(
+                f"    # of a range {first:g} … {last:g}: unit: {facts.unit}, {numbers_of}"
+            )
     name = element if re.fullmatch(r"[A-Za-z0-9_.]+", element) else None
     for key, feature in (("q:       ", STATE), ("q_target:", ACTION)):
         column = f"{feature}.{element}" if name else f'"{feature}.{element}"'

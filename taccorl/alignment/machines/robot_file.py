@@ -37,7 +37,9 @@ _LEAST_REACH_M = 0.05
 MOST_EARLY_S = 0.01
 """``position_age_s`` of a file must be above minus this value [s]. A choice: longer than the period of any drive's loop."""
 _ALONG = 0.9999  # least cosine between axes that count as parallel
-_HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
+_HEADER = (
+    "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
+)
 
 
 @dataclass(kw_only=True)
@@ -47,8 +49,12 @@ class JointConfig(DriveLaw):
     gains: Literal["commanded", "fitted"] = "commanded"
     """commanded: kp and kd are those of the controller. fitted: they are only the start of a fit. With law pwm they are always
     the servo's own, and stall torque and back-EMF are fitted."""
-    rotor_inertia: float = 0.0  # Inertia of the motor's rotor on the motor's side of the gear [kg·m²]
-    gear: float = 1.0  # Turns of the motor per turn of the joint; for a sliding joint [rad/m]
+    rotor_inertia: float = (
+        0.0  # Inertia of the motor's rotor on the motor's side of the gear [kg·m²]
+    )
+    gear: float = (
+        1.0  # Turns of the motor per turn of the joint; for a sliding joint [rad/m]
+    )
     loop_hz: float | None = None  # Rate of the drive's control loop [Hz]
     command_hz: float | None = None
     """Rate at which the drive receives targets [Hz], if only some of them are logged: a replay interpolates rows linearly at this
@@ -57,18 +63,35 @@ class JointConfig(DriveLaw):
     """Age of the measured position when the torque acts, beyond that of the loop's timing [s]; ``diagnose`` fits it."""
     effects: list[Effect] = field(default_factory=list)
     """Effects beyond rigid bodies and control law; empty if there are none."""
-    FITTED: ClassVar[tuple[str, ...]] = (*DriveLaw.FITTED, "effort_scale", "speed_delay_s", "position_age_s")
+    FITTED: ClassVar[tuple[str, ...]] = (
+        *DriveLaw.FITTED,
+        "effort_scale",
+        "speed_delay_s",
+        "position_age_s",
+    )
 
     def __post_init__(self) -> None:
-        check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",), finite=("position_age_s",))
+        check_numbers(
+            "joint",
+            self,
+            positive=("gear",),
+            not_negative=("rotor_inertia",),
+            finite=("position_age_s",),
+        )
         optional = ("loop_hz", "command_hz")
-        check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
+        check_numbers(
+            "joint",
+            self,
+            positive=[name for name in optional if getattr(self, name) is not None],
+        )
         if not self.position_age_s > -MOST_EARLY_S:
             raise TaccorlError(
                 f"joint.position_age_s: is {self.position_age_s:g} s; write a value above −{MOST_EARLY_S:g} s"
             )
         self.check_law("joint")
-        self.check_known("joint", {e.name: [p.name for p in e.parameters()] for e in self.effects})
+        self.check_known(
+            "joint", {e.name: [p.name for p in e.parameters()] for e in self.effects}
+        )
         if self.law == "pwm" and self.gains == "fitted":
             raise TaccorlError(
                 "joint.gains: with law pwm, stall torque and back-EMF are fitted instead of kp and kd; write the servo's own "
@@ -92,7 +115,9 @@ class RobotConfig:
 
     kind: Literal["robot"]
     model: str  # Path of the MJCF or URDF file, relative to this file
-    gravity_compensation: float = 0.0  # Share of the weight that the controller compensates, 0 … 1
+    gravity_compensation: float = (
+        0.0  # Share of the weight that the controller compensates, 0 … 1
+    )
     gravity: list[float] = field(default_factory=list)
     """Direction of gravity (x, y, z) in the model's frame, of any length, where the base is not mounted as in the model, which
     the controller does not know. Empty: as the model has it."""
@@ -101,9 +126,17 @@ class RobotConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.gravity_compensation <= 1.0:
             share = f"robot.gravity_compensation: is {self.gravity_compensation:g}; give the share of the weight, 0 … 1"
-            raise TaccorlError(f"{share}. A controller that is wrong about the weight is the effect gravity_mismatch")
-        if self.gravity and (len(self.gravity) != 3 or not math.isfinite(sum(self.gravity)) or not any(self.gravity)):
-            raise TaccorlError(f"robot.gravity: is {self.gravity}; give the three numbers x, y, z of a direction")
+            raise TaccorlError(
+                f"{share}. A controller that is wrong about the weight is the effect gravity_mismatch"
+            )
+        if self.gravity and (
+            len(self.gravity) != 3
+            or not math.isfinite(sum(self.gravity))
+            or not any(self.gravity)
+        ):
+            raise TaccorlError(
+                f"robot.gravity: is {self.gravity}; give the three numbers x, y, z of a direction"
+            )
 
 
 @dataclass(frozen=True)
@@ -124,7 +157,9 @@ class Robot:
     def joint(self, signal: str) -> RobotJoint:
         """The joint for the one-joint model. Raises TaccorlError: the file names no such joint."""
         if signal not in self.config.joints:
-            raise TaccorlError(f"{self.path}: no joint {signal!r}; {nearest(signal, self.config.joints)}")
+            raise TaccorlError(
+                f"{self.path}: no joint {signal!r}; {nearest(signal, self.config.joints)}"
+            )
         return RobotJoint(self, signal)
 
     def last_body(self, signal: str) -> int:
@@ -141,7 +176,11 @@ class Robot:
 
     def body_of(self, signal: str, payload: Payload) -> int:
         """Id of the body in which a payload of the joint is."""
-        return self.rigid.model.body(payload.link).id if payload.link else self.last_body(signal)
+        return (
+            self.rigid.model.body(payload.link).id
+            if payload.link
+            else self.last_body(signal)
+        )
 
     def body_name(self, body: int) -> str:
         """Name of a body in the model; ``body 3`` of one without a name."""
@@ -151,7 +190,11 @@ class Robot:
         """Name → id of the bodies with joints between the base and a body."""
         model, found = self.rigid.model, dict[str, int]()
         while (body := int(model.body_parentid[body])) != 0:
-            found |= {model.body(body).name: body} if model.body(body).name and model.body_jntnum[body] else {}
+            found |= (
+                {model.body(body).name: body}
+                if model.body(body).name and model.body_jntnum[body]
+                else {}
+            )
         return found
 
     def moves_body(self, signal: str, body: int) -> bool:
@@ -164,10 +207,18 @@ class Robot:
 
     def along_chain(self, signal: str) -> tuple[str, ...]:
         """Joints whose positions change what weight the joint carries: those behind it, to the tip, then those before it."""
-        bodies = {name: int(self.rigid.model.joint(name).bodyid[0]) for name in self.rigid.joints if name != signal}
-        behind = [name for name, body in bodies.items() if self.moves_body(signal, body)]
+        bodies = {
+            name: int(self.rigid.model.joint(name).bodyid[0])
+            for name in self.rigid.joints
+            if name != signal
+        }
+        behind = [
+            name for name, body in bodies.items() if self.moves_body(signal, body)
+        ]
         own = int(self.rigid.model.joint(signal).bodyid[0])
-        before = [name for name in bodies if name not in behind and self.moves_body(name, own)]
+        before = [
+            name for name in bodies if name not in behind and self.moves_body(name, own)
+        ]
         return (*behind, *reversed(before))
 
     @property
@@ -181,15 +232,30 @@ class Robot:
 
     def masses(self) -> dict[str, PointMass]:
         """Joint → the mass of its effect ``payload``, which all joints move that move its body."""
-        every = [(name, effect) for name, joint in self.config.joints.items() for effect in joint.effects]
-        return {name: self.mass(name, e) for name, e in every if isinstance(e, Payload) and not e.is_absent}
+        every = [
+            (name, effect)
+            for name, joint in self.config.joints.items()
+            for effect in joint.effects
+        ]
+        return {
+            name: self.mass(name, e)
+            for name, e in every
+            if isinstance(e, Payload) and not e.is_absent
+        }
 
     def mass(self, signal: str, payload: Payload) -> PointMass:
         """The mass of a ``payload`` at one joint: its place is along the axes of its body, from that body's centre of mass."""
         model, body = self.rigid.model, self.body_of(signal, payload)
-        x, y, z = (float(a + getattr(payload, n)) for a, n in zip(model.body_ipos[body], PAYLOAD_AT, strict=True))
+        x, y, z = (
+            float(a + getattr(payload, n))
+            for a, n in zip(model.body_ipos[body], PAYLOAD_AT, strict=True)
+        )
         mujoco.mju_quat2Mat(turn := np.empty(9), model.body_iquat[body])
-        inertia = payload.like_link * model.body_inertia[body] / max(model.body_mass[body], 1e-9)
+        inertia = (
+            payload.like_link
+            * model.body_inertia[body]
+            / max(model.body_mass[body], 1e-9)
+        )
         own = 0.5 * inertia.sum() - inertia
         axes = turn.reshape(3, 3)
         return PointMass(payload.mass_kg, body, (x, y, z), axes * own @ axes.T)
@@ -197,7 +263,9 @@ class Robot:
     def removable_kg(self, body: int) -> float:
         """Most mass that a payload below 0 may remove from a body [kg]: a share of that of all bodies fixed to one another."""
         model = self.rigid.model
-        return REMOVABLE * float(model.body_mass[model.body_weldid == model.body_weldid[body]].sum())
+        return REMOVABLE * float(
+            model.body_mass[model.body_weldid == model.body_weldid[body]].sum()
+        )
 
     def wrong_mass(self) -> tuple[str, str]:
         """Joint and error message of the first ``payload`` that removes more mass than its body has, or that is in the same body
@@ -223,7 +291,9 @@ class Robot:
         """Largest distance of a payload from its body's centre of mass along each axis, for a search [m]: half the length of the
         chain from the base, or twice the distance of that centre from its joint. A choice."""
         model, body = self.rigid.model, self.last_body(signal)
-        from_joint = np.linalg.norm(model.body_ipos[body] - model.jnt_pos[model.body_jntadr[body]])
+        from_joint = np.linalg.norm(
+            model.body_ipos[body] - model.jnt_pos[model.body_jntadr[body]]
+        )
         chain = float(np.linalg.norm(model.body_ipos[body]))
         while model.body_parentid[body] != 0:
             chain += float(np.linalg.norm(model.body_pos[body]))
@@ -241,7 +311,10 @@ class Robot:
         mujoco.mj_kinematics(model, data)
         body = last
         while body != model.jnt_bodyid[own]:
-            for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            for j in range(
+                model.body_jntadr[body],
+                model.body_jntadr[body] + model.body_jntnum[body],
+            ):
                 hinge = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
                 if hinge and abs(data.xaxis[j] @ data.xaxis[own]) < _ALONG:
                     return ()
@@ -251,39 +324,66 @@ class Robot:
 
     def with_joint(self, signal: str, config: JointConfig) -> "Robot":
         """The robot with another drive at one joint."""
-        joints = {name: config if name == signal else own for name, own in self.config.joints.items()}
-        return dataclasses.replace(self, config=dataclasses.replace(self.config, joints=joints))
+        joints = {
+            name: config if name == signal else own
+            for name, own in self.config.joints.items()
+        }
+        return dataclasses.replace(
+            self, config=dataclasses.replace(self.config, joints=joints)
+        )
 
     def text(self, path: Path) -> str:
         """YAML text of the robot file for ``path``, to which the model's path is relative, without default values."""
         model = self.rigid.path.resolve()
         folder = Path(path).resolve().parent
-        content: dict[str, Any] = {"kind": "robot", "model": Path(os.path.relpath(model, folder)).as_posix()}
+        content: dict[str, Any] = {
+            "kind": "robot",
+            "model": Path(os.path.relpath(model, folder)).as_posix(),
+        }
         content |= _set(self.config, ("gravity_compensation",))
         content |= {"gravity": self.config.gravity} if self.config.gravity else {}
         content["joints"] = {}
         for name, joint in self.config.joints.items():
-            names = [f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"]
+            names = [
+                f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"
+            ]
             content["joints"][name] = _set(joint, names)
             if joint.effects:
                 # z_m of a payload is always written: its default is a place in the PiPER's hand, and robot files must state one.
-                placed = [{"z_m": e.z_m} if isinstance(e, Payload) else {} for e in joint.effects]
-                entries = [effect_entry(e) | more for e, more in zip(joint.effects, placed, strict=True)]
+                placed = [
+                    {"z_m": e.z_m} if isinstance(e, Payload) else {}
+                    for e in joint.effects
+                ]
+                entries = [
+                    effect_entry(e) | more
+                    for e, more in zip(joint.effects, placed, strict=True)
+                ]
                 content["joints"][name]["effects"] = [
-                    {k: v for k, v in entry.items() if k not in ("arm", "joints")} for entry in entries
+                    {k: v for k, v in entry.items() if k not in ("arm", "joints")}
+                    for entry in entries
                 ]
         return _HEADER + yaml.safe_dump(
-            content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+            content,
+            sort_keys=False,
+            allow_unicode=True,
+            default_flow_style=None,
+            width=120,
         )
 
     def digest(self) -> str:
         """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""
-        return hashlib.sha256(self.text(self.path).encode() + self.rigid.path.read_bytes()).hexdigest()[:16]
+        return hashlib.sha256(
+            self.text(self.path).encode() + self.rigid.path.read_bytes()
+        ).hexdigest()[:16]
 
 
 def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
     fields = {f.name: f for f in dataclasses.fields(config)}
-    return {name: getattr(config, name) for name in names if getattr(config, name) != fields[name].default}
+    return {
+        name: getattr(config, name)
+        for name in names
+        if getattr(config, name) != fields[name].default
+    }
 
 
 def load_robot(path: Path) -> Robot:
@@ -295,10 +395,16 @@ def load_robot(path: Path) -> Robot:
     config = document.value
     model = path.parent / config.model
     if not model.is_file():
-        raise document.error("model", f"no file {config.model!r} beside it; write the path of the MJCF or URDF file")
+        raise document.error(
+            "model",
+            f"no file {config.model!r} beside it; write the path of the MJCF or URDF file",
+        )
     rigid = load_robot_model(model, config.gravity_compensation)
     if not config.joints:
-        raise document.error("joints", f"the file names no joint; the model has {', '.join(rigid.joints)}")
+        raise document.error(
+            "joints",
+            f"the file names no joint; the model has {', '.join(rigid.joints)}",
+        )
     robot = Robot(config, rigid, path)
     document.refuse(_rules(robot, document))
     return robot
@@ -308,16 +414,30 @@ def _rules(robot: Robot, document: EffectsDocument) -> Rules:
     config, rigid = robot.config, robot.rigid
     bodies = {rigid.model.body(k).name: k for k in range(1, rigid.model.nbody)}
     for joint, drive in config.joints.items():
-        unknown = f"{config.model} has no joint {joint!r}; {nearest(joint, rigid.joints)}"
+        unknown = (
+            f"{config.model} has no joint {joint!r}; {nearest(joint, rigid.joints)}"
+        )
         yield joint not in rigid.joints, f"joints/{joint}", unknown
         for k, effect in enumerate(drive.effects):
             key, name = f"joints/{joint}/effects/{k}", effect.name
             twice = name in [other.name for other in drive.effects[:k]]
-            yield twice, key, f"{name} stands twice at {joint}, which has one of each effect; remove one"
+            yield (
+                twice,
+                key,
+                f"{name} stands twice at {joint}, which has one of each effect; remove one",
+            )
             can_act = acts_on_joint(type(effect), weight=True, rotor=True, payload=True)
-            yield not can_act, key, f"{name} cannot act on one joint of a robot file; remove it"
+            yield (
+                not can_act,
+                key,
+                f"{name} cannot act on one joint of a robot file; remove it",
+            )
             of_slide = name in OF_A_TURN and rigid.joints[joint].unit == "m"
-            yield of_slide, key, f"{name} repeats with each turn, and {joint} is a slide; remove it"
+            yield (
+                of_slide,
+                key,
+                f"{name} repeats with each turn, and {joint} is a slide; remove it",
+            )
             no_loop = f"{name} acts in a control loop that law {drive.law} does not have; remove it"
             yield not drive.allows_effect(name), key, no_loop
             rotor = f"{name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of {joint}"
@@ -326,8 +446,14 @@ def _rules(robot: Robot, document: EffectsDocument) -> Rules:
             way_out = "payload: write z_m [m], along z of its body, from that body's centre of mass (x_m, y_m: else 0)"
             yield unplaced, key, way_out
             link = getattr(effect, "link", "")
-            is_moved = not link or (link in bodies and robot.moves_body(joint, bodies[link]))
-            yield not is_moved, key, f"link: {joint} moves no body {link!r}; {nearest(link, bodies)}"
+            is_moved = not link or (
+                link in bodies and robot.moves_body(joint, bodies[link])
+            )
+            yield (
+                not is_moved,
+                key,
+                f"link: {joint} moves no body {link!r}; {nearest(link, bodies)}",
+            )
     joint, why = robot.wrong_mass()
     yield joint, f"joints/{joint}/effects", why
 
@@ -347,7 +473,14 @@ def _refuse_todo(path: Path) -> None:
             joint = key.strip()
         if value.strip() == TODO:
             owner = f"{joint}/" if key.startswith("    ") else ""
-            left.append((number, f"{owner}{key.strip()} ({comment.strip() or 'write its value'})"))
+            left.append(
+                (
+                    number,
+                    f"{owner}{key.strip()} ({comment.strip() or 'write its value'})",
+                )
+            )
     if left:
         words = "; ".join(f"line {number} {what}" for number, what in left)
-        raise SpecError(f"{path}:{left[0][0]}: {TODO} must be replaced by a value: {words}")
+        raise SpecError(
+            f"{path}:{left[0][0]}: {TODO} must be replaced by a value: {words}"
+        )

@@ -14,7 +14,13 @@ from scipy.interpolate import CubicSpline
 
 from taccorl.alignment.controller.drive_law import DriveJoint, with_gains
 from taccorl.alignment.controller.joint_model import JointModel
-from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings, beside_model, moved_by_others, resting
+from taccorl.alignment.controller.joint_motion import (
+    JointMotion,
+    Surroundings,
+    beside_model,
+    moved_by_others,
+    resting,
+)
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import (
     NEED_ROTOR,
@@ -39,7 +45,15 @@ from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, sc
 if TYPE_CHECKING:
     from taccorl.alignment.machines.robot_file import Robot  # which makes the joints
 
-_GIVES = ("target", "position", "velocity", "acceleration", "effort", "load", "dry_friction")
+_GIVES = (
+    "target",
+    "position",
+    "velocity",
+    "acceleration",
+    "effort",
+    "load",
+    "dry_friction",
+)
 """Words of ``Effect.needs`` for what the one-joint model can compute: an effect that needs another one cannot act in it."""
 FINE_S = 1e-3
 """Largest time step of the positions from which the torques of moving joints on each other are computed [s]. Of a simulated arm
@@ -52,12 +66,20 @@ _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swin
 LEAST_INERTIA = 0.01
 """Least inertia of a joint with a ``payload`` of negative mass, as a share of its inertia in the model. A choice: a search may
 try places of the mass that would make the inertia negative."""
-PAYLOAD_AT = ("x_m", "y_m", "z_m")  # Parameters of ``payload`` for its place along the axes of its body
-_SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
+PAYLOAD_AT = (
+    "x_m",
+    "y_m",
+    "z_m",
+)  # Parameters of ``payload`` for its place along the axes of its body
+_SLIDE_WAVES = Scale(
+    unit="m", length=1.0 / WAVE_SHARE
+)  # bounds of wave numbers are those of a file, in rad/m
 
 
 @contextmanager
-def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> Iterator[mujoco.MjModel]:
+def under_gravity(
+    model: mujoco.MjModel, gravity_mps2: np.ndarray
+) -> Iterator[mujoco.MjModel]:
     """Context manager: ``model`` with another gravity ``gravity_mps2`` (3,) [m/s²], in the frame of the world, for a while."""
     own = model.opt.gravity.copy()
     model.opt.gravity[:] = gravity_mps2
@@ -68,16 +90,22 @@ def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> Iterator[m
 
 
 @cache
-def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
+def acts_on_joint(
+    cls: type[Effect], *, weight: bool, rotor: bool, payload: bool
+) -> bool:
     """True if an effect can act on one joint of a robot file, whose ``weight`` is compensated, of whose ``rotor`` the inertia is
     known, and in whose body no other joint's ``payload`` is, so that the one-joint model can compute it."""
     if cls is Payload:
         return payload
-    if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
+    if "joint" not in cls.kinds() or not cls.works_with(
+        (*_GIVES, *["weight"] * weight)
+    ):
         return False
     if cls.name in NEED_ROTOR and not rotor:
         return False
-    return bool(make_effect(cls.name, **{p.name: p.typical for p in cls.parameters()}).drive())
+    return bool(
+        make_effect(cls.name, **{p.name: p.typical for p in cls.parameters()}).drive()
+    )
 
 
 class RobotJoint(DriveJoint):
@@ -95,7 +123,9 @@ class RobotJoint(DriveJoint):
         along: "Along | None" = None,
     ) -> None:
         self._robot, self._config = robot, (law := robot.config.joints[signal])
-        super().__init__(law, signal, robot.rigid.joints[signal].unit, law.loop_hz, law.command_hz)
+        super().__init__(
+            law, signal, robot.rigid.joints[signal].unit, law.loop_hz, law.command_hz
+        )
         self._stated, self._along = robot if stated is None else stated, along
         self._masses = robot.masses() if masses is None else masses
         own = [self._masses[signal].body] if signal in self._masses else []
@@ -103,7 +133,10 @@ class RobotJoint(DriveJoint):
         self._payload_in = [*own, robot.last_body(signal)][0]
         # At a slide the weight of an unknown mass is a constant force, too.
         self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
-        self.position_age_s, self.stated_age_s = self.position_age_s + law.position_age_s, law.position_age_s
+        self.position_age_s, self.stated_age_s = (
+            self.position_age_s + law.position_age_s,
+            law.position_age_s,
+        )
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
 
@@ -116,7 +149,9 @@ class RobotJoint(DriveJoint):
     def winding(self) -> dict[str, float]:
         """Stall torque ``stall_nm`` [N·m] and ``back_emf`` [N·m·s/rad] of law pwm; empty for other laws."""
         c = self._config
-        return {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
+        return (
+            {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
+        )
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
         gains, facts = super().numbers(values)
@@ -124,21 +159,32 @@ class RobotJoint(DriveJoint):
             return gains, facts
         factor = values["stall_nm"] / self._config.stall_nm
         gains = gains._replace(kp=self.gains.kp * factor, kd=self.gains.kd * factor)
-        return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
+        return gains, {
+            "duty_torque": values["stall_nm"],
+            "back_emf": values["back_emf"],
+        }
 
     def timestep_s(self, motion: JointMotion) -> float:
         c = self._config
-        return c.timestep_s(motion.rate_hz, self.known.inertia + c.armature, motion.kp_scale, c.loop_hz)
+        return c.timestep_s(
+            motion.rate_hz, self.known.inertia + c.armature, motion.kp_scale, c.loop_hz
+        )
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = self._terms(motion.pose, self._every_mass(bodies))
         # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
-        inertia = max(terms.inertia, LEAST_INERTIA * self.known.inertia) + self._config.armature
+        inertia = (
+            max(terms.inertia, LEAST_INERTIA * self.known.inertia)
+            + self._config.armature
+        )
         return terms._replace(inertia=inertia, rotor_inertia=self._config.armature)
 
     def inertia_kgm2(self, m: Measurement) -> float:
         """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""
-        return self._terms(self.pose(m), self._every_mass(self.effects(()))).inertia + self._config.armature
+        return (
+            self._terms(self.pose(m), self._every_mass(self.effects(()))).inertia
+            + self._config.armature
+        )
 
     def _terms(self, pose: np.ndarray, masses: Sequence[PointMass] = ()) -> Rigid:
         """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor."""
@@ -149,19 +195,32 @@ class RobotJoint(DriveJoint):
         if not (more := self._robot.more_gravity).any():
             return terms
         with under_gravity(model, more):  # the weight is linear in gravity
-            extra = with_masses(rigid_terms(model, self.signal, pose), model, self.signal, pose, masses)
+            extra = with_masses(
+                rigid_terms(model, self.signal, pose), model, self.signal, pose, masses
+            )
         names = ("gravity_sin", "gravity_cos", "weight_n")
-        return terms._replace(**{name: getattr(terms, name) + getattr(extra, name) for name in names})
+        return terms._replace(
+            **{name: getattr(terms, name) + getattr(extra, name) for name in names}
+        )
 
     def _every_mass(self, bodies: Sequence[Effect]) -> list[PointMass]:
         """Point masses that the model file lacks: payloads of the robot file at other joints, and those of ``bodies``."""
         masses = [mass for name, mass in self._masses.items() if name != self.signal]
-        return masses + [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
+        return masses + [
+            self._robot.mass(self.signal, effect)
+            for effect in bodies
+            if isinstance(effect, Payload)
+        ]
 
-    def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
+    def moving_masses_nm(
+        self, motion: JointMotion, bodies: Sequence[Effect]
+    ) -> np.ndarray | float:
         if motion.positions is None:
             return 0.0
-        return sum(self._mass_torque(motion, one.body).of(one) for one in self._every_mass(bodies))
+        return sum(
+            self._mass_torque(motion, one.body).of(one)
+            for one in self._every_mass(bodies)
+        )
 
     def _mass_torque(self, motion: JointMotion, body: int) -> MassTorque:
         """Torque for masses in one body because other joints move; kept, since a search changes masses only."""
@@ -169,11 +228,19 @@ class RobotJoint(DriveJoint):
             model, q = self._robot.rigid.model, motion.positions
             assert q is not None
             gravity = model.opt.gravity + self._robot.more_gravity
-            period_s, alone = len(motion.target) / len(q) / motion.rate_hz, np.tile(motion.pose, (len(q), 1))
+            period_s, alone = (
+                len(motion.target) / len(q) / motion.rate_hz,
+                np.tile(motion.pose, (len(q), 1)),
+            )
             own = model.joint(self.signal).qposadr[0]
             alone[:, own] = q[:, own]
-            whole, alone = (mass_torque_along(model, self.signal, body, at, period_s, gravity) for at in (q, alone))
-            self._mass_torques[motion, body] = MassTorque(*(a - b for a, b in zip(whole, alone, strict=True)))
+            whole, alone = (
+                mass_torque_along(model, self.signal, body, at, period_s, gravity)
+                for at in (q, alone)
+            )
+            self._mass_torques[motion, body] = MassTorque(
+                *(a - b for a, b in zip(whole, alone, strict=True))
+            )
         return self._mass_torques[motion, body]
 
     def pose(self, m: Measurement) -> np.ndarray:
@@ -197,7 +264,13 @@ class RobotJoint(DriveJoint):
         drive = super().surroundings(m)
         coupling = coupling + np.interp(rows, np.arange(m.num_rows), drive.coupling_nm)
         positions = None if along is None else along.positions
-        return dataclasses.replace(drive, coupling_nm=coupling, carrying_nm=carrying, pose=pose, positions=positions)
+        return dataclasses.replace(
+            drive,
+            coupling_nm=coupling,
+            carrying_nm=carrying,
+            pose=pose,
+            positions=positions,
+        )
 
     def whole(self, m: Measurement) -> Measurement:
         """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording states
@@ -210,24 +283,40 @@ class RobotJoint(DriveJoint):
                     f"{m.name}: {model} has no joint {name!r} ({nearest(name, names)}). Rename the columns of the recording"
                 )
             if unit != self._robot.units[name]:
-                raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")
+                raise TaccorlError(
+                    f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}"
+                )
             for key in ("lever_m", "arm_kg"):
                 if name in getattr(m, key):
                     raise TaccorlError(
                         f"{m.name}: {key} of {name} is stated, which is supported for axis files only; remove it from "
                         "measurements.yaml, and fix the mass to its link in the model"
                     )
-            if m.enabled.size and not m.enabled[:, m.column(name)].all() and self._robot.config.gravity_compensation:
+            if (
+                m.enabled.size
+                and not m.enabled[:, m.column(name)].all()
+                and self._robot.config.gravity_compensation
+            ):
                 row = int(np.argmin(m.enabled[:, m.column(name)]))
                 raise TaccorlError(
                     f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, but according to the robot file the "
                     "controller compensates the weight; cut the recording there"
                 )
-        m = with_gains(m, {n: joint for n, joint in self._robot.config.joints.items() if joint.gains == "commanded"})
+        m = with_gains(
+            m,
+            {
+                n: joint
+                for n, joint in self._robot.config.joints.items()
+                if joint.gains == "commanded"
+            },
+        )
         if m.signals == names:
             return m
         model = self._robot.rigid.model
-        return m.extended(self._robot.units, [model.qpos0[model.joint(name).qposadr[0]] for name in names])
+        return m.extended(
+            self._robot.units,
+            [model.qpos0[model.joint(name).qposadr[0]] for name in names],
+        )
 
     def effects(self, more: Sequence[Effect]) -> list[Effect]:
         names = {effect.name for effect in more}
@@ -236,17 +325,37 @@ class RobotJoint(DriveJoint):
 
     def freed(self, held: Collection[str] = ()) -> "tuple[list[Effect], RobotJoint]":
         own = [e for e in self._config.effects if e.fitted and e.name not in held]
-        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if e not in own], known=())
-        return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal, self._masses, self._stated)
+        bare = dataclasses.replace(
+            self._config,
+            effects=[e for e in self._config.effects if e not in own],
+            known=(),
+        )
+        return own, RobotJoint(
+            self._robot.with_joint(self.signal, bare),
+            self.signal,
+            self._masses,
+            self._stated,
+        )
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:
         if cls is Payload:  # bounds for this robot's size
-            far, most = self._robot.reach_m(self.signal), next(p.high for p in cls.parameters() if p.name == "mass_kg")
-            mass = ("mass_kg", -min(self._robot.removable_kg(self._payload_in), most), most)
-            return bounded("payload", (mass, *((name, -far, far) for name in PAYLOAD_AT)))
+            far, most = (
+                self._robot.reach_m(self.signal),
+                next(p.high for p in cls.parameters() if p.name == "mass_kg"),
+            )
+            mass = (
+                "mass_kg",
+                -min(self._robot.removable_kg(self._payload_in), most),
+                most,
+            )
+            return bounded(
+                "payload", (mass, *((name, -far, far) for name in PAYLOAD_AT))
+            )
         if self.unit == "rad":
             return cls
-        return scaled(cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m"))
+        return scaled(
+            cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m")
+        )
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         if self.unit == "m" and cls.name in OF_A_TURN:
@@ -254,7 +363,8 @@ class RobotJoint(DriveJoint):
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,
             "rotor": self._config.armature > 0,
-            "payload": self._payload_in not in [m.body for name, m in self._masses.items() if name != self.signal],
+            "payload": self._payload_in
+            not in [m.body for name, m in self._masses.items() if name != self.signal],
         }
         if not (acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name)):
             return None
@@ -265,27 +375,63 @@ class RobotJoint(DriveJoint):
         the file has it, else in the centre of mass of its body."""
         robot, last = self._robot, self._payload_in
         known = robot.assumed.get(last, self._masses.get(self.signal))
-        at = np.zeros(3) if known is None else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
+        at = (
+            np.zeros(3)
+            if known is None
+            else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
+        )
         spread = known is not None and known.spread_m2.any()
-        axes = (0, 1, 2) if last in robot.assumed or spread else robot.idle_axes(self.signal, last)
-        link = {"link": robot.body_name(last)} if spread or last != robot.last_body(self.signal) else {}
-        return link | ({"like_link": True} if spread else {}) | {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
+        axes = (
+            (0, 1, 2)
+            if last in robot.assumed or spread
+            else robot.idle_axes(self.signal, last)
+        )
+        link = (
+            {"link": robot.body_name(last)}
+            if spread or last != robot.last_body(self.signal)
+            else {}
+        )
+        return (
+            link
+            | ({"like_link": True} if spread else {})
+            | {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
+        )
 
-    def _coupling(self, m: Measurement, pose: np.ndarray, along: "Along | None") -> tuple[np.ndarray, np.ndarray]:
+    def _coupling(
+        self, m: Measurement, pose: np.ndarray, along: "Along | None"
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(T · F,) torque because other joints move, without payloads (``moving_masses_nm``); of a sliding joint the model's
         weight as well, which does not change as it slides. And (T · F,) the part of it that the gravity compensation supplies."""
-        model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
-        slide, dof = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE, joint.dofadr[0]
+        model, joint = (
+            self._robot.rigid.model,
+            self._robot.rigid.model.joint(self.signal),
+        )
+        slide, dof = (
+            model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE,
+            joint.dofadr[0],
+        )
         if along is None or along.moving <= {self.signal}:
             rest = needed_along(self._robot, np.tile(pose, (2, 1)), 1.0)
-            needed, carried = (np.full(m.num_rows, values[0, dof] if slide else 0.0) for values in rest[:2])
+            needed, carried = (
+                np.full(m.num_rows, values[0, dof] if slide else 0.0)
+                for values in rest[:2]
+            )
             return needed, carried
         terms, q = self._terms(pose), along.positions[:, joint.qposadr[0]]
         acceleration = rates(q, m.period_s * m.num_rows / len(q))[1]
-        needed, carried = along.needed[:, dof] - terms.inertia * acceleration, along.carried[:, dof]
+        needed, carried = (
+            along.needed[:, dof] - terms.inertia * acceleration,
+            along.carried[:, dof],
+        )
         if not slide:
-            needed = needed - terms.gravity_sin * np.sin(q) - terms.gravity_cos * np.cos(q)
-            carried = carried - terms.compensation_sin * np.sin(q) - terms.compensation_cos * np.cos(q)
+            needed = (
+                needed - terms.gravity_sin * np.sin(q) - terms.gravity_cos * np.cos(q)
+            )
+            carried = (
+                carried
+                - terms.compensation_sin * np.sin(q)
+                - terms.compensation_cos * np.cos(q)
+            )
         return needed, carried
 
 
@@ -294,11 +440,17 @@ class Along(NamedTuple):
 
     moving: frozenset[str]  # Joints that move
     positions: np.ndarray  # (T · F, nq) positions [rad, m]
-    needed: np.ndarray  # (T · F, nv) torques that they need, without payloads and armature [N·m, N]
-    carried: np.ndarray  # (T · F, nv) the part of them that the gravity compensation supplies [N·m, N]
+    needed: (
+        np.ndarray
+    )  # (T · F, nv) torques that they need, without payloads and armature [N·m, N]
+    carried: (
+        np.ndarray
+    )  # (T · F, nv) the part of them that the gravity compensation supplies [N·m, N]
 
 
-def needed_along(robot: "Robot", positions: np.ndarray, period_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def needed_along(
+    robot: "Robot", positions: np.ndarray, period_s: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``torque_along`` of ``positions`` (T, nq) with the robot's own gravity: twice (T, nv), and (T, nv, nv)."""
     needed, carried, masses = torque_along(robot.rigid.model, positions, period_s)
     if (more := robot.more_gravity).any():
@@ -314,8 +466,12 @@ def moved_together(robot: "Robot", m: Measurement) -> Along | None:
     joints. So a position is what the file's drive makes of the targets, and the low-pass filtered rest (``beside_model``). As the
     joints load each other, the accelerations are found by Gauss–Seidel sweeps, which converge for every mass matrix.
     """
-    said = repr((robot.rigid.path, robot.config, m.rate_hz, m.kp, m.kd, m.gain_scale)).encode()
-    arrays = [getattr(m, name).tobytes() for name in ("target", "measured", *m.extra_columns)]
+    said = repr(
+        (robot.rigid.path, robot.config, m.rate_hz, m.kp, m.kd, m.gain_scale)
+    ).encode()
+    arrays = [
+        getattr(m, name).tobytes() for name in ("target", "measured", *m.extra_columns)
+    ]
     key = hashlib.sha1(b"".join([said, *arrays])).digest()
     if key not in _KEPT:
         while sum(len(one.positions) for one in _KEPT.values() if one) > MOST_KEPT:
@@ -327,14 +483,24 @@ def moved_together(robot: "Robot", m: Measurement) -> Along | None:
 def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
     model, laws = robot.rigid.model, robot.config.joints
     angles = moved_by_others(m, list(robot.rigid.joints), _STILL)
-    driven = [n for n in angles if n in laws and laws[n].target_kind == "position" == m.target_kind(n)]
-    driven = [n for n in driven if len(angles) > 1 and np.isfinite(m.target[:, m.column(n)]).all()]
+    driven = [
+        n
+        for n in angles
+        if n in laws and laws[n].target_kind == "position" == m.target_kind(n)
+    ]
+    driven = [
+        n
+        for n in driven
+        if len(angles) > 1 and np.isfinite(m.target[:, m.column(n)]).all()
+    ]
     most = MOST_NUMBERS // (m.num_rows * model.nv**2)
     fine = max(1, min(math.ceil(m.period_s / FINE_S - 1e-6), most)) if driven else 1
     rows, times = np.arange(m.num_rows), np.arange(m.num_rows * fine) / fine
     q = np.tile(RobotJoint(robot, next(iter(laws))).pose(m), (len(times), 1))
     for name, values in angles.items():
-        q[:, model.joint(name).qposadr[0]] = CubicSpline(rows, values)(times) if fine > 1 else values
+        q[:, model.joint(name).qposadr[0]] = (
+            CubicSpline(rows, values)(times) if fine > 1 else values
+        )
     needed, carried, masses = needed_along(robot, q, m.period_s / fine)
     found = Along(frozenset(angles), q, needed, carried)
     models = {name: JointModel(RobotJoint(robot, name, along=found)) for name in driven}
@@ -343,14 +509,20 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         one, moved, joint = models[name], motions[name], model.joint(name)
         coupling, carrying = RobotJoint(robot, name)._coupling(m, moved.pose, found)
         coupling = coupling + one.joint.moving_masses_nm(moved, one.joint.effects(()))
-        moved = dataclasses.replace(moved, coupling_nm=coupling, carrying_nm=carrying, positions=None)
+        moved = dataclasses.replace(
+            moved, coupling_nm=coupling, carrying_nm=carrying, positions=None
+        )
         answer = one.simulate(moved, one.gains, each_step=True).reported
-        answer = np.interp(times, np.arange(len(answer)) * m.num_rows / len(answer), answer)
+        answer = np.interp(
+            times, np.arange(len(answer)) * m.num_rows / len(answer), answer
+        )
         before = q[:, joint.qposadr[0]].copy()
         q[:, joint.qposadr[0]] = beside_model(m, name, answer)
         more = rates(q[:, joint.qposadr[0]] - before, m.period_s / fine)[1]
         needed += masses[:, :, joint.dofadr[0]] * more[:, None]
-    needed, carried = needed_along(robot, q, m.period_s / fine)[:2] if driven else (needed, carried)
+    needed, carried = (
+        needed_along(robot, q, m.period_s / fine)[:2] if driven else (needed, carried)
+    )
     return Along(frozenset(angles), q, needed, carried) if angles else None
 
 

@@ -21,14 +21,32 @@ import mujoco
 import numpy as np
 
 from taccorl.alignment.machines import omitted_actuators as actuators
-from taccorl.alignment.machines.model_xml import Element, joints_of, read_model, unbalanced, without_shapes
+from taccorl.alignment.machines.model_xml import (
+    Element,
+    joints_of,
+    read_model,
+    unbalanced,
+    without_shapes,
+)
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-MOST_TURNS = 3.0  # Turns to a side of a hinge beyond which its limits are probably in degrees
+MOST_TURNS = (
+    3.0  # Turns to a side of a hinge beyond which its limits are probably in degrees
+)
 _CLOSING = {mujoco.mjtEq.mjEQ_CONNECT: "connect", mujoco.mjtEq.mjEQ_WELD: "weld"}
-_REMOVED = ("sensors", "keys", "equalities", "tendons", "pairs", "excludes", "skins", "lights", "cameras")
+_REMOVED = (
+    "sensors",
+    "keys",
+    "equalities",
+    "tendons",
+    "pairs",
+    "excludes",
+    "skins",
+    "lights",
+    "cameras",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +56,9 @@ class ActuatorFacts:
     name: str
     kp: float  # Position gain at the joint [N·m/rad or N/m]; 0 for a motor
     kd: float  # Velocity gain at the joint [N·m·s/rad or N·s/m]
-    effort_limit: float | None  # Largest torque or force at the joint [N·m or N]; None if unlimited
+    effort_limit: (
+        float | None
+    )  # Largest torque or force at the joint [N·m or N]; None if unlimited
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +67,9 @@ class JointFacts:
 
     name: str
     unit: Literal["rad", "m"]  # Unit of its position: rad of a hinge, m of a slide
-    limits: tuple[float, float] | None  # Lowest and highest position [rad or m]; None if unlimited
+    limits: (
+        tuple[float, float] | None
+    )  # Lowest and highest position [rad or m]; None if unlimited
     inertia: float
     """Inertia of all bodies that the joint moves, with other joints at the model's zero pose [kg·m² or kg]; without armature."""
     armature: float  # Rotor inertia at the joint [kg·m² or kg]
@@ -55,7 +77,9 @@ class JointFacts:
     damping: float  # Damping coefficient [N·m·s/rad or N·s/m]
     friction: float  # Dry friction [N·m or N]
     stiffness: float  # Stiffness of a spring at the joint [N·m/rad or N/m]
-    spring_rest: float  # Position at which the spring of ``stiffness`` is relaxed [rad or m]
+    spring_rest: (
+        float  # Position at which the spring of ``stiffness`` is relaxed [rad or m]
+    )
     actuators: tuple[ActuatorFacts, ...]
     """Actuators of the joint; one that stands for all those that hold it through tendons, if it has none of its own and they do
     not couple it with another joint; empty if it has none."""
@@ -67,8 +91,12 @@ class RobotModel:
 
     path: Path  # Path of the MJCF or URDF file
     model: mujoco.MjModel
-    joints: dict[str, JointFacts]  # Name → facts of the hinge and slide joints, in the order of the tree
-    remarks: tuple[str, ...]  # Parts of the file that were left out, and what that means for the robot file
+    joints: dict[
+        str, JointFacts
+    ]  # Name → facts of the hinge and slide joints, in the order of the tree
+    remarks: tuple[
+        str, ...
+    ]  # Parts of the file that were left out, and what that means for the robot file
 
 
 def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotModel:
@@ -94,14 +122,28 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     if "" in names:
         k = names.index("")
         body = model.body(model.jnt_bodyid[k]).name or "without a name"
-        raise TaccorlError(f"{path}: joint {k + 1} of {model.njnt}, of body {body}, has no name; give it one")
+        raise TaccorlError(
+            f"{path}: joint {k + 1} of {model.njnt}, of body {body}, has no name; give it one"
+        )
     inertias = _inertias(model)
-    joints = {name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(names)}
-    remarks += [remark for facts in joints.values() for remark in _of_limits(root, facts)]
-    remarks += [_of_mimic(joints[name], *mimic) for name, mimic in mimics.items() if name in joints]
+    joints = {
+        name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(names)
+    }
+    remarks += [
+        remark for facts in joints.values() for remark in _of_limits(root, facts)
+    ]
+    remarks += [
+        _of_mimic(joints[name], *mimic)
+        for name, mimic in mimics.items()
+        if name in joints
+    ]
     if not joints:
-        raise TaccorlError(f"{path}: the file has neither hinge nor slide joints; is it the whole robot?")
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        raise TaccorlError(
+            f"{path}: the file has neither hinge nor slide joints; is it the whole robot?"
+        )
+    model.opt.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    )
     for field in ("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness"):
         getattr(model, field)[:] = 0.0
     # MuJoCo stores the inertia of a body on one slide when it compiles, with the armature.
@@ -109,23 +151,41 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     return RobotModel(path, model, joints, tuple(remarks))
 
 
-def _spec(path: Path) -> tuple[mujoco.MjSpec, Element, list[str], dict[str, tuple[str, float]]]:
+def _spec(
+    path: Path,
+) -> tuple[mujoco.MjSpec, Element, list[str], dict[str, tuple[str, float]]]:
     """The model, the file's elements, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic> or an MJCF's
     <equality>."""
     root, content = read_model(path)
     if root.tag not in ("mujoco", "robot"):
-        hint = "; expand it first: xacro robot.urdf.xacro > robot.urdf" if "xacro" in path.name else ""
-        raise TaccorlError(f"{path}: <{root.tag}> is neither MJCF (<mujoco>) nor URDF (<robot>){hint}")
-    if root.tag == "robot" and any("xacro" in element.tag for element in root.iterate()):
-        raise TaccorlError(f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf")
+        hint = (
+            "; expand it first: xacro robot.urdf.xacro > robot.urdf"
+            if "xacro" in path.name
+            else ""
+        )
+        raise TaccorlError(
+            f"{path}: <{root.tag}> is neither MJCF (<mujoco>) nor URDF (<robot>){hint}"
+        )
+    if root.tag == "robot" and any(
+        "xacro" in element.tag for element in root.iterate()
+    ):
+        raise TaccorlError(
+            f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf"
+        )
     try:
         if root.tag == "mujoco":
             spec = mujoco.MjSpec.from_file(str(path))
-            tied = (e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active and e.name2)
+            tied = (
+                e
+                for e in spec.equalities
+                if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active and e.name2
+            )
             mimics = {e.name1: (e.name2, float(e.data[1])) for e in tied}
             return spec, root, [], mimics
         text, shapes = without_shapes(root, content)
-        remarks = [f"{shapes} visual and collision shapes of the URDF are not used"] * bool(shapes)
+        remarks = [
+            f"{shapes} visual and collision shapes of the URDF are not used"
+        ] * bool(shapes)
         mimics = {
             joint.get("name"): (mimic.get("joint"), float(mimic.get("multiplier", "1")))
             for joint in root.all("joint")
@@ -133,7 +193,9 @@ def _spec(path: Path) -> tuple[mujoco.MjSpec, Element, list[str], dict[str, tupl
         }
         return mujoco.MjSpec.from_string(text), root, remarks, mimics
     except (ValueError, mujoco.FatalError) as error:
-        raise TaccorlError(f"{_placed(path, error)}: MuJoCo cannot read it: {_one_line(error)}") from error
+        raise TaccorlError(
+            f"{_placed(path, error)}: MuJoCo cannot read it: {_one_line(error)}"
+        ) from error
 
 
 def _placed(path: Path, error: Exception) -> str:
@@ -144,7 +206,11 @@ def _placed(path: Path, error: Exception) -> str:
 
 def _of_limits(root: Element, facts: JointFacts) -> list[str]:
     """A remark on limits of a hinge that are more than three turns to a side."""
-    if facts.unit != "rad" or facts.limits is None or max(map(abs, facts.limits)) <= MOST_TURNS * 2.0 * math.pi:
+    if (
+        facts.unit != "rad"
+        or facts.limits is None
+        or max(map(abs, facts.limits)) <= MOST_TURNS * 2.0 * math.pi
+    ):
         return []
     element = joints_of(root).get(facts.name)
     limit = element and (element.child("limit") or element)
@@ -167,9 +233,14 @@ def _of_mimic(facts: JointFacts, follows: str, multiplier: float) -> str:
 
 
 def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:
-    closing = {e: _CLOSING[e.type] for e in spec.equalities if e.type in _CLOSING and e.active}
+    closing = {
+        e: _CLOSING[e.type] for e in spec.equalities if e.type in _CLOSING and e.active
+    }
     if closing:
-        names = [f"{t} {e.name or '(no name)'} between {e.name1} and {e.name2 or 'world'}" for e, t in closing.items()]
+        names = [
+            f"{t} {e.name or '(no name)'} between {e.name1} and {e.name2 or 'world'}"
+            for e, t in closing.items()
+        ]
         raise TaccorlError(
             f"{path}: closed chain: {listed(names)}. Only trees are supported: remove <{next(iter(closing.values()))}> and the "
             "links that close the loop, and add the inertia of the removed links to those that remain"
@@ -178,14 +249,20 @@ def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:
 
 def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
     """Remove meshes and all that refers to them. Raises TaccorlError: a moving body has its inertia from a mesh."""
-    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    always = (
+        spec.compiler.inertiafromgeom
+        == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    )
     groups = spec.compiler.inertiagrouprange
     from_mesh: dict[str, str] = {}
     moving = _moving(spec)
     meshes = 0
     for geom in list(spec.geoms):
         geom.material = ""
-        if not geom.meshname and geom.type not in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD):
+        if not geom.meshname and geom.type not in (
+            mujoco.mjtGeom.mjGEOM_MESH,
+            mujoco.mjtGeom.mjGEOM_HFIELD,
+        ):
             continue
         body = geom.parent
         weightless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0)
@@ -196,7 +273,11 @@ def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
         meshes += 1
     if from_mesh:
         body, mesh = next(iter(from_mesh.items()))
-        others = f" The same holds for {listed(list(from_mesh)[1:])}." if len(from_mesh) > 1 else ""
+        others = (
+            f" The same holds for {listed(list(from_mesh)[1:])}."
+            if len(from_mesh) > 1
+            else ""
+        )
         why = ' (the file says inertiafromgeom="true")' if always else ""
         raise TaccorlError(
             f"{path}: body {body} has its inertia from mesh {mesh!r}{why}, but meshes are not read. State it: <inertial "
@@ -206,12 +287,18 @@ def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
     for kind in (*_REMOVED, "materials", "textures", "meshes", "hfields"):
         for thing in list(getattr(spec, kind)):
             spec.delete(thing)
-    return [f"{meshes} mesh geoms are not used; inertias are those of the file"] * bool(meshes)
+    return [f"{meshes} mesh geoms are not used; inertias are those of the file"] * bool(
+        meshes
+    )
 
 
 def _moving(spec: mujoco.MjSpec) -> set[str]:
     """Bodies that a hinge, slide or ball joint moves."""
-    own = [joint.parent for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    own = [
+        joint.parent
+        for joint in spec.joints
+        if joint.type != mujoco.mjtJoint.mjJNT_FREE
+    ]
     return {body.name for first in own for body in (first, *first.find_all("body"))}
 
 
@@ -221,7 +308,9 @@ def _held_base(spec: mujoco.MjSpec) -> list[str]:
     for joint in list(spec.joints):
         if joint.type not in (_HINGE, _SLIDE):
             what = "free" if joint.type == mujoco.mjtJoint.mjJNT_FREE else "ball"
-            remarks.append(f"{what} joint {joint.name or 'of ' + joint.parent.name}: held fixed")
+            remarks.append(
+                f"{what} joint {joint.name or 'of ' + joint.parent.name}: held fixed"
+            )
             spec.delete(joint)
     return remarks
 
@@ -245,7 +334,9 @@ def _compiled(path: Path, spec: mujoco.MjSpec, root: Element) -> mujoco.MjModel:
             ) from error
         if "inertia" in text and (why := unbalanced(root)):
             raise TaccorlError(why) from error
-        raise TaccorlError(f"{_placed(path, error)}: MuJoCo cannot compile it: {text}") from error
+        raise TaccorlError(
+            f"{_placed(path, error)}: MuJoCo cannot compile it: {text}"
+        ) from error
 
 
 def _one_line(error: Exception) -> str:
@@ -262,17 +353,25 @@ def _inertias(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _facts(
-    model: mujoco.MjModel, name: str, k: int, omitted: list[actuators.OmittedActuator], inertias: np.ndarray
+    model: mujoco.MjModel,
+    name: str,
+    k: int,
+    omitted: list[actuators.OmittedActuator],
+    inertias: np.ndarray,
 ) -> JointFacts:
     dof = model.jnt_dofadr[k]
-    own = [_actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
+    own = [
+        _actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k
+    ]
     if not own and (held := actuators.held_by(omitted, name)):
         own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None)]
     effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
     return JointFacts(
         name=name,
         unit="m" if model.jnt_type[k] == _SLIDE else "rad",
-        limits=(float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1])) if model.jnt_limited[k] else None,
+        limits=(float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1]))
+        if model.jnt_limited[k]
+        else None,
         inertia=float(inertias[dof] - model.dof_armature[dof]),
         armature=float(model.dof_armature[dof]),
         effort_limit=None if effort is None else float(np.abs(effort).max()),
@@ -287,9 +386,18 @@ def _facts(
 def _actuator(model: mujoco.MjModel, a: int) -> ActuatorFacts:
     gear = float(model.actuator_gear[a, 0])
     affine = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
-    kp, kd = (-(gear**2) * float(model.actuator_biasprm[a, p]) if affine else 0.0 for p in (1, 2))
-    limit = abs(gear) * float(np.abs(model.actuator_forcerange[a]).max()) if model.actuator_forcelimited[a] else None
+    kp, kd = (
+        -(gear**2) * float(model.actuator_biasprm[a, p]) if affine else 0.0
+        for p in (1, 2)
+    )
+    limit = (
+        abs(gear) * float(np.abs(model.actuator_forcerange[a]).max())
+        if model.actuator_forcelimited[a]
+        else None
+    )
     if limit is None and not affine and model.actuator_ctrllimited[a]:
-        limit = abs(gear * float(model.actuator_gainprm[a, 0])) * float(np.abs(model.actuator_ctrlrange[a]).max())
+        limit = abs(gear * float(model.actuator_gainprm[a, 0])) * float(
+            np.abs(model.actuator_ctrlrange[a]).max()
+        )
     name = model.actuator(a).name or str(a)
     return ActuatorFacts(name=name, kp=kp + 0.0, kd=kd + 0.0, effort_limit=limit)

@@ -70,10 +70,14 @@ def block_sums(values: np.ndarray, layout: Sequence[Rows]) -> np.ndarray:
     first, number = 0, []
     for rows in layout:
         block = block_of_rows(len(rows.measured), rows.rate_hz)
-        number.append(first + np.broadcast_to(block[:, None], rows.measured.shape)[rows.measured])
+        number.append(
+            first + np.broadcast_to(block[:, None], rows.measured.shape)[rows.measured]
+        )
         first += int(block[-1]) + 1
     where = np.concatenate(number)
-    starts = np.flatnonzero(np.diff(where, prepend=-1))  # entries of a block stand together: rows are in order of time
+    starts = np.flatnonzero(
+        np.diff(where, prepend=-1)
+    )  # entries of a block stand together: rows are in order of time
     return np.add.reduceat(values, starts, axis=0)
 
 
@@ -83,9 +87,13 @@ def lasting_square(values: np.ndarray, layout: Sequence[Rows]) -> float:
     products = np.zeros(2)  # of values, and of ones in their places
     for part, rows in zip(unstacked(values, layout), layout, strict=True):
         block = max(1, round(BLOCK_S * rows.rate_hz))
-        for k, own in enumerate((np.nan_to_num(part), rows.measured) if rows.short_noise else ()):
+        for k, own in enumerate(
+            (np.nan_to_num(part), rows.measured) if rows.short_noise else ()
+        ):
             sums = np.cumsum(own, axis=0)
-            products[k] += (own[: -2 * block] * (sums[2 * block :] - sums[block:-block])).sum()
+            products[k] += (
+                own[: -2 * block] * (sums[2 * block :] - sums[block:-block])
+            ).sum()
     return max(float(products[0]), 0.0) / max(float(products[1]), 1.0)
 
 
@@ -121,7 +129,9 @@ def _independent(part: np.ndarray) -> float:
     spectrum = np.abs(np.fft.rfft(filled, length, axis=0))
     correlation = np.fft.irfft(spectrum**2, length, axis=0)[: max(len(part) // 2, 1)]
     power = correlation[0]
-    varies = power > 1e-20 * np.maximum((np.where(measured, part, 0.0) ** 2).sum(axis=0), 1e-300)
+    varies = power > 1e-20 * np.maximum(
+        (np.where(measured, part, 0.0) ** 2).sum(axis=0), 1e-300
+    )
     correlation = correlation[:, varies] / power[varies]
     alike = np.logical_and.accumulate(correlation[1:] >= SMALL, axis=0)
     implied = 1.0 + 2.0 * (correlation[1:] * alike).sum(axis=0)

@@ -24,7 +24,11 @@ import numpy as np
 from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.recorded import TACTILE, signal_names, signal_units
-from taccorl.alignment.measurements.tables import TableSpec, measurement_of_columns, wanted_columns
+from taccorl.alignment.measurements.tables import (
+    TableSpec,
+    measurement_of_columns,
+    wanted_columns,
+)
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
 from taccorl.data.origin import UNSTATED, Origin
@@ -32,10 +36,14 @@ from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 
-TIME = "timestamp"  # Column of a LeRobot dataset with the time of a row in its episode [s]
+TIME = (
+    "timestamp"  # Column of a LeRobot dataset with the time of a row in its episode [s]
+)
 
 
-def read_dataset(root: Path, columns: TableSpec | None = None, *, is_all: bool = False) -> list[Measurement]:
+def read_dataset(
+    root: Path, columns: TableSpec | None = None, *, is_all: bool = False
+) -> list[Measurement]:
     """One measurement per episode of a dataset, in their order, at the dataset's rate. ``columns``: names and units of the
     columns of a dataset that states none. A dataset that states its units is read by those. ``is_all``: nothing else is read, so
     that ``columns`` can be meant for this dataset only. Raises TaccorlError: it is not a dataset, its numbers have no units, it
@@ -45,7 +53,9 @@ def read_dataset(root: Path, columns: TableSpec | None = None, *, is_all: bool =
         names, units = signal_names(dataset.spec), signal_units(dataset.spec)
     except RecordingError as error:
         if columns is not None:
-            return [_from_columns(dataset, columns, k) for k in range(dataset.num_episodes)]
+            return [
+                _from_columns(dataset, columns, k) for k in range(dataset.num_episodes)
+            ]
         raise TaccorlError(
             f"{root}: {error}. Only datasets of taccorl state their units (meta/taccorl/). State those of others in a columns "
             "file (--columns, or `columns:` in measurements.yaml); `taccorl init-robot MODEL --dataset=DATASET` drafts one"
@@ -55,7 +65,10 @@ def read_dataset(root: Path, columns: TableSpec | None = None, *, is_all: bool =
             f"{root}: this dataset states its units itself (meta/taccorl/), so its columns file would not be used: leave out "
             "--columns or `columns:` of measurements.yaml. If the stated units are wrong, correct the spec and ingest again"
         )
-    return [from_episode(dataset.episode(k), names, units, Path(root), k) for k in range(dataset.num_episodes)]
+    return [
+        from_episode(dataset.episode(k), names, units, Path(root), k)
+        for k in range(dataset.num_episodes)
+    ]
 
 
 def dataset_columns(dataset: Dataset) -> dict[str, tuple[str, int]]:
@@ -78,26 +91,44 @@ def _from_columns(dataset: Dataset, columns: TableSpec, k: int) -> Measurement:
     wanted = wanted_columns(columns, [TIME, *known])
     for column in wanted:
         if column != TIME and column not in known:
-            raise RecordingError(f"{dataset.root}: no column {column!r}; {nearest(column, [TIME, *known])}")
-    stored = dataset.values(k, sorted({known[c][0] if c in known else TIME for c in wanted}))
-    values = {c: stored[known[c][0]][:, known[c][1]] if c in known else stored[TIME].ravel() for c in wanted}
+            raise RecordingError(
+                f"{dataset.root}: no column {column!r}; {nearest(column, [TIME, *known])}"
+            )
+    stored = dataset.values(
+        k, sorted({known[c][0] if c in known else TIME for c in wanted})
+    )
+    values = {
+        c: stored[known[c][0]][:, known[c][1]] if c in known else stored[TIME].ravel()
+        for c in wanted
+    }
     for column, numbers in values.items():
         bad = np.flatnonzero(~np.isfinite(numbers))
         if len(bad):
-            raise RecordingError(f"{name}: column {column!r}: row {bad[0]} is not finite; remove the episode")
-    stated, found = Origin(columns.domain, columns.origin), dataset.episode_facts(k).get("origin", UNSTATED)
+            raise RecordingError(
+                f"{name}: column {column!r}: row {bad[0]} is not finite; remove the episode"
+            )
+    stated, found = (
+        Origin(columns.domain, columns.origin),
+        dataset.episode_facts(k).get("origin", UNSTATED),
+    )
     m = measurement_of_columns(
         dataset.data_file(k),
         {column: numbers.astype(float) for column, numbers in values.items()},
         columns,
         name=name,
-        origin=stated if found == UNSTATED else found.agreed(stated.domain, "the columns file"),
+        origin=stated
+        if found == UNSTATED
+        else found.agreed(stated.domain, "the columns file"),
     )
     tasks = dataset.tasks(k)
-    return dataclasses.replace(m, instruction=columns.instruction or (tasks[0][1] if tasks else ""))
+    return dataclasses.replace(
+        m, instruction=columns.instruction or (tasks[0][1] if tasks else "")
+    )
 
 
-def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...], root: Path, k: int) -> Measurement:
+def from_episode(
+    episode: Episode, names: tuple[str, ...], units: tuple[str, ...], root: Path, k: int
+) -> Measurement:
     """Read one episode of a dataset as a measurement. Its target at a row is the command that the joint was following when the
     row was recorded; ``DatasetSpec.action_time`` states which row of ``action`` that is.
 
@@ -106,7 +137,10 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
     ``names``, ``units``: of the J signals, in the order of the columns of state and action. ``root``: folder of the dataset.
     ``k``: index of the episode. Raises TaccorlError: there are too few rows, or the dataset does not state its action_time."""
     episode.spec.require_action_time(episode.name)
-    state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)
+    state, action = (
+        episode.arrays[STATE].astype(float),
+        episode.executed().astype(float),
+    )
     first = 1 if episode.spec.action_time == "next_row" else 0
     target, measured = action[: len(action) - first], state[first:]
     if len(measured) < 2:
@@ -118,8 +152,16 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
     if TACTILE in episode.arrays:
         counts = episode.arrays[TACTILE][first:].astype(np.int16)
         baseline = np.asarray(episode.baselines.get(TACTILE, np.zeros(counts.shape[1])))
-        touch = Touch(time_s=np.repeat(time_s[:, None], len(ROBOT.pads), axis=1), counts=counts, baseline=baseline)
-    ages = [t.age_max_s for t in episode.timing if t.feature in (STATE, ACTION) and math.isfinite(t.age_max_s)]
+        touch = Touch(
+            time_s=np.repeat(time_s[:, None], len(ROBOT.pads), axis=1),
+            counts=counts,
+            baseline=baseline,
+        )
+    ages = [
+        t.age_max_s
+        for t in episode.timing
+        if t.feature in (STATE, ACTION) and math.isfinite(t.age_max_s)
+    ]
     return Measurement(
         name=f"{root.name}/episode_{k}",
         time_s=time_s,

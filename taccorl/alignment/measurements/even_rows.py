@@ -29,7 +29,9 @@ LONGEST_GAP_S = 0.25  # Longest gap of a table that is resampled [s]
 MOST_LOST = 0.1  # Largest share of lost rows of a table that is resampled
 RATE_TOLERANCE = 0.02
 """Largest relative difference from a rate with a whole number of physics steps at which the rate is set to it."""
-AT_ROW = 0.1  # A row this near to a grid row beside a gap [periods] counts as being at it
+AT_ROW = (
+    0.1  # A row this near to a grid row beside a gap [periods] counts as being at it
+)
 
 
 def even_rows(m: Measurement) -> Measurement:
@@ -44,15 +46,29 @@ def even_rows(m: Measurement) -> Measurement:
     lost = int(np.round(steps[gaps] / period - 1).sum())
     if (off < EVEN).all():
         return m
-    if jitter > MOST_JITTER or (steps[gaps] > LONGEST_GAP_S).any() or lost > MOST_LOST * (m.num_rows + lost):
+    if (
+        jitter > MOST_JITTER
+        or (steps[gaps] > LONGEST_GAP_S).any()
+        or lost > MOST_LOST * (m.num_rows + lost)
+    ):
         return m
     grid = start_s + np.arange(round((m.time_s[-1] - start_s) / period) + 1) * period
-    columns = {name: _between(grid, m.time_s, getattr(m, name), period) for name in ("measured", "velocity", "effort")}
+    columns = {
+        name: _between(grid, m.time_s, getattr(m, name), period)
+        for name in ("measured", "velocity", "effort")
+    }
     target = _commands(grid, m.time_s, m.target, period)
-    inputs = np.array([kind == "effort" for kind in m.target_kinds] or [False])  # no commands, but measured positions
-    target = np.where(inputs & np.isfinite(columns["measured"]), columns["measured"], target)
+    inputs = np.array(
+        [kind == "effort" for kind in m.target_kinds] or [False]
+    )  # no commands, but measured positions
+    target = np.where(
+        inputs & np.isfinite(columns["measured"]), columns["measured"], target
+    )
     command_s = _commands(grid, m.time_s, m.time_s[:, None], period)[:, 0] - grid[0]
-    columns |= {name: _commands(grid, m.time_s, getattr(m, name), period) for name in m.extra_columns}
+    columns |= {
+        name: _commands(grid, m.time_s, getattr(m, name), period)
+        for name in m.extra_columns
+    }
     if m.enabled.size:
         columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
     masked = int((~np.isfinite(columns["measured"]).any(axis=1)).sum())
@@ -69,14 +85,21 @@ def even_rows(m: Measurement) -> Measurement:
     )
     finding = Finding("resampled", "warning", "time", text)
     return dataclasses.replace(
-        m, time_s=grid - grid[0], target=target, command_s=command_s, **columns, findings=(*m.findings, finding)
+        m,
+        time_s=grid - grid[0],
+        target=target,
+        command_s=command_s,
+        **columns,
+        findings=(*m.findings, finding),
     )
 
 
 def _grid(time_s: np.ndarray) -> tuple[float, float]:
     """(start, period) [s]: time over row numbers that count lost rows; the period snapped to whole physics steps."""
     period = float(np.median(np.diff(time_s)))
-    number = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(time_s) / period), 1.0))])
+    number = np.concatenate(
+        [[0.0], np.cumsum(np.maximum(np.round(np.diff(time_s) / period), 1.0))]
+    )
     period = float(np.polyfit(number, time_s, 1)[0])
     step_s = PhysicsConfig().timestep_s
     whole = max(1, round(period / step_s)) * step_s
@@ -84,20 +107,33 @@ def _grid(time_s: np.ndarray) -> tuple[float, float]:
     return float(np.median(time_s - number * period)), period
 
 
-def _commands(grid: np.ndarray, time_s: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
+def _commands(
+    grid: np.ndarray, time_s: np.ndarray, target: np.ndarray, period: float
+) -> np.ndarray:
     """(G, J) targets in force."""
-    last = np.clip(np.searchsorted(time_s, grid + 0.5 * period, side="right") - 1, 0, len(time_s) - 1)
+    last = np.clip(
+        np.searchsorted(time_s, grid + 0.5 * period, side="right") - 1,
+        0,
+        len(time_s) - 1,
+    )
     held = target[last]
     following = np.minimum(last + 1, len(time_s) - 1)
-    in_gap = (time_s[following] - time_s[last] > GAP * period) & (grid > time_s[last] + 0.5 * period)
+    in_gap = (time_s[following] - time_s[last] > GAP * period) & (
+        grid > time_s[last] + 0.5 * period
+    )
     changes = np.diff(target, axis=0) != 0
     # A command that changes on both sides of a gap was streamed: it is interpolated. Any other command was held.
-    streamed = changes[np.clip(last - 1, 0, len(changes) - 1)] & changes[np.clip(following, 0, len(changes) - 1)]
+    streamed = (
+        changes[np.clip(last - 1, 0, len(changes) - 1)]
+        & changes[np.clip(following, 0, len(changes) - 1)]
+    )
     line = np.column_stack([np.interp(grid, time_s, column) for column in target.T])
     return np.where(in_gap[:, None] & streamed, line, held)
 
 
-def _between(grid: np.ndarray, time_s: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
+def _between(
+    grid: np.ndarray, time_s: np.ndarray, values: np.ndarray, period: float
+) -> np.ndarray:
     """(G, J) of (T, J) between rows that are near each other; NaN elsewhere."""
     after = np.clip(np.searchsorted(time_s, grid, side="left"), 1, len(time_s) - 1)
     before = after - 1
@@ -112,10 +148,16 @@ def _between(grid: np.ndarray, time_s: np.ndarray, values: np.ndarray, period: f
     line[around] = _cubic(grid[around], time_s, values, k[whole])
     nearer = np.where(share < 0.5, before, after)
     exact = np.abs(grid - time_s[nearer]) < AT_ROW * period
-    return np.where((width <= GAP * period)[:, None], line, np.where(exact[:, None], values[nearer], np.nan))
+    return np.where(
+        (width <= GAP * period)[:, None],
+        line,
+        np.where(exact[:, None], values[nearer], np.nan),
+    )
 
 
-def _cubic(at: np.ndarray, time_s: np.ndarray, values: np.ndarray, before: np.ndarray) -> np.ndarray:
+def _cubic(
+    at: np.ndarray, time_s: np.ndarray, values: np.ndarray, before: np.ndarray
+) -> np.ndarray:
     """(G, J) at times ``at`` on the cubics through rows ``before`` − 1 to ``before`` + 2 (Lagrange). A line errs by a h² / 8,
     which is an encoder's step where a pendulum swings: 1.2 mrad at 100 rad/s² and 100 Hz."""
     rows = before[:, None] + np.arange(-1, 3)

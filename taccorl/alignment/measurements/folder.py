@@ -37,7 +37,11 @@ from taccorl.alignment.measurements.tables import TableSpec, load_table_spec, re
 from taccorl.data.decode import natural_key
 from taccorl.data.origin import Domain
 from taccorl.data.recording import find_sources
-from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
+from taccorl.data.spec import (
+    RecordingSpec,
+    load_recording_spec,
+    shipped_recording_specs,
+)
 from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, TaccorlError, nearest, no_such_path
 from taccorl.robots import ROBOT
@@ -62,7 +66,9 @@ class PressedNote:
     shape: Literal["sphere", "rod"]
     radius_m: float  # Radius of the sphere or rod [m]
     arm: ArmName
-    length_m: float | None = None  # Length of a rod, which has flat ends [m]; not for a sphere
+    length_m: float | None = (
+        None  # Length of a rod, which has flat ends [m]; not for a sphere
+    )
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of the object [m]: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y),
     or in the world's, as ``frame`` says."""
@@ -73,11 +79,17 @@ class PressedNote:
 
     def made(self) -> PressedObject:
         """The object as a ``PressedObject``, for ``touch_motion``."""
-        return indenter(**{name: value for name, value in vars(self).items() if value is not None})
+        return indenter(
+            **{name: value for name, value in vars(self).items() if value is not None}
+        )
 
     def entry(self) -> dict[str, Any]:
         """The note as YAML values."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in vars(self).items() if v is not None}
+        return {
+            k: list(v) if isinstance(v, tuple) else v
+            for k, v in vars(self).items()
+            if v is not None
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,19 +106,29 @@ class RecordingNote(Stated):
     effort_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor from the recorded effort to N·m or N; 0: the effort is not used. PiPER's firmware 1.5 to 1.8 reports
     joints 1 to 3 four times too large (piper_sdk issue 73)."""
-    pressed: PressedNote | None = None  # Known object between the fingers of one arm; None if there is none
+    pressed: PressedNote | None = (
+        None  # Known object between the fingers of one arm; None if there is none
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementIndex:
     """Content of ``measurements.yaml``."""
 
-    spec: str | None = None  # Recording spec of the recordings: a shipped one's name, or a path; None if not needed
+    spec: str | None = (
+        None  # Recording spec of the recordings: a shipped one's name, or a path; None if not needed
+    )
     columns: str | None = None
     """Path of the columns file of tables and of datasets without units; None if they have taccorl's own names."""
-    domain: Domain | None = None  # Domain of all recordings that state none, such as ``real``
-    validation_every: int = 0  # Every k-th motion is for validation; 0: only recordings that are named
-    recordings: dict[str, RecordingNote] = field(default_factory=dict)  # File name of the recording → facts about it
+    domain: Domain | None = (
+        None  # Domain of all recordings that state none, such as ``real``
+    )
+    validation_every: int = (
+        0  # Every k-th motion is for validation; 0: only recordings that are named
+    )
+    recordings: dict[str, RecordingNote] = field(
+        default_factory=dict
+    )  # File name of the recording → facts about it
 
 
 @dataclass(frozen=True)
@@ -117,7 +139,9 @@ class Measurements:
     validation: tuple[Measurement, ...] = ()
     test: tuple[Measurement, ...] = ()
     rule: str = ""  # Description of the rule of the division
-    skipped: tuple[str, ...] = ()  # Other entries of the folder that were not read, with the reason
+    skipped: tuple[
+        str, ...
+    ] = ()  # Other entries of the folder that were not read, with the reason
     unlisted: tuple[str, ...] = ()
     """Recordings for the fit that ``measurements.yaml`` does not list, although it states the use of others."""
 
@@ -128,7 +152,10 @@ class Measurements:
 
     def record(self) -> dict[str, object]:
         """The division for a report: keys ``rule``, ``fit``, ``validation``, ``test`` (lists of names) and ``skipped``."""
-        names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "validation", "test")}
+        names = {
+            use: [m.name for m in getattr(self, use)]
+            for use in ("fit", "validation", "test")
+        }
         return {"rule": self.rule, **names, "skipped": list(self.skipped)}
 
 
@@ -160,11 +187,17 @@ def read_measurements(
     index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))
     if spec is None and index.spec is not None:  # beside the index, or a shipped one
         spec = folder / index.spec if (folder / index.spec).is_file() else index.spec
-    columns = columns if columns is not None or index.columns is None else folder / index.columns
+    columns = (
+        columns
+        if columns is not None or index.columns is None
+        else folder / index.columns
+    )
     if isinstance(columns, TableSpec):
         stated = columns
     else:
-        stated = None if columns is None or table is not None else load_table_spec(columns)
+        stated = (
+            None if columns is None or table is not None else load_table_spec(columns)
+        )
     read_one = table or (lambda one, _: read_table(one, stated, units))
     skipped: list[str] = []
     found = _read(
@@ -175,7 +208,11 @@ def read_measurements(
         skipped,
     )
     found = sorted(found, key=lambda m: natural_key(m.name))
-    whole, uses, names = path.is_dir(), ("fit", "validation", "test"), [m.name for m in found]
+    whole, uses, names = (
+        path.is_dir(),
+        ("fit", "validation", "test"),
+        [m.name for m in found],
+    )
     unknown = [name for name in index.recordings if name not in names]
     if whole and unknown:
         raise TaccorlError(
@@ -183,13 +220,22 @@ def read_measurements(
         )
     found = [_with_note(m, index, folder, names if whole else None) for m in found]
     held = not repeat_pairs(found)
-    found = [dataclasses.replace(m, held=held and "torque" in m.target_kinds) for m in found]
+    found = [
+        dataclasses.replace(m, held=held and "torque" in m.target_kinds) for m in found
+    ]
     # If the path is a single file, it is fitted, whatever ``use`` measurements.yaml states for it.
-    named = {use: [m.name for m in found if whole and _note(index, m).use == use] for use in uses}
-    every = index.validation_every * whole if validation_every is None else validation_every
+    named = {
+        use: [m.name for m in found if whole and _note(index, m).use == use]
+        for use in uses
+    }
+    every = (
+        index.validation_every * whole if validation_every is None else validation_every
+    )
     divided = split(found, **named, validation_every=every, fit_needed=fit_needed)
     states_uses = whole and any(note.use for note in index.recordings.values())
-    unlisted = tuple(m.name for m in divided.fit if states_uses and m.name not in index.recordings)
+    unlisted = tuple(
+        m.name for m in divided.fit if states_uses and m.name not in index.recordings
+    )
     return dataclasses.replace(divided, skipped=tuple(skipped), unlisted=unlisted)
 
 
@@ -214,9 +260,13 @@ def split(
     for use, listed in (("fit", fit), ("validation", validation), ("test", test)):
         for name in listed:
             if name not in names:
-                raise TaccorlError(f"{use}: no measurement {name!r}; {nearest(name, names)}")
+                raise TaccorlError(
+                    f"{use}: no measurement {name!r}; {nearest(name, names)}"
+                )
             if uses.setdefault(name, use) != use:
-                raise TaccorlError(f"{name} is listed both for {uses[name]} and for {use}; list it once")
+                raise TaccorlError(
+                    f"{name} is listed both for {uses[name]} and for {use}; list it once"
+                )
     if validation_every < 0 or validation_every == 1:
         raise TaccorlError(
             f"validation_every: {validation_every} leaves nothing for the fit; 0 means no motion, 2 every second"
@@ -229,24 +279,38 @@ def split(
                     f"{name} ({use}) and {other} ({uses[other]}) are repeats of one motion: give both the same use"
                 )
     free = list(dict.fromkeys(motion[n] for n in names if n not in uses))
-    taken = {m for k, m in enumerate(free) if validation_every and k % validation_every == validation_every - 1}
+    taken = {
+        m
+        for k, m in enumerate(free)
+        if validation_every and k % validation_every == validation_every - 1
+    }
     for name in names:
         uses.setdefault(name, "validation" if motion[name] in taken else "fit")
     for name, first in copies(measurements).items():
         if uses[name] != uses[first]:
-            said = (
-                f"{name} ({uses[name]}) is {first} ({uses[first]}), number for number, and would be checked with itself"
+            said = f"{name} ({uses[name]}) is {first} ({uses[first]}), number for number, and would be checked with itself"
+            raise TaccorlError(
+                f"{said}; remove one of them, and its entry in {INDEX} if it has one"
             )
-            raise TaccorlError(f"{said}; remove one of them, and its entry in {INDEX} if it has one")
-    sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
+    sides = {
+        use: tuple(m for m in measurements if uses[m.name] == use)
+        for use in ("fit", "validation", "test")
+    }
     if fit_needed and not sides["fit"]:
         raise TaccorlError(
             f"no recording is left for the fit: of {', '.join(names)}, {len(sides['validation'])} are for validation and "
             f"{len(sides['test'])} for the test; record another motion, or give one of them use: fit in measurements.yaml"
         )
     words = [f"{len(validation) + len(test)} by name"] * bool(validation or test)
-    words += [f"every {validation_every}. of {len(free)} motions for validation"] * bool(validation_every)
-    return Measurements(sides["fit"], sides["validation"], sides["test"], rule=", ".join(words) or "all for fitting")
+    words += [
+        f"every {validation_every}. of {len(free)} motions for validation"
+    ] * bool(validation_every)
+    return Measurements(
+        sides["fit"],
+        sides["validation"],
+        sides["test"],
+        rule=", ".join(words) or "all for fitting",
+    )
 
 
 def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
@@ -259,7 +323,9 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
         while of.get(root) is not None:
             root = str(of[root])
             if root in seen:
-                raise TaccorlError(f"{' repeats '.join([*seen, root])}: a circle; correct repeat_of")
+                raise TaccorlError(
+                    f"{' repeats '.join([*seen, root])}: a circle; correct repeat_of"
+                )
             seen.append(root)
         roots[name] = root
     return roots
@@ -271,7 +337,9 @@ def copies(measurements: Iterable[Measurement]) -> dict[str, str]:
     measurements = list(measurements)
     firsts, there = {m.repeat_of for m in measurements}, dict[bytes, Measurement]()
     found = {}
-    for m in sorted(measurements, key=lambda m: (m.name not in firsts, m.repeat_of is not None)):
+    for m in sorted(
+        measurements, key=lambda m: (m.name not in firsts, m.repeat_of is not None)
+    ):
         first = there.setdefault(m.measured.tobytes(), m)
         if first is not m and m.is_copy_of(first):
             found[m.name] = first.name
@@ -284,7 +352,9 @@ def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]
     firsts: dict[str, M] = {}
     pairs = []
     roots = motions(by_name.values())
-    for name, root in sorted(roots.items(), key=lambda item: item[0] != item[1]):  # the original first, if it is here
+    for name, root in sorted(
+        roots.items(), key=lambda item: item[0] != item[1]
+    ):  # the original first, if it is here
         first = firsts.setdefault(root, by_name[name])
         if first.name != name and not by_name[name].is_copy_of(first):
             pairs.append((first, by_name[name]))
@@ -303,17 +373,44 @@ def _rules(index: MeasurementIndex, folder: Path, holders: Sequence[str]) -> Rul
     axes = [h for h in holders if h not in (*ROBOT.arms, *ROBOT.action_names)]
     for name, note in index.recordings.items():
         place = f"recordings/{name}"
-        for key in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "supply_v"):
+        for key in (
+            "kp",
+            "kd",
+            "gain_scale",
+            "payload_kg",
+            "lever_m",
+            "arm_kg",
+            "supply_v",
+        ):
             for signal, value in getattr(note, key).items():
                 yield value < 0, f"{place}/{key}/{signal}", f"{value:g} is below 0"
-        for key in ("payload_kg", "payload_position_m", "lever_m", "arm_kg", "supply_v"):
-            known = {"payload_kg": holders, "payload_position_m": ROBOT.arms}.get(key, axes)
-            others = ", ".join(h for h in known if h not in ROBOT.action_names) or "there is none"
-            what = "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
+        for key in (
+            "payload_kg",
+            "payload_position_m",
+            "lever_m",
+            "arm_kg",
+            "supply_v",
+        ):
+            known = {"payload_kg": holders, "payload_position_m": ROBOT.arms}.get(
+                key, axes
+            )
+            others = (
+                ", ".join(h for h in known if h not in ROBOT.action_names)
+                or "there is none"
+            )
+            what = (
+                "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
+            )
             for holder in getattr(note, key):
-                yield holder not in known, f"{place}/{key}/{holder}", f"no {what} {holder!r}; {others}"
+                yield (
+                    holder not in known,
+                    f"{place}/{key}/{holder}",
+                    f"no {what} {holder!r}; {others}",
+                )
         for arm, at_m in note.payload_position_m.items():
-            is_near = all(math.isfinite(x) and abs(x) <= FARTHEST_PAYLOAD_M for x in at_m)
+            is_near = all(
+                math.isfinite(x) and abs(x) <= FARTHEST_PAYLOAD_M for x in at_m
+            )
             far = f"{list(at_m)} is further than {FARTHEST_PAYLOAD_M:g} m from the flange; is it in millimetres?"
             yield not is_near, f"{place}/payload_position_m/{arm}", far
         if note.pressed is not None:
@@ -323,20 +420,33 @@ def _rules(index: MeasurementIndex, folder: Path, holders: Sequence[str]) -> Rul
 
 
 def _rules_of_pressed(key: str, pressed: PressedNote) -> Rules:
-    is_rod, lengths = pressed.shape == "rod", {} if pressed.length_m is None else {"length_m": pressed.length_m}
-    need = "a rod needs its length_m" if is_rod else "a sphere has no length_m; leave it out"
+    is_rod, lengths = (
+        pressed.shape == "rod",
+        {} if pressed.length_m is None else {"length_m": pressed.length_m},
+    )
+    need = (
+        "a rod needs its length_m"
+        if is_rod
+        else "a sphere has no length_m; leave it out"
+    )
     yield is_rod != bool(lengths), f"{key}/length_m" if lengths else key, need
     for name, size in {"radius_m": pressed.radius_m, **lengths}.items():
         yield not 0 < size < math.inf, f"{key}/{name}", f"{size:g} is not above 0"
     room = f"does not fit between the fingers, which open {ROBOT.opening_max_m:g} m; is it in millimetres?"
-    yield 2 * pressed.radius_m > ROBOT.opening_max_m, f"{key}/radius_m", f"{pressed.radius_m:g} m {room}"
+    yield (
+        2 * pressed.radius_m > ROBOT.opening_max_m,
+        f"{key}/radius_m",
+        f"{pressed.radius_m:g} m {room}",
+    )
 
 
 def _note(index: MeasurementIndex, measurement: Measurement) -> RecordingNote:
     return index.recordings.get(measurement.name, RecordingNote())
 
 
-def _with_note(m: Measurement, index: MeasurementIndex, folder: Path, names: Sequence[str] | None) -> Measurement:
+def _with_note(
+    m: Measurement, index: MeasurementIndex, folder: Path, names: Sequence[str] | None
+) -> Measurement:
     """``m`` with what the index says of it; ``names``: of all recordings of the folder, None if not all were read."""
     note = _note(index, m)
 
@@ -345,28 +455,49 @@ def _with_note(m: Measurement, index: MeasurementIndex, folder: Path, names: Seq
 
     first = note.repeat_of
     if names is not None and first is not None and first not in names:
-        refuse("repeat_of", f"there is no recording {first!r} in this folder; {nearest(first, names)}")
+        refuse(
+            "repeat_of",
+            f"there is no recording {first!r} in this folder; {nearest(first, names)}",
+        )
     for key in ("kp", "kd", "effort_scale", "supply_v"):
         for name in getattr(note, key):
             if name not in m.signals:
                 refuse(key, f"no signal {name!r}; {nearest(name, m.signals)}")
     for arm in note.payload_position_m:
         if not (m.payload_kg | note.payload_kg).get(arm):
-            refuse("payload_position_m", f"{arm} holds no payload; state payload_kg, or leave it out")
+            refuse(
+                "payload_position_m",
+                f"{arm} holds no payload; state payload_kg, or leave it out",
+            )
     if note.pressed is not None and m.touch is None:
         why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
-        refuse("pressed", f"the recording holds no frames of the pads{why}; record them, or remove pressed")
+        refuse(
+            "pressed",
+            f"the recording holds no frames of the pads{why}; record them, or remove pressed",
+        )
     repeat_of = note.repeat_of or m.repeat_of
-    if repeat_of and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed:
+    if (
+        repeat_of
+        and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed
+    ):
         text = f"this recording repeats {repeat_of}, whose pressed differs; correct pressed, or repeat_of"
         refuse("pressed", text)
     supply_v = m.supply_v
     if note.supply_v:
         if supply_v.size:
-            refuse("supply_v", "the recording also has a column with the supply voltage; remove one of them")
-        supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
-    scale = np.array([note.effort_scale.get(name, 1.0) or np.nan for name in m.signals])  # 0: as if not recorded
-    facts: dict[str, Any] = {name: getattr(m, name) | getattr(note, name) for name in Stated.names()}
+            refuse(
+                "supply_v",
+                "the recording also has a column with the supply voltage; remove one of them",
+            )
+        supply_v = np.tile(
+            [note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1)
+        )
+    scale = np.array(
+        [note.effort_scale.get(name, 1.0) or np.nan for name in m.signals]
+    )  # 0: as if not recorded
+    facts: dict[str, Any] = {
+        name: getattr(m, name) | getattr(note, name) for name in Stated.names()
+    }
     return dataclasses.replace(
         m,
         **facts,
@@ -410,9 +541,13 @@ def _read(
         found += _read_recordings(path, spec, left)
     except _NoRecording as error:
         if not found:
-            raise RecordingError(f"{error}, and there are no tables ({', '.join(SUFFIXES)}) or datasets") from error
+            raise RecordingError(
+                f"{error}, and there are no tables ({', '.join(SUFFIXES)}) or datasets"
+            ) from error
     read = {p.name for p in (*datasets, *tables)} | {INDEX}
-    read |= {p.name for p in children if p.suffix in (".yaml", ".yml")}  # specs and columns files
+    read |= {
+        p.name for p in children if p.suffix in (".yaml", ".yml")
+    }  # specs and columns files
     skipped += [text for text in left if text.split(" (")[0] not in read]
     return found
 
@@ -421,8 +556,14 @@ class _NoRecording(RecordingError):
     """A folder without recordings, which may still hold tables."""
 
 
-def _read_recordings(path: Path, spec: str | Path | RecordingSpec | None, skipped: list[str]) -> list[Measurement]:
-    loaded = spec if isinstance(spec, RecordingSpec) or spec is None else load_recording_spec(spec)
+def _read_recordings(
+    path: Path, spec: str | Path | RecordingSpec | None, skipped: list[str]
+) -> list[Measurement]:
+    loaded = (
+        spec
+        if isinstance(spec, RecordingSpec) or spec is None
+        else load_recording_spec(spec)
+    )
     try:
         found = find_sources(
             path,
@@ -443,12 +584,18 @@ def _read_recordings(path: Path, spec: str | Path | RecordingSpec | None, skippe
             measurements.append(read_recording(source, own))
         except TaccorlError as error:
             text = str(error)
-            raise RecordingError(text if text.startswith(source.name) else f"{source.name}: {text}") from error
+            raise RecordingError(
+                text if text.startswith(source.name) else f"{source.name}: {text}"
+            ) from error
     return measurements
 
 
 def _only_spec(path: Path, reader: str) -> RecordingSpec:
-    fitting = {name: spec for name, spec in shipped_recording_specs().items() if spec.reader == reader}
+    fitting = {
+        name: spec
+        for name, spec in shipped_recording_specs().items()
+        if spec.reader == reader
+    }
     if len(fitting) != 1:
         raise RecordingError(
             f"{path}: {len(fitting)} shipped specs read {reader} ({', '.join(fitting) or 'none'}); choose one: --spec=NAME, or "

@@ -23,7 +23,10 @@ from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError, nearest, plain_name, printable
 from taccorl.robots import ROBOT
 
-UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}  # Unit of a position → units of its velocity and effort
+UNITS = {
+    "rad": ("rad/s", "N·m"),
+    "m": ("m/s", "N"),
+}  # Unit of a position → units of its velocity and effort
 
 
 def unit_of(name: str) -> str:
@@ -51,8 +54,12 @@ class Touch:
 class Stated:
     """Facts about one recording that its rows do not hold."""
 
-    kp: dict[str, float] = field(default_factory=dict)  # Signal → commanded K_p [N·m/rad, N/m], if stated
-    kd: dict[str, float] = field(default_factory=dict)  # Signal → commanded K_d [N·m·s/rad, N·s/m], if stated
+    kp: dict[str, float] = field(
+        default_factory=dict
+    )  # Signal → commanded K_p [N·m/rad, N/m], if stated
+    kd: dict[str, float] = field(
+        default_factory=dict
+    )  # Signal → commanded K_d [N·m·s/rad, N·s/m], if stated
     gain_scale: dict[str, float] = field(default_factory=dict)
     """Signal → factor of both gains relative to those of the other recordings, if only this is known."""
     payload_kg: dict[str, float] = field(default_factory=dict)
@@ -61,7 +68,9 @@ class Stated:
     """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
     arm_kg: dict[str, float] = field(default_factory=dict)
     """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
-    payload_position_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    payload_position_m: dict[str, tuple[float, float, float]] = field(
+        default_factory=dict
+    )
     """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
     (0, 0, 0.168)."""
 
@@ -98,9 +107,13 @@ class Measurement(Stated):
     """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
     command_s: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T,) arrival times of each row's targets [s], on the clock of ``time_s``; empty if they equal the rows' times."""
-    signals: tuple[str, ...] = ROBOT.action_names  # (J,) names of the signals, in the order of the columns
+    signals: tuple[str, ...] = (
+        ROBOT.action_names
+    )  # (J,) names of the signals, in the order of the columns
     units: tuple[str, ...] = ROBOT_UNITS  # Unit of each signal's position: rad or m
-    target_kinds: tuple[TargetKind, ...] = ()  # Quantity that ``target`` states for each signal; positions if not given
+    target_kinds: tuple[
+        TargetKind, ...
+    ] = ()  # Quantity that ``target`` states for each signal; positions if not given
     quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 if none is visible."""
     touch: Touch | None = None  # Frames of the pads; None if there are none
@@ -108,14 +121,18 @@ class Measurement(Stated):
     origin: Origin = UNSTATED  # Origin as the file states it
     instruction: str = ""  # Task text of the recording; empty if it has none
     start_ns: int = 0  # Time of row 0 on the recording's clock [ns]
-    repeat_of: str | None = None  # Name of the measurement whose commands this one repeats; None if it is no repeat
+    repeat_of: str | None = (
+        None  # Name of the measurement whose commands this one repeats; None if it is no repeat
+    )
     held: bool = False
     """True: models of law torque are held near the measured position, since no recording repeats another: replays would drift."""
     pressed: PressedObject | None = None
     """Known object between the fingers of one arm, if stated; the arm's pads are compared with the twin's for it."""
     time_error_s: float = 0.0
     """Largest time by which a row's position and target may differ from its time [s] (rows of a dataset show the last sample)."""
-    timing: tuple[ChannelTiming, ...] = ()  # Timing of each channel's samples; empty for tables
+    timing: tuple[
+        ChannelTiming, ...
+    ] = ()  # Timing of each channel's samples; empty for tables
     findings: tuple[Finding, ...] = ()  # Findings that were made while reading it
 
     def __post_init__(self) -> None:
@@ -130,18 +147,30 @@ class Measurement(Stated):
         for name in ("target", "measured", "velocity", "effort", *self.extra_columns):
             found = getattr(self, name).shape
             if found != shape:
-                raise TaccorlError(f"measurement {self.name}: {name} is {found}, but times and signals require {shape}")
-        lengths = {len(self.units), len(self.target_kinds) or shape[1], len(set(self.signals))}
+                raise TaccorlError(
+                    f"measurement {self.name}: {name} is {found}, but times and signals require {shape}"
+                )
+        lengths = {
+            len(self.units),
+            len(self.target_kinds) or shape[1],
+            len(set(self.signals)),
+        }
         if lengths != {shape[1]} or self.quantum.shape != shape[1:]:
             other = f"units, quantum and names have other lengths than signals {self.signals}"
             raise TaccorlError(f"measurement {self.name}: {other}")
         for unit in (unit for unit in self.units if unit not in self.known_units):
-            raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {unit!r}")
+            raise TaccorlError(
+                f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {unit!r}"
+            )
 
     @property
     def extra_columns(self) -> list[str]:
         """Names of those fields among ``load``, ``torque_ff``, ``supply_v`` and ``enabled`` that this measurement has."""
-        return [name for name in ("load", "torque_ff", "supply_v", "enabled") if getattr(self, name).size]
+        return [
+            name
+            for name in ("load", "torque_ff", "supply_v", "enabled")
+            if getattr(self, name).size
+        ]
 
     @property
     def columns(self) -> list[str]:
@@ -156,7 +185,11 @@ class Measurement(Stated):
     @cached_property
     def period_s(self) -> float:
         """Median time between rows [s]."""
-        return float(np.median(np.diff(self.time_s))) if self.num_rows > 1 else float("nan")
+        return (
+            float(np.median(np.diff(self.time_s)))
+            if self.num_rows > 1
+            else float("nan")
+        )
 
     @property
     def rate_hz(self) -> float:
@@ -175,16 +208,24 @@ class Measurement(Stated):
         """Index j of a signal in ``signals`` and in the columns of the arrays. Raises TaccorlError: there is no signal of that
         name."""
         if signal not in self.signals:
-            raise TaccorlError(f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}")
+            raise TaccorlError(
+                f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}"
+            )
         return self.signals.index(signal)
 
     def target_kind(self, signal: str) -> TargetKind:
         """Quantity that the target of a signal commands: position, velocity, torque, or effort (no target)."""
-        return self.target_kinds[self.column(signal)] if self.target_kinds else "position"
+        return (
+            self.target_kinds[self.column(signal)] if self.target_kinds else "position"
+        )
 
     def known_load(self, signal: str) -> np.ndarray:
         """(T,) known external torque on a signal [N·m, N]; 0 if there is none."""
-        return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
+        return (
+            self.load[:, self.column(signal)]
+            if self.load.size
+            else np.zeros(self.num_rows)
+        )
 
     def twin_cannot_take(self, signal: str) -> str:
         """Text: data of a signal that the PiPER's twin cannot use, and the remedy; empty if there are none."""
@@ -198,13 +239,17 @@ class Measurement(Stated):
         if self.enabled.size and not self.enabled[:, j].all():
             row = int(np.argmin(self.enabled[:, j]))
             return f"a motor that is off at {self.time_s[row]:.3f} s; cut the recording there"
-        stated = next((key for key in ("lever_m", "arm_kg") if signal in getattr(self, key)), "")
+        stated = next(
+            (key for key in ("lever_m", "arm_kg") if signal in getattr(self, key)), ""
+        )
         return stated and f"{stated}; remove it from measurements.yaml"
 
     def moved(self, signal: str) -> np.ndarray:
         """(T,) positions [rad, m] from which the motion of a signal is determined: the commanded positions, or the measured ones
         if the targets are velocities or torques."""
-        return (self.target if self.target_kind(signal) == "position" else self.measured)[:, self.column(signal)]
+        return (
+            self.target if self.target_kind(signal) == "position" else self.measured
+        )[:, self.column(signal)]
 
     def only(self, signals: Sequence[str]) -> Self:
         """A copy of the measurement that has only these signals."""
@@ -216,7 +261,9 @@ class Measurement(Stated):
             quantum=self.quantum[at],
             signals=tuple(signals),
             units=tuple(self.units[j] for j in at),
-            target_kinds=tuple(self.target_kinds[j] for j in at) if self.target_kinds else (),
+            target_kinds=tuple(self.target_kinds[j] for j in at)
+            if self.target_kinds
+            else (),
         )
 
     def with_position_targets(self, positions: np.ndarray) -> Self:
@@ -224,25 +271,41 @@ class Measurement(Stated):
         if not self.target_kinds:
             return self
         kept = np.array([kind == "position" for kind in self.target_kinds])
-        return dataclasses.replace(self, target=np.where(kept, self.target, positions), target_kinds=())
+        return dataclasses.replace(
+            self, target=np.where(kept, self.target, positions), target_kinds=()
+        )
 
     def has_effort(self) -> np.ndarray:
         """(J,) bool: the signal's effort was recorded, and is not always 0."""
-        return np.isfinite(self.effort).any(axis=0) & (np.nan_to_num(self.effort) != 0).any(axis=0)
+        return np.isfinite(self.effort).any(axis=0) & (
+            np.nan_to_num(self.effort) != 0
+        ).any(axis=0)
 
     def resampled(self, rate_hz: float) -> Self:
         """The measurement resampled to an even ``rate_hz`` by linear interpolation, which keeps the mean time of every command
         and position. Raises TaccorlError: there are less than two rows, or time does not increase."""
         if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
-            raise TaccorlError(f"{self.name}: its time does not increase: it cannot be resampled to {rate_hz:g} Hz")
-        time_s = self.time_s[0] + np.arange(int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1) / rate_hz
+            raise TaccorlError(
+                f"{self.name}: its time does not increase: it cannot be resampled to {rate_hz:g} Hz"
+            )
+        time_s = (
+            self.time_s[0]
+            + np.arange(int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1)
+            / rate_hz
+        )
         columns = {
-            name: np.apply_along_axis(lambda column: np.interp(time_s, self.time_s, column), 0, getattr(self, name))
+            name: np.apply_along_axis(
+                lambda column: np.interp(time_s, self.time_s, column),
+                0,
+                getattr(self, name),
+            )
             for name in self.columns
         }
         if self.enabled.size:
             columns["enabled"] = np.where(columns["enabled"] < 0.5, 0.0, 1.0)
-        return dataclasses.replace(self, time_s=time_s, command_s=np.empty(0), **columns)
+        return dataclasses.replace(
+            self, time_s=time_s, command_s=np.empty(0), **columns
+        )
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
         """The measurement extended to all signals of the robot, in the order of actions: missing ones stay at ``rest`` (14,)
@@ -254,33 +317,62 @@ class Measurement(Stated):
                     f"signal in the columns file; {nearest(name, ROBOT.action_names)}"
                 )
             if unit != unit_of(name):
-                raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")
+                raise TaccorlError(
+                    f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}"
+                )
             if (kind := self.target_kind(name)) != "position":
-                raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
+                raise TaccorlError(
+                    f"{self.name}: {name} is commanded by {kind}, the robot's joints by position"
+                )
             if extra := self.twin_cannot_take(name):
-                raise TaccorlError(f"{self.name}: {name} has {extra}: the PiPER's twin cannot use this")
+                raise TaccorlError(
+                    f"{self.name}: {name} has {extra}: the PiPER's twin cannot use this"
+                )
         extra = dict.fromkeys(self.extra_columns, np.empty(0))
         plain = dataclasses.replace(self, **extra, target_kinds=())
-        return plain.extended(dict(zip(ROBOT.action_names, ROBOT_UNITS, strict=True)), rest)
+        return plain.extended(
+            dict(zip(ROBOT.action_names, ROBOT_UNITS, strict=True)), rest
+        )
 
-    def extended(self, units: Mapping[str, str], rest: Sequence[float] | np.ndarray) -> Self:
+    def extended(
+        self, units: Mapping[str, str], rest: Sequence[float] | np.ndarray
+    ) -> Self:
         """The measurement extended to the signals ``units`` (signal → unit of its position), in their order: missing ones stay at
         ``rest`` [rad, m] and count as not measured."""
         at, names = [list(units).index(name) for name in self.signals], tuple(units)
         absent = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
         columns = ("measured", "velocity", "effort", *self.extra_columns)
-        arrays = {name: np.full((self.num_rows, len(units)), absent.get(name, np.nan)) for name in columns}
+        arrays = {
+            name: np.full((self.num_rows, len(units)), absent.get(name, np.nan))
+            for name in columns
+        }
         arrays |= {"target": np.tile(np.asarray(rest, float), (self.num_rows, 1))}
         for name, values in arrays.items():
             values[:, at] = getattr(self, name)
-        kinds = tuple(self.target_kind(name) if name in self.signals else "position" for name in names)
+        kinds = tuple(
+            self.target_kind(name) if name in self.signals else "position"
+            for name in names
+        )
         quantum = np.zeros(len(units))
         quantum[at] = self.quantum
-        more: dict[str, Any] = {"signals": names, "units": tuple(units.values()), "quantum": quantum}
-        return dataclasses.replace(self, **arrays, **more, target_kinds=kinds if self.target_kinds else ())
+        more: dict[str, Any] = {
+            "signals": names,
+            "units": tuple(units.values()),
+            "quantum": quantum,
+        }
+        return dataclasses.replace(
+            self, **arrays, **more, target_kinds=kinds if self.target_kinds else ()
+        )
 
 
 def other_arm(signal: str) -> str:
     """Name of the other arm's signal: ``left_joint5`` → ``right_joint5``; a name without an arm is returned unchanged."""
     swap = {"left_": "right_", "right_": "left_"}
-    return next((new + signal.removeprefix(old) for old, new in swap.items() if signal.startswith(old)), signal)
+    return next(
+        (
+            new + signal.removeprefix(old)
+            for old, new in swap.items()
+            if signal.startswith(old)
+        ),
+        signal,
+    )

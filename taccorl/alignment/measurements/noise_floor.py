@@ -32,7 +32,9 @@ from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.repeats import Overlay, cycles, overlay
 from taccorl.errors import TaccorlError
 
-Kind = Literal["position", "velocity", "effort"]  # Quantity of a signal whose noise is estimated
+Kind = Literal[
+    "position", "velocity", "effort"
+]  # Quantity of a signal whose noise is estimated
 Method = Literal["repeats", "cycles", "rest", "residue", "quantisation", "number"]
 """How the noise was estimated, a row of the table above; ``number``: the least floor allowed, ``NUMBER`` or ``EXACT``."""
 BLOCK_S = 0.25  # Duration of a block [s]. Estimates are made per block, and their scatter gives the interval.
@@ -49,14 +51,18 @@ BANDWIDTH_FACTOR = 5.0
 MOTION_POWER = 0.99  # Share of the motion's power that defines its highest frequency
 OTHER_START = 5.0
 """Two recordings of one motion began at different positions if they differ by so many times their usual difference."""
-MOVING = 1e-3  # Range within which a command is no motion with a relevant bandwidth [rad, m]
+MOVING = (
+    1e-3  # Range within which a command is no motion with a relevant bandwidth [rad, m]
+)
 BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
 """Repeats differ in bursts if less than ``BURST_SHARE`` of the blocks hold ``BURST_POWER`` of the squared difference, and the
 RMS of all is ``BURST_RATIO`` times that of the typical block."""
 ODD = 5.0
 """A repeat is left out if the RMS of its typical block is more than this many times the others' median. A choice."""
 DISAGREE = 3.0  # Ratio of the floor from repeats to that from rest, residue or rounding above which they disagree
-NUMBER = 2.0**-24  # Last bit of a 32-bit number of size 1: no floor is smaller than this rounding
+NUMBER = (
+    2.0**-24
+)  # Last bit of a 32-bit number of size 1: no floor is smaller than this rounding
 EXACT = 1e-3
 """Least noise floor of an effort, as a share of its standard deviation. A choice: simulated efforts have no noise at all."""
 
@@ -98,7 +104,9 @@ class SignalFloor:
     def quiet(self) -> float:
         """The largest estimate from rest, residue and rounding, without use of repeats; ``value`` if there is none."""
         quiet = ("rest", "residue", "quantisation")
-        return max((e.value for e in self.estimates if e.method in quiet), default=self.value)
+        return max(
+            (e.value for e in self.estimates if e.method in quiet), default=self.value
+        )
 
     @property
     def is_unknown(self) -> bool:
@@ -108,17 +116,25 @@ class SignalFloor:
     def words(self) -> str:
         """Text such as ``0.204 mrad (0.198 … 0.211, from repeats, n = 4000)``."""
         factor, prefix = (1e3, "m") if self.kind != "effort" else (1.0, "")
-        a, b, c = (f"{x * factor:.3g}" for x in (self.used.value, self.used.low, self.used.high))
+        a, b, c = (
+            f"{x * factor:.3g}"
+            for x in (self.used.value, self.used.low, self.used.high)
+        )
         bound = "; a lower bound: record the motion twice" if self.lower_bound else ""
         times = f"{self.value / self.quiet:.0f} times"
-        bound += f"; not known: two recordings differ {times} as much as rows" * self.is_unknown
+        bound += (
+            f"; not known: two recordings differ {times} as much as rows"
+            * self.is_unknown
+        )
         bursts = ", bursts left out" if self.used.without_bursts else ""
         bursts += "".join(f", without {name}" for name, _ in self.used.left_out)
         return f"{a} {prefix}{self.unit} ({b} … {c}, from {self.used.method}{bursts}, n = {self.used.n}{bound})"
 
 
 def noise_floor(
-    measurements: Sequence[Measurement], kind: Kind = "position", unexplained: Sequence[Measurement] = ()
+    measurements: Sequence[Measurement],
+    kind: Kind = "position",
+    unexplained: Sequence[Measurement] = (),
 ) -> dict[str, SignalFloor]:
     """Estimate the noise floor of every signal. ``measurements``: measurements of one robot. Those with ``repeat_of`` are aligned
     with the recording that they repeat. ``kind``: quantity whose noise is estimated. ``unexplained``: the same measurements, from
@@ -132,37 +148,69 @@ def noise_floor(
     signals, units = measurements[0].signals, measurements[0].units
     for m in (m for m in measurements if m.signals != signals):
         two = f"{m.name} and {measurements[0].name}"
-        raise TaccorlError(f"noise floor: {two} have different signals; read them separately")
+        raise TaccorlError(
+            f"noise floor: {two} have different signals; read them separately"
+        )
     pairs = laid_pairs(unexplained or measurements)
     blocks: dict[Method, list[_Blocks]] = {
-        "repeats": [_repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in pairs],
+        "repeats": [
+            _repeat_blocks(a.rate_hz, b.name, laid, kind) for a, b, laid in pairs
+        ],
         "cycles": [_cycle_blocks(m, kind) for m in measurements],
         "rest": [_rest_blocks(m, kind) for m in measurements],
         "residue": [_residue_blocks(m, kind) for m in measurements],
     }
-    estimates = {method: _estimate(method, found, len(signals), kind) for method, found in blocks.items()}
+    estimates = {
+        method: _estimate(method, found, len(signals), kind)
+        for method, found in blocks.items()
+    }
     floors = {}
     for j, (signal, unit) in enumerate(zip(signals, units, strict=True)):
         values = np.concatenate([_values(m, kind)[:, j] for m in measurements])
         if not np.isfinite(values).any():
             continue
         found = [e for method in blocks if (e := estimates[method][j]) is not None]
-        step = max(float(m.quantum[j]) for m in measurements) if kind == "position" else 0.0
+        step = (
+            max(float(m.quantum[j]) for m in measurements)
+            if kind == "position"
+            else 0.0
+        )
         if step > 0:
             rounding = step / math.sqrt(12)
-            found.append(Estimate("quantisation", rounding, rounding, rounding, int(np.isfinite(values).sum())))
-        last = float(max(NUMBER * max(1e-3, np.nanmax(np.abs(values))), EXACT * (kind == "effort") * np.nanstd(values)))
-        used = _chosen(found, bool(unexplained)) or Estimate("number", last, last, last, 0)
+            found.append(
+                Estimate(
+                    "quantisation",
+                    rounding,
+                    rounding,
+                    rounding,
+                    int(np.isfinite(values).sum()),
+                )
+            )
+        last = float(
+            max(
+                NUMBER * max(1e-3, np.nanmax(np.abs(values))),
+                EXACT * (kind == "effort") * np.nanstd(values),
+            )
+        )
+        used = _chosen(found, bool(unexplained)) or Estimate(
+            "number", last, last, last, 0
+        )
         if used.value < last:
             used = Estimate("number", last, last, last, used.n)
-        name = {"position": unit, "velocity": UNITS[unit][0], "effort": UNITS[unit][1]}[kind]
+        name = {"position": unit, "velocity": UNITS[unit][0], "effort": UNITS[unit][1]}[
+            kind
+        ]
         repeated = any(e.method in ("repeats", "cycles") for e in found)
-        floors[signal] = SignalFloor(signal, kind, name, used, tuple(found), lower_bound=not repeated)
+        floors[signal] = SignalFloor(
+            signal, kind, name, used, tuple(found), lower_bound=not repeated
+        )
     return floors
 
 
 def floors_by_motion(
-    measurements: Sequence[Measurement], kind: Kind = "position", unexplained: Sequence[Measurement] = ()
+    measurements: Sequence[Measurement],
+    kind: Kind = "position",
+    unexplained: Sequence[Measurement] = (),
 ) -> dict[str, dict[str, SignalFloor]]:
     """Noise floors of each recording: recording → signal → floor. If its motion was repeated, the floor is estimated from the
     recordings of that motion, else from all ``measurements``. The noise of an effort grows with gains and motion, so its floor
@@ -170,8 +218,13 @@ def floors_by_motion(
     roots, every = motions(measurements), noise_floor(measurements, kind, unexplained)
     own: dict[str, dict[str, SignalFloor]] = {}
     for root in dict.fromkeys(roots.values()):
-        group, left = ([m for m in of if roots[m.name] == root] for of in (measurements, unexplained))
-        own[root] = every | (noise_floor(group, kind, left) if repeat_pairs(group) else {})
+        group, left = (
+            [m for m in of if roots[m.name] == root]
+            for of in (measurements, unexplained)
+        )
+        own[root] = every | (
+            noise_floor(group, kind, left) if repeat_pairs(group) else {}
+        )
     found = {name: dict(own[root]) for name, root in roots.items()}
     for m in measurements if kind == "effort" else ():
         for signal, alone in noise_floor([m], kind).items():
@@ -191,35 +244,62 @@ def laid_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M, Ov
             continue
         (first, second, _), *others = own
         among = [(second, b, overlay(second, b)) for _, b, _ in others]
-        usual, odd = (np.median([_typical(laid) for _, _, laid in of], axis=0) for of in (among, own))
+        usual, odd = (
+            np.median([_typical(laid) for _, _, laid in of], axis=0)
+            for of in (among, own)
+        )
         if ((odd > ODD**2 * usual) & (usual > 0.0)).any():
-            pairs = [p for p in pairs if p not in own] + [(second, first, overlay(second, first)), *among]
+            pairs = [p for p in pairs if p not in own] + [
+                (second, first, overlay(second, first)),
+                *among,
+            ]
     return pairs
 
 
 def _typical(laid: Overlay) -> np.ndarray:
     """(J,) median of the squared differences of positions; 0 where none was measured."""
     squares = np.square(laid.difference["position"])
-    return np.array([np.median(own[np.isfinite(own)]) if np.isfinite(own).any() else 0.0 for own in squares.T])
+    return np.array(
+        [
+            np.median(own[np.isfinite(own)]) if np.isfinite(own).any() else 0.0
+            for own in squares.T
+        ]
+    )
 
 
 def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
     """(K,) noise of every taxel [counts] from the residue at the pads' own rate, at least 1 / √12; None without touch."""
     touched = [m.touch for m in measurements if m.touch is not None]
-    frames = [(t.counts.astype(np.float32), 1.0 / float(np.median(np.diff(t.time_s[:, 0])))) for t in touched]
+    frames = [
+        (t.counts.astype(np.float32), 1.0 / float(np.median(np.diff(t.time_s[:, 0]))))
+        for t in touched
+    ]
     values = residue_floor(frames) if frames else np.zeros(0)
-    return np.maximum(values, 1.0 / math.sqrt(12)) if values.size and np.isfinite(values).all() else None
+    return (
+        np.maximum(values, 1.0 / math.sqrt(12))
+        if values.size and np.isfinite(values).all()
+        else None
+    )
 
 
 def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
     """(K,) noise of each column by the residue method, in the unit of the values; NaN if all channels are too short. The median
     over blocks is used, because contact changes in few of them. Blocks of more than half NaN are not used.
     ``channels``: several (values (T, K), rate [Hz]), with the same K columns."""
-    found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
+    found = [
+        b
+        for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels)
+        if len(b.mean_squares)
+    ]
     if not found:
         return np.full(channels[0][0].shape[1], np.nan)
-    own = [column[np.isfinite(column)] for column in np.concatenate([b.mean_squares for b in found]).T]
-    return np.sqrt([float(_median(c, found[0].freedom)) if len(c) else np.nan for c in own])
+    own = [
+        column[np.isfinite(column)]
+        for column in np.concatenate([b.mean_squares for b in found]).T
+    ]
+    return np.sqrt(
+        [float(_median(c, found[0].freedom)) if len(c) else np.nan for c in own]
+    )
 
 
 def _chosen(found: list[Estimate], is_smoothed: bool) -> Estimate | None:
@@ -227,11 +307,17 @@ def _chosen(found: list[Estimate], is_smoothed: bool) -> Estimate | None:
     never below rounding, nor below noise of rows if repeats are ``is_smoothed``."""
     by = {e.method: e for e in found}
     surer, other = by.get("rest"), by.get("residue")
-    if surer is None or (other is not None and other.high - other.low < surer.high - surer.low):
+    if surer is None or (
+        other is not None and other.high - other.low < surer.high - surer.low
+    ):
         surer, other = other, surer
     if surer is not None and other is not None and other.low > surer.high:
         surer = other
-    own = [by["repeats"]] if "repeats" in by else [e for e in (surer, by.get("cycles")) if e is not None]
+    own = (
+        [by["repeats"]]
+        if "repeats" in by
+        else [e for e in (surer, by.get("cycles")) if e is not None]
+    )
     own += [surer] if is_smoothed and surer is not None else []
     own += [by["quantisation"]] if "quantisation" in by else []
     return max(own, key=lambda e: e.value, default=None)
@@ -253,14 +339,21 @@ class _Blocks:
 
 def _repeat_blocks(rate_hz: float, name: str, laid: Overlay, kind: Kind) -> _Blocks:
     rows = _block_rows(rate_hz)
-    squares = _mean_squares(without_beginning(laid.difference[kind], rate_hz), rows) / laid.noise_gain
+    squares = (
+        _mean_squares(without_beginning(laid.difference[kind], rate_hz), rows)
+        / laid.noise_gain
+    )
     return _Blocks(squares, rows, float(rows), name)
 
 
 def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
     rows, values = _block_rows(m.rate_hz), _values(m, kind)
     found = cycles(m)
-    squares = np.empty((0, values.shape[1])) if found is None else _mean_squares(found.difference(values), rows) / 2.0
+    squares = (
+        np.empty((0, values.shape[1]))
+        if found is None
+        else _mean_squares(found.difference(values), rows) / 2.0
+    )
     return _Blocks(squares, rows, float(rows))
 
 
@@ -274,7 +367,9 @@ def without_beginning(difference: np.ndarray, rate_hz: float) -> np.ndarray:
     measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
     usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
     blocks = np.logical_and.accumulate(squares > usual, axis=0).sum(axis=0)
-    return np.where(np.arange(len(difference))[:, None] < rows * blocks, np.nan, difference)
+    return np.where(
+        np.arange(len(difference))[:, None] < rows * blocks, np.nan, difference
+    )
 
 
 def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -293,10 +388,15 @@ def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
 
 def rest_stretches(m: Measurement) -> list[tuple[int, int]]:
     """[first, end) rows of every interval in which all commands rest, from 1.5 s (``SETTLE_S``) after the last motion on."""
-    changed = np.flatnonzero(np.any(np.abs(np.diff(m.target, axis=0)) > REST_TARGET, axis=1)) + 1
+    changed = (
+        np.flatnonzero(np.any(np.abs(np.diff(m.target, axis=0)) > REST_TARGET, axis=1))
+        + 1
+    )
     settle = round(SETTLE_S / m.period_s)
     begins, ends = [0, *(changed + settle).tolist()], [*changed.tolist(), m.num_rows]
-    return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]
+    return [
+        (begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin
+    ]
 
 
 def _residue_blocks(m: Measurement, kind: Kind) -> _Blocks:
@@ -314,11 +414,15 @@ def _smooth_blocks(values: np.ndarray, rate_hz: float) -> _Blocks:
     half = WINDOW // 2
     if len(values) < WINDOW + rows:
         return _Blocks(np.empty((0, values.shape[1])), rows, 1.0)
-    residue = (values - savgol_filter(values, WINDOW, ORDER, axis=0, mode="nearest"))[half:-half]
+    residue = (values - savgol_filter(values, WINDOW, ORDER, axis=0, mode="nearest"))[
+        half:-half
+    ]
     kernel = -savgol_coeffs(WINDOW, ORDER)
     kernel[half] += 1.0
     correlation = np.convolve(kernel, kernel[::-1])
-    passed = float(correlation[WINDOW - 1])  # 1 − h₀: the share of white noise that the residue keeps
+    passed = float(
+        correlation[WINDOW - 1]
+    )  # 1 − h₀: the share of white noise that the residue keeps
     freedom = rows * passed**2 / float((correlation**2).sum())
     return _Blocks(_mean_squares(residue, rows) / passed, rows, freedom)
 
@@ -330,9 +434,17 @@ def motion_hz(m: Measurement) -> np.ndarray:
     frequency = np.fft.rfftfreq(m.num_rows, m.period_s)
     for j in np.flatnonzero(np.ptp(m.target, axis=0) > MOVING):
         known = np.isfinite(m.measured[:, j])
-        x = np.interp(m.time_s, m.time_s[known], m.measured[known, j]) if known.any() else np.zeros(m.num_rows)
+        x = (
+            np.interp(m.time_s, m.time_s[known], m.measured[known, j])
+            if known.any()
+            else np.zeros(m.num_rows)
+        )
         power = np.cumsum(np.abs(np.fft.rfft((x - x.mean()) * window)) ** 2)
-        found[j] = frequency[int(np.searchsorted(power, MOTION_POWER * power[-1]))] if power[-1] > 0 else 0.0
+        found[j] = (
+            frequency[int(np.searchsorted(power, MOTION_POWER * power[-1]))]
+            if power[-1] > 0
+            else 0.0
+        )
     return found
 
 
@@ -346,10 +458,16 @@ def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
     squares = values[: count * rows].reshape(count, rows, values.shape[1]) ** 2
     known = np.isfinite(squares)
     enough = known.mean(axis=1) >= 0.5  # lost rows leave gaps everywhere
-    return np.where(enough, np.where(known, squares, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
+    return np.where(
+        enough,
+        np.where(known, squares, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1),
+        np.nan,
+    )
 
 
-def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kind) -> list[Estimate | None]:
+def _estimate(
+    method: Method, blocks: list[_Blocks], num_signals: int, kind: Kind
+) -> list[Estimate | None]:
     """One estimate per signal over the blocks of all recordings; None where there are none."""
     blocks = [b for b in blocks if len(b.mean_squares)]
     if not blocks:
@@ -357,12 +475,20 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
     rows, freedom = min(b.rows for b in blocks), min(b.freedom for b in blocks)
     found: list[Estimate | None] = []
     for j in range(num_signals):
-        parts = [(b.name, own[np.isfinite(own)]) for b in blocks for own in (b.mean_squares[:, j],)]
+        parts = [
+            (b.name, own[np.isfinite(own)])
+            for b in blocks
+            for own in (b.mean_squares[:, j],)
+        ]
         parts = [part for part in parts if len(part[1])]
         if not parts:
             found.append(None)
             continue
-        odd = _odd({name: float(np.median(own)) for name, own in parts}) if method == "repeats" else {}
+        odd = (
+            _odd({name: float(np.median(own)) for name, own in parts})
+            if method == "repeats"
+            else {}
+        )
         own = np.concatenate([own for name, own in parts if name not in odd])
         # Repeats in the mean (unless positions differ in bursts): what happens once belongs to it, and the noise of an effort
         # grows with the motion. The others in the median: a stretch that
@@ -370,20 +496,36 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
         repeated = method in ("repeats", "cycles")
         bursts = repeated and kind == "position" and _in_bursts(own, freedom)
         robust = not repeated or bursts
-        square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
+        square = (
+            float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
+        )
         spread = _log_spread(own, freedom, robust=robust)
         value = math.sqrt(square)
         pairs = (len(parts) - len(odd)) * (method == "repeats")
         ends = value / spread, value * spread
-        found.append(Estimate(method, value, *ends, len(own) * rows, bursts, (*odd.items(),), pairs))
+        found.append(
+            Estimate(
+                method, value, *ends, len(own) * rows, bursts, (*odd.items(),), pairs
+            )
+        )
     return found
 
 
 def _odd(squares: dict[str, float]) -> dict[str, float]:
     """Repeats that differ over ``ODD`` times as much as the others: name → ratio. ``squares``: name → typical difference²."""
-    others = {name: [square for other, square in squares.items() if other != name] or [math.inf] for name in squares}
-    ratios = {name: (own, float(np.median(others[name]))) for name, own in squares.items()}
-    return {name: math.sqrt(own / usual) for name, (own, usual) in ratios.items() if own > ODD**2 * usual > 0.0}
+    others = {
+        name: [square for other, square in squares.items() if other != name]
+        or [math.inf]
+        for name in squares
+    }
+    ratios = {
+        name: (own, float(np.median(others[name]))) for name, own in squares.items()
+    }
+    return {
+        name: math.sqrt(own / usual)
+        for name, (own, usual) in ratios.items()
+        if own > ODD**2 * usual > 0.0
+    }
 
 
 def _in_bursts(squares: np.ndarray, freedom: float) -> bool:
@@ -391,7 +533,10 @@ def _in_bursts(squares: np.ndarray, freedom: float) -> bool:
     ordered = np.sort(squares)[::-1]
     few = math.ceil(BURST_SHARE * len(ordered))
     usual = float(_median(squares[:, None], freedom)[0])
-    return bool(ordered[:few].sum() > BURST_POWER * ordered.sum() and ordered.mean() > BURST_RATIO**2 * usual)
+    return bool(
+        ordered[:few].sum() > BURST_POWER * ordered.sum()
+        and ordered.mean() > BURST_RATIO**2 * usual
+    )
 
 
 def _median(squares: np.ndarray, freedom: float) -> np.ndarray:
@@ -405,7 +550,11 @@ def _log_spread(squares: np.ndarray, freedom: float, *, robust: bool) -> float:
     count = len(squares)
     if count > 1 and (squares > 0).all():
         log = np.log(squares)
-        spread = 1.4826 * np.median(np.abs(log - np.median(log))) if robust else squares.std() / squares.mean()
+        spread = (
+            1.4826 * np.median(np.abs(log - np.median(log)))
+            if robust
+            else squares.std() / squares.mean()
+        )
     else:
         spread = least
     # a median scatters √(π/2) times as much

@@ -13,7 +13,9 @@ from taccorl.alignment.measurements.motions import RATE_HZ
 
 RADIUS_M = {"sphere": 0.012, "rod": 0.008}  # Shape of the object → its radius [m]
 ROD_LENGTH_M = 0.04  # Length of the rod [m]
-AWAY_M = -1e-3  # Penetration while nothing is pressed [m]: a distance of a millimetre at each pad
+AWAY_M = (
+    -1e-3
+)  # Penetration while nothing is pressed [m]: a distance of a millimetre at each pad
 FRAME_S = 0.01  # Time between two frames of the pads [s]
 REST_S = 2.5  # Rest before and after the presses of pads [s]
 SMOOTH_ROWS = 13  # Number of rows over which corners are rounded (65 ms), because fingers have inertia
@@ -23,13 +25,21 @@ Knots = tuple[tuple[float, float], ...]
 
 
 def in_turn(
-    *each: tuple[float, float, float], rest_s: float, away: float = 0.0, before_s: float, after_s: float = 0.0
+    *each: tuple[float, float, float],
+    rest_s: float,
+    away: float = 0.0,
+    before_s: float,
+    after_s: float = 0.0,
 ) -> Knots:
     """Presses one after the other: (size, seconds of loading and unloading, seconds of hold), with ``rest_s`` at the size
     ``away`` after each; before the first one ``before_s``, after the last one ``after_s`` more."""
     knots, now = [(0.0, away), (before_s, away)], before_s
     for size, ramp_s, hold_s in each:
-        knots += [(now + ramp_s, size), (now + ramp_s + hold_s, size), (now + 2 * ramp_s + hold_s, away)]
+        knots += [
+            (now + ramp_s, size),
+            (now + ramp_s + hold_s, size),
+            (now + 2 * ramp_s + hold_s, away),
+        ]
         now += 2 * ramp_s + hold_s + rest_s
         knots.append((now, away))
     return (*knots, (now + after_s, away)) if after_s else tuple(knots)
@@ -47,7 +57,9 @@ def pad_presses(
     """Corners of presses to each of ``depths_m`` [m] within each of ``rises_s`` [s], each held for ``hold_s`` [s]. ``before_s``,
     ``between_s``, ``after_s``: rest before the first press, between two, after the last [s]."""
     each = ((depth, rise, hold_s) for depth in depths_m for rise in rises_s)
-    return in_turn(*each, rest_s=between_s, away=AWAY_M, before_s=before_s, after_s=after_s)
+    return in_turn(
+        *each, rest_s=between_s, away=AWAY_M, before_s=before_s, after_s=after_s
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,21 +75,43 @@ class Press:
     along x."""
     wiggle_m: float = 0.0
     """Amplitude a of a vibration that is added to the penetration [m]: a sin(2π · 2.3 Hz t) + 0.6 a sin(2π · 5.1 Hz t)."""
-    repeat_of: str | None = None  # Name of the press that it repeats; None if it is no repeat
+    repeat_of: str | None = (
+        None  # Name of the press that it repeats; None if it is no repeat
+    )
 
     def pressed(self, arm: str) -> PressedNote:
         """Entry ``pressed`` of measurements.yaml for the press."""
-        place = {"arm": arm, "radius_m": RADIUS_M[self.shape], "position_m": (self.x_m, 0.0, self.z_m)}
+        place = {
+            "arm": arm,
+            "radius_m": RADIUS_M[self.shape],
+            "position_m": (self.x_m, 0.0, self.z_m),
+        }
         if self.shape == "sphere":
             return PressedNote(shape="sphere", **place)
-        return PressedNote(shape="rod", length_m=ROD_LENGTH_M, rpy_rad=(0.0, round(math.pi / 2, 4), 0.0), **place)
+        return PressedNote(
+            shape="rod",
+            length_m=ROD_LENGTH_M,
+            rpy_rad=(0.0, round(math.pi / 2, 4), 0.0),
+            **place,
+        )
 
-    def penetration_m(self, rate_hz: float = RATE_HZ, smooth_rows: int = SMOOTH_ROWS) -> np.ndarray:
+    def penetration_m(
+        self, rate_hz: float = RATE_HZ, smooth_rows: int = SMOOTH_ROWS
+    ) -> np.ndarray:
         """Penetration (T,) into each pad at ``rate_hz`` [m], with corners rounded over ``smooth_rows``; negative values are
         distances to the pad."""
         time_s, depth_m = np.array(self.knots).T
-        at_s = np.arange(-(smooth_rows // 2), round(time_s[-1] * rate_hz) + smooth_rows // 2) / rate_hz
-        depth = np.convolve(np.interp(at_s, time_s, depth_m), np.ones(smooth_rows) / smooth_rows, mode="valid")
+        at_s = (
+            np.arange(
+                -(smooth_rows // 2), round(time_s[-1] * rate_hz) + smooth_rows // 2
+            )
+            / rate_hz
+        )
+        depth = np.convolve(
+            np.interp(at_s, time_s, depth_m),
+            np.ones(smooth_rows) / smooth_rows,
+            mode="valid",
+        )
         angle = 2 * np.pi * np.arange(len(depth)) / rate_hz
         return depth + self.wiggle_m * (np.sin(2.3 * angle) + 0.6 * np.sin(5.1 * angle))
 

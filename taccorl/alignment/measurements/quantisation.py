@@ -28,8 +28,16 @@ def find_quantum(values: np.ndarray) -> float:
     if len(steps) == 0 or (len(steps) < MANY and len(values) < REPEATS * len(levels)):
         return 0.0
     quantum = float(steps.min())
-    near = steps[steps < 10 * quantum]  # where a rounded multiple is sure before the step is known well
+    near = steps[
+        steps < 10 * quantum
+    ]  # where a rounded multiple is sure before the step is known well
     quantum = float(near.sum() / np.round(near / quantum).sum())
     counts = np.round(steps / quantum)
     quantum = float(steps.sum() / counts.sum())
-    return quantum if (np.abs(steps / quantum - counts) < SAME * np.maximum(1.0, counts * 1e-3)).all() else 0.0
+    return (
+        quantum
+        if (
+            np.abs(steps / quantum - counts) < SAME * np.maximum(1.0, counts * 1e-3)
+        ).all()
+        else 0.0
+    )

@@ -15,7 +15,9 @@ from taccorl.errors import TaccorlError
 SAME_SHARE = 0.01
 """Largest difference of the commands, after alignment, as a share of the motion, for recordings of one motion."""
 SAME_QUANTA = 1e-4  # Difference of commands that is always accepted [rad, m]: rounding
-COMMON_SHARE = 0.5  # Least common part of the motion, as a share of the shorter recording's motion
+COMMON_SHARE = (
+    0.5  # Least common part of the motion, as a share of the shorter recording's motion
+)
 AFTER_S = 0.5  # The motion lasts from its first command to so long after its last [s]
 
 
@@ -32,46 +34,68 @@ class Overlay:
     between rows."""
 
 
-def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SHARE) -> Overlay:
+def overlay(
+    first: Measurement, second: Measurement, same_share: float = SAME_SHARE
+) -> Overlay:
     """Align ``second`` with ``first``: the time shift is that of the best agreement of their commands, to a fraction of a row.
     ``same_share``: largest difference of the aligned commands, as a share of the motion; larger for loads, which are measured and
     not commanded. Raises TaccorlError: the signals or the commands differ."""
     no_repeat = f"{second.name} does not repeat {first.name}"
     if first.signals != second.signals:
         two = f"{second.name} and {first.name}"
-        raise TaccorlError(f"{two} have different signals, so that one cannot repeat the other")
+        raise TaccorlError(
+            f"{two} have different signals, so that one cannot repeat the other"
+        )
     for what in Stated.names():
         one, other = getattr(first, what), getattr(second, what)
-        silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
+        silent = what in ("kp", "kd") and not (
+            one and other
+        )  # nobody wrote them down: not known to differ
         if one != other and not silent:
             values = f"{what} is {other or 'as usual'} in the latter and {one or 'as usual'} in the former"
             raise TaccorlError(f"{no_repeat}: {values}; correct repeat_of")
     if [m.torque_ff.any() for m in (first, second)] in ([True, False], [False, True]):
-        raise TaccorlError(f"{no_repeat}: only one of them commands a torque_ff; correct repeat_of")
+        raise TaccorlError(
+            f"{no_repeat}: only one of them commands a torque_ff; correct repeat_of"
+        )
     a, b = (m.resampled(rate_hz := first.rate_hz) for m in (first, second))
     scale = np.maximum(np.ptp(a.target, axis=0), 1e-9)
     lag = _lag(a.target / scale, b.target / scale)
     share, lag = _refine(a.target, b.target, lag)
     rows, start = _common(a.num_rows, b.num_rows, lag)
     target = _shifted(b.target, start, share, len(rows)) - a.target[rows]
-    moving, whole = _moving(a.target[rows], round(AFTER_S * rate_hz)), _moving(a.target, 0).sum()
+    moving, whole = (
+        _moving(a.target[rows], round(AFTER_S * rate_hz)),
+        _moving(a.target, 0).sum(),
+    )
     rms = float(np.sqrt(np.mean(target[moving] ** 2))) if moving.any() else 0.0
     motion = float(np.sqrt(np.mean(np.var(a.target, axis=0))))
     speed = rate_hz * np.linalg.norm(np.diff(a.target, axis=0)) / np.sqrt(a.target.size)
-    jitter_s = max(np.median(np.abs(np.diff(m.time_s) - m.period_s)) for m in (first, second))  # that of their stamps
+    jitter_s = max(
+        np.median(np.abs(np.diff(m.time_s) - m.period_s)) for m in (first, second)
+    )  # that of their stamps
     alike = max(same_share * motion, SAME_QUANTA, 2.0 * jitter_s * speed)
     if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > alike:
-        loop = "; torques of an outer loop never repeat: then remove it" * ("torque" in first.target_kinds)
+        loop = "; torques of an outer loop never repeat: then remove it" * (
+            "torque" in first.target_kinds
+        )
         raise TaccorlError(
             f"{no_repeat}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
             f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice{loop}"
         )
     weights = _weights(share)
     columns = {"position": "measured", "velocity": "velocity", "effort": "effort"}
-    both = {kind: (getattr(a, name), getattr(b, name)) for kind, name in columns.items()}
-    difference = {k: (_shifted(y, start, share, len(rows)) - x[rows])[moving] for k, (x, y) in both.items()}
+    both = {
+        kind: (getattr(a, name), getattr(b, name)) for kind, name in columns.items()
+    }
+    difference = {
+        k: (_shifted(y, start, share, len(rows)) - x[rows])[moving]
+        for k, (x, y) in both.items()
+    }
     shift_s = (lag + share) / rate_hz - first.time_s[0] + second.time_s[0]
-    return Overlay(shift_s, difference, a.time_s[rows][moving], 1.0 + float((weights**2).sum()))
+    return Overlay(
+        shift_s, difference, a.time_s[rows][moving], 1.0 + float((weights**2).sum())
+    )
 
 
 def _lag(a: np.ndarray, b: np.ndarray) -> int:
@@ -89,7 +113,11 @@ def _refine(a: np.ndarray, b: np.ndarray, lag: int) -> tuple[float, int]:
     costs = []
     for k in (lag - 1, lag, lag + 1):
         rows, start = _common(len(a), len(b), k)
-        costs.append(float(np.mean((b[start : start + len(rows)] - a[rows]) ** 2)) if len(rows) else np.inf)
+        costs.append(
+            float(np.mean((b[start : start + len(rows)] - a[rows]) ** 2))
+            if len(rows)
+            else np.inf
+        )
     before, at, after = costs
     bend = before - 2 * at + after
     part = 0.5 * (before - after) / bend if np.isfinite(bend) and bend > 0 else 0.0
@@ -158,23 +186,38 @@ def cycles(m: Measurement) -> Cycles | None:
     that state a velocity or a torque have no cycles: from them positions drift.
     """
     period_s = np.diff(m.time_s)
-    if m.num_rows < 4 or m.command_s.size or any(kind != "position" for kind in m.target_kinds):
+    if (
+        m.num_rows < 4
+        or m.command_s.size
+        or any(kind != "position" for kind in m.target_kinds)
+    ):
         return None
     if np.ptp(period_s) > EVEN * float(np.median(period_s)):
         return None
-    columns = np.nan_to_num(np.column_stack([m.target, *(getattr(m, name) for name in m.extra_columns)]))
+    columns = np.nan_to_num(
+        np.column_stack([m.target, *(getattr(m, name) for name in m.extra_columns)])
+    )
     span = np.ptp(columns, axis=0)
     columns = columns[:, span > 0.0] / span[span > 0.0]
     if columns.shape[1] == 0:
         return None
     third = m.num_rows // 3
-    at = third + int(np.argmax(np.abs(np.diff(columns[third : 2 * third + 1], axis=0)).max(axis=1)))
+    at = third + int(
+        np.argmax(np.abs(np.diff(columns[third : 2 * third + 1], axis=0)).max(axis=1))
+    )
     alike = (np.abs(columns - columns[at]) <= SAME).all(axis=1)
-    alike = np.flatnonzero(alike[:-1] & (np.abs(columns[1:] - columns[at + 1]) <= SAME).all(axis=1))
+    alike = np.flatnonzero(
+        alike[:-1] & (np.abs(columns[1:] - columns[at + 1]) <= SAME).all(axis=1)
+    )
     periods = np.unique(np.abs(alike - at))
     for period in periods[(periods > 0) & (periods <= third)][:MOST_PERIODS].tolist():
-        same = np.asarray((np.abs(columns[period:] - columns[:-period]) <= SAME).all(axis=1))
+        same = np.asarray(
+            (np.abs(columns[period:] - columns[:-period]) <= SAME).all(axis=1)
+        )
         first, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
-        if end - first >= 2 * period and (np.ptp(columns[first:end], axis=0) >= MOVES).all():
+        if (
+            end - first >= 2 * period
+            and (np.ptp(columns[first:end], axis=0) >= MOVES).all()
+        ):
             return Cycles(period, first + period, end)
     return None

@@ -22,7 +22,11 @@ from taccorl.errors import RecordingError, TaccorlError, nearest
 SUFFIXES = (".csv", ".parquet", ".mat")  # Suffixes of the files that are read as tables
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 """Name of a separator in a columns file → the character in CSV files."""
-MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
 """First bytes of a CSV file that state its encoding (byte order marks) → that encoding, for Python's codecs."""
 LONGEST_LINE = 1000  # Most characters of a line that states an origin
 _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
@@ -33,10 +37,15 @@ _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S
 class EmptyColumns(RecordingError):
     """Columns of a file in which no row holds a number."""
 
-    def __init__(self, files: Mapping[tuple[str, ...], Sequence[object]], folder: str = "") -> None:
+    def __init__(
+        self, files: Mapping[tuple[str, ...], Sequence[object]], folder: str = ""
+    ) -> None:
         """``files``: empty columns → files that have them."""
         self.columns = next(iter(files))
-        every = "; ".join(f"{', '.join(map(str, of))}: column {', '.join(map(repr, own))}" for own, of in files.items())
+        every = "; ".join(
+            f"{', '.join(map(str, of))}: column {', '.join(map(repr, own))}"
+            for own, of in files.items()
+        )
         way_out = "leave the column out of the file, and its line out of a columns file"
         super().__init__(f"{folder}{every}: no row holds a number: {way_out}")
 
@@ -46,7 +55,9 @@ class FileForm:
     """Keys of a columns file: how the table files are written (separator, decimal sign, encoding), and what made them."""
 
     separator: str = "comma"  # Separator of CSV files: comma, semicolon, tab or space; several spaces count as one
-    decimal: Literal["point", "comma"] = "point"  # Decimal sign of the numbers in CSV files
+    decimal: Literal["point", "comma"] = (
+        "point"  # Decimal sign of the numbers in CSV files
+    )
     encoding: str = "utf-8"
     """Encoding of CSV files without a byte order mark, such as ``latin-1`` or ``utf-16-le``; a mark states its own."""
     domain: Domain | None = None
@@ -56,12 +67,17 @@ class FileForm:
     def check(self, document: Document[Any]) -> None:
         """Raises SpecError: the separator or the encoding is unknown. ``document``: the columns file, which messages name."""
         if self.separator not in SEPARATORS:
-            raise document.error("separator", f"{self.separator!r}; {nearest(self.separator, SEPARATORS)}")
+            raise document.error(
+                "separator",
+                f"{self.separator!r}; {nearest(self.separator, SEPARATORS)}",
+            )
         try:
             "".encode(self.encoding)
         except LookupError as error:
             known = ("utf-8", "latin-1", "cp1252", "utf-16-le", "utf-16-be")
-            text = f"{self.encoding!r} is not an encoding; {nearest(self.encoding, known)}"
+            text = (
+                f"{self.encoding!r} is not an encoding; {nearest(self.encoding, known)}"
+            )
             raise document.error("encoding", text) from error
 
 
@@ -74,10 +90,16 @@ def read_columns(
     occurs twice, or a cell is empty or not a number; the message names file, line and column."""
     if path.suffix == ".mat":
         return _read_mat(path, choose)
-    return _read_parquet(path, choose) if path.suffix == ".parquet" else _read_csv(path, choose, spec)
+    return (
+        _read_parquet(path, choose)
+        if path.suffix == ".parquet"
+        else _read_csv(path, choose, spec)
+    )
 
 
-def _chosen(path: Path, header: list[str], choose: Callable[[list[str]], list[str]]) -> list[str]:
+def _chosen(
+    path: Path, header: list[str], choose: Callable[[list[str]], list[str]]
+) -> list[str]:
     """Columns to read, each of which must be there once."""
     twice = sorted({h for h in header if header.count(h) > 1})
     wanted = choose(header)
@@ -111,7 +133,10 @@ def _encoding(path: Path, spec: FileForm | None) -> str:
     mark the one under ``encoding:`` of the columns file; without both UTF-8."""
     with path.open("rb") as file:
         start = file.read(3)
-    return next((name for mark, name in MARKS.items() if start.startswith(mark)), spec.encoding if spec else "utf-8")
+    return next(
+        (name for mark, name in MARKS.items() if start.startswith(mark)),
+        spec.encoding if spec else "utf-8",
+    )
 
 
 def _stated(path: Path, encoding: str) -> list[tuple[str, str]]:
@@ -134,7 +159,11 @@ def _read_csv(
         with path.open(newline="", encoding=encoding) as file:
             for _ in range(first):
                 next(file)
-            lines = (" ".join(line.split()) for line in file) if separator == "space" else file
+            lines = (
+                (" ".join(line.split()) for line in file)
+                if separator == "space"
+                else file
+            )
             rows = csv.reader(lines, delimiter=SEPARATORS[separator], strict=True)
             header = [cell.strip() for cell in next(rows, [])]
             if not header:
@@ -144,7 +173,14 @@ def _read_csv(
                     f"{path}:{first + 1}: has bytes of 0, as UTF-16 without a byte order mark; write `encoding: utf-16-le` (or "
                     "utf-16-be) in a columns file, or save it as UTF-8"
                 )
-            other = next((word for word, sign in SEPARATORS.items() if len(header) == 1 and sign in header[0]), None)
+            other = next(
+                (
+                    word
+                    for word, sign in SEPARATORS.items()
+                    if len(header) == 1 and sign in header[0]
+                ),
+                None,
+            )
             if other:
                 raise RecordingError(
                     f"{path}: its columns are separated by {other}; write `separator: {other}` in a columns file"
@@ -166,12 +202,28 @@ def _read_csv(
                         f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}{hint}"
                     )
                 try:
-                    found.append([_number(row[k], path, first + rows.line_num, header[k], decimal) for k in at])
+                    found.append(
+                        [
+                            _number(
+                                row[k], path, first + rows.line_num, header[k], decimal
+                            )
+                            for k in at
+                        ]
+                    )
                 except RecordingError:
-                    left = [] if found else [row, *rows]  # a column with a number in the first row is not empty
-                    full = {k for r in left for k in at if k < len(r) and _is_number(r[k].replace(",", "."))}
+                    left = (
+                        [] if found else [row, *rows]
+                    )  # a column with a number in the first row is not empty
+                    full = {
+                        k
+                        for r in left
+                        for k in at
+                        if k < len(r) and _is_number(r[k].replace(",", "."))
+                    }
                     if left and len(full) < len(at):
-                        raise EmptyColumns({tuple(header[k] for k in at if k not in full): [path]}) from None
+                        raise EmptyColumns(
+                            {tuple(header[k] for k in at if k not in full): [path]}
+                        ) from None
                     bad = [k for k in at if not _is_number(row[k].replace(",", "."))]
                     if found and bad == [len(header) - 1] and next(rows, None) is None:
                         last = f"{path}:{first + rows.line_num}: the last row ends at column {header[-1]!r}"
@@ -181,7 +233,11 @@ def _read_csv(
         raise _undecodable(path, encoding, str(error)) from error
     except (OSError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
-    return header, dict(zip(wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True))
+    return header, dict(
+        zip(
+            wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True
+        )
+    )
 
 
 def _undecodable(path: Path, encoding: str, what: str) -> RecordingError:
@@ -198,7 +254,9 @@ def _undecodable(path: Path, encoding: str, what: str) -> RecordingError:
     )
 
 
-def _number(cell: str, path: Path, line: int, column: str, decimal: str = "point") -> float:
+def _number(
+    cell: str, path: Path, line: int, column: str, decimal: str = "point"
+) -> float:
     """The number in a cell. Raises RecordingError: it is none, is not finite, or has the other decimal sign."""
     own = cell.strip()
     if decimal == "comma" and "." in own:
@@ -210,11 +268,17 @@ def _number(cell: str, path: Path, line: int, column: str, decimal: str = "point
         value = float(own.replace(",", ".") if decimal == "comma" else own)
     except ValueError:
         comma = "," in own and _is_number(own.replace(",", "."))
-        way = "write `decimal: comma` in a columns file" if comma else "correct the cell, or leave the row out"
+        way = (
+            "write `decimal: comma` in a columns file"
+            if comma
+            else "correct the cell, or leave the row out"
+        )
         what = f"{cell!r} is no number; {way}" if own else "is empty; leave the row out"
         raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
     if not math.isfinite(value):
-        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; {_CUT}")
+        raise RecordingError(
+            f"{path}:{line}: column {column!r}: {cell} is not finite; {_CUT}"
+        )
     return value
 
 
@@ -225,19 +289,29 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
+def _read_parquet(
+    path: Path, choose: Callable[[list[str]], list[str]]
+) -> tuple[list[str], dict[str, np.ndarray]]:
     try:
         header = list(pq.read_schema(path).names)
         wanted = _chosen(path, header, choose)
         table = pq.read_table(path, columns=wanted)
     except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{path}: cannot be read as parquet: {' '.join(str(error).split())}") from error
+        raise RecordingError(
+            f"{path}: cannot be read as parquet: {' '.join(str(error).split())}"
+        ) from error
     columns = {}
     for name in wanted:
         column = table[name]
         if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-            hint = "; of a LeRobot dataset give the folder" if pa.types.is_fixed_size_list(column.type) else ""
-            raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers{hint}")
+            hint = (
+                "; of a LeRobot dataset give the folder"
+                if pa.types.is_fixed_size_list(column.type)
+                else ""
+            )
+            raise RecordingError(
+                f"{path}: column {name!r} holds {column.type}, not numbers{hint}"
+            )
         columns[name] = np.asarray(column.to_numpy(), dtype=float)
     _check_numbers(path, columns)
     return header, columns
@@ -245,7 +319,11 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
 
 def _check_numbers(path: Path, columns: dict[str, np.ndarray]) -> None:
     """Raise if a column has numbers that are not finite: RecordingError, of those without any EmptyColumns."""
-    bad = {name: rows for name, values in columns.items() if len(rows := np.flatnonzero(~np.isfinite(values)))}
+    bad = {
+        name: rows
+        for name, values in columns.items()
+        if len(rows := np.flatnonzero(~np.isfinite(values)))
+    }
     if empty := [name for name, rows in bad.items() if len(rows) == len(columns[name])]:
         raise EmptyColumns({tuple(empty): [path]})
     for name, rows in bad.items():
@@ -253,18 +331,27 @@ def _check_numbers(path: Path, columns: dict[str, np.ndarray]) -> None:
         raise RecordingError(f"{path}: column {name!r}: {what}; {_CUT}")
 
 
-def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
+def _read_mat(
+    path: Path, choose: Callable[[list[str]], list[str]]
+) -> tuple[list[str], dict[str, np.ndarray]]:
     """Variables of a MATLAB file up to version 7 that are vectors of numbers."""
     try:
         content = scipy.io.loadmat(path)
-    except (OSError, ValueError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
+    except (
+        OSError,
+        ValueError,
+        NotImplementedError,
+        scipy.io.matlab.MatReadError,
+    ) as error:
         raise RecordingError(
             f"{path}: cannot be read as a MATLAB file up to version 7: {' '.join(str(error).split())}"
         ) from error
     vectors = {
         name: np.asarray(value, dtype=float).ravel()
         for name, value in content.items()
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.size == max(value.shape, default=0) > 1
+        if isinstance(value, np.ndarray)
+        and value.dtype.kind in "fiu"
+        and value.size == max(value.shape, default=0) > 1
     }
     wanted = _chosen(path, list(vectors), choose)
     lengths = {name: len(vectors[name]) for name in wanted}

@@ -36,34 +36,95 @@ import numpy as np
 from taccorl.alignment.measurements.even_rows import even_rows
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, unit_of
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.table_files import SUFFIXES, FileForm, read_columns, table_origin
+from taccorl.alignment.measurements.table_files import (
+    SUFFIXES,
+    FileForm,
+    read_columns,
+    table_origin,
+)
 from taccorl.data.origin import Origin
 from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, nearest
 from taccorl.robots import ROBOT
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
-TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}  # Unit of time → seconds
-POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
-POSITION |= {"rev": ("rad", _TURN), "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3)}
+TIME_S = {
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "ns": 1e-9,
+    "min": 60.0,
+}  # Unit of time → seconds
+POSITION = {
+    "rad": ("rad", 1.0),
+    "mrad": ("rad", 1e-3),
+    "deg": ("rad", _DEG),
+    "mdeg": ("rad", 1e-3 * _DEG),
+}
+POSITION |= {
+    "rev": ("rad", _TURN),
+    "m": ("m", 1.0),
+    "cm": ("m", 1e-2),
+    "mm": ("m", 1e-3),
+}
 POSITION |= {"um": ("m", 1e-6), "µm": ("m", 1e-6)}
 """Unit of a position → (rad or m, factor to it)."""
-VELOCITY = {"rad/s": ("rad", 1.0), "mrad/s": ("rad", 1e-3), "deg/s": ("rad", _DEG), "rpm": ("rad", _TURN / 60)}
-VELOCITY |= {"rev/s": ("rad", _TURN), "m/s": ("m", 1.0), "cm/s": ("m", 1e-2), "mm/s": ("m", 1e-3)}
+VELOCITY = {
+    "rad/s": ("rad", 1.0),
+    "mrad/s": ("rad", 1e-3),
+    "deg/s": ("rad", _DEG),
+    "rpm": ("rad", _TURN / 60),
+}
+VELOCITY |= {
+    "rev/s": ("rad", _TURN),
+    "m/s": ("m", 1.0),
+    "cm/s": ("m", 1e-2),
+    "mm/s": ("m", 1e-3),
+}
 """Unit of a velocity → (unit of the position that it goes with, factor to that per second)."""
-EFFORT = {"Nm": ("rad", 1.0), "N·m": ("rad", 1.0), "Ncm": ("rad", 1e-2), "Nmm": ("rad", 1e-3), "mNm": ("rad", 1e-3)}
-EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": ("m", 1e-3)}
+EFFORT = {
+    "Nm": ("rad", 1.0),
+    "N·m": ("rad", 1.0),
+    "Ncm": ("rad", 1e-2),
+    "Nmm": ("rad", 1e-3),
+    "mNm": ("rad", 1e-3),
+}
+EFFORT |= {
+    "kgcm": ("rad", 0.0980665),
+    "N": ("m", 1.0),
+    "kN": ("m", 1e3),
+    "mN": ("m", 1e-3),
+}
 """Unit of an effort → (unit of the position that it goes with, factor to N·m or N). Amperes are no effort: a torque
 constant is somebody's guess until it is written down as a column in N·m."""
-_CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
+_CONVERSIONS = {
+    "q": POSITION,
+    "q_target": POSITION,
+    "qd": VELOCITY,
+    "tau": EFFORT,
+    "load": EFFORT,
+}
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
-_CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
+_CONVERSIONS |= {
+    "torque_ff": EFFORT,
+    "supply": {"V": ("", 1.0), "mV": ("", 1e-3)},
+    "enabled": {"1": ("", 1.0)},
+}
 _TICKS = "; write `unit: rad` with `factor:` in rad a tick"
 _CURRENT = "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column"
-_HINTS: dict[str, str] = {**dict.fromkeys(("ticks", "tick", "counts", "count"), _TICKS), "A": _CURRENT, "mA": _CURRENT}
+_HINTS: dict[str, str] = {
+    **dict.fromkeys(("ticks", "tick", "counts", "count"), _TICKS),
+    "A": _CURRENT,
+    "mA": _CURRENT,
+}
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
-_KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
+_KINDS: dict[str, TargetKind] = {
+    "q_target": "position",
+    "qd_target": "velocity",
+    "tau_target": "torque",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +137,9 @@ class Column:
     """Factor from the column's numbers to ``unit``: turns per tick, N·m per mA, or −1 to reverse the sign."""
     zero: float = 0.0
     """The column's number at 0 of its quantity, such as 512 counts or a pulse of 1500 µs; subtracted before ``factor``."""
-    if_missing: float | None = None  # Value for files without the column; if not given, such a file is rejected
+    if_missing: float | None = (
+        None  # Value for files without the column; if not given, such a file is rejected
+    )
 
     def quantity(self, numbers: np.ndarray) -> np.ndarray:
         """(any shape) the quantity [``unit``] for the column's ``numbers``, of the same shape."""
@@ -98,12 +161,16 @@ class SignalColumns:
     """Columns of one signal; None for quantities that the table does not have."""
 
     q: Column  # Measured position
-    q_target: Column | None = None  # Commanded position; one of the target columns is given, or none where ``tau`` is
+    q_target: Column | None = (
+        None  # Commanded position; one of the target columns is given, or none where ``tau`` is
+    )
     qd_target: Column | None = None  # Commanded velocity
     tau_target: Column | None = None  # Commanded torque; 0 while the motor is off
     qd: Column | None = None  # Measured velocity
     tau: Column | None = None  # Effort of the motor
-    load: Column | None = None  # Known external torque, positive if it drives the joint forwards
+    load: Column | None = (
+        None  # Known external torque, positive if it drives the joint forwards
+    )
     torque_ff: Column | None = None  # Torque that the controller adds to its law
     supply: Column | None = None
     """Supply voltage of the motor (V or mV): it scales the motor's torque in law pwm; with another law it is an error."""
@@ -120,7 +187,9 @@ class ColumnsFile(FileForm):
         """Raises SpecError: a separator, text encoding or unit of time that is not supported."""
         super().check(document)
         if (unit := self.time.unit) not in TIME_S:
-            raise document.error("time/unit", f"{unit!r} is not a unit of time; {nearest(unit, TIME_S)}")
+            raise document.error(
+                "time/unit", f"{unit!r} is not a unit of time; {nearest(unit, TIME_S)}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,16 +226,32 @@ def _rules(spec: TableSpec) -> Rules:
     for name, signal in spec.signals.items():
         place, kinds = f"signals/{name}", dict[str, str]()
         num = sum(getattr(signal, key) is not None for key in TARGETS)
-        yield num > 1, place, f"has {num} targets; one of {', '.join(TARGETS)} commands it"
+        yield (
+            num > 1,
+            place,
+            f"has {num} targets; one of {', '.join(TARGETS)} commands it",
+        )
         none = "key 'q_target' is missing; or qd_target, tau_target, or tau alone for a file with law: effort"
         yield num == 0 and signal.tau is None, place, none
         for key, column in _columns_of(signal):
             known, where = _CONVERSIONS[key], f"{place}/{key}/unit"
             alike = f"{nearest(column.unit, known)}{_HINTS.get(column.unit, '')}"
-            yield column.unit not in known, where, f"{column.unit!r} is not a unit of {key}; {alike}"
-            yield not math.isfinite(column.zero), f"{place}/{key}/zero", f"{column.zero:g}; give a finite number"
+            yield (
+                column.unit not in known,
+                where,
+                f"{column.unit!r} is not a unit of {key}; {alike}",
+            )
+            yield (
+                not math.isfinite(column.zero),
+                f"{place}/{key}/zero",
+                f"{column.zero:g}; give a finite number",
+            )
             wrong = not math.isfinite(column.factor) or column.factor == 0.0
-            yield wrong, where, f"factor {column.factor:g}; give a finite number other than 0"
+            yield (
+                wrong,
+                where,
+                f"factor {column.factor:g}; give a finite number other than 0",
+            )
             if known[column.unit][0]:
                 kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
         mixed = "units of rotation and of translation are mixed; is the joint a hinge or a slide?"
@@ -174,38 +259,83 @@ def _rules(spec: TableSpec) -> Rules:
         if name in ROBOT.action_names:
             unit = unit_of(name)
             must = f"the robot's signal {name} must be in {unit} or a multiple of it, such as m{unit}"
-            yield POSITION[signal.q.unit][0] != unit, f"{place}/q/unit", f"{signal.q.unit!r}: {must}"
+            yield (
+                POSITION[signal.q.unit][0] != unit,
+                f"{place}/q/unit",
+                f"{signal.q.unit!r}: {must}",
+            )
     twice = _used_twice(spec)
     yield twice, "signals", twice
 
 
 def _used_twice(spec: TableSpec) -> str:
-    names = [c.column for c in (spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s)))]
-    return next((f"column {name!r} is used twice" for name in sorted(names) if names.count(name) > 1), "")
+    names = [
+        c.column
+        for c in (
+            spec.time,
+            *(c for s in spec.signals.values() for _, c in _columns_of(s)),
+        )
+    ]
+    return next(
+        (
+            f"column {name!r} is used twice"
+            for name in sorted(names)
+            if names.count(name) > 1
+        ),
+        "",
+    )
 
 
-def _resolved(path: Path, header: list[str], spec: TableSpec | None, units: Mapping[str, str] | None) -> TableSpec:
+def _resolved(
+    path: Path,
+    header: list[str],
+    spec: TableSpec | None,
+    units: Mapping[str, str] | None,
+) -> TableSpec:
     """``spec``, or that of taccorl's own names with its ``changes``."""
     if spec is not None and spec.signals:
         return spec
     own = _own_spec(path, header, units)
     for column, change in {} if spec is None else spec.changes.items():
         name, _, key = column.rpartition(".")
-        if name not in own.signals or (old := getattr(own.signals[name], key, None)) is None:
-            raise RecordingError(f"{path}: changes: no column {column!r}; {nearest(column, header)}")
-        new, kinds = replace(old, **{k: v for k, v in vars(change).items() if v is not None}), _CONVERSIONS[key]
+        if (
+            name not in own.signals
+            or (old := getattr(own.signals[name], key, None)) is None
+        ):
+            raise RecordingError(
+                f"{path}: changes: no column {column!r}; {nearest(column, header)}"
+            )
+        new, kinds = (
+            replace(old, **{k: v for k, v in vars(change).items() if v is not None}),
+            _CONVERSIONS[key],
+        )
         is_alike = new.unit in kinds and kinds[new.unit][0] == kinds[old.unit][0]
-        if not is_alike or not math.isfinite(new.zero) or not math.isfinite(new.factor) or new.factor == 0.0:
-            way_out = "finite numbers, and a factor other than 0" if is_alike else f"a unit of the kind of {old.unit}"
+        if (
+            not is_alike
+            or not math.isfinite(new.zero)
+            or not math.isfinite(new.factor)
+            or new.factor == 0.0
+        ):
+            way_out = (
+                "finite numbers, and a factor other than 0"
+                if is_alike
+                else f"a unit of the kind of {old.unit}"
+            )
             raise RecordingError(f"{path}: changes: {column}: {new}; give {way_out}")
         own.signals[name] = replace(own.signals[name], **{key: new})
     if twice := _used_twice(own):
-        raise RecordingError(f"{path}: changes: {twice}; state which one takes its place")
+        raise RecordingError(
+            f"{path}: changes: {twice}; state which one takes its place"
+        )
     return own if spec is None else replace(spec, signals=own.signals)
 
 
 def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
-    return [(own.name, column) for own in fields(signal) if (column := getattr(signal, own.name)) is not None]
+    return [
+        (own.name, column)
+        for own in fields(signal)
+        if (column := getattr(signal, own.name)) is not None
+    ]
 
 
 def _expected(units: Mapping[str, str]) -> str:
@@ -218,11 +348,15 @@ def _expected(units: Mapping[str, str]) -> str:
     )
 
 
-def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = None) -> TableSpec:
+def _own_spec(
+    path: Path, header: list[str], units: Mapping[str, str] | None = None
+) -> TableSpec:
     """Columns of a table with taccorl's own names. ``units``: signal of the machine → unit of its position, the PiPER's if None.
     Raises RecordingError: ``t`` or a position or a target is missing, or a column is unknown; the message names file and
     column."""
-    known = {name: unit_of(name) for name in ROBOT.action_names} if units is None else units
+    known = (
+        {name: unit_of(name) for name in ROBOT.action_names} if units is None else units
+    )
     if "t" not in header:
         has = f"it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}"
         raise RecordingError(f"{path}: no column 't' [s]; {has}. {_expected(known)}")
@@ -251,38 +385,68 @@ def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = N
                 f"{path}: {name} has several targets, {' and '.join(targets)}; keep the one that commands it, and remove the "
                 "others"
             )
-        for needed in ("q", *(["q_target"] if not targets and "tau" not in keys else [])):
+        for needed in (
+            "q",
+            *(["q_target"] if not targets and "tau" not in keys else []),
+        ):
             if needed not in keys:
-                hint = "; or give tau, for a file with law: effort" if needed == "q_target" else ""
+                hint = (
+                    "; or give tau, for a file with law: effort"
+                    if needed == "q_target"
+                    else ""
+                )
                 raise RecordingError(
                     f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}{hint}"
                 )
 
     def named(name: str, key: str) -> Column:
         unit = known[name]
-        of = {"q": unit, "q_target": unit, "qd": f"{unit}/s", "qd_target": f"{unit}/s", "supply": "V", "enabled": "1"}
-        return Column(column=f"{name}.{key}", unit=of.get(key, "Nm" if unit == "rad" else "N"))
+        of = {
+            "q": unit,
+            "q_target": unit,
+            "qd": f"{unit}/s",
+            "qd_target": f"{unit}/s",
+            "supply": "V",
+            "enabled": "1",
+        }
+        return Column(
+            column=f"{name}.{key}", unit=of.get(key, "Nm" if unit == "rad" else "N")
+        )
 
     names = sorted(parts, key=list(known).index)
-    signals = {name: SignalColumns(**{key: named(name, key) for key in parts[name]}) for name in names}
+    signals = {
+        name: SignalColumns(**{key: named(name, key) for key in parts[name]})
+        for name in names
+    }
     if not signals:
         raise RecordingError(f"{path}: it has a time column, but no signal")
     return TableSpec(time=Column(column="t", unit="s"), signals=signals)
 
 
-def read_table(path: Path, spec: TableSpec | None = None, units: Mapping[str, str] | None = None) -> Measurement:
+def read_table(
+    path: Path, spec: TableSpec | None = None, units: Mapping[str, str] | None = None
+) -> Measurement:
     """Read a CSV, parquet or MATLAB file as a measurement. Uneven rows are resampled to an even grid (``even_rows``). ``spec``:
     names and units of its columns; taccorl's own names if not given. ``units``: signal of the machine → unit of its position,
     for a table without a spec; the PiPER's if not given. Raises RecordingError: a column is missing, or a cell is empty or not
     a number; the message names file, line and column."""
     path = Path(path)
-    header, columns = read_columns(path, lambda own: wanted_columns(_resolved(path, own, spec, units), own), spec)
+    header, columns = read_columns(
+        path, lambda own: wanted_columns(_resolved(path, own, spec, units), own), spec
+    )
     spec = _resolved(path, header, spec, units)
-    return measurement_of_columns(path, columns, spec, name=path.name, origin=table_origin(path, spec))
+    return measurement_of_columns(
+        path, columns, spec, name=path.name, origin=table_origin(path, spec)
+    )
 
 
 def measurement_of_columns(
-    path: Path, columns: Mapping[str, np.ndarray], spec: TableSpec, *, name: str, origin: Origin
+    path: Path,
+    columns: Mapping[str, np.ndarray],
+    spec: TableSpec,
+    *,
+    name: str,
+    origin: Origin,
 ) -> Measurement:
     """Make a ``Measurement`` of one table read from ``path``. Uneven rows are resampled to an even grid (``even_rows``).
     ``columns``: name of each column of ``spec`` → its numbers (T,). Raises RecordingError: there are too few rows, or a motor is
@@ -302,10 +466,16 @@ def measurement_of_columns(
         for key, column in _columns_of(signal):
             if key in TARGETS:
                 kinds.append(_KINDS[key])
-            read = columns[column.column] if column.column in columns else np.full(len(time_s), column.if_missing)
+            read = (
+                columns[column.column]
+                if column.column in columns
+                else np.full(len(time_s), column.if_missing)
+            )
             numbers = column.quantity(read) * _CONVERSIONS[key][column.unit][1]
             values["q_target" if key in TARGETS else key][:, j] = numbers
-        if not any(getattr(signal, key) for key in TARGETS):  # the model is held where this was measured
+        if not any(
+            getattr(signal, key) for key in TARGETS
+        ):  # the model is held where this was measured
             kinds.append("effort")
             values["q_target"][:, j] = values["q"][:, j]
     between = ~np.isin(values["enabled"], (0.0, 1.0))
@@ -317,12 +487,20 @@ def measurement_of_columns(
         )
 
     def extra(key: str) -> np.ndarray:
-        return values[key][rows] if any(getattr(s, key) for s in spec.signals.values()) else np.empty(0)
+        return (
+            values[key][rows]
+            if any(getattr(s, key) for s in spec.signals.values())
+            else np.empty(0)
+        )
 
     late = spec.target_rows_late
     if abs(late) >= len(time_s) - 1:
-        raise RecordingError(f"{path}: target_rows_late {late} removes all {len(time_s)} rows")
-    rows = slice(max(0, -late), len(time_s) - max(0, late))  # rows for which the target in force is in the file
+        raise RecordingError(
+            f"{path}: target_rows_late {late} removes all {len(time_s)} rows"
+        )
+    rows = slice(
+        max(0, -late), len(time_s) - max(0, late)
+    )  # rows for which the target in force is in the file
     start = time_s[rows][0]
     found = Measurement(
         name=name,
@@ -349,5 +527,8 @@ def measurement_of_columns(
 
 def wanted_columns(spec: TableSpec, header: list[str]) -> list[str]:
     """Columns to read of a table with this ``header``: all of ``spec`` but those that may be missing and are."""
-    columns = [spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s))]
+    columns = [
+        spec.time,
+        *(c for s in spec.signals.values() for _, c in _columns_of(s)),
+    ]
     return [c.column for c in columns if c.if_missing is None or c.column in header]

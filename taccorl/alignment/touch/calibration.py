@@ -25,7 +25,9 @@ from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 QUANTILE = 0.999  # Share of the readings without contact that lie below λ_noise
-MIN_FRAMES = 50  # Least number of frames without contact for a noise level: half a second
+MIN_FRAMES = (
+    50  # Least number of frames without contact for a noise level: half a second
+)
 _NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
 _MIN_IN_CONTACT = 20  # frames
 _STIFFNESS_PER_M, _DAMPING_S_PER_M = (1.0, 1e6), (0.0, 1e4)
@@ -52,7 +54,9 @@ class TouchMatch:
     """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
 
     rms_count: float  # RMS difference of counts [counts], over taxels that are ever active in either
-    mask_iou: float  # Masks of active taxels: intersection over union, all frames together
+    mask_iou: (
+        float  # Masks of active taxels: intersection over union, all frames together
+    )
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,9 @@ class TouchCalibration:
     noise: NoiseLevel  # Readings without contact
     stiffness: Estimate  # k_n [reading per metre]
     damping: Estimate  # k_d [reading per m/s]
-    before: TouchMatch  # Match on the validation recordings with the twin's own k_n and k_d
+    before: (
+        TouchMatch  # Match on the validation recordings with the twin's own k_n and k_d
+    )
     after: TouchMatch  # Match on the same recordings with the fitted k_n and k_d
     fitted_to: tuple[str, ...]
     validation: tuple[str, ...]
@@ -74,31 +80,51 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
     frames last less than half a second, or the recordings are of different pads."""
     pads = _pads(motions)
     quiet = [(motion.measured, motion.undisturbed()) for motion in motions]
-    still = [[counts[:, p][rows[:, p]].astype(float) for counts, rows in quiet] for p in range(len(pads))]
+    still = [
+        [counts[:, p][rows[:, p]].astype(float) for counts, rows in quiet]
+        for p in range(len(pads))
+    ]
     frames = [np.concatenate(of_pad) for of_pad in still]
-    for short in (pad for pad, of_pad in zip(pads, frames, strict=True) if len(of_pad) < MIN_FRAMES):
+    for short in (
+        pad
+        for pad, of_pad in zip(pads, frames, strict=True)
+        if len(of_pad) < MIN_FRAMES
+    ):
         raise TaccorlError(
             f"touch calibration: pad {short} has {min(map(len, frames))} frames without contact in {_names(motions)}; record "
             "some seconds before the first touch"
         )
     means = np.array([of_pad.mean(axis=0) for of_pad in frames])
     # About the mean of each recording: baselines are taken anew for each.
-    centred = [[one - one.mean(axis=0) for one in of_pad if len(one) > 1] for of_pad in still]
+    centred = [
+        [one - one.mean(axis=0) for one in of_pad if len(one) > 1] for of_pad in still
+    ]
     rest = [max(sum(map(len, of_pad)) - len(of_pad), 1) for of_pad in centred]
-    squares = np.array([sum(np.square(one).sum(axis=0) for one in of_pad) for of_pad in centred])
+    squares = np.array(
+        [sum(np.square(one).sum(axis=0) for one in of_pad) for of_pad in centred]
+    )
     std = np.sqrt(squares / np.array(rest)[:, None, None])
     return NoiseLevel(
         pads=pads,
         mean_count=means,
         std_count=np.maximum(std, 1 / math.sqrt(12)),
-        threshold_count=float(np.quantile(np.concatenate([f.ravel() for f in frames]), QUANTILE)),
+        threshold_count=float(
+            np.quantile(np.concatenate([f.ravel() for f in frames]), QUANTILE)
+        ),
     )
 
 
-def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray], threshold_count: float) -> TouchMatch:
+def touch_match(
+    motions: Sequence[TouchMotion],
+    simulated: Sequence[np.ndarray],
+    threshold_count: float,
+) -> TouchMatch:
     """Compare measured with simulated counts; a taxel is active above ``threshold_count`` (λ_noise).
     ``simulated``: counts (T, P, R, C) for each of ``motions``."""
-    both = [(m.measured.astype(np.float32), s.astype(np.float32)) for m, s in zip(motions, simulated, strict=True)]
+    both = [
+        (m.measured.astype(np.float32), s.astype(np.float32))
+        for m, s in zip(motions, simulated, strict=True)
+    ]
     masks = [(a > threshold_count, b > threshold_count) for a, b in both]
     ever = [a.any(axis=0) | b.any(axis=0) for a, b in masks]
     union = sum(int((a | b).sum()) for a, b in masks)
@@ -107,8 +133,13 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
             f"touch: no taxel ever has a reading above λ_noise = {threshold_count:g} counts in {_names(motions)}"
         )
     differences = [(x - y)[:, of] for (x, y), of in zip(both, ever, strict=True)]
-    rms = math.sqrt(sum(float(np.square(x).sum()) for x in differences) / max(sum(x.size for x in differences), 1))
-    return TouchMatch(rms_count=rms, mask_iou=sum(int((a & b).sum()) for a, b in masks) / union)
+    rms = math.sqrt(
+        sum(float(np.square(x).sum()) for x in differences)
+        / max(sum(x.size for x in differences), 1)
+    )
+    return TouchMatch(
+        rms_count=rms, mask_iou=sum(int((a & b).sum()) for a, b in masks) / union
+    )
 
 
 def calibrate_touch(
@@ -129,14 +160,18 @@ def calibrate_touch(
         raise TaccorlError(
             f"touch calibration: {sum(in_contact)} frames in contact in {_names(fit)}; record presses of known depth"
         )
-    start = np.array([model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m])
+    start = np.array(
+        [model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m]
+    )
     scale = np.array([max(start[0], 1.0), max(start[1], 0.005 * start[0], 1e-3)])
 
     def left(x: np.ndarray) -> list[np.ndarray]:
         found = []
         for motion, of in zip(fit, taxels, strict=True):
             counts = model.counts(motion, model.simulate(motion, *(x * scale)))
-            found.append(((counts - motion.measured)[:, of] / noise.std_count[of]).astype(float))
+            found.append(
+                ((counts - motion.measured)[:, of] / noise.std_count[of]).astype(float)
+            )
         return found
 
     def stacked(x: np.ndarray) -> np.ndarray:
@@ -144,25 +179,46 @@ def calibrate_touch(
 
     def slopes(x: np.ndarray) -> np.ndarray:
         here = stacked(x)  # steps are absolute: at k_d = 0 a relative one would be none
-        return np.stack([(stacked(x + step) - here) / _STEP for step in _STEP * np.eye(2)], axis=1)
+        return np.stack(
+            [(stacked(x + step) - here) / _STEP for step in _STEP * np.eye(2)], axis=1
+        )
 
     low_x, high_x = np.array([_STIFFNESS_PER_M, _DAMPING_S_PER_M]).T / scale
     first = np.clip(start / scale, low_x, high_x)
-    solved = least_squares(stacked, first, jac=slopes, bounds=(low_x, high_x), x_scale="jac")  # pyright: ignore[reportArgumentType]
+    solved = least_squares(
+        stacked,
+        first,
+        jac=slopes,  # pyright: ignore[reportArgumentType]
+        bounds=(low_x, high_x),
+        x_scale="jac",
+    )
     curvature = np.linalg.pinv(solved.jac.T @ solved.jac)
-    layout = [Rows(np.isfinite(own), rate_of(m.time_s[:, 0])) for own, m in zip(left(solved.x), fit, strict=True)]
+    layout = [
+        Rows(np.isfinite(own), rate_of(m.time_s[:, 0]))
+        for own, m in zip(left(solved.x), fit, strict=True)
+    ]
     # If residuals of one block of time hang together in any way (sandwich).
     pulls = block_sums(solved.jac * solved.fun[:, None], layout) @ curvature
     covariance = pulls.T @ pulls * np.outer(scale, scale)
     value, std = solved.x * scale, np.sqrt(np.diag(covariance))
     low, high = value - 1.96 * std, value + 1.96 * std
     threshold = noise.threshold_count
-    simulated = [[model.counts(m, model.simulate(m, *numbers)) for m in validation] for numbers in (start, value)]
+    simulated = [
+        [model.counts(m, model.simulate(m, *numbers)) for m in validation]
+        for numbers in (start, value)
+    ]
     matches = [touch_match(validation, counts, threshold) for counts in simulated]
     return TouchCalibration(
         noise=noise,
-        stiffness=Estimate(value=float(value[0]), low=float(low[0]), high=float(high[0]), unit="1/m"),
-        damping=Estimate(value=float(value[1]), low=float(max(low[1], 0.0)), high=float(high[1]), unit="s/m"),
+        stiffness=Estimate(
+            value=float(value[0]), low=float(low[0]), high=float(high[0]), unit="1/m"
+        ),
+        damping=Estimate(
+            value=float(value[1]),
+            low=float(max(low[1], 0.0)),
+            high=float(high[1]),
+            unit="s/m",
+        ),
         before=matches[0],
         after=matches[1],
         fitted_to=tuple(m.name for m in fit),
@@ -176,9 +232,13 @@ def _trouble(status: int, value: np.ndarray, std: np.ndarray) -> str:
     if status <= 0:
         said.append("not converged: still improving when it was stopped")
     if value[0] <= 1.01 * _STIFFNESS_PER_M[0] or value[0] >= 0.99 * _STIFFNESS_PER_M[1]:
-        said.append(f"k_n is at its bound, {value[0]:g}: the taxels hardly read what depth says; check object and pose")
+        said.append(
+            f"k_n is at its bound, {value[0]:g}: the taxels hardly read what depth says; check object and pose"
+        )
     if value[1] <= std[1]:
-        said.append("k_d is no more than its error: readings come late or the presses are too slow to show it")
+        said.append(
+            "k_d is no more than its error: readings come late or the presses are too slow to show it"
+        )
     return "; ".join(said)
 
 

@@ -22,7 +22,9 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
 
-_TAXELS_AT_ONCE = 64 * ROBOT.num_taxels  # 0.4 MB: a core's cache holds what is being worked on
+_TAXELS_AT_ONCE = (
+    64 * ROBOT.num_taxels
+)  # 0.4 MB: a core's cache holds what is being worked on
 
 
 class TouchModel:
@@ -31,7 +33,9 @@ class TouchModel:
 
     def __init__(self, config: TwinConfig) -> None:
         if not isinstance(config.sensor, FlexiTacConfig):
-            raise TaccorlError(f"touch model: only FlexiTac pads are supported, not {type(config.sensor).__name__}")
+            raise TaccorlError(
+                f"touch model: only FlexiTac pads are supported, not {type(config.sensor).__name__}"
+            )
         self.sensor = config.sensor
         self.spec = load_sensor_spec(find_spec(config.sensor.spec))
         self._own = list(config.effects)
@@ -68,7 +72,9 @@ class TouchModel:
         at_once = _TAXELS_AT_ONCE // (len(ROBOT.pads) * math.prod(shape))
         for start in range(0, len(time_s), at_once):
             some = slice(start, start + at_once)
-            law = normal_reading(depth[some], rate[some], float(stiffness_per_m), float(damping_s_per_m))
+            law = normal_reading(
+                depth[some], rate[some], float(stiffness_per_m), float(damping_s_per_m)
+            )
             if not acting:
                 seen[some] = law
                 continue
@@ -83,12 +89,18 @@ class TouchModel:
         """True if a motion from ``TouchMotion.cut`` can be simulated with these effects in addition to the twin's own."""
         whole = (slice(None), slice(None))
         acting = [e for e in (*self._own, *effects) if _reads(e) and not e.is_absent]
-        return all(isinstance(e, TouchEffect) and e.within(whole) is not None for e in acting)
+        return all(
+            isinstance(e, TouchEffect) and e.within(whole) is not None for e in acting
+        )
 
     def remembers(self, effects: Sequence[Effect]) -> bool:
         """True if a frame's readings depend on earlier frames, through one of ``effects`` or of the twin's own."""
         shape = self.spec.rows, self.spec.columns
-        return any(bool(e.memory(1, shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
+        return any(
+            bool(e.memory(1, shape))
+            for e in (*self._own, *effects)
+            if _reads(e) and not e.is_absent
+        )
 
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
         """(T, P, R, C) counts above baseline for ``reading`` (T, P, R, C), without noise and rounding, limited to the ends of
@@ -115,28 +127,45 @@ def _memory(effect: Effect, motion: TouchMotion) -> Memory:
     """State of the effects' memory before the first scan, for the taxels in the motion's window."""
     shape = motion.layout.shape
     return {
-        name: np.ascontiguousarray(array[..., *motion.window]) if array.shape[-2:] == shape else array
+        name: np.ascontiguousarray(array[..., *motion.window])
+        if array.shape[-2:] == shape
+        else array
         for name, array in effect.memory(1, shape).items()
     }
 
 
-def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[float, float, float], ...]:
+def _offsets(
+    effects: Sequence[Effect], pads: Sequence[str]
+) -> tuple[tuple[float, float, float], ...]:
     """By how much the effects move the taxels of each pad, in its frame; empty if none does."""
     moving = [effect for effect in effects if isinstance(effect, PadFrameEffect)]
     if not moving:
         return ()
     own = ([e.offset_pad_m(pad) for e in moving if pad in e.pads] for pad in pads)
-    return tuple((float(x), float(y), float(z)) for x, y, z in (np.sum([np.zeros(3), *o], axis=0) for o in own))
+    return tuple(
+        (float(x), float(y), float(z))
+        for x, y, z in (np.sum([np.zeros(3), *o], axis=0) for o in own)
+    )
 
 
-def through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+def through(
+    effect: Effect,
+    reading: np.ndarray,
+    memory: Memory,
+    time_s: np.ndarray,
+    dt_s: np.ndarray,
+) -> np.ndarray:
     """Apply an effect to frames ``reading`` (B, P, R, C) of all pads, and advance its memory. Returns the changed frames.
     ``memory``: state after the frames before; {} for an effect without memory. Changed in place. ``time_s``, ``dt_s``: (B,) time
     since the first scan, and since the scan before [s]."""
     if not memory:
         return effect.reading(reading, memory, time_s, dt_s)
     if isinstance(effect, RememberingEffect):
-        reading[:, effect.slots] = effect.scans(reading[:, effect.slots][:, None], memory, dt_s[:, None])[:, 0]
+        reading[:, effect.slots] = effect.scans(
+            reading[:, effect.slots][:, None], memory, dt_s[:, None]
+        )[:, 0]
         return reading
     rows = [slice(k, k + 1) for k in range(len(reading))]
-    return np.concatenate([effect.reading(reading[k], memory, time_s[k], dt_s[k]) for k in rows])
+    return np.concatenate(
+        [effect.reading(reading[k], memory, time_s[k], dt_s[k]) for k in rows]
+    )

@@ -51,14 +51,22 @@ class TouchMotion:
     ``touch_motion``."""
 
     measurement: Measurement = field(repr=False)  # Measurement from which it was made
-    pads: tuple[str, ...]  # Names of the pads that the object came near, in the order of ``ROBOT.pads``
-    time_s: np.ndarray  # (T, P) time stamps on the measurement's clock: ends of scans [s]
+    pads: tuple[
+        str, ...
+    ]  # Names of the pads that the object came near, in the order of ``ROBOT.pads``
+    time_s: (
+        np.ndarray
+    )  # (T, P) time stamps on the measurement's clock: ends of scans [s]
     measured: np.ndarray  # (T, P, R, C) int16 counts above baseline
     baseline: np.ndarray  # (P, R, C) resting counts
     object_from_pad: np.ndarray
     """(T, P, I, 3, 4) pose of each pad in the object's frame at the instants at which the taxels of ``groups`` were read."""
-    velocity: np.ndarray  # (T, P, I, 3, 4) time derivative of ``object_from_pad`` [1/s, m/s]
-    groups: np.ndarray  # (I, G) flat indices of the taxels that are read at each instant
+    velocity: (
+        np.ndarray
+    )  # (T, P, I, 3, 4) time derivative of ``object_from_pad`` [1/s, m/s]
+    groups: (
+        np.ndarray
+    )  # (I, G) flat indices of the taxels that are read at each instant
     shapes: ShapeTables  # Shapes of the object, in its own frame
     clearance_m: np.ndarray
     """(T, P, I) lower bound of the distance from the taxels' plane to the object [m]; below 0 they may overlap."""
@@ -71,9 +79,13 @@ class TouchMotion:
         """Name of the measurement."""
         return self.measurement.name
 
-    _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+    _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
-    def depth(self, offsets_m: tuple[tuple[float, float, float], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+    def depth(
+        self, offsets_m: tuple[tuple[float, float, float], ...] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Depth of the object in each taxel [m] and its rate [m/s], (T rows, P pads, R, C taxels) float32, 0 without contact.
         ``offsets_m``: how far each pad's taxels lie from their nominal place, (x, y, z) in the pad's frame [m]; empty: 0."""
         if not any(any(offset) for offset in offsets_m):
@@ -110,20 +122,33 @@ class TouchMotion:
             **arrays,
         )
 
-    def _depth(self, offsets_m: tuple[tuple[float, float, float], ...]) -> tuple[np.ndarray, np.ndarray]:
+    def _depth(
+        self, offsets_m: tuple[tuple[float, float, float], ...]
+    ) -> tuple[np.ndarray, np.ndarray]:
         offset = np.array(offsets_m or [(0.0, 0.0, 0.0)] * len(self.pads))
-        taxel_xy = np.stack(np.meshgrid(*self.layout.taxel_axes_m()), axis=2)[self.window]
-        xyz = np.append(taxel_xy.reshape(-1, 2), np.zeros((taxel_xy.size // 2, 1)), axis=1)
+        taxel_xy = np.stack(np.meshgrid(*self.layout.taxel_axes_m()), axis=2)[
+            self.window
+        ]
+        xyz = np.append(
+            taxel_xy.reshape(-1, 2), np.zeros((taxel_xy.size // 2, 1)), axis=1
+        )
         # Taxels of a group lie in a line: what is common to them goes into the position, what differs into the grid.
         first = xyz[self.groups[:, 0]]
         along = xyz[self.groups[0]] - first[0]
         grid = np.stack([along[:, 0], along[:, 1], np.ones(len(along))])
-        start = np.append(first + offset[:, None], np.ones((len(offset), len(first), 1)), axis=2)  # (P, I, 4)
+        start = np.append(
+            first + offset[:, None], np.ones((len(offset), len(first), 1)), axis=2
+        )  # (P, I, 4)
         frame, pad, instant = np.nonzero(self.clearance_m < offset[:, None, 2])
         at = start[pad, instant]
-        flat = _moved(self.object_from_pad[frame, pad, instant], at), _moved(self.velocity[frame, pad, instant], at)
+        flat = (
+            _moved(self.object_from_pad[frame, pad, instant], at),
+            _moved(self.velocity[frame, pad, instant], at),
+        )
         felt_m, felt_mps = depth_in_body(self.shapes, *flat, grid)
-        taxels = np.zeros((2, *self.clearance_m.shape[:2], self.groups.size), np.float32)
+        taxels = np.zeros(
+            (2, *self.clearance_m.shape[:2], self.groups.size), np.float32
+        )
         where = frame[:, None], pad[:, None], self.groups[instant]
         taxels[0][where], taxels[1][where] = felt_m, felt_mps
         taxels.flags.writeable = False
@@ -148,18 +173,31 @@ def _moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
     return moved
 
 
-def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
+def touch_motion(
+    measurement: Measurement, config: TwinConfig, pressed: PressedObject
+) -> TouchMotion:
     """Make the matched contact replay of a measurement, from its gripper openings and its pad frames. ``config``: configuration
     of the twin, for the robot's mounts and the sensor's scan. Raises TaccorlError: there are no frames of the pads, openings or
     joints were not measured, or the object never came near a pad."""
     if measurement.touch is None:
         none = "the recording has no frames of the pads; record them, or remove this recording"
         raise TaccorlError(f"{measurement.name}: {none}")
-    spec = load_sensor_spec(find_spec(config.sensor.spec if hasattr(config.sensor, "spec") else "flexitac_v2"))  # pyright: ignore[reportAttributeAccessIssue]
-    instants_s, number = scan_instants_s(spec), np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns)
+    spec = load_sensor_spec(
+        find_spec(
+            config.sensor.spec  # pyright: ignore[reportAttributeAccessIssue]
+            if hasattr(config.sensor, "spec")
+            else "flexitac_v2"
+        )
+    )
+    instants_s, number = (
+        scan_instants_s(spec),
+        np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns),
+    )
     slots = [ROBOT.pads.index(f"{pressed.arm}_{finger}") for finger in ROBOT.fingers]
     stamps = measurement.touch.time_s
-    covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (stamps[:, slots] <= measurement.time_s[-1])
+    covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (
+        stamps[:, slots] <= measurement.time_s[-1]
+    )
     frames = covered.all(axis=1)
     if frames.sum() < 10:
         raise TaccorlError(
@@ -169,7 +207,9 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
     stamps = stamps[frames][:, slots]
     moving = _Fingers(measurement, config.robot, pressed)
     times = stamps[:, :, None] + instants_s
-    pose, later, earlier = (moving.object_from_pad(times + shift) for shift in (0.0, _STEP_S, -_STEP_S))
+    pose, later, earlier = (
+        moving.object_from_pad(times + shift) for shift in (0.0, _STEP_S, -_STEP_S)
+    )
     shapes, corners_m = shapes_in_object(pressed.solids)
     layout = dataclasses.replace(ROBOT.pad, rows=spec.rows, columns=spec.columns)
     whole = (-1, len(ROBOT.pads), *layout.shape)
@@ -184,7 +224,9 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
         groups=as_wire(number, spec).copy(),
         shapes=shapes,
         layout=layout,
-        clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[..., 0].min(axis=-1),
+        clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[
+            ..., 0
+        ].min(axis=-1),
     )
     comes_near = motion.near(_NEAR_M).any(axis=(0, 2, 3))
     if not comes_near.any():
@@ -203,13 +245,17 @@ def _only(motion: TouchMotion, pads: np.ndarray) -> TouchMotion:
         for name in ("time_s", "measured", "object_from_pad", "velocity", "clearance_m")
     }
     kept = tuple(motion.pads[p] for p in pads)
-    return dataclasses.replace(motion, pads=kept, baseline=motion.baseline[pads], **arrays)
+    return dataclasses.replace(
+        motion, pads=kept, baseline=motion.baseline[pads], **arrays
+    )
 
 
 class _Fingers:
     """Poses of both pads of an arm in the object's frame, at any time of a measurement."""
 
-    def __init__(self, measurement: Measurement, robot: RobotConfig, pressed: PressedObject) -> None:
+    def __init__(
+        self, measurement: Measurement, robot: RobotConfig, pressed: PressedObject
+    ) -> None:
         names = [f"{pressed.arm}_gripper"]
         if pressed.frame == "world":
             names += [f"{pressed.arm}_{joint}" for joint in ROBOT.joints]
@@ -220,12 +266,20 @@ class _Fingers:
                 f"{measurement.name}: {', '.join(names)} were measured in only {there.mean():.0%} of the rows; depths cannot "
                 "be computed without them"
             )
-        window = max(SMOOTH_ORDER + 2, round(SMOOTH_S * measurement.rate_hz)) // 2 * 2 + 1
+        window = (
+            max(SMOOTH_ORDER + 2, round(SMOOTH_S * measurement.rate_hz)) // 2 * 2 + 1
+        )
         if there.sum() < window:
-            raise TaccorlError(f"{measurement.name}: {there.sum()} measured rows are too few; {window} are needed")
+            raise TaccorlError(
+                f"{measurement.name}: {there.sum()} measured rows are too few; {window} are needed"
+            )
         time_s = measurement.time_s
-        even = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in rows.T])
-        self._rows = CubicSpline(time_s, savgol_filter(even, window, SMOOTH_ORDER, axis=0))
+        even = np.column_stack(
+            [np.interp(time_s, time_s[there], column[there]) for column in rows.T]
+        )
+        self._rows = CubicSpline(
+            time_s, savgol_filter(even, window, SMOOTH_ORDER, axis=0)
+        )
         self._pressed, self._robot = pressed, robot
         self.opening_m = even[:, 0]
 
@@ -261,12 +315,19 @@ def shapes_in_object(solids: Sequence[Solid]) -> tuple[ShapeTables, np.ndarray]:
     for k, solid in enumerate(s for s in solids if s.touches):
         if isinstance(solid, Capsule) and solid.half_height_m == 0:
             pos, size = solid.part_from_solid[:3, 3], [solid.radius_m, 0, 0]
-            body.add_geom(name=f"{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=pos, size=size)
+            body.add_geom(
+                name=f"{k}", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=pos, size=size
+            )
         else:
             add_geom(spec, body, solid, f"pressed_{k}")
     model = spec.compile()
     shapes = shapes_of(model, list(range(model.ngeom)), np.float64)
     signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-    boxes = [model.geom_aabb[g, :3] + signs * model.geom_aabb[g, 3:] for g in shapes.geom]
-    corners = [box @ pose[:, :3].T + pose[:, 3] for box, pose in zip(boxes, shapes.body_from_geom, strict=True)]
+    boxes = [
+        model.geom_aabb[g, :3] + signs * model.geom_aabb[g, 3:] for g in shapes.geom
+    ]
+    corners = [
+        box @ pose[:, :3].T + pose[:, 3]
+        for box, pose in zip(boxes, shapes.body_from_geom, strict=True)
+    ]
     return shapes, np.concatenate(corners)

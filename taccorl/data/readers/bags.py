@@ -21,7 +21,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from taccorl.data import decode
 from taccorl.data.readers.mcap import MOST_METADATA_BYTES, BagReader, bag_sources
-from taccorl.data.recording import Damage, Message, Query, Reader, Source, TopicType, readers
+from taccorl.data.recording import (
+    Damage,
+    Message,
+    Query,
+    Reader,
+    Source,
+    TopicType,
+    readers,
+)
 from taccorl.data.ros import Decoder, full_name, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
@@ -32,7 +40,10 @@ if TYPE_CHECKING:
 
 FARTHEST_ID = 1 << 62
 MOST_FAULTS = 5  # Most reported results of SQLite's integrity check; a damaged page gives one for each of its cells
-EVERY_TIME = (-(1 << 63), (1 << 63) - 1)  # Earliest and latest log time that SQLite can hold [ns]
+EVERY_TIME = (
+    -(1 << 63),
+    (1 << 63) - 1,
+)  # Earliest and latest log time that SQLite can hold [ns]
 UNPROTECTED = "bags hold no checksums: changed bytes in a message that still decodes are read as values"
 
 
@@ -49,8 +60,12 @@ class Db3Reader(BagReader):
         self._distro: str | None = None
         folder = source.path if source.path.is_dir() else source.path.parent
         with contextlib.suppress(SpecError, KeyError, TypeError):
-            found = load_yaml(folder / "metadata.yaml", MOST_METADATA_BYTES)["rosbag2_bagfile_information"]
-            if {p.name for p in source.files} <= {Path(n).name for n in found["relative_file_paths"]}:
+            found = load_yaml(folder / "metadata.yaml", MOST_METADATA_BYTES)[
+                "rosbag2_bagfile_information"
+            ]
+            if {p.name for p in source.files} <= {
+                Path(n).name for n in found["relative_file_paths"]
+            }:
                 self._distro = found.get("ros_distro")
 
     def topics(self) -> dict[str, TopicType]:
@@ -61,12 +76,17 @@ class Db3Reader(BagReader):
 
     def read(self, query: Query, damage: list[Damage]) -> Generator[Message, None, str]:
         between = tuple(
-            x if x is not None else e for x, e in zip((query.start_ns, query.end_ns), EVERY_TIME, strict=True)
+            x if x is not None else e
+            for x, e in zip((query.start_ns, query.end_ns), EVERY_TIME, strict=True)
         )
         for path in self.source.files:
             with _File(path, damage) as file:
                 names = self._learn(file)
-                self.check_decodable({name: self._topics[name] for name in names.values()}, query, str(path))
+                self.check_decodable(
+                    {name: self._topics[name] for name in names.values()},
+                    query,
+                    str(path),
+                )
                 asked, orphans = [i for i, name in names.items() if query.asks(name)], 0
                 for _, topic_id, log_ns, data in file.rows(asked, between):
                     orphans += topic_id not in names
@@ -75,7 +95,9 @@ class Db3Reader(BagReader):
                 if query.topics is not None and query.whole:
                     file.check_structure()
                 if orphans:
-                    file.lost(f"{orphans} messages of topics that the bag does not name")
+                    file.lost(
+                        f"{orphans} messages of topics that the bag does not name"
+                    )
         return f"SQLite {UNPROTECTED}"
 
     def _message(self, topic: str, log_ns: int, data: bytes, query: Query) -> Message:
@@ -86,7 +108,9 @@ class Db3Reader(BagReader):
         except Exception as error:  # rosbags raises what it likes on bytes that do not fit the definition
             if query.reads(topic):
                 raise misfit(topic, log_ns, self._topics[topic].name, error) from error
-        return Message(topic, log_ns, decode.stamp_ns(value), value if query.reads(topic) else None)
+        return Message(
+            topic, log_ns, decode.stamp_ns(value), value if query.reads(topic) else None
+        )
 
     def _learn(self, file: "_File") -> dict[int, str]:
         """Topic id → name within ``file``; learns how its topics are decoded."""
@@ -102,7 +126,9 @@ class Db3Reader(BagReader):
             first = file.first(topic_id) if full not in definitions else None
             try:
                 if encoding != "cdr":
-                    raise RecordingError(f"{encoding!r} messages are not supported (supported: cdr)")
+                    raise RecordingError(
+                        f"{encoding!r} messages are not supported (supported: cdr)"
+                    )
                 store, origin = _definition(full, definitions, distro, first)
                 self._decoders[name] = functools.partial(_decode, store, full)
                 self.metadata.setdefault("definitions", {})[full] = origin
@@ -127,11 +153,20 @@ class _File:
             try:
                 self._connection = self._connect(stack)
             except (OSError, sqlite3.Error) as error:
-                raise RecordingError(f"{self.path}: cannot be opened: {error}") from error
-            self._tables = {row[0] for row in self.all("SELECT name FROM sqlite_master WHERE type = 'table'")}
+                raise RecordingError(
+                    f"{self.path}: cannot be opened: {error}"
+                ) from error
+            self._tables = {
+                row[0]
+                for row in self.all(
+                    "SELECT name FROM sqlite_master WHERE type = 'table'"
+                )
+            }
             if not {"topics", "messages"} <= self._tables:
                 names = ", ".join(sorted(self._tables)) or "none"
-                raise RecordingError(f"{self.path}: is an SQLite file, but not a ROS 2 bag: its tables are {names}")
+                raise RecordingError(
+                    f"{self.path}: is an SQLite file, but not a ROS 2 bag: its tables are {names}"
+                )
             self._stack = stack.pop_all()
         return self
 
@@ -145,20 +180,37 @@ class _File:
         if size == 0:
             raise RecordingError(f"{self.path}: is empty (0 bytes)")
         if not header.startswith(b"SQLite format 3\0") or len(header) < 100:
-            raise RecordingError(f"{self.path}: is not an SQLite file: it begins with {header[:16]!r}")
-        page_bytes, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
+            raise RecordingError(
+                f"{self.path}: is not an SQLite file: it begins with {header[:16]!r}"
+            )
+        page_bytes, pages = (
+            struct.unpack_from(">H", header, 16)[0],
+            struct.unpack_from(">I", header, 28)[0],
+        )
         page_bytes = 65536 if page_bytes == 1 else page_bytes
         whole, part = page_bytes * pages, 0
         if size < whole:
             part = size % page_bytes
-            self.lost(f"the file ends {whole - size:,} bytes early (cut off?)", (size - part, whole))
-        path, how = self.path, "mode=ro&immutable=1"  # immutable: no lock, no journal, no shared memory file
-        unfinished = [p for end in ("-wal", "-journal") if (p := path.with_name(path.name + end)).is_file()]
+            self.lost(
+                f"the file ends {whole - size:,} bytes early (cut off?)",
+                (size - part, whole),
+            )
+        path, how = (
+            self.path,
+            "mode=ro&immutable=1",
+        )  # immutable: no lock, no journal, no shared memory file
+        unfinished = [
+            p
+            for end in ("-wal", "-journal")
+            if (p := path.with_name(path.name + end)).is_file()
+        ]
         in_writing = any(p.stat().st_size for p in unfinished)
         if in_writing or part:
             # A recorder that died left its newest messages there; SQLite merges them by writing, so into a copy. Of a page that
             # was cut off it reads zeros for what is missing, so the copy ends before it.
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="taccorl_")))
+            folder = Path(
+                stack.enter_context(tempfile.TemporaryDirectory(prefix="taccorl_"))
+            )
             for original in (self.path, *unfinished):
                 shutil.copyfile(original, folder / original.name)
             path, how = folder / self.path.name, "mode=rw" if in_writing else how
@@ -166,32 +218,48 @@ class _File:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)
         stack.enter_context(contextlib.closing(connection))
         connection.text_factory = lambda raw: raw.decode(errors="replace")
-        connection.execute("PRAGMA writable_schema = ON")  # opens also a file that was cut off; nothing is written
+        connection.execute(
+            "PRAGMA writable_schema = ON"
+        )  # opens also a file that was cut off; nothing is written
         return connection
 
     def all(self, query: str, *values: Any) -> list[Any]:
         try:
             return self._connection.execute(query, values).fetchall()
         except sqlite3.DatabaseError as error:
-            raise RecordingError(f"{self.path}: damaged, its list of topics cannot be read ({error})") from error
+            raise RecordingError(
+                f"{self.path}: damaged, its list of topics cannot be read ({error})"
+            ) from error
 
     def definitions(self) -> dict[str, tuple[str, str]]:
         """Type → (format, text) of the definitions that the bag holds; empty before ROS 2 Iron."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         rows = self.all(query) if "message_definitions" in self._tables else []
-        return {full_name(kind): (encoding, text) for kind, encoding, text in rows if text}
+        return {
+            full_name(kind): (encoding, text) for kind, encoding, text in rows if text
+        }
 
     def distro(self) -> str | None:
         """The ROS 2 distribution that wrote the bag, where it says so."""
         with contextlib.suppress(RecordingError):
-            rows = self.all("SELECT ros_distro FROM schema") if "schema" in self._tables else []
+            rows = (
+                self.all("SELECT ros_distro FROM schema")
+                if "schema" in self._tables
+                else []
+            )
             return str(rows[0][0]) if rows else None
         return None
 
     def first(self, topic_id: int) -> bytes | None:
         """The topic's first message."""
-        with contextlib.suppress(RecordingError, ValueError, IndexError):  # a damaged one has no layout to compare
-            return unpacked(self.all("SELECT data FROM messages WHERE topic_id = ? LIMIT 1", topic_id)[0][0])
+        with contextlib.suppress(
+            RecordingError, ValueError, IndexError
+        ):  # a damaged one has no layout to compare
+            return unpacked(
+                self.all(
+                    "SELECT data FROM messages WHERE topic_id = ? LIMIT 1", topic_id
+                )[0][0]
+            )
         return None
 
     def rows(
@@ -215,7 +283,12 @@ class _File:
                 until = "the last" if following is None else str(following[0] - 1)
                 begin = "the first" if after == -FARTHEST_ID else str(after + 1)
                 end_ns = None if following is None else following[1]
-                self.lost(f"messages {begin} to {until} cannot be read ({error})", None, after_ns, end_ns)
+                self.lost(
+                    f"messages {begin} to {until} cannot be read ({error})",
+                    None,
+                    after_ns,
+                    end_ns,
+                )
                 if following is None:
                     return
                 after, after_ns = following[0] - 1, following[1]
@@ -227,7 +300,12 @@ class _File:
         if len(self.damage) > self._sound:
             return
         with contextlib.suppress(sqlite3.DatabaseError):
-            found = [row[0] for row in self._connection.execute(f"PRAGMA integrity_check({MOST_FAULTS})")]
+            found = [
+                row[0]
+                for row in self._connection.execute(
+                    f"PRAGMA integrity_check({MOST_FAULTS})"
+                )
+            ]
             for text in (" ".join(str(t).split()) for t in found if t != "ok"):
                 self.lost(f"SQLite's integrity check: {text}")
 
@@ -260,7 +338,11 @@ class _File:
         return look(high)
 
     def lost(
-        self, reason: str, where: tuple[int, int] | None = None, start_ns: int | None = None, end_ns: int | None = None
+        self,
+        reason: str,
+        where: tuple[int, int] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
     ) -> None:
         """Note a damage; without ``where`` SQLite did not tell at which bytes."""
         start, end = where or (0, self.path.stat().st_size)
@@ -269,13 +351,18 @@ class _File:
 
 def _check_row(row: Any, after: int) -> None:
     """Raises sqlite3.DatabaseError: no message can be like this, a damage that SQLite itself did not notice."""
-    whole = all(isinstance(number, int) for number in row[:3]) and isinstance(row[3], bytes | None)
+    whole = all(isinstance(number, int) for number in row[:3]) and isinstance(
+        row[3], bytes | None
+    )
     if not whole or row[0] <= after:
         raise sqlite3.DatabaseError("a message with an invalid topic or time")
 
 
 def _definition(
-    kind: str, definitions: dict[str, tuple[str, str]], distro: str | None, first: bytes | None
+    kind: str,
+    definitions: dict[str, tuple[str, str]],
+    distro: str | None,
+    first: bytes | None,
 ) -> tuple[Any, str]:
     """(rosbags type store that knows ``kind``, where its definition is from). Raises RecordingError: no definition, or none
     that fits the first message."""
@@ -283,7 +370,11 @@ def _definition(
 
     if kind in definitions:
         return type_store(kind, *definitions[kind]), "in the bag"
-    newest_first = [s for s in reversed(Stores) if s.value.startswith("ros2_") and s is not Stores.LATEST]
+    newest_first = [
+        s
+        for s in reversed(Stores)
+        if s.value.startswith("ros2_") and s is not Stores.LATEST
+    ]
     named = [s for s in newest_first if s.value == f"ros2_{distro}"]
     known = [s for s in named or newest_first if kind in get_typestore(s).fielddefs]
     for candidate in known:
@@ -291,12 +382,19 @@ def _definition(
         with contextlib.suppress(Exception):
             if first is not None:
                 store.deserialize_cdr(first, kind)
-            return store, f"{candidate.value}, {'as named by the bag' if named else 'the newest that fits'}"
+            return (
+                store,
+                f"{candidate.value}, {'as named by the bag' if named else 'the newest that fits'}",
+            )
     text = f"the bag does not define {kind}, "
     if known:
-        raise RecordingError(f"{text}and the definitions of all ROS 2 distributions do not fit its first message")
+        raise RecordingError(
+            f"{text}and the definitions of all ROS 2 distributions do not fit its first message"
+        )
     text += f"nor does any ROS 2 distribution from {newest_first[-1].value} to {newest_first[0].value}: convert it to "
-    raise RecordingError(f"{text}MCAP where its package is installed (`ros2 bag convert`)")
+    raise RecordingError(
+        f"{text}MCAP where its package is installed (`ros2 bag convert`)"
+    )
 
 
 def misfit(topic: str, log_ns: int, kind: str, error: Exception) -> RecordingError:
@@ -333,21 +431,31 @@ class Rosbag1Reader(Reader):
             with _opened_bag(path) as bag:
                 asked = [c for c in bag.connections if query.asks(c.topic)]
                 for connection in asked:
-                    self.check_decodable({connection.topic: _topic_type(connection)}, query, str(path))
+                    self.check_decodable(
+                        {connection.topic: _topic_type(connection)}, query, str(path)
+                    )
                 # rosbags sorts by log time, which hides a clock that was set back
                 bag.indexes = {  # pyright: ignore[reportAttributeAccessIssue]
-                    number: sorted(_Entry._make(entry) for entry in entries if query.covers(entry.time))
+                    number: sorted(
+                        _Entry._make(entry)
+                        for entry in entries
+                        if query.covers(entry.time)
+                    )
                     for number, entries in bag.indexes.items()
                 }
                 for connection, log_ns, data in bag.messages(asked) if asked else ():
                     topic, value, kind = connection.topic, None, connection.msgtype
                     try:
-                        value = type_store(kind, "ros1msg", connection.msgdef.data).deserialize_ros1(data, kind)
+                        value = type_store(
+                            kind, "ros1msg", connection.msgdef.data
+                        ).deserialize_ros1(data, kind)
                     except Exception as error:  # rosbags raises what it likes on bytes that do not fit the definition
                         if query.reads(topic):
                             raise misfit(topic, log_ns, kind, error) from error
                     stamp_ns = None if value is None else decode.stamp_ns(value)
-                    yield Message(topic, log_ns, stamp_ns, value if query.reads(topic) else None)
+                    yield Message(
+                        topic, log_ns, stamp_ns, value if query.reads(topic) else None
+                    )
         return f"ROS 1 {UNPROTECTED}"
 
 
@@ -371,7 +479,16 @@ def _opened_bag(path: Path) -> "Iterator[BagFile]":
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f"{path}: is empty (0 bytes)")
     # rosbags checks its own assumptions by assert, and decompressors and struct raise what they like
-    faults = (ReaderError, AssertionError, ValueError, LookupError, struct.error, EOFError, RuntimeError, OSError)
+    faults = (
+        ReaderError,
+        AssertionError,
+        ValueError,
+        LookupError,
+        struct.error,
+        EOFError,
+        RuntimeError,
+        OSError,
+    )
     try:
         with BagFile(path) as bag:
             yield bag

@@ -19,27 +19,51 @@ import numpy as np
 from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording
 from taccorl.data.finding import listed
-from taccorl.data.recording import Damage, Message, Query, Reader, Source, TopicType, readers
+from taccorl.data.recording import (
+    Damage,
+    Message,
+    Query,
+    Reader,
+    Source,
+    TopicType,
+    readers,
+)
 from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S, check_stamps
 from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20  # Number of bytes that are read at once
 MOST_ROWS = 1_000_000  # Most rows of a dataset: 9 h at 30 Hz; a file of a few kB can hold any number
-MOST_BLOCK_BYTES = 1 << 30  # Largest block read at once, a chunk or a row; 1000 pictures of 480×640 are 0.9 GB
+MOST_BLOCK_BYTES = (
+    1 << 30
+)  # Largest block read at once, a chunk or a row; 1000 pictures of 480×640 are 0.9 GB
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
-RATE_ATTRIBUTES = ("fps", "frequency")  # Attributes of a file in which its rate of rows may be stated [Hz]
+RATE_ATTRIBUTES = (
+    "fps",
+    "frequency",
+)  # Attributes of a file in which its rate of rows may be stated [Hz]
 EPISODE_WORDS = (
     *("", "demo", "demonstration", "ep", "episode", "traj", "trajectory"),
     *("rollout", "trial", "sequence", "seq"),
 )
 """Names of groups, before their number, that are one episode each: robomimic, MimicGen and their like."""
 DEEPEST_EPISODES = 3  # Levels of groups that are searched for episodes
-TIME_WORDS = ("time", "stamp", "clock")  # How words in the name of a dataset of time stamps begin
-RATES_HZ = (0.5, 5000.0)  # Plausible rates of rows, which tell the unit of time stamps that do not count from 1970 [Hz]
+TIME_WORDS = (
+    "time",
+    "stamp",
+    "clock",
+)  # How words in the name of a dataset of time stamps begin
+RATES_HZ = (
+    0.5,
+    5000.0,
+)  # Plausible rates of rows, which tell the unit of time stamps that do not count from 1970 [Hz]
 RATE_TOLERANCE = 0.02  # Largest accepted difference of the time stamps' rate from that of the spec, as a share
-LONGEST_STEP = 2.5  # Longest accepted step of the time stamps, in periods of the spec's rate
-BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoders find the end themselves
+LONGEST_STEP = (
+    2.5  # Longest accepted step of the time stamps, in periods of the spec's rate
+)
+BOOKKEEPING = (
+    "/compress_len",
+)  # ALOHA: bytes of each padded picture; decoders find the end themselves
 
 
 @dataclass(frozen=True)
@@ -58,16 +82,24 @@ class RowClock:
         or a channel of ``action`` states none."""
         leads: dict[str, int] = {}
         firsts = [0]
-        commands = spec.features[ACTION].channels if spec and ACTION in spec.features else ()
+        commands = (
+            spec.features[ACTION].channels if spec and ACTION in spec.features else ()
+        )
         for name, channel in spec.channels.items() if spec else ():
             if name in commands and channel.lead_frames is None:
                 text = f"channel {name!r} fills {ACTION}: key 'lead_frames' is missing. 1: row k of {channel.topic} "
-                raise RecordingError(f"{text}was sent after the observation of row k (LeRobot, ALOHA); 0: before")
+                raise RecordingError(
+                    f"{text}was sent after the observation of row k (LeRobot, ALOHA); 0: before"
+                )
             lead = channel.lead_frames or 0
             if leads.setdefault(channel.topic, lead) != lead:
                 text = f"channel {name!r}: lead_frames is {lead}, of another channel of {channel.topic}"
-                raise RecordingError(f"{text} lead_frames {leads[channel.topic]}: a topic must have one value")
-            firsts.append(lead - 1 if name in commands else lead)  # the action of row t is due at row t + 1
+                raise RecordingError(
+                    f"{text} lead_frames {leads[channel.topic]}: a topic must have one value"
+                )
+            firsts.append(
+                lead - 1 if name in commands else lead
+            )  # the action of row t is due at row t + 1
         return cls(rate_hz, leads, max(firsts))
 
     def time_ns(self, topic: str, k: int) -> int:
@@ -101,7 +133,10 @@ class RowStamps:
         mean_hz = 1 / float(np.median(steps_s)) if np.median(steps_s) > 0 else 0.0
         if (steps_s <= 0).any():
             return f"go back or stand still at row {int(np.argmax(steps_s <= 0)) + 1}"
-        if steps_s.max() > LONGEST_STEP / rate_hz or abs(mean_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
+        if (
+            steps_s.max() > LONGEST_STEP / rate_hz
+            or abs(mean_hz - rate_hz) > RATE_TOLERANCE * rate_hz
+        ):
             return f"say {mean_hz:.4g} Hz with a longest step of {steps_s.max():.3g} s"
         return ""
 
@@ -117,34 +152,57 @@ class Hdf5Reader(Reader):
         whole = super().sources(path, split_bag=split_bag)
         if whole is not None and no_recording(path) is None:
             # whoever reads it says what is wrong
-            with contextlib.suppress(OSError, RuntimeError, KeyError), h5py.File(path, "r", locking=False) as file:
-                return [Source(path, (path,), part) for part in _episode_groups(file)] or whole
+            with (
+                contextlib.suppress(OSError, RuntimeError, KeyError),
+                h5py.File(path, "r", locking=False) as file,
+            ):
+                return [
+                    Source(path, (path,), part) for part in _episode_groups(file)
+                ] or whole
         return whole
 
     def topics(self) -> dict[str, TopicType]:
         with self._open() as group:
-            return {topic: _topic_type(dataset) for topic, dataset in _datasets(group).items()}
+            return {
+                topic: _topic_type(dataset)
+                for topic, dataset in _datasets(group).items()
+            }
 
     def read(self, query: Query, damage: list[Damage]) -> Generator[Message, None, str]:
         with self._open() as group:
             datasets, attributes = _datasets(group), _attributes(group)
-            self.metadata["attributes"] = {name: _text(value) for name, value in attributes.items()}
+            self.metadata["attributes"] = {
+                name: _text(value) for name, value in attributes.items()
+            }
             stamps = self._stamps(datasets)
             clock = RowClock.of(self._rate_hz(attributes, stamps), self.spec)
             # The file's time stamps, if it has some, are used for a spec with `clock: header`, and for inspection.
-            by_stamps = self.spec is None or any(self.spec.clock_of(c) == "header" for c in self.spec.channels)
-            if stamps is not None and not by_stamps and (why := stamps.differs_from(clock.rate_hz)):
+            by_stamps = self.spec is None or any(
+                self.spec.clock_of(c) == "header" for c in self.spec.channels
+            )
+            if (
+                stamps is not None
+                and not by_stamps
+                and (why := stamps.differs_from(clock.rate_hz))
+            ):
                 text = f"{self.source.name}: the file's time stamps {stamps.topic} {why}, the spec's channels "
-                raise RecordingError(f"{text}{clock.rate_hz:g} Hz: `clock: header` uses the time stamps")
+                raise RecordingError(
+                    f"{text}{clock.rate_hz:g} Hz: `clock: header` uses the time stamps"
+                )
             asked = [
-                t for t in datasets if query.asks(t) and (query.topics is not None or not _unreadable(datasets[t]))
+                t
+                for t in datasets
+                if query.asks(t)
+                and (query.topics is not None or not _unreadable(datasets[t]))
             ]
             for topic in asked:
                 if problem := _unreadable(datasets[topic]) or (
                     query.reads(topic) and _topic_type(datasets[topic]).undecodable
                 ):
                     raise RecordingError(f"{self.source.path}: {topic}: {problem}")
-            blocks = {topic: _Blocks(datasets[topic]) for topic in asked if query.reads(topic)}
+            blocks = {
+                topic: _Blocks(datasets[topic]) for topic in asked if query.reads(topic)
+            }
             pictures = {t for t in blocks if _is_compressed(datasets[t])} | (
                 self.spec.picture_topics if self.spec else set()
             )
@@ -153,17 +211,23 @@ class Hdf5Reader(Reader):
                 for topic in asked:
                     log_ns, stamp_ns, value = clock.time_ns(topic, k), None, None
                     if stamps is not None and by_stamps:
-                        log_ns = stamp_ns = stamps.at(k + clock.lead_frames.get(topic, 0))
+                        log_ns = stamp_ns = stamps.at(
+                            k + clock.lead_frames.get(topic, 0)
+                        )
                     if k >= lengths[topic] or not query.covers(log_ns):
                         continue
                     if topic in blocks:
                         try:
                             value = blocks[topic].row(k)
                         except OSError as error:
-                            damage.append(self._lost(clock, topic, blocks[topic], error))
+                            damage.append(
+                                self._lost(clock, topic, blocks[topic], error)
+                            )
                         if value is None and topic not in pictures:
                             continue
-                        value = b"" if value is None else value  # a broken picture: who asked by its time must not wait
+                        value = (
+                            b"" if value is None else value
+                        )  # a broken picture: who asked by its time must not wait
                     yield Message(topic, log_ns, stamp_ns, value)
             return _unprotected({topic: datasets[topic] for topic in asked})
 
@@ -172,35 +236,61 @@ class Hdf5Reader(Reader):
         """The group of the recording: the file, or that of its part."""
         path = self.source.path
         try:
-            file = h5py.File(path, "r", locking=False)  # it would lock the file, which read-only folders do not allow
+            file = h5py.File(
+                path, "r", locking=False
+            )  # it would lock the file, which read-only folders do not allow
         except OSError as error:
             text, size = str(error), path.stat().st_size if path.is_file() else -1
             cut = "HDF5 cannot be read without its end; copy it again from the robot"
-            why = f"is cut off ({text}): {cut}" if "truncated file" in text else f"cannot be opened ({text})"
+            why = (
+                f"is cut off ({text}): {cut}"
+                if "truncated file" in text
+                else f"cannot be opened ({text})"
+            )
             why = "is not an HDF5 file" if "signature not found" in text else why
-            raise RecordingError(f"{path}: {why if size else 'is empty (0 bytes)'}") from error
+            raise RecordingError(
+                f"{path}: {why if size else 'is empty (0 bytes)'}"
+            ) from error
         with file:
             try:
                 part = self.source.part
                 found = "/" if part is None else _episode_groups(file).get(part, "")
                 if not isinstance(group := file[found] if found else None, h5py.Group):
-                    raise RecordingError(f"{self.source.name}: no such group of an episode")
+                    raise RecordingError(
+                        f"{self.source.name}: no such group of an episode"
+                    )
                 yield group
-            except (OSError, RuntimeError, KeyError) as error:  # h5py, on damaged groups and headers
-                raise RecordingError(f"{path}: is damaged ({type(error).__name__}: {error})") from error
+            except (
+                OSError,
+                RuntimeError,
+                KeyError,
+            ) as error:  # h5py, on damaged groups and headers
+                raise RecordingError(
+                    f"{path}: is damaged ({type(error).__name__}: {error})"
+                ) from error
 
     def _stamps(self, datasets: dict[str, h5py.Dataset]) -> RowStamps | None:
         """The file's time stamps of the rows: the first dataset of numbers that is named so or counts from 1970. Raises
         RecordingError: the channels have different numbers of rows: row k is one instant only if all have as many."""
         used = {c.topic for c in self.spec.channels.values()} if self.spec else set()
-        if lengths := sorted((_length(d), topic) for topic, d in datasets.items() if topic in used):
+        if lengths := sorted(
+            (_length(d), topic) for topic, d in datasets.items() if topic in used
+        ):
             (few, short), (many, long) = lengths[0], lengths[-1]
             if few != many:
                 text = f"{self.source.path}: {short} has {few} rows, but {long} has {many}: without time stamps it is "
-                raise RecordingError(f"{text}unknown which rows belong together; did the recorder die while writing?")
-        known = (d for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1))
+                raise RecordingError(
+                    f"{text}unknown which rows belong together; did the recorder die while writing?"
+                )
+        known = (
+            d
+            for topic, d in datasets.items()
+            if topic in used or (not used and d.ndim > 1)
+        )
         rows = max(map(_length, known), default=0)
-        for topic, d in sorted(datasets.items(), key=lambda item: (item[0].count("/"), item[0])):
+        for topic, d in sorted(
+            datasets.items(), key=lambda item: (item[0].count("/"), item[0])
+        ):
             numbers = d.dtype.kind in "iuf" and math.prod(d.shape) == rows == _length(d)
             if numbers and rows > 2 and topic not in used and _unreadable(d) is None:
                 try:
@@ -212,12 +302,18 @@ class Hdf5Reader(Reader):
         return None
 
     def _rate_hz(self, attributes: dict[str, Any], stamps: RowStamps | None) -> float:
-        told = {name: rate for name in RATE_ATTRIBUTES if (rate := _rate(attributes.get(name))) is not None}
+        told = {
+            name: rate
+            for name in RATE_ATTRIBUTES
+            if (rate := _rate(attributes.get(name))) is not None
+        }
         if self.spec is None:
             if not told and stamps is not None:
                 return NS_PER_S / max(stamps.period_ns, 1)
             if not told:
-                self.metadata["time"] = {"rate": "the file names no rate: sample k is shown at k seconds"}
+                self.metadata["time"] = {
+                    "rate": "the file names no rate: sample k is shown at k seconds"
+                }
             return next(iter(told.values()), 1.0)
         rates: dict[float, str] = {}
         for channel, c in self.spec.channels.items():
@@ -228,10 +324,14 @@ class Hdf5Reader(Reader):
             raise RecordingError(f"{text}all rows of one file must have the same rate")
         for name, value in told.items():
             if value != rate_hz:
-                raise RecordingError(f"{self.source.path}: attribute {name}: {value:g} Hz, the spec: {rate_hz:g} Hz")
+                raise RecordingError(
+                    f"{self.source.path}: attribute {name}: {value:g} Hz, the spec: {rate_hz:g} Hz"
+                )
         return rate_hz
 
-    def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> Damage:
+    def _lost(
+        self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError
+    ) -> Damage:
         first, last = blocks.start, blocks.stop - 1
         start, end = blocks.bytes_in_file() or (0, self.source.path.stat().st_size)
         times_ns = clock.time_ns(topic, first), clock.time_ns(topic, last)
@@ -261,14 +361,26 @@ class _Blocks:
         if self._rows is None:
             return None
         value = self._rows[k - self.start]
-        return _text(value) if self._text else bytes(value) if isinstance(value, bytes) else value
+        return (
+            _text(value)
+            if self._text
+            else bytes(value)
+            if isinstance(value, bytes)
+            else value
+        )
 
     def bytes_in_file(self) -> tuple[int, int] | None:
         """[start, end) of the block's first chunk in the file."""
         if not self._dataset.chunks:
             return None
-        info = self._dataset.id.get_chunk_info_by_coord((self.start,) + (0,) * (self._dataset.ndim - 1))
-        return (info.byte_offset, info.byte_offset + info.size) if info.byte_offset is not None else None
+        info = self._dataset.id.get_chunk_info_by_coord(
+            (self.start,) + (0,) * (self._dataset.ndim - 1)
+        )
+        return (
+            (info.byte_offset, info.byte_offset + info.size)
+            if info.byte_offset is not None
+            else None
+        )
 
 
 # ---- one HDF5 dataset ----
@@ -285,18 +397,28 @@ def _row_bytes(dataset: h5py.Dataset) -> int:
 def _rows_at_once(dataset: h5py.Dataset) -> int:
     if h5py.check_vlen_dtype(dataset.dtype) is not None:
         return 1
-    return dataset.chunks[0] if dataset.chunks else max(1, BLOCK_BYTES // max(1, _row_bytes(dataset)))
+    return (
+        dataset.chunks[0]
+        if dataset.chunks
+        else max(1, BLOCK_BYTES // max(1, _row_bytes(dataset)))
+    )
 
 
 def _unreadable(dataset: h5py.Dataset) -> str | None:
     """Reason why the dataset must not be read; None if it may. Opens no other file and allocates nothing large."""
     if dataset.is_virtual or dataset.external:
-        others = [s.file_name for s in dataset.virtual_sources()] if dataset.is_virtual else []
+        others = (
+            [s.file_name for s in dataset.virtual_sources()]
+            if dataset.is_virtual
+            else []
+        )
         others += [name for name, _, _ in dataset.external or ()]
         kind = "a virtual dataset" if dataset.is_virtual else "external storage"
         return f"its values are in {listed(sorted(set(others)))} ({kind}), which is not opened: write the values into this file"
     rows, at_once = _length(dataset), _rows_at_once(dataset)
-    chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize  # wider than the rows, if they may grow
+    chunk_bytes = (
+        math.prod(dataset.chunks or ()) * dataset.dtype.itemsize
+    )  # wider than the rows, if they may grow
     block_bytes = max(at_once * _row_bytes(dataset), chunk_bytes)
     if rows > MOST_ROWS:
         return f"it claims {rows:,} rows; at most {MOST_ROWS:,} are read: write shorter recordings"
@@ -313,26 +435,41 @@ def _topic_type(dataset: h5py.Dataset) -> TopicType:
     if problem := _unreadable(dataset):
         return TopicType(name, "hdf5", problem)
     if _is_compressed(dataset) or _is_text(dataset):
-        return TopicType("CompressedImage" if _is_compressed(dataset) else "String", "hdf5")
+        return TopicType(
+            "CompressedImage" if _is_compressed(dataset) else "String", "hdf5"
+        )
     if dataset.dtype.kind not in "biuf":
-        return TopicType(name, "hdf5", f"values of type {name} are not read (numbers, texts and pictures are)")
+        return TopicType(
+            name,
+            "hdf5",
+            f"values of type {name} are not read (numbers, texts and pictures are)",
+        )
     return TopicType(name, "hdf5", shape=tuple(dataset.shape[1:]))
 
 
 def _is_text(dataset: h5py.Dataset) -> bool:
-    return h5py.check_string_dtype(dataset.dtype) is not None and not _is_compressed(dataset)
+    return h5py.check_string_dtype(dataset.dtype) is not None and not _is_compressed(
+        dataset
+    )
 
 
 def _is_compressed(dataset: h5py.Dataset) -> bool:
     """Rows of bytes that begin as a JPEG or PNG does."""
     as_bytes = dataset.dtype.kind in "SO" and dataset.ndim == 1
-    if not (as_bytes or (dataset.dtype == np.uint8 and dataset.ndim == 2)) or len(dataset) == 0:
+    if (
+        not (as_bytes or (dataset.dtype == np.uint8 and dataset.ndim == 2))
+        or len(dataset) == 0
+    ):
         return False
     try:
         first = dataset[0]
     except OSError:
         return False
-    head = first[:4] if isinstance(first, bytes) else np.asarray(first).ravel()[:4].tobytes()
+    head = (
+        first[:4]
+        if isinstance(first, bytes)
+        else np.asarray(first).ravel()[:4].tobytes()
+    )
     return head.startswith(COMPRESSED)
 
 
@@ -348,7 +485,11 @@ def _datasets(group: h5py.Group) -> dict[str, h5py.Dataset]:
     found: dict[str, h5py.Dataset] = {}
 
     def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and f"/{name}" not in BOOKKEEPING and (item.shape or _is_text(item)):
+        if (
+            isinstance(item, h5py.Dataset)
+            and f"/{name}" not in BOOKKEEPING
+            and (item.shape or _is_text(item))
+        ):
             found[f"/{name}"] = item
 
     group.visititems(visit)
@@ -357,7 +498,11 @@ def _datasets(group: h5py.Group) -> dict[str, h5py.Dataset]:
 
 def _unprotected(datasets: dict[str, h5py.Dataset]) -> str:
     """Sentence that names the datasets without a checksum (Fletcher32, or gzip with its Adler-32); empty if all have one."""
-    names = [topic for topic, d in datasets.items() if not d.fletcher32 and d.compression != "gzip"]
+    names = [
+        topic
+        for topic, d in datasets.items()
+        if not d.fletcher32 and d.compression != "gzip"
+    ]
     text = f"no checksum in {listed(names)}: changed bytes are read as values or pictures; the recorder can write one "
     return f"{text}with create_dataset(…, fletcher32=True)" if names else ""
 
@@ -369,36 +514,67 @@ def _episode_groups(file: h5py.File) -> dict[str, str]:
     found: list[str] = []
     for _ in range(DEEPEST_EPISODES):
         families: dict[tuple[str, str], list[str]] = {}
-        below = [g[name] for g in level for name in g if g.get(name, getclass=True, getlink=True) is h5py.HardLink]
+        below = [
+            g[name]
+            for g in level
+            for name in g
+            if g.get(name, getclass=True, getlink=True) is h5py.HardLink
+        ]
         level = [item for item in below if isinstance(item, h5py.Group)]
         for group in level:
             parent, _, name = str(group.name).rpartition("/")
             if (number := re.fullmatch(r"(.*?)[_-]?(\d+)", name)) is not None:
-                families.setdefault((parent, number[1].lower()), []).append(str(group.name))
-        found = [path for (_, word), paths in families.items() if _are_episodes(file, word, paths) for path in paths]
+                families.setdefault((parent, number[1].lower()), []).append(
+                    str(group.name)
+                )
+        found = [
+            path
+            for (_, word), paths in families.items()
+            if _are_episodes(file, word, paths)
+            for path in paths
+        ]
         if found:
             break
     names = [path.rpartition("/")[2] for path in found]
-    named = {name if names.count(name) == 1 else path.strip("/"): path for name, path in zip(names, found, strict=True)}
+    named = {
+        name if names.count(name) == 1 else path.strip("/"): path
+        for name, path in zip(names, found, strict=True)
+    }
     return dict(sorted(named.items(), key=lambda item: decode.natural_key(item[0])))
 
 
 def _are_episodes(file: h5py.File, word: str, paths: list[str]) -> bool:
-    contents = [_datasets(group) for path in paths if isinstance(group := file[path], h5py.Group)]
+    contents = [
+        _datasets(group)
+        for path in paths
+        if isinstance(group := file[path], h5py.Group)
+    ]
     if not any(d.ndim > 0 for found in contents for d in found.values()):
         return False
-    inside = {f"{path}{topic}" for path, found in zip(paths, contents, strict=True) for topic in found}
+    inside = {
+        f"{path}{topic}"
+        for path, found in zip(paths, contents, strict=True)
+        for topic in found
+    }
     alone = all(topic in inside or d.ndim < 2 for topic, d in _datasets(file).items())
     if not word or word in EPISODE_WORDS:
         return bool(word) or alone
     lengths = {max(map(_length, found.values()), default=0) for found in contents}
-    return alone and len({frozenset(found) for found in contents}) == 1 and len(lengths) > 1
+    return (
+        alone
+        and len({frozenset(found) for found in contents}) == 1
+        and len(lengths) > 1
+    )
 
 
 def _attributes(group: h5py.Group) -> dict[str, Any]:
     """Attributes of a group and of those that contain it; its own win."""
     above = group.parent
-    parents = {} if group.name == "/" or not isinstance(above, h5py.Group) else _attributes(above)
+    parents = (
+        {}
+        if group.name == "/" or not isinstance(above, h5py.Group)
+        else _attributes(above)
+    )
     return parents | dict(group.attrs.items())
 
 
@@ -410,7 +586,9 @@ def _rate(value: Any) -> float | None:
     single = found.reshape(-1)[0]
     if found.dtype.kind in "iuf":
         return float(single)
-    text = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(?:hz|fps)?\s*", _text(single), re.IGNORECASE)
+    text = re.fullmatch(
+        r"\s*(\d+(?:\.\d+)?)\s*(?:hz|fps)?\s*", _text(single), re.IGNORECASE
+    )
     return float(text[1]) if text else None
 
 
@@ -425,11 +603,26 @@ def _as_times(values: np.ndarray, topic: str) -> np.ndarray | None:
     named = any(word.startswith(TIME_WORDS) or word in ("t", "ts") for word in words)
     first, period = abs(float(finite[0])), abs(float(np.median(steps)))
     for unit_ns in (NS_PER_S, 1_000_000, 1000, 1):
-        first_s, rate_hz = first * unit_ns / NS_PER_S, NS_PER_S / max(period * unit_ns, 1e-9)
+        first_s, rate_hz = (
+            first * unit_ns / NS_PER_S,
+            NS_PER_S / max(period * unit_ns, 1e-9),
+        )
         from_1970 = 1e9 <= first_s < 4e9 and (named or (steps > 0).all())
-        if from_1970 or (named and first_s < 1e9 and RATES_HZ[0] <= rate_hz <= RATES_HZ[1]):
+        if from_1970 or (
+            named and first_s < 1e9 and RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
+        ):
             way_out = "correct it, or remove these time stamps from the file"
-            check_stamps(values.astype(float) * (unit_ns / NS_PER_S), f"time stamp {topic}", way_out)
-            whole = values.astype(np.int64) if values.dtype.kind in "iu" else np.floor(values).astype(np.int64)
-            return whole * unit_ns + np.rint((values - whole).astype(float) * unit_ns).astype(np.int64)
+            check_stamps(
+                values.astype(float) * (unit_ns / NS_PER_S),
+                f"time stamp {topic}",
+                way_out,
+            )
+            whole = (
+                values.astype(np.int64)
+                if values.dtype.kind in "iu"
+                else np.floor(values).astype(np.int64)
+            )
+            return whole * unit_ns + np.rint(
+                (values - whole).astype(float) * unit_ns
+            ).astype(np.int64)
     return None

@@ -17,14 +17,32 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from taccorl.data import decode
-from taccorl.data.mcap_records import BEGINNINGS, DATA_END_BYTES, MAGIC, McapFile, Record, chunk_records, parse
-from taccorl.data.recording import Damage, Message, Query, Reader, Source, TopicType, readers
+from taccorl.data.mcap_records import (
+    BEGINNINGS,
+    DATA_END_BYTES,
+    MAGIC,
+    McapFile,
+    Record,
+    chunk_records,
+    parse,
+)
+from taccorl.data.recording import (
+    Damage,
+    Message,
+    Query,
+    Reader,
+    Source,
+    TopicType,
+    readers,
+)
 from taccorl.data.ros import Decoder, cdr_stamp, full_name, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
 
-MOST_METADATA_BYTES = 1 << 20  # Largest metadata.yaml of a bag that is read; rosbag2 writes 1 to 2 kB for each topic
+MOST_METADATA_BYTES = (
+    1 << 20
+)  # Largest metadata.yaml of a bag that is read; rosbag2 writes 1 to 2 kB for each topic
 MAX_TIME_NS = 2**63 - 1  # Latest time that an int64 can hold [ns]
 MAX_MISFITS = 10  # Most messages of a channel without CRC that may fail to decode as damage; more: its schema is wrong
 NO_SCHEMA = "no schema"  # Type of messages of a channel without a schema
@@ -36,12 +54,18 @@ NO_SCHEMA = "no schema"  # Type of messages of a channel without a schema
 def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
     """Function from bytes to a message: an object with attributes (ROS 2, protobuf) or a JSON object. Raises RecordingError:
     an encoding that is not read, or a schema that does not parse."""
-    encoding, found, kind = channel.message_encoding, None, schema.name if schema else NO_SCHEMA
+    encoding, found, kind = (
+        channel.message_encoding,
+        None,
+        schema.name if schema else NO_SCHEMA,
+    )
     if encoding == "json":
         return json.loads
     if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
         full, text = full_name(kind), schema.data.decode(errors="replace")
-        store = type_store(full, "ros2msg", text, f"{channel.topic}: its schema {schema.name}")
+        store = type_store(
+            full, "ros2msg", text, f"{channel.topic}: its schema {schema.name}"
+        )
         return lambda data: store.deserialize_cdr(data, full)
     try:
         if encoding == "protobuf":
@@ -53,19 +77,29 @@ def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
         raise RecordingError(text) from error
     if found is None:
         described = f"{schema.encoding} schema {kind}" if schema else NO_SCHEMA
-        text = f"{channel.topic}: {encoding!r} messages with {described} are not supported"
+        text = (
+            f"{channel.topic}: {encoding!r} messages with {described} are not supported"
+        )
         raise RecordingError(f"{text} (supported: cdr with ros2msg, protobuf, json)")
     return found
 
 
-def message_stamper(channel: Channel, schema: Schema | None) -> Callable[[bytes], int | None]:
+def message_stamper(
+    channel: Channel, schema: Schema | None
+) -> Callable[[bytes], int | None]:
     """Function from a message's bytes to its stamp [ns]. If a ROS 2 header comes first, the rest is not decoded."""
     try:
         decoder = message_decoder(channel, schema)
         if channel.message_encoding == "cdr" and schema is not None:
             full, text = full_name(schema.name), schema.data.decode(errors="replace")
-            fields = type_store(full, "ros2msg", text, f"{channel.topic}: its schema {schema.name}").fielddefs[full][1]
-            if fields and fields[0][0] == "header" and fields[0][1][1] == "std_msgs/msg/Header":
+            fields = type_store(
+                full, "ros2msg", text, f"{channel.topic}: its schema {schema.name}"
+            ).fielddefs[full][1]
+            if (
+                fields
+                and fields[0][0] == "header"
+                and fields[0][1][1] == "std_msgs/msg/Header"
+            ):
                 return cdr_stamp
             if not {"header", "timestamp"} & {name for name, _ in fields}:
                 return lambda data: None
@@ -98,12 +132,16 @@ class _Definitions:
 
     def decoder(self, channel: Channel) -> Decoder:
         if channel.id not in self.decoders:
-            self.decoders[channel.id] = message_decoder(channel, self.schemas.get(channel.schema_id))
+            self.decoders[channel.id] = message_decoder(
+                channel, self.schemas.get(channel.schema_id)
+            )
         return self.decoders[channel.id]
 
     def stamp(self, channel: Channel, data: bytes) -> int | None:
         if channel.id not in self.stampers:
-            self.stampers[channel.id] = message_stamper(channel, self.schemas.get(channel.schema_id))
+            self.stampers[channel.id] = message_stamper(
+                channel, self.schemas.get(channel.schema_id)
+            )
         return self.stampers[channel.id](data)
 
 
@@ -121,20 +159,33 @@ def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | N
     """A rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers with ``split_bag``; None if
     ``path`` is no such folder. Raises RecordingError: a file is compressed, or metadata.yaml is damaged or differs."""
     if packed := sorted(path.glob(f"*{suffix}.zstd")):
-        raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
-    files = sorted((p for p in path.iterdir() if p.suffix == suffix), key=lambda p: decode.natural_key(p.name))
+        raise RecordingError(
+            f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`"
+        )
+    files = sorted(
+        (p for p in path.iterdir() if p.suffix == suffix),
+        key=lambda p: decode.natural_key(p.name),
+    )
     index = path / "metadata.yaml"
     if not files or not index.is_file():
         return [Source(path, tuple(files))] if files and split_bag else None
     try:
-        names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"]["relative_file_paths"]
+        names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"][
+            "relative_file_paths"
+        ]
         named = [path / Path(n).name for n in names]
     except (SpecError, KeyError, TypeError) as error:
-        raise RecordingError(f"{index}: no metadata file of rosbag2 ({type(error).__name__}: {error})") from error
+        raise RecordingError(
+            f"{index}: no metadata file of rosbag2 ({type(error).__name__}: {error})"
+        ) from error
     if absent := [p.name for p in named if not p.is_file()]:
-        raise RecordingError(f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag")
+        raise RecordingError(
+            f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag"
+        )
     if unnamed := [p.name for p in files if p not in named]:
-        raise RecordingError(f"{index} does not name {', '.join(unnamed)}: run `ros2 bag reindex`, or move it away")
+        raise RecordingError(
+            f"{index} does not name {', '.join(unnamed)}: run `ros2 bag reindex`, or move it away"
+        )
     return [Source(path, tuple(named))]
 
 
@@ -163,13 +214,19 @@ class McapReader(BagReader):
             yield from file.messages()
         self._whole |= query.whole
         without = any(file.unprotected for file in files)
-        return "its recorder wrote messages without a CRC: changed bytes are read as values" if without else ""
+        return (
+            "its recorder wrote messages without a CRC: changed bytes are read as values"
+            if without
+            else ""
+        )
 
 
 class _File:
     """One walk through one MCAP file."""
 
-    def __init__(self, path: Path, reader: McapReader, query: Query, damage: list[Damage]) -> None:
+    def __init__(
+        self, path: Path, reader: McapReader, query: Query, damage: list[Damage]
+    ) -> None:
         self.path, self.reader, self.query, self.damage = path, reader, query, damage
         self.known = reader.definitions[path]
         self.misfits: Counter[int] = Counter()
@@ -182,7 +239,9 @@ class _File:
         try:
             file = self.path.open("rb")
         except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be opened: {error.strerror}") from error
+            raise RecordingError(
+                f"{self.path}: cannot be opened: {error.strerror}"
+            ) from error
         with file:
             mcap = McapFile(file, self.path.stat().st_size)
             for definition in mcap.summary.definitions:
@@ -199,11 +258,23 @@ class _File:
                         self._learn(r, proven, record)
             if self.query.whole:
                 self._check_ends(mcap, sound=len(self.damage) == already)
-                self.unprotected += self.unchunked if self.data_end is None or not any(mcap.body(self.data_end)) else 0
+                self.unprotected += (
+                    self.unchunked
+                    if self.data_end is None or not any(mcap.body(self.data_end))
+                    else 0
+                )
         if self.orphans:
-            self._damaged(0, mcap.size, f"{self.orphans} messages of channels whose definition was lost")
+            self._damaged(
+                0,
+                mcap.size,
+                f"{self.orphans} messages of channels whose definition was lost",
+            )
         if self.timeless:
-            self._damaged(0, mcap.size, f"{self.timeless} messages with a log time after the year 2262")
+            self._damaged(
+                0,
+                mcap.size,
+                f"{self.timeless} messages with a log time after the year 2262",
+            )
 
     def _begin(self, mcap: McapFile) -> int:
         """Offset of the first record."""
@@ -219,7 +290,9 @@ class _File:
         if start is None:
             text = f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}, and holds no chunk"
             raise RecordingError(text)
-        self._damaged(0, start, "not the beginning of an MCAP file", lost=start != len(MAGIC))
+        self._damaged(
+            0, start, "not the beginning of an MCAP file", lost=start != len(MAGIC)
+        )
         return start
 
     def _walk(self, mcap: McapFile) -> Iterator[Record]:
@@ -231,31 +304,62 @@ class _File:
                 following = self._resume(mcap, sure, offset)
                 if following is None:
                     cut = mcap.summary.end is None
-                    reason = "the file ends without a footer (cut by a crash?)" if cut else "a damaged end of the data"
-                    self._damaged(offset, mcap.end, reason, lost=cut or mcap.end - offset > DATA_END_BYTES)
+                    reason = (
+                        "the file ends without a footer (cut by a crash?)"
+                        if cut
+                        else "a damaged end of the data"
+                    )
+                    self._damaged(
+                        offset,
+                        mcap.end,
+                        reason,
+                        lost=cut or mcap.end - offset > DATA_END_BYTES,
+                    )
                     return
-                self._damaged(offset if offset < following else sure, following, "a record header that makes no sense")
+                self._damaged(
+                    offset if offset < following else sure,
+                    following,
+                    "a record header that makes no sense",
+                )
                 offset = sure = following
                 continue
             if record.opcode == Op.DATA_END:
                 self.data_end = record
                 return
             mcap.chunked = mcap.chunked or record.opcode == Op.CHUNK
-            if record.opcode in (Op.SCHEMA, Op.CHANNEL, Op.MESSAGE, Op.CHUNK, Op.METADATA):
+            if record.opcode in (
+                Op.SCHEMA,
+                Op.CHANNEL,
+                Op.MESSAGE,
+                Op.CHUNK,
+                Op.METADATA,
+            ):
                 yield record
             offset, self.after_lost = self.after_lost or record.end, None
             if record.opcode in (Op.CHUNK, Op.MESSAGE):
                 sure = offset  # the others may have eaten a chunk's beginning if bytes are missing
-            if offset == mcap.summary.end:  # what was before it was no end-of-data record
+            if (
+                offset == mcap.summary.end
+            ):  # what was before it was no end-of-data record
                 return
 
     def _resume(self, mcap: McapFile, sure: int, bad: int) -> int | None:
         """Where the walk goes on. Within chunked data only a chunk vouches for its messages, by its CRC."""
-        if mcap.summary.end is None and (moved := mcap.find(sure, bad, {Op.CHUNK, Op.DATA_END})) is not None:
+        if (
+            mcap.summary.end is None
+            and (moved := mcap.find(sure, bad, {Op.CHUNK, Op.DATA_END})) is not None
+        ):
             return moved
         indexed = mcap.summary.next_start(bad + 1)
-        opcodes = BEGINNINGS | (set() if mcap.chunked else {Op.SCHEMA, Op.CHANNEL, Op.MESSAGE})
-        found = mcap.find(bad + 1, mcap.end if indexed is None else indexed, opcodes, self.known.channels)
+        opcodes = BEGINNINGS | (
+            set() if mcap.chunked else {Op.SCHEMA, Op.CHANNEL, Op.MESSAGE}
+        )
+        found = mcap.find(
+            bad + 1,
+            mcap.end if indexed is None else indexed,
+            opcodes,
+            self.known.channels,
+        )
         return indexed if found is None else found
 
     def _contents(self, mcap: McapFile, record: Record) -> tuple[list[Any], bool]:
@@ -264,13 +368,27 @@ class _File:
             try:
                 found = [parse(record.opcode, mcap.body(record))]
             except Exception as error:
-                self._damaged(record.offset, record.end, f"record lost ({type(error).__name__}: {error})")
+                self._damaged(
+                    record.offset,
+                    record.end,
+                    f"record lost ({type(error).__name__}: {error})",
+                )
                 return [], False
             self.unchunked += record.opcode == Op.MESSAGE
             return found, False
-        first, last = self.reader.chunk_times.get((self.path, record.offset), (None, None))
-        late = first is not None and self.query.end_ns is not None and first > self.query.end_ns
-        if late or (last is not None and self.query.start_ns is not None and last < self.query.start_ns):
+        first, last = self.reader.chunk_times.get(
+            (self.path, record.offset), (None, None)
+        )
+        late = (
+            first is not None
+            and self.query.end_ns is not None
+            and first > self.query.end_ns
+        )
+        if late or (
+            last is not None
+            and self.query.start_ns is not None
+            and last < self.query.start_ns
+        ):
             return [], True
         chunk = None
         try:
@@ -279,14 +397,18 @@ class _File:
         except Exception as error:  # CRC, decompression, struct: whatever it is, only this chunk is lost
             # It ends as it says, but before the next one if bytes are missing and that has moved into it.
             cut = mcap.summary.end is None
-            moved = mcap.find(record.offset + 1, record.end, BEGINNINGS) if cut else None
+            moved = (
+                mcap.find(record.offset + 1, record.end, BEGINNINGS) if cut else None
+            )
             self.after_lost = record.end if moved is None else moved
             reason = f"chunk lost ({type(error).__name__}: {str(error)[:120]})"
             self._damaged(record.offset, self.after_lost, reason, chunk)
             return [], True
         self.unprotected += chunk.uncompressed_crc == 0
         logged = [r.log_time for r in found if isinstance(r, McapMessage)]
-        self.reader.chunk_times[self.path, record.offset] = (min(logged), max(logged)) if logged else (0, 0)
+        self.reader.chunk_times[self.path, record.offset] = (
+            (min(logged), max(logged)) if logged else (0, 0)
+        )
         return found, chunk.uncompressed_crc != 0
 
     def _check_ends(self, mcap: McapFile, *, sound: bool) -> None:
@@ -300,31 +422,48 @@ class _File:
             reason = f"no index behind the data ({why}): nothing there was read"
             # no index holds these: joined files
             another = mcap.find(self.data_end.end, mcap.end, {Op.CHUNK, Op.DATA_END})
-            self._damaged(self.data_end.end, mcap.size, reason, lost=another is not None)
+            self._damaged(
+                self.data_end.end, mcap.size, reason, lost=another is not None
+            )
 
     def _message(self, m: McapMessage, proven: bool, place: Record) -> Message | None:
         channel = self.known.channels.get(m.channel_id)
         if channel is not None and not self.query.asks(channel.topic):
             return None
-        with_schema = channel is not None and (channel.message_encoding == "json" or channel.schema_id == 0)
-        if channel is None or not (with_schema or channel.schema_id in self.known.schemas):
+        with_schema = channel is not None and (
+            channel.message_encoding == "json" or channel.schema_id == 0
+        )
+        if channel is None or not (
+            with_schema or channel.schema_id in self.known.schemas
+        ):
             self.orphans += 1
             return None
         schema = self.known.schemas.get(channel.schema_id)
-        kind, first = schema.name if schema else NO_SCHEMA, self.reader.types[channel.topic].name
+        kind, first = (
+            schema.name if schema else NO_SCHEMA,
+            self.reader.types[channel.topic].name,
+        )
         if full_name(kind) != full_name(first) and self.query.reads(channel.topic):
             text = f"{channel.topic}: messages of {kind}, but its first channel is of {first}: record one type a topic"
             raise RecordingError(text)
         if m.log_time > MAX_TIME_NS:
             self.timeless += 1
             return None
-        decoder = self.known.decoder(channel) if self.query.reads(channel.topic) else None
+        decoder = (
+            self.known.decoder(channel) if self.query.reads(channel.topic) else None
+        )
         is_cdr, value = channel.message_encoding == "cdr", None
         try:
             data = unpacked(m.data) if is_cdr else m.data
             value = None if decoder is None else decoder(data)
-            stamp = decode.stamp_ns(value) if decoder and not is_cdr else self.known.stamp(channel, data)
-        except Exception as error:  # decoders raise what they like on bytes that do not fit the schema
+            stamp = (
+                decode.stamp_ns(value)
+                if decoder and not is_cdr
+                else self.known.stamp(channel, data)
+            )
+        except (
+            Exception
+        ) as error:  # decoders raise what they like on bytes that do not fit the schema
             if decoder is None:
                 return Message(channel.topic, m.log_time, None, None)
             problem = f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema {kind} "
@@ -336,14 +475,20 @@ class _File:
             return None
         return Message(channel.topic, m.log_time, stamp, value)
 
-    def _learn(self, definition: Schema | Channel, proven: bool, place: Record | None) -> None:
+    def _learn(
+        self, definition: Schema | Channel, proven: bool, place: Record | None
+    ) -> None:
         """Take in a definition; one that no CRC vouches for does not replace one that has that."""
         kind, number = type(definition), definition.id
-        table: dict[int, Any] = self.known.schemas if kind is Schema else self.known.channels
+        table: dict[int, Any] = (
+            self.known.schemas if kind is Schema else self.known.channels
+        )
         if table.get(number) != definition:
             if (kind, number) in self.known.proven and not proven:
                 if place is not None:
-                    reason = f"a damaged {kind.__name__.lower()}; the index's copy is used"
+                    reason = (
+                        f"a damaged {kind.__name__.lower()}; the index's copy is used"
+                    )
                     self._damaged(place.offset, place.end, reason, lost=False)
                 return
             table[number] = definition
@@ -365,8 +510,24 @@ class _File:
         except RecordingError as error:
             problem = str(error)
         kind = schema.name if schema else NO_SCHEMA
-        self.reader.types[channel.topic] = TopicType(kind, channel.message_encoding, problem)
+        self.reader.types[channel.topic] = TopicType(
+            kind, channel.message_encoding, problem
+        )
 
-    def _damaged(self, start: int, end: int, reason: str, chunk: Chunk | None = None, *, lost: bool = True) -> None:
-        times = (chunk.message_start_time, chunk.message_end_time) if chunk is not None else (None, None)
-        self.damage.append(Damage(str(self.path), start, end, reason, *times, lost=lost))
+    def _damaged(
+        self,
+        start: int,
+        end: int,
+        reason: str,
+        chunk: Chunk | None = None,
+        *,
+        lost: bool = True,
+    ) -> None:
+        times = (
+            (chunk.message_start_time, chunk.message_end_time)
+            if chunk is not None
+            else (None, None)
+        )
+        self.damage.append(
+            Damage(str(self.path), start, end, reason, *times, lost=lost)
+        )

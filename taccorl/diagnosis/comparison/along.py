@@ -12,7 +12,12 @@ from typing import Literal
 import numpy as np
 
 from taccorl.alignment.measurements.measurement import UNITS
-from taccorl.diagnosis.comparison.localise import LEAST_SHARE, Motion, bridged, motions_of
+from taccorl.diagnosis.comparison.localise import (
+    LEAST_SHARE,
+    Motion,
+    bridged,
+    motions_of,
+)
 from taccorl.diagnosis.comparison.result import BLOCK_S, Comparison, Kind, drawn_blocks
 
 BINS = 14
@@ -38,14 +43,36 @@ class Variable:
 
 
 VARIABLES: tuple[Variable, ...] = (
-    Variable("velocity", "friction, drag, damping, delay", "mean", lambda m: m.velocity),
-    Variable("position", "gravity, springs, cogging, encoder waves", "mean", lambda m: bridged(m.trace.position)),
-    Variable("commanded acceleration", "inertia, delay, slew limits", "mean", lambda m: m.acceleration),
     Variable(
-        "modelled torque", "load friction, compliance, saturation, torque scale", "mean", lambda m: m.trace.torque
+        "velocity", "friction, drag, damping, delay", "mean", lambda m: m.velocity
     ),
-    Variable("time", "heating, drift", "RMS", lambda m: m.trace.time_s - m.trace.time_s[0]),
-    Variable("commanded speed", "slew limits, lag, feed-forward", "RMS", lambda m: np.abs(m.target_speed)),
+    Variable(
+        "position",
+        "gravity, springs, cogging, encoder waves",
+        "mean",
+        lambda m: bridged(m.trace.position),
+    ),
+    Variable(
+        "commanded acceleration",
+        "inertia, delay, slew limits",
+        "mean",
+        lambda m: m.acceleration,
+    ),
+    Variable(
+        "modelled torque",
+        "load friction, compliance, saturation, torque scale",
+        "mean",
+        lambda m: m.trace.torque,
+    ),
+    Variable(
+        "time", "heating, drift", "RMS", lambda m: m.trace.time_s - m.trace.time_s[0]
+    ),
+    Variable(
+        "commanded speed",
+        "slew limits, lag, feed-forward",
+        "RMS",
+        lambda m: np.abs(m.target_speed),
+    ),
 )
 """The variables of the figures and reports, in their order."""
 
@@ -53,7 +80,12 @@ VARIABLES: tuple[Variable, ...] = (
 def variable_unit(variable: str, position_unit: str) -> str:
     """Unit of the variable of that name, such as "rad/s", for a signal whose position is in ``position_unit`` (rad or m)."""
     speed, effort = UNITS[position_unit]
-    units = {"velocity": speed, "position": position_unit, "commanded acceleration": f"{speed}²", "time": "s"}
+    units = {
+        "velocity": speed,
+        "position": position_unit,
+        "commanded acceleration": f"{speed}²",
+        "time": "s",
+    }
     return units.get(variable, effort if variable == "modelled torque" else speed)
 
 
@@ -88,17 +120,28 @@ def curves(comparison: Comparison, signal: str, kind: Kind = "position") -> list
     return [c for c in found if c is not None]
 
 
-def _curve(motions: Sequence[Motion], signal: str, kind: Kind, variable: Variable) -> Curve | None:
+def _curve(
+    motions: Sequence[Motion], signal: str, kind: Kind, variable: Variable
+) -> Curve | None:
     values = np.concatenate([variable.values(m) for m in motions])
     residual = np.concatenate([m.trace.residual for m in motions])
     rows = [max(1, round(BLOCK_S / m.trace.period_s)) for m in motions]
     sizes = [len(m.trace.time_s) for m in motions]
-    firsts = np.concatenate([[0], np.cumsum([-(-size // r) for size, r in zip(sizes, rows, strict=True)])])
+    firsts = np.concatenate(
+        [[0], np.cumsum([-(-size // r) for size, r in zip(sizes, rows, strict=True)])]
+    )
     block = np.concatenate(
-        [first + np.arange(size) // r for first, size, r in zip(firsts[:-1], sizes, rows, strict=True)]
+        [
+            first + np.arange(size) // r
+            for first, size, r in zip(firsts[:-1], sizes, rows, strict=True)
+        ]
     )
     known = np.isfinite(values) & np.isfinite(residual)
-    low, high = np.quantile(values[known], (0.01, 0.99)) if known.sum() > 10 * BINS else (0.0, 0.0)
+    low, high = (
+        np.quantile(values[known], (0.01, 0.99))
+        if known.sum() > 10 * BINS
+        else (0.0, 0.0)
+    )
     if high - low < STANDS:
         return None
     which = np.clip(np.floor((values - low) / (high - low) * BINS), 0, BINS - 1)
@@ -113,10 +156,15 @@ def _curve(motions: Sequence[Motion], signal: str, kind: Kind, variable: Variabl
     if kept.sum() < 3:
         return None
     weights = drawn_blocks(shape[0])
-    with np.errstate(invalid="ignore", divide="ignore"):  # a draw may hold no row of a bin
+    with np.errstate(
+        invalid="ignore", divide="ignore"
+    ):  # a draw may hold no row of a bin
         draws = ((weights @ sums) / (weights @ counts))[:, kept]
     curve = np.vstack(
-        [sums.sum(axis=0)[kept] / counts.sum(axis=0)[kept], np.nanquantile(draws, (0.025, 0.975), axis=0)]
+        [
+            sums.sum(axis=0)[kept] / counts.sum(axis=0)[kept],
+            np.nanquantile(draws, (0.025, 0.975), axis=0),
+        ]
     )
     middle, band_low, band_high = np.sqrt(curve) if variable.measure == "RMS" else curve
     return Curve(
@@ -145,5 +193,11 @@ def _explained(residual: np.ndarray, which: np.ndarray, num: int) -> float:
 def _by_chance(residual: np.ndarray, which: np.ndarray, num: int) -> float:
     """95th percentile over shifts of the residual by random parts of the whole."""
     rng = np.random.default_rng(0)
-    shifts = rng.integers(len(residual) // 10, max(len(residual) - len(residual) // 10, 2), 100)
-    return float(np.quantile([_explained(np.roll(residual, s), which, num) for s in shifts], 0.95))
+    shifts = rng.integers(
+        len(residual) // 10, max(len(residual) - len(residual) // 10, 2), 100
+    )
+    return float(
+        np.quantile(
+            [_explained(np.roll(residual, s), which, num) for s in shifts], 0.95
+        )
+    )

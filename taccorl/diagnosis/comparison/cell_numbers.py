@@ -17,7 +17,9 @@ FAMILIES = {"gain_": "gain", "offset_": "offset"}
 """Beginning of the names of one number of all cells (``gain_r0c0``, …) → its name."""
 
 
-def spread_words(names: Sequence[str], values: np.ndarray, unit: str = "", *, largest: bool = False) -> str:
+def spread_words(
+    names: Sequence[str], values: np.ndarray, unit: str = "", *, largest: bool = False
+) -> str:
     """Text such as ``median 30 count, middle half 25 … 35 count, farthest r1c2 62, r0c9 12``.
 
     Args:
@@ -26,7 +28,9 @@ def spread_words(names: Sequence[str], values: np.ndarray, unit: str = "", *, la
         largest: name the largest ones, as of errors; else those that differ most from the median.
     """
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    order = np.argsort(-(values if largest else np.abs(values - median)), kind="stable")[:FARTHEST]
+    order = np.argsort(
+        -(values if largest else np.abs(values - median)), kind="stable"
+    )[:FARTHEST]
     some = ", ".join(f"{names[k]} {values[k]:.3g}" for k in order)
     of = f" {unit}" if unit else ""
     word = "largest" if largest else "farthest"
@@ -42,13 +46,20 @@ def summarised(numbers: Mapping[str, float]) -> tuple[dict[str, float], dict[str
         if len(own) > FEW:
             rest = {name: value for name, value in rest.items() if name not in own}
             cells = [name.removeprefix(begin) for name in own]
-            words[f"{word} of {len(own)} cells"] = spread_words(cells, np.array(list(own.values())))
+            words[f"{word} of {len(own)} cells"] = spread_words(
+                cells, np.array(list(own.values()))
+            )
     return rest, words
 
 
 def cell_errors(traces: Sequence[TouchTrace]) -> np.ndarray:
     """(R, C) RMS residual of each cell of a sensor over all recordings, in noise floors."""
-    return np.sqrt(np.concatenate([np.square(t.residual[:, 0]) for t in traces]).mean(axis=0)) / traces[0].floor[0]
+    return (
+        np.sqrt(
+            np.concatenate([np.square(t.residual[:, 0]) for t in traces]).mean(axis=0)
+        )
+        / traces[0].floor[0]
+    )
 
 
 def best_of(cells: CellNumbers) -> str:

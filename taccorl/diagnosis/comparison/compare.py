@@ -15,12 +15,21 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.telemetry import MOVED
 from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.controller.drive_law import FOLLOWED, DriveLaw
-from taccorl.alignment.controller.joint_model import JointModel, with_more_lead, with_other_numbers
+from taccorl.alignment.controller.joint_model import (
+    JointModel,
+    with_more_lead,
+    with_other_numbers,
+)
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor, floors_by_motion, noise_floor, touch_floor
+from taccorl.alignment.measurements.noise_floor import (
+    SignalFloor,
+    floors_by_motion,
+    noise_floor,
+    touch_floor,
+)
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.data.finding import Finding
@@ -32,7 +41,13 @@ from taccorl.diagnosis.comparison.replays import (
     replay_joints,
     replay_whole,
 )
-from taccorl.diagnosis.comparison.result import USES, Comparison, Kind, TouchTrace, Trace
+from taccorl.diagnosis.comparison.result import (
+    USES,
+    Comparison,
+    Kind,
+    TouchTrace,
+    Trace,
+)
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
@@ -64,10 +79,14 @@ def compare(
     Raises TaccorlError: the robot lacks a signal, a recording has nothing to compare, or the pads contradict the stated
     object."""
     uses: list[tuple[Use, Measurement]] = [
-        (use, m.on_robot(BENCH_REST)) for use in USES for m in getattr(measurements, use)
+        (use, m.on_robot(BENCH_REST))
+        for use in USES
+        for m in getattr(measurements, use)
     ]
     every = [m for _, m in uses]
-    floors: dict[Kind, Floors] = {kind: floors_by_motion(every, kind) for kind in ("position", "effort")}
+    floors: dict[Kind, Floors] = {
+        kind: floors_by_motion(every, kind) for kind in ("position", "effort")
+    }
     traces: list[Trace] = []
     touches: list[TouchTrace] = []
     left_out: list[str] = []
@@ -77,7 +96,9 @@ def compare(
     for (use, m), response in zip(uses, responses, strict=True):
         traces += traces_of(m, use, response, floors)
         if np.isfinite(response.reported).any():
-            clock[m.name] = tuple(check_against_twin(response.measurement, response.reported, levels))
+            clock[m.name] = tuple(
+                check_against_twin(response.measurement, response.reported, levels)
+            )
     for signal in GRIPPERS:
         names = [m.name for m in every if signal in held_up(m)]
         if names:
@@ -89,7 +110,9 @@ def compare(
         left_out += why_not
     if not traces and not touches:
         why = "; ".join(left_out) or "no position was measured"
-        raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: {why}")
+        raise TaccorlError(
+            f"{', '.join(m.name for m in every)}: nothing to compare: {why}"
+        )
     return Comparison(
         twin=name,
         effects=tuple(e.name for e in config.effects if not e.is_absent),
@@ -122,7 +145,9 @@ def compare_joints(
         by_motion: each recording has the noise floors of ``floors_by_motion``; if false, those of all recordings together. It
             is as the machine's own ``diagnose`` takes them.
     """
-    uses: list[tuple[Use, Measurement]] = [(use, whole(m)) for use in USES for m in getattr(measurements, use)]
+    uses: list[tuple[Use, Measurement]] = [
+        (use, whole(m)) for use in USES for m in getattr(measurements, use)
+    ]
     every = [m for _, m in uses]
     traces, clock, held, replayed, left = [], {}, set(), [], []
     for k, m in enumerate(every):
@@ -131,47 +156,81 @@ def compare_joints(
         known = [s for s in m.signals if s in laws and (s in moved or len(laws) == 1)]
         held |= {s for s in moved if s not in laws}
         replayed.append((known, response := replay_joints(machine, m, known)))
-        followed = FOLLOWED * np.array([m.target_kind(s) == "effort" for s in m.signals])
-        left.append(dataclasses.replace(m, effort=m.effort - followed * np.nan_to_num(response.effort)))
+        followed = FOLLOWED * np.array(
+            [m.target_kind(s) == "effort" for s in m.signals]
+        )
+        left.append(
+            dataclasses.replace(
+                m, effort=m.effort - followed * np.nan_to_num(response.effort)
+            )
+        )
     left *= any("effort" in m.target_kinds for m in every)
     pooled: dict[Kind, dict[str, SignalFloor]] = {"position": noise_floor(every)}
     pooled["effort"] = noise_floor(every, "effort", left)
-    floors: dict[Kind, Floors] = {kind: dict.fromkeys((m.name for m in every), own) for kind, own in pooled.items()}
+    floors: dict[Kind, Floors] = {
+        kind: dict.fromkeys((m.name for m in every), own)
+        for kind, own in pooled.items()
+    }
     if by_motion:
-        floors = {"position": floors_by_motion(every), "effort": floors_by_motion(every, "effort", left)}
+        floors = {
+            "position": floors_by_motion(every),
+            "effort": floors_by_motion(every, "effort", left),
+        }
     levels = {signal: floor.value for signal, floor in pooled["position"].items()}
     for (use, m), (known, response) in zip(uses, replayed, strict=True):
         positions = m.with_position_targets(np.nan_to_num(response.reported))
-        response.reported[:, [m.column(s) for s in known if laws[s].law == "effort"]] = np.nan  # held where measured
-        own = traces_of(positions, use, dataclasses.replace(response, measurement=positions), floors)
+        response.reported[
+            :, [m.column(s) for s in known if laws[s].law == "effort"]
+        ] = np.nan  # held where measured
+        own = traces_of(
+            positions, use, dataclasses.replace(response, measurement=positions), floors
+        )
         traces += [t for t in own if t.signal in known]
         if not (known := [s for s in known if laws[s].law != "effort"]):
             continue
         commanded = m.with_position_targets(np.zeros(m.target.shape)).only(known)
 
-        def with_more[T](change: Callable[[JointModel, JointMotion], T], signal: str, m: Measurement = m) -> T:
+        def with_more[T](
+            change: Callable[[JointModel, JointMotion], T],
+            signal: str,
+            m: Measurement = m,
+        ) -> T:
             model = JointModel(machine, signal)
             return change(model, motion_of(m, signal, model.joint))
 
-        changed, rivals = partial(with_more, with_other_numbers), partial(with_more, with_more_lead)
-        reported, fitted = response.reported[:, [m.column(s) for s in known]], [s for s in known if s in uncertain]
-        clock[m.name] = tuple(check_against_twin(commanded, reported, levels, fitted, changed, rivals))
+        changed, rivals = (
+            partial(with_more, with_other_numbers),
+            partial(with_more, with_more_lead),
+        )
+        reported, fitted = (
+            response.reported[:, [m.column(s) for s in known]],
+            [s for s in known if s in uncertain],
+        )
+        clock[m.name] = tuple(
+            check_against_twin(commanded, reported, levels, fitted, changed, rivals)
+        )
     progress("", len(uses), len(uses))
     if not traces:
         why = f"no position of a joint that {file} names was measured in motion"
-        raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: {why}")
+        raise TaccorlError(
+            f"{', '.join(m.name for m in every)}: nothing to compare: {why}"
+        )
     return Comparison(
         twin=name,
         effects=effects,
         traces=tuple(traces),
         split=measurements.record(),
         clock=beside_onsets(clock),
-        left_out=tuple(f"{s}: {file} does not name it under joints" for s in sorted(held)),
+        left_out=tuple(
+            f"{s}: {file} does not name it under joints" for s in sorted(held)
+        ),
     )
 
 
 def replay_all(
-    config: TwinConfig, measurements: Sequence[Measurement], progress: Callable[[str, int, int], None]
+    config: TwinConfig,
+    measurements: Sequence[Measurement],
+    progress: Callable[[str, int, int], None],
 ) -> list[Response]:
     """One response per measurement, in their order: without contact and without a gripper command each moving joint is replayed
     alone in the one-joint model, otherwise the whole twin. A measurement without a signal to compare gets a response of NaN.
@@ -182,7 +241,9 @@ def replay_all(
         moved = moving(m)
         if not compared(m):
             found.append(replay_joints(config, m, []))
-        elif moved and not in_contact(m).any() and not any("gripper" in s for s in moved):
+        elif (
+            moved and not in_contact(m).any() and not any("gripper" in s for s in moved)
+        ):
             found.append(replay_joints(config, m, moved))
         else:
             found.append(replay_whole(config, m))
@@ -193,7 +254,11 @@ def replay_all(
 def moving(m: Measurement) -> list[str]:
     """Names of the signals whose targets move: by more than 0.02 rad or 2 mm."""
     spans = np.ptp(m.target, axis=0)
-    return [s for s, unit, span in zip(m.signals, m.units, spans, strict=True) if span > MOVED[unit]]
+    return [
+        s
+        for s, unit, span in zip(m.signals, m.units, spans, strict=True)
+        if span > MOVED[unit]
+    ]
 
 
 def compared(m: Measurement) -> list[str]:
@@ -207,10 +272,16 @@ def held_up(m: Measurement) -> list[str]:
     further."""
     touched = np.asarray(in_contact(m).any(axis=0))
     stated = [m.pressed is not None and m.pressed.arm == arm for arm in ROBOT.arms]
-    return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
+    return [
+        signal
+        for signal, held, said in zip(GRIPPERS, touched, stated, strict=True)
+        if held or said
+    ]
 
 
-def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, Floors]) -> list[Trace]:
+def traces_of(
+    m: Measurement, use: Use, response: Response, floors: dict[Kind, Floors]
+) -> list[Trace]:
     """Measured and replayed values over time: one trace for each compared signal, one for its effort if recorded. ``floors``:
     of each kind; signals without one are left out."""
     touched = in_contact(response.measurement)
@@ -218,7 +289,11 @@ def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, F
     even = response.measurement
     for signal in compared(m):
         j, arm = even.column(signal), signal.split("_", 1)[0]
-        felt = touched[:, ROBOT.arms.index(arm)] if arm in ROBOT.arms else np.zeros(even.num_rows, dtype=bool)
+        felt = (
+            touched[:, ROBOT.arms.index(arm)]
+            if arm in ROBOT.arms
+            else np.zeros(even.num_rows, dtype=bool)
+        )
         columns: dict[Kind, tuple[np.ndarray, np.ndarray]] = {
             "position": (even.measured[:, j], response.reported[:, j]),
             "effort": (even.effort[:, j], response.effort[:, j]),
@@ -252,10 +327,14 @@ def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, F
 
 
 def _touches(
-    config: TwinConfig, uses: Sequence[tuple[Use, Measurement]], pressed: PressedObject | None
+    config: TwinConfig,
+    uses: Sequence[tuple[Use, Measurement]],
+    pressed: PressedObject | None,
 ) -> tuple[list[TouchTrace], list[str]]:
     """Matched contact replays, and why there are none of some recordings."""
-    felt: list[tuple[Use, Measurement]] = [(use, m) for use, m in uses if m.touch is not None]
+    felt: list[tuple[Use, Measurement]] = [
+        (use, m) for use, m in uses if m.touch is not None
+    ]
     unknown = [m.name for _, m in felt if m.pressed is None and pressed is None]
     found, why_not = [], []
     if unknown:
@@ -268,7 +347,9 @@ def _touches(
     model, sensor = TouchModel(config), TouchModel(config).sensor
     floor = touch_floor([m for _, m in felt])
     if floor is None:
-        return [], [f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"]
+        return [], [
+            f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"
+        ]
     floor = floor.reshape(len(ROBOT.pads), model.spec.rows, model.spec.columns)
     for use, m in felt:
         solid = m.pressed or pressed
@@ -281,7 +362,9 @@ def _touches(
                 raise
             why_not.append(f"touch: {error}")
             continue
-        reading = model.simulate(motion, sensor.normal_stiffness_per_m, sensor.normal_damping_s_per_m)
+        reading = model.simulate(
+            motion, sensor.normal_stiffness_per_m, sensor.normal_damping_s_per_m
+        )
         found.append(
             TouchTrace(
                 recording=m.name,

@@ -64,7 +64,9 @@ class Motion:
     @property
     def after_reversal(self) -> np.ndarray:
         """(T,) bool: rows after a reversal. A reversal counts if the joint was faster than near zero on both sides of it."""
-        sign = np.where(np.abs(self.velocity) > SLOW * self.peak_speed, np.sign(self.velocity), 0.0)
+        sign = np.where(
+            np.abs(self.velocity) > SLOW * self.peak_speed, np.sign(self.velocity), 0.0
+        )
         moving = np.flatnonzero(sign)
         after = np.zeros(len(sign), dtype=bool)
         rows = round(REVERSAL_S / self.trace.period_s)
@@ -87,7 +89,9 @@ def motions_of(traces: Sequence[Trace]) -> list[Motion]:
     found = []
     for t, velocity in zip(traces, velocities, strict=True):
         speed = _slope(t.target, t.period_s)
-        found.append(Motion(t, velocity, _slope(speed, t.period_s), speed, peak, span, high))
+        found.append(
+            Motion(t, velocity, _slope(speed, t.period_s), speed, peak, span, high)
+        )
     return found
 
 
@@ -95,14 +99,22 @@ def bridged(values: np.ndarray) -> np.ndarray:
     """``values`` (T,) with linear interpolation in place of NaN; all 0 if every value is NaN."""
     known = np.isfinite(values)
     at = np.arange(len(values))
-    return np.interp(at, at[known], values[known]) if known.any() else np.zeros(len(values))
+    return (
+        np.interp(at, at[known], values[known])
+        if known.any()
+        else np.zeros(len(values))
+    )
 
 
 def _slope(values: np.ndarray, period_s: float) -> np.ndarray:
-    window = min(2 * round(SMOOTH_S / period_s / 2) + 1, len(values) - (len(values) + 1) % 2)
+    window = min(
+        2 * round(SMOOTH_S / period_s / 2) + 1, len(values) - (len(values) + 1) % 2
+    )
     if window < 3:
         return np.gradient(values, period_s)
-    return np.asarray(savgol_filter(values, window, 1, deriv=1, delta=period_s, mode="interp"))
+    return np.asarray(
+        savgol_filter(values, window, 1, deriv=1, delta=period_s, mode="interp")
+    )
 
 
 def _third(values: np.ndarray, low: float, high: float, part: int) -> np.ndarray:
@@ -129,7 +141,10 @@ REGIMES: tuple[Regime, ...] = (
         "medium speed",
         "speed",
         f"{SLOW:.0%} to {FAST:.0%} of its peak speed",
-        lambda m: (np.abs(m.velocity) >= SLOW * m.peak_speed) & (np.abs(m.velocity) <= FAST * m.peak_speed),
+        lambda m: (
+            (np.abs(m.velocity) >= SLOW * m.peak_speed)
+            & (np.abs(m.velocity) <= FAST * m.peak_speed)
+        ),
     ),
     Regime(
         "high speed",
@@ -137,10 +152,23 @@ REGIMES: tuple[Regime, ...] = (
         f"faster than {FAST:.0%} of its peak speed",
         lambda m: np.abs(m.velocity) > FAST * m.peak_speed,
     ),
-    Regime("forwards", "direction", "moving towards larger positions", lambda m: m.velocity > SLOW * m.peak_speed),
-    Regime("backwards", "direction", "moving towards smaller positions", lambda m: m.velocity < -SLOW * m.peak_speed),
     Regime(
-        "after a reversal", "reversal", f"within {REVERSAL_S:g} s of a change of direction", lambda m: m.after_reversal
+        "forwards",
+        "direction",
+        "moving towards larger positions",
+        lambda m: m.velocity > SLOW * m.peak_speed,
+    ),
+    Regime(
+        "backwards",
+        "direction",
+        "moving towards smaller positions",
+        lambda m: m.velocity < -SLOW * m.peak_speed,
+    ),
+    Regime(
+        "after a reversal",
+        "reversal",
+        f"within {REVERSAL_S:g} s of a change of direction",
+        lambda m: m.after_reversal,
     ),
     Regime(
         "high load",
@@ -154,8 +182,15 @@ REGIMES: tuple[Regime, ...] = (
     Regime("first third", "time", "of each recording's time", _time(0)),
     Regime("second third", "time", "of each recording's time", _time(1)),
     Regime("last third", "time", "of each recording's time", _time(2)),
-    Regime("in contact", "contact", "a pad of its arm touches", lambda m: m.trace.touched),
-    Regime("no contact", "contact", "no pad of its arm touches", lambda m: ~m.trace.touched & m.trace.touched.any()),
+    Regime(
+        "in contact", "contact", "a pad of its arm touches", lambda m: m.trace.touched
+    ),
+    Regime(
+        "no contact",
+        "contact",
+        "no pad of its arm touches",
+        lambda m: ~m.trace.touched & m.trace.touched.any(),
+    ),
 )
 """All regimes of the motion of a joint or axis."""
 WHERE_NOT_WHY = (
@@ -190,7 +225,13 @@ class Cell:
 
 
 def cell_of(
-    signal: str, kind: Kind | Literal["touch"], regime: str, inside: np.ndarray, total: float, rows: float, floor: float
+    signal: str,
+    kind: Kind | Literal["touch"],
+    regime: str,
+    inside: np.ndarray,
+    total: float,
+    rows: float,
+    floor: float,
 ) -> Cell | None:
     """The error of a regime from its finite squared residuals ``inside`` (n,), of a signal with so many ``rows`` and the sum
     ``total``. None if it holds fewer rows than ``LEAST_SHARE``."""
@@ -215,19 +256,37 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
     for signal in [s for s, k in comparison.signals if k == kind]:
         motions = motions_of(comparison.of(signal, kind))
         squares = [m.trace.residual**2 for m in motions]
-        total, rows = (float(f(np.concatenate(squares))) for f in (np.nansum, lambda s: np.isfinite(s).sum()))
-        levels = [np.full(len(s), m.trace.floor.value**2) for s, m in zip(squares, motions, strict=True)]
+        total, rows = (
+            float(f(np.concatenate(squares)))
+            for f in (np.nansum, lambda s: np.isfinite(s).sum())
+        )
+        levels = [
+            np.full(len(s), m.trace.floor.value**2)
+            for s, m in zip(squares, motions, strict=True)
+        ]
         for regime in REGIMES:
-            which = [regime.rows(m) & np.isfinite(s) for s, m in zip(squares, motions, strict=True)]
-            inside, level = (np.concatenate([v[w] for v, w in zip(of, which, strict=True)]) for of in (squares, levels))
+            which = [
+                regime.rows(m) & np.isfinite(s)
+                for s, m in zip(squares, motions, strict=True)
+            ]
+            inside, level = (
+                np.concatenate([v[w] for v, w in zip(of, which, strict=True)])
+                for of in (squares, levels)
+            )
             floor = math.sqrt(level.sum() / max(len(level), 1))
             cells.append(cell_of(signal, kind, regime.name, inside, total, rows, floor))
     return [cell for cell in cells if cell]
 
 
-def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
+def worst_regime(
+    cells: Sequence[Cell], signal: str, kind: str = "position"
+) -> Cell | None:
     """The cell (errors of one signal in one regime of motion) of ``signal`` with the highest root mean square error. Regimes that
     hold 90 % of the rows or more are left out; None if no other one remains. ``cells``: errors as from ``heat_map`` or
     ``touch_heat_map``. ``kind``: ``position``, ``effort`` or ``touch``."""
-    own = [c for c in cells if c.signal == signal and c.kind == kind and c.share_of_time < 0.9]
+    own = [
+        c
+        for c in cells
+        if c.signal == signal and c.kind == kind and c.share_of_time < 0.9
+    ]
     return max(own, key=lambda c: c.ratio, default=None)

@@ -40,7 +40,11 @@ def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
     period_s = trace.period_s
     total = gaussian_filter1d(counts.sum(axis=1), SMOOTH_S / period_s)
     rate = np.gradient(total, period_s)
-    touched = np.asarray((counts > CONTACT_COUNTS).any(axis=1)) if trace.touched is None else trace.touched[:, pad]
+    touched = (
+        np.asarray((counts > CONTACT_COUNTS).any(axis=1))
+        if trace.touched is None
+        else trace.touched[:, pad]
+    )
     found = {name: np.zeros(len(total), dtype=bool) for name in PHASES}
     for first, end in runs(touched):
         fast = CHANGE_PER_S * total[first:end].max()
@@ -66,7 +70,10 @@ def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarr
         "in contact": (~quiet, everywhere),
         "no contact": (quiet, everywhere),
         **{name: (frames, everywhere) for name, frames in found.items()},
-        **{name: (always, everywhere & (third == k)) for k, name in enumerate(trace.thirds)},
+        **{
+            name: (always, everywhere & (third == k))
+            for k, name in enumerate(trace.thirds)
+        },
     }
 
 
@@ -75,18 +82,28 @@ def touch_heat_map(traces: Sequence[TouchTrace]) -> list[Cell]:
     cells = []
     for pad in dict.fromkeys(pad for t in traces for pad in t.pads):
         own_traces = [t for t in traces if pad in t.pads]
-        squares: dict[str, list[np.ndarray]] = {name: [] for name in (*EVERYWHERE, *own_traces[0].thirds)}
+        squares: dict[str, list[np.ndarray]] = {
+            name: [] for name in (*EVERYWHERE, *own_traces[0].thirds)
+        }
         floor_squares = []
         for t in own_traces:
             p = t.pads.index(pad)
             felt = t.felt(p)
             floor_squares.append(t.floor[p][felt] ** 2)
             for name, (rows, taxels) in regimes(t, p).items():
-                squares[name].append((t.residual[rows, p][:, felt & taxels] ** 2).ravel())
+                squares[name].append(
+                    (t.residual[rows, p][:, felt & taxels] ** 2).ravel()
+                )
         parts = {name: np.concatenate(found) for name, found in squares.items()}
-        total, count = sum(float(parts[n].sum()) for n in PHASES), sum(len(parts[n]) for n in PHASES)
+        total, count = (
+            sum(float(parts[n].sum()) for n in PHASES),
+            sum(len(parts[n]) for n in PHASES),
+        )
         if count == 0:
             continue
         floor = float(np.sqrt(np.mean(np.concatenate(floor_squares))))
-        cells += [cell_of(pad, "touch", name, own, total, count, floor) for name, own in parts.items()]
+        cells += [
+            cell_of(pad, "touch", name, own, total, count, floor)
+            for name, own in parts.items()
+        ]
     return [cell for cell in cells if cell]

@@ -17,7 +17,12 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, laid_pairs
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import VARIABLES, variable_unit
-from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, motions_of
+from taccorl.diagnosis.comparison.localise import (
+    LEAST_SHARE,
+    REGIMES,
+    Motion,
+    motions_of,
+)
 from taccorl.diagnosis.comparison.result import USES, Trace
 from taccorl.diagnosis.search.problem import Recording
 from taccorl.diagnosis.search.result import SearchConfig
@@ -77,7 +82,8 @@ class RegimeErrors:
         return tuple(
             c.variable
             for c in self.coverage
-            if {use, other} <= {*c.ranges} and not _covers(c.ranges[use], c.ranges[other])
+            if {use, other} <= {*c.ranges}
+            and not _covers(c.ranges[use], c.ranges[other])
         )
 
     @property
@@ -90,7 +96,11 @@ class RegimeErrors:
 def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
     """Errors of one signal by recording and regime. ``traces``: all recordings of the signal, replayed with the fitted twin."""
     motions, regimes = motions_of(traces), _regimes()
-    rows = [_row(m.trace.recording, m.trace.use, name, [m], inside) for m in motions for name, inside in regimes]
+    rows = [
+        _row(m.trace.recording, m.trace.use, name, [m], inside)
+        for m in motions
+        for name, inside in regimes
+    ]
     uses: list[Use] = [use for use in USES if any(m.trace.use == use for m in motions)]
     pooled = [
         _row("", use, name, [m for m in motions if m.trace.use == use], inside)
@@ -100,11 +110,18 @@ def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
     found = [r for r in (*pooled, *rows) if r is not None]
     coverage = _coverage(motions)
     remarks = (*_disagreements(found), *_gaps(coverage))
-    return RegimeErrors(signal=traces[0].signal, rows=tuple(found), coverage=tuple(coverage), remarks=remarks)
+    return RegimeErrors(
+        signal=traces[0].signal,
+        rows=tuple(found),
+        coverage=tuple(coverage),
+        remarks=remarks,
+    )
 
 
 def with_regimes(
-    sides: Sequence[Sequence[Recording]], measurements: Sequence[Measurement], floor: SignalFloor
+    sides: Sequence[Sequence[Recording]],
+    measurements: Sequence[Measurement],
+    floor: SignalFloor,
 ) -> list[Sequence[Recording]]:
     """``sides`` (fit, validation, test) of a joint or axis, each recording with the rows of its regimes and the noise of
     positions there: by repeats of a motion, and ``EXACT`` of the tracking error, which no equations have more exactly (arms
@@ -113,27 +130,41 @@ def with_regimes(
     if floor.kind != "position":
         return [[*side] for side in sides]
     motions = motions_of([_trace(r, floor) for side in sides for r in side])
-    rows = {m.trace.recording: {name: inside(m) for name, inside in _regimes()} for m in motions}
+    rows = {
+        m.trace.recording: {name: inside(m) for name, inside in _regimes()}
+        for m in motions
+    }
     noise = {name: 0.0 for name, _ in _regimes()}
     odd = {name for name, _ in floor.used.left_out}
     for first, second, laid in laid_pairs(measurements):
         if second.name in odd:
             continue
         j = first.column(floor.signal)
-        at = np.searchsorted(first.time_s, laid.time_s - 1e-9).clip(max=first.num_rows - 1)
+        at = np.searchsorted(first.time_s, laid.time_s - 1e-9).clip(
+            max=first.num_rows - 1
+        )
         for name, inside in rows[first.name].items():
             own = laid.difference["position"][inside[at], j]
             own = own[np.isfinite(own)]
             if len(own) >= LEAST_ROWS:
-                noise[name] = max(noise[name], float(np.sqrt(np.mean(own**2) / laid.noise_gain)))
+                noise[name] = max(
+                    noise[name], float(np.sqrt(np.mean(own**2) / laid.noise_gain))
+                )
 
     def marked(r: Recording) -> Recording:
-        off = EXACT * (r.data.measured - r.data.target) * (measurements[0].target_kind(floor.signal) == "position")
+        off = (
+            EXACT
+            * (r.data.measured - r.data.target)
+            * (measurements[0].target_kind(floor.signal) == "position")
+        )
         own = {}
         for name, inside in rows[r.name].items():
             known = off[inside & np.isfinite(off)]
             inexact = float(np.std(known)) if len(known) else 0.0
-            own[name] = inside, math.hypot(max(noise[name], r.floor[0]), inexact) / r.floor[0]
+            own[name] = (
+                inside,
+                math.hypot(max(noise[name], r.floor[0]), inexact) / r.floor[0],
+            )
         return dataclasses.replace(r, regimes=own)
 
     return [[marked(r) for r in side] for side in sides]
@@ -142,9 +173,29 @@ def with_regimes(
 def _trace(r: Recording, floor: SignalFloor) -> Trace:
     """What the regimes of a recording depend on; nothing was replayed."""
     none, position = np.full(len(r.time_s), np.nan), r.data.measured
-    of = {"recording": r.name, "signal": floor.signal, "unit": floor.unit, "time_s": r.time_s, "target": r.data.target}
-    seen = {"position": position, "measured": position, "replayed": none, "torque": none, "touched": none > 0.0}
-    return Trace(use="fit", kind="position", way="joint", floor=floor, origin=Origin(), **of, **seen)
+    of = {
+        "recording": r.name,
+        "signal": floor.signal,
+        "unit": floor.unit,
+        "time_s": r.time_s,
+        "target": r.data.target,
+    }
+    seen = {
+        "position": position,
+        "measured": position,
+        "replayed": none,
+        "torque": none,
+        "touched": none > 0.0,
+    }
+    return Trace(
+        use="fit",
+        kind="position",
+        way="joint",
+        floor=floor,
+        origin=Origin(),
+        **of,
+        **seen,
+    )
 
 
 def _regimes() -> list[tuple[str, Callable[[Motion], np.ndarray]]]:
@@ -155,15 +206,27 @@ def _regimes() -> list[tuple[str, Callable[[Motion], np.ndarray]]]:
 
 
 def _row(
-    recording: str, use: Use, regime: str, motions: Sequence[Motion], inside: Callable[[Motion], np.ndarray]
+    recording: str,
+    use: Use,
+    regime: str,
+    motions: Sequence[Motion],
+    inside: Callable[[Motion], np.ndarray],
 ) -> RegimeError | None:
     """None: fewer rows of it than ``LEAST_SHARE``."""
     squares = [(m.trace.residual / m.trace.floor.value) ** 2 for m in motions]
-    chosen = np.concatenate([s[inside(m)] for s, m in zip(squares, motions, strict=True)])
+    chosen = np.concatenate(
+        [s[inside(m)] for s, m in zip(squares, motions, strict=True)]
+    )
     n = int(np.isfinite(chosen).sum())
     if n == 0 or n < LEAST_SHARE * sum(np.isfinite(s).sum() for s in squares):
         return None
-    return RegimeError(recording=recording, use=use, regime=regime, error=float(np.sqrt(np.nanmean(chosen))), n=n)
+    return RegimeError(
+        recording=recording,
+        use=use,
+        regime=regime,
+        error=float(np.sqrt(np.nanmean(chosen))),
+        n=n,
+    )
 
 
 def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
@@ -176,7 +239,9 @@ def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
             if own:
                 low, high = np.quantile(np.concatenate(own), INNER)
                 ranges[use] = (float(low), float(high))
-        found.append(Coverage(variable=name, unit=variable_unit(name, unit), ranges=ranges))
+        found.append(
+            Coverage(variable=name, unit=variable_unit(name, unit), ranges=ranges)
+        )
     return found
 
 
@@ -185,7 +250,10 @@ def _disagreements(rows: Sequence[RegimeError]) -> list[str]:
     pooled = {(r.use, r.regime): r.error for r in rows if not r.recording}
     found = []
     for regime in dict.fromkeys(r.regime for r in rows):
-        fit, validation = pooled.get(("fit", regime)), pooled.get(("validation", regime))
+        fit, validation = (
+            pooled.get(("fit", regime)),
+            pooled.get(("validation", regime)),
+        )
         if fit is None or validation is None:
             continue
         high, low = max(fit, validation), min(fit, validation)
@@ -204,11 +272,21 @@ def _gaps(coverage: Sequence[Coverage]) -> list[str]:
             continue
         fit, validation = c.ranges["fit"], c.ranges["validation"]
         for mine, other, words in (
-            (fit, validation, "fit recordings reach {0}, validation recordings {1}: what acts beyond is not validated"),
-            (validation, fit, "validation recordings reach {0}, fit recordings {1}: what acts beyond was not fitted"),
+            (
+                fit,
+                validation,
+                "fit recordings reach {0}, validation recordings {1}: what acts beyond is not validated",
+            ),
+            (
+                validation,
+                fit,
+                "validation recordings reach {0}, fit recordings {1}: what acts beyond was not fitted",
+            ),
         ):
             if not _covers(other, mine):
-                told = [f"{ends[0]:.3g} … {ends[1]:.3g} {c.unit}" for ends in (mine, other)]
+                told = [
+                    f"{ends[0]:.3g} … {ends[1]:.3g} {c.unit}" for ends in (mine, other)
+                ]
                 found.append(f"{c.variable}: " + words.format(*told))
     return found
 

@@ -49,7 +49,9 @@ class Response:
     """(T, J) motor efforts at the time of each row [N·m, N]; NaN where not known."""
 
 
-def replay_joints(machine: TwinConfig | HasJoints, m: Measurement, signals: Sequence[str]) -> Response:
+def replay_joints(
+    machine: TwinConfig | HasJoints, m: Measurement, signals: Sequence[str]
+) -> Response:
     """Replay each of ``signals`` alone, while the others move as measured; with the gains and payloads that the recording
     states."""
     m = evened(m, machine) if isinstance(machine, TwinConfig) else m
@@ -68,9 +70,13 @@ def replay_whole(config: TwinConfig, m: Measurement) -> Response:
     sim.reset([0])
     done = replay(sim, m.target, m.rate_hz, _start(m))
     if sim.diverged[0] or not np.isfinite(done.reported).all():
-        raise TaccorlError(f"{m.name}: the twin diverged in the replay; check its gains and effects")
+        raise TaccorlError(
+            f"{m.name}: the twin diverged in the replay; check its gains and effects"
+        )
     # ``Replay.effort`` is at the end of each command's stretch: the time of the next row.
-    effort = np.concatenate([np.full((1, len(ROBOT.action_names)), np.nan), done.effort[:-1]])
+    effort = np.concatenate(
+        [np.full((1, len(ROBOT.action_names)), np.nan), done.effort[:-1]]
+    )
     return Response(m, "twin", done.reported, effort)
 
 
@@ -82,14 +88,20 @@ def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
         for key, known in (("kp_nm_per_rad", m.kp), ("kd_nms_per_rad", m.kd)):
             values = [
                 known.get(f"{arm}_{joint}", value)
-                for joint, value in zip(ROBOT.joints, getattr(control, key), strict=True)
+                for joint, value in zip(
+                    ROBOT.joints, getattr(control, key), strict=True
+                )
             ]
             control = dataclasses.replace(control, **{key: values})
         controllers[arm] = control
     held = [
-        held_payload(arm, mass, m.payload_position_m.get(arm, AT_TCP)) for arm, mass in m.payload_kg.items() if mass > 0
+        held_payload(arm, mass, m.payload_position_m.get(arm, AT_TCP))
+        for arm, mass in m.payload_kg.items()
+        if mass > 0
     ]
-    return dataclasses.replace(config, arm_controllers=controllers, effects=[*config.effects, *held])
+    return dataclasses.replace(
+        config, arm_controllers=controllers, effects=[*config.effects, *held]
+    )
 
 
 def evened(m: Measurement, config: TwinConfig) -> Measurement:
@@ -121,19 +133,34 @@ def in_contact(m: Measurement) -> np.ndarray:
     if m.touch is None:
         return np.zeros((m.num_rows, len(ROBOT.arms)), dtype=bool)
     pads = len(ROBOT.pads)
-    beyond = np.asarray((m.touch.counts.reshape(len(m.touch.counts), pads, -1) > CONTACT_COUNTS).any(axis=2))
-    felt = [np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5 for p in range(pads)]
-    return np.asarray(np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1)).any(axis=1)).T
+    beyond = np.asarray(
+        (m.touch.counts.reshape(len(m.touch.counts), pads, -1) > CONTACT_COUNTS).any(
+            axis=2
+        )
+    )
+    felt = [
+        np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5
+        for p in range(pads)
+    ]
+    return np.asarray(
+        np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1)).any(axis=1)
+    ).T
 
 
-def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) -> TouchMotion:
+def matched_contact(
+    m: Measurement, config: TwinConfig, pressed: PressedObject
+) -> TouchMotion:
     """Matched contact replay for the stated object, which must agree with the readings of the pads. Raises TaccorlError: as
     ``touch_motion``; the object touches no pad, or a pad in contact reads nothing."""
     motion = touch_motion(m, config, pressed)
     depth, _ = motion.depth()
     if not (depth > 0).any():
         most = float(motion.measured.max())
-        told = f", and their taxels read up to {most:.0f} counts" if most > CONTACT_COUNTS else ""
+        told = (
+            f", and their taxels read up to {most:.0f} counts"
+            if most > CONTACT_COUNTS
+            else ""
+        )
         raise TaccorlError(
             f"{m.name}: the object comes near the pads of the {pressed.arm} arm and never touches them, according to its size, "
             f"its pose and the measured opening{told}; press it, or correct radius_m and position_m of its `pressed`"

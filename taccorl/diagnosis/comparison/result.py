@@ -74,7 +74,9 @@ class Trace:
     @property
     def position_unit(self) -> str:
         """Unit of the signal's position, rad or m, also for traces of efforts."""
-        return self.unit if self.kind == "position" else "m" if self.unit == "N" else "rad"
+        return (
+            self.unit if self.kind == "position" else "m" if self.unit == "N" else "rad"
+        )
 
     @property
     def period_s(self) -> float:
@@ -143,7 +145,9 @@ class TouchTrace:
         """(R, C) bool: taxels of pad number ``pad`` (0 … P − 1) above the noise at some time, in the measurement or in the
         replay."""
         level = FELT_FLOORS * self.floor[pad]
-        return (np.abs(self.measured[:, pad]) > level).any(axis=0) | (np.abs(self.replayed[:, pad]) > level).any(axis=0)
+        return (np.abs(self.measured[:, pad]) > level).any(axis=0) | (
+            np.abs(self.replayed[:, pad]) > level
+        ).any(axis=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,23 +202,41 @@ class Comparison:
     @property
     def origins(self) -> tuple[Origin, ...]:
         """Origins of the recordings, each once."""
-        return tuple(dict.fromkeys(t.origin for t in (*self.traces, *self.touches) if t.origin))
+        return tuple(
+            dict.fromkeys(t.origin for t in (*self.traces, *self.touches) if t.origin)
+        )
 
     @property
     def uses(self) -> tuple[Use, ...]:
         """The uses (fit, validation, test) for which there are recordings."""
-        return tuple(use for use in USES if any(t.use == use for t in (*self.traces, *self.touches)))
+        return tuple(
+            use
+            for use in USES
+            if any(t.use == use for t in (*self.traces, *self.touches))
+        )
 
     @property
     def signals(self) -> tuple[tuple[str, Kind], ...]:
         """(signal, kind), positions first, in the order of the PiPER's actions, or else in the order of the recordings."""
-        found: dict[tuple[str, Kind], None] = dict.fromkeys((t.signal, t.kind) for t in self.traces)
+        found: dict[tuple[str, Kind], None] = dict.fromkeys(
+            (t.signal, t.kind) for t in self.traces
+        )
         place = {name: k for k, name in enumerate(ROBOT.action_names)}
-        return tuple(sorted(found, key=lambda s: (s[1] != "position", place.get(s[0], len(place)))))
+        return tuple(
+            sorted(
+                found, key=lambda s: (s[1] != "position", place.get(s[0], len(place)))
+            )
+        )
 
-    def of(self, signal: str, kind: Kind = "position", use: Use | None = None) -> tuple[Trace, ...]:
+    def of(
+        self, signal: str, kind: Kind = "position", use: Use | None = None
+    ) -> tuple[Trace, ...]:
         """Traces of one signal, for one use or (None) for all."""
-        return tuple(t for t in self.traces if t.signal == signal and t.kind == kind and (use is None or t.use == use))
+        return tuple(
+            t
+            for t in self.traces
+            if t.signal == signal and t.kind == kind and (use is None or t.use == use)
+        )
 
     def score(self, signal: str, kind: Kind, use: Use) -> Score | None:
         """Error of one signal for one use; None without such a recording."""
@@ -223,16 +245,32 @@ class Comparison:
 
     def scores(self) -> list[Score]:
         """Errors of every signal and use, then of all pads together for every use if there are several pads."""
-        found = [self.score(signal, kind, use) for signal, kind in self.signals for use in self.uses]
+        found = [
+            self.score(signal, kind, use)
+            for signal, kind in self.signals
+            for use in self.uses
+        ]
         if len({pad for t in self.touches for pad in t.pads}) > 1:
-            found += [_touch_score([t for t in self.touches if t.use == use]) for use in self.uses]
+            found += [
+                _touch_score([t for t in self.touches if t.use == use])
+                for use in self.uses
+            ]
         return [s for s in found if s is not None]
 
     def pad_scores(self) -> list[Score]:
         """Errors of every pad and use: pad by pad, in the order of ``ROBOT.pads``."""
         there = dict.fromkeys(pad for t in self.touches for pad in t.pads)
-        pads = sorted(there, key=lambda pad: ROBOT.pads.index(pad) if pad in ROBOT.pads else len(ROBOT.pads))
-        found = [_touch_score([t for t in self.touches if t.use == use], pad) for pad in pads for use in self.uses]
+        pads = sorted(
+            there,
+            key=lambda pad: (
+                ROBOT.pads.index(pad) if pad in ROBOT.pads else len(ROBOT.pads)
+            ),
+        )
+        found = [
+            _touch_score([t for t in self.touches if t.use == use], pad)
+            for pad in pads
+            for use in self.uses
+        ]
         return [s for s in found if s is not None]
 
 
@@ -242,15 +280,26 @@ class Comparison:
 def pooled_floor(traces: Sequence[Trace]) -> float:
     """Noise floor of several recordings of one signal, in its unit: root mean square, weighted by measured rows."""
     rows = [np.isfinite(t.residual).sum() for t in traces]
-    return float(np.sqrt(np.average([t.floor.value**2 for t in traces], weights=rows if any(rows) else None)))
+    return float(
+        np.sqrt(
+            np.average(
+                [t.floor.value**2 for t in traces], weights=rows if any(rows) else None
+            )
+        )
+    )
 
 
 def _score(traces: Sequence[Trace]) -> Score:
     first = traces[0]
     left = np.concatenate([t.residual for t in traces])
-    measured = np.concatenate([t.measured[np.isfinite(t.measured)] - np.nanmean(t.measured) for t in traces])
+    measured = np.concatenate(
+        [t.measured[np.isfinite(t.measured)] - np.nanmean(t.measured) for t in traces]
+    )
     rmse = float(np.sqrt(np.nanmean(left**2)))
-    sums, counts = zip(*[block_sums(t.residual**2, round(BLOCK_S / t.period_s)) for t in traces], strict=True)
+    sums, counts = zip(
+        *[block_sums(t.residual**2, round(BLOCK_S / t.period_s)) for t in traces],
+        strict=True,
+    )
     spread = float(np.sqrt(np.mean(measured**2)))
     return Score(
         signal=first.signal,
@@ -261,7 +310,8 @@ def _score(traces: Sequence[Trace]) -> Score:
         interval=_rms_interval(np.concatenate(sums), np.concatenate(counts)),
         nrmse=rmse / spread if spread > 0 else math.inf,
         floor=pooled_floor(traces),
-        floor_words=first.floor.words() + "; of each motion its own" * (len({t.floor.value for t in traces}) > 1),
+        floor_words=first.floor.words()
+        + "; of each motion its own" * (len({t.floor.value for t in traces}) > 1),
         lower_bound=any(t.floor.lower_bound for t in traces),
         n=int(np.isfinite(left).sum()),
         recordings=len(traces),
@@ -284,7 +334,9 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
         if pad is not None:
             felt = felt & (np.arange(len(t.pads)) == t.pads.index(pad))[:, None, None]
         rows = round(BLOCK_S / t.period_s)
-        sums.append(block_sums(np.where(felt, t.residual**2, 0.0).sum(axis=(1, 2, 3)), rows)[0])
+        sums.append(
+            block_sums(np.where(felt, t.residual**2, 0.0).sum(axis=(1, 2, 3)), rows)[0]
+        )
         counts.append(block_sums(felt.sum(axis=(1, 2, 3)).astype(float), rows)[0])
         readings.append(t.measured[felt].astype(float))
         floors.append(np.broadcast_to(t.floor, felt.shape)[felt])
@@ -315,7 +367,9 @@ def block_sums(values: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """(B,) sums and (B,) numbers of the finite ``values`` (T,) in blocks of ``rows``; the last block may be shorter."""
     starts = np.arange(0, len(values), max(rows, 1))
     finite = np.isfinite(values)
-    return np.add.reduceat(np.where(finite, values, 0.0), starts), np.add.reduceat(finite.astype(float), starts)
+    return np.add.reduceat(np.where(finite, values, 0.0), starts), np.add.reduceat(
+        finite.astype(float), starts
+    )
 
 
 def _rms_interval(sums: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
@@ -329,7 +383,11 @@ def _rms_interval(sums: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
 
 def drawn_blocks(num_blocks: int) -> np.ndarray:
     """(DRAWS, B) number of times that each of the B = ``num_blocks`` blocks is drawn; it depends on B only."""
-    return np.random.default_rng(0).multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), DRAWS).astype(float)
+    return (
+        np.random.default_rng(0)
+        .multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), DRAWS)
+        .astype(float)
+    )
 
 
 def origin_words(origins: Sequence[Origin]) -> str:
@@ -355,4 +413,6 @@ def only(comparison: Comparison, signals: Iterable[str]) -> Comparison:
     for name in wanted:
         if name not in known:
             raise TaccorlError(f"{name!r} was not compared; {nearest(name, known)}")
-    return dataclasses.replace(comparison, traces=tuple(t for t in comparison.traces if t.signal in wanted))
+    return dataclasses.replace(
+        comparison, traces=tuple(t for t in comparison.traces if t.signal in wanted)
+    )

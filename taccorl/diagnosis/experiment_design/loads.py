@@ -23,7 +23,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.alignment.machines.cell_model import Calibration, calibrated, readings, responses
+from taccorl.alignment.machines.cell_model import (
+    Calibration,
+    calibrated,
+    readings,
+    responses,
+)
 from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of
 from taccorl.alignment.machines.cells_file import LOADS, CellsConfig
@@ -61,9 +66,15 @@ class LoadProfile:
             speed: largest change of the load in a second.
         """
         knots = np.array(self.knots)
-        steps_s = np.maximum(np.diff(knots[:, 0]), highest * np.abs(np.diff(knots[:, 1])) / speed)
+        steps_s = np.maximum(
+            np.diff(knots[:, 0]), highest * np.abs(np.diff(knots[:, 1])) / speed
+        )
         times_s = np.concatenate([[0.0], np.cumsum(steps_s)])
-        return np.interp(np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz, times_s, highest * knots[:, 1])
+        return np.interp(
+            np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz,
+            times_s,
+            highest * knots[:, 1],
+        )
 
 
 def _presses(*each: tuple[float, float, float], rest_s: float = REST_S) -> Knots:
@@ -78,14 +89,25 @@ LIBRARY = (
     LoadProfile(
         name="loops",
         knots=(
-            *((0.0, 0.0), (REST_S, 0.0), (7.0, 0.6), (9.0, 0.3), (11.0, 0.8), (13.0, 0.5), (15.0, 1.0)),
+            *(
+                (0.0, 0.0),
+                (REST_S, 0.0),
+                (7.0, 0.6),
+                (9.0, 0.3),
+                (11.0, 0.8),
+                (13.0, 0.5),
+                (15.0, 1.0),
+            ),
             *((17.0, 0.4), (19.0, 0.7), (23.0, 0.0), (23.0 + REST_S, 0.0)),
         ),
     ),
     LoadProfile(name="two_speeds", knots=_presses((0.7, 0.05, 3.0), (0.7, 4.0, 3.0))),
     LoadProfile(name="taps", knots=_presses(*((0.5, 0.05, 0.1),) * 12, rest_s=0.5)),
     LoadProfile(name="long_hold", knots=(*_presses((0.7, 0.05, 30.0)), (60.0, 0.0))),
-    LoadProfile(name="light", knots=_presses(*((share, 0.5, 1.0) for share in (0.02, 0.05, 0.1, 0.2)))),
+    LoadProfile(
+        name="light",
+        knots=_presses(*((share, 0.5, 1.0) for share in (0.02, 0.05, 0.1, 0.2))),
+    ),
     LoadProfile(name="rests", knots=_presses((0.5, 0.5, 2.0), rest_s=30.0)),
     LoadProfile(name="one_cell", knots=_presses(*_THREE), one_cell=True),
 )
@@ -102,7 +124,11 @@ class LoadRange:
 
 
 def load_range(
-    config: CellsConfig, measurements: Measurements, *, span: Sequence[float] = (), speed: float | None = None
+    config: CellsConfig,
+    measurements: Measurements,
+    *,
+    span: Sequence[float] = (),
+    speed: float | None = None,
 ) -> LoadRange:
     """Highest load and speed of planned presses: those of existing recordings, if they are not given.
 
@@ -120,7 +146,11 @@ def load_range(
         )
     if speed is not None and not speed > 0:
         raise TaccorlError(f"--speed={speed:g}: above 0, in {unit}/s")
-    highest = float(span[1]) if span else min(max(float(np.nanmax(m.target)) for m in cells), rated)
+    highest = (
+        float(span[1])
+        if span
+        else min(max(float(np.nanmax(m.target)) for m in cells), rated)
+    )
     if speed is None:
         speed = 0.0
         for m in cells:
@@ -128,7 +158,9 @@ def load_range(
             change = np.abs(m.target[rows:] - m.target[:-rows])
             speed = max(speed, float(np.nanmax(change)) * m.rate_hz / rows)
     if not (highest > 0 and speed > 0):
-        raise TaccorlError(f"{config.name}: no recording loads it; give --span=[0, {rated:g}] and --speed= in {unit}/s")
+        raise TaccorlError(
+            f"{config.name}: no recording loads it; give --span=[0, {rated:g}] and --speed= in {unit}/s"
+        )
     return LoadRange(highest=highest, speed=speed)
 
 
@@ -141,10 +173,20 @@ class CellsPart(Part):
 
     Raises TaccorlError: no fit recording loads it."""
 
-    def __init__(self, config: CellsConfig, measurements: Measurements, allowed: LoadRange) -> None:
+    def __init__(
+        self, config: CellsConfig, measurements: Measurements, allowed: LoadRange
+    ) -> None:
         measurements = with_places(config, measurements)
-        self.machine, self.name, self.config, self._allowed = CellsMachine(config), config.name, config, allowed
-        self.problem, self._known = CellsProblem(config, measurements), prepared_all(config, measurements.fit)
+        self.machine, self.name, self.config, self._allowed = (
+            CellsMachine(config),
+            config.name,
+            config,
+            allowed,
+        )
+        self.problem, self._known = (
+            CellsProblem(config, measurements),
+            prepared_all(config, measurements.fit),
+        )
         self.library = [p for p in LIBRARY if not (p.one_cell and config.load.shared)]
         like = self._known[0]
         self.rate_hz = like.rate_hz
@@ -157,10 +199,22 @@ class CellsPart(Part):
         column, factor = LOADS[sensor.load.unit]
         columns = {column: factor * new.target[:, 0]}
         if not sensor.load.shared:
-            columns = {f"{cell}.{column}": factor * new.target[:, k] for k, cell in enumerate(sensor.names)}
+            columns = {
+                f"{cell}.{column}": factor * new.target[:, k]
+                for k, cell in enumerate(sensor.names)
+            }
         if self.place_mm is not None:
-            columns |= {key: np.full(new.num_rows, mm) for key, mm in zip(("x_mm", "y_mm"), self.place_mm, strict=True)}
-        return Planned(part=self, item=item, columns=columns, peak=float(new.target.max()), made=new)
+            columns |= {
+                key: np.full(new.num_rows, mm)
+                for key, mm in zip(("x_mm", "y_mm"), self.place_mm, strict=True)
+            }
+        return Planned(
+            part=self,
+            item=item,
+            columns=columns,
+            peak=float(new.target.max()),
+            made=new,
+        )
 
     def scene(self, p: Planned) -> Scene:
         return LoadScene(self.config, self.problem, [*self._known, p.made])
@@ -174,7 +228,11 @@ class CellsPart(Part):
         if profile.one_cell:
             middle = self.problem.channels[len(self.problem.channels) // 2]
             target[:, np.arange(target.shape[1]) != middle] = 0.0
-        temperature_c = np.full(len(load), np.nanmedian(like.temperature_c)) if like.temperature_c.size else np.empty(0)
+        temperature_c = (
+            np.full(len(load), np.nanmedian(like.temperature_c))
+            if like.temperature_c.size
+            else np.empty(0)
+        )
         return CellMeasurement(
             name=profile.name,
             time_s=np.arange(len(load)) / like.rate_hz,
@@ -196,7 +254,12 @@ class LoadScene(Scene):
 
     problem: CellsProblem
 
-    def __init__(self, config: CellsConfig, problem: CellsProblem, measurements: Sequence[CellMeasurement]) -> None:
+    def __init__(
+        self,
+        config: CellsConfig,
+        problem: CellsProblem,
+        measurements: Sequence[CellMeasurement],
+    ) -> None:
         super().__init__(problem, [])
         self.config, self._measurements = config, measurements
 
@@ -213,7 +276,10 @@ class LoadScene(Scene):
         ]
         # With a validation recording, gain and offset are those that fit all rows.
         again = CellsProblem(self.config, Measurements(tuple(said), (said[-1],), ()))
-        return again, [dataclasses.replace(r, floor=self.problem.floor[again.channels]) for r in again.fit]
+        return again, [
+            dataclasses.replace(r, floor=self.problem.floor[again.channels])
+            for r in again.fit
+        ]
 
 
 def _longest(m: CellMeasurement) -> int:

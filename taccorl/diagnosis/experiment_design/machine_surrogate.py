@@ -22,7 +22,14 @@ import numpy as np
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.motions import AGAIN, CHIRP, PACK, TEST, VALIDATION, Motion
+from taccorl.alignment.measurements.motions import (
+    AGAIN,
+    CHIRP,
+    PACK,
+    TEST,
+    VALIDATION,
+    Motion,
+)
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.motions import EFFORT_NOISE_SHARE, Ground
 from taccorl.diagnosis.machines.machine import Addition, Machine
@@ -80,7 +87,9 @@ class MachineSurrogate:
     @property
     def machine(self) -> Machine:
         """The simulated machine, with what is hidden."""
-        addition = Addition(self.ground.part, [h.effect for h in self.hidden], self.numbers, {})
+        addition = Addition(
+            self.ground.part, [h.effect for h in self.hidden], self.numbers, {}
+        )
         return self.ground.machine.with_additions([addition])
 
     def truth(self) -> dict[str, Any]:
@@ -96,7 +105,10 @@ class MachineSurrogate:
 
 
 def draw_machine(
-    ground: Ground, seed: int, effects: Sequence[str] | None = None, strength: float | None = None
+    ground: Ground,
+    seed: int,
+    effects: Sequence[str] | None = None,
+    strength: float | None = None,
 ) -> MachineSurrogate:
     """Draw hidden effects and numbers for one part.
 
@@ -112,17 +124,28 @@ def draw_machine(
     efforts = [np.abs(m.effort[:, m.column(ground.part)]).max() for m in made.fit]
     effort_floor = EFFORT_NOISE_SHARE * float(np.nanmax([*efforts, 1e-12]))
     floors = np.array([NOISE_SHARE * ground.room.wide_rad, effort_floor])
-    told = [dataclasses.replace(r, floor=floors[: len(r.channels)]) for r in problem.fit]
+    told = [
+        dataclasses.replace(r, floor=floors[: len(r.channels)]) for r in problem.fit
+    ]
     numbers = {
-        f.name: problem.start.get(f.name, f.start) * math.exp(SPREAD * rng.standard_normal())
+        f.name: problem.start.get(f.name, f.start)
+        * math.exp(SPREAD * rng.standard_normal())
         for f in problem.base
         if f.name in ADJUSTED and not f.held
     }
-    known = {name: c for name, c in problem.candidates.items() if name not in problem.present}
+    known = {
+        name: c for name, c in problem.candidates.items() if name not in problem.present
+    }
     for name in effects or ():
         if name not in known:
-            raise TaccorlError(f"--effects: {name} cannot be hidden in {ground.part}; {nearest(name, known)}")
-    wanted = [*effects] if effects is not None else [str(name) for name in rng.permutation(sorted(known))]
+            raise TaccorlError(
+                f"--effects: {name} cannot be hidden in {ground.part}; {nearest(name, known)}"
+            )
+    wanted = (
+        [*effects]
+        if effects is not None
+        else [str(name) for name in rng.permutation(sorted(known))]
+    )
     found: list[Hidden] = []
     for name in wanted:
         if effects is None and found:
@@ -140,44 +163,69 @@ def draw_machine(
 
 
 def _sized(
-    problem: RecordedProblem, c: Candidate, recordings_: Sequence[Recording], wanted: float, rng: np.random.Generator
+    problem: RecordedProblem,
+    c: Candidate,
+    recordings_: Sequence[Recording],
+    wanted: float,
+    rng: np.random.Generator,
 ) -> Hidden:
     """The effect in the strength that leaves about ``wanted`` floors, or in the strongest possible."""
     strength = next(p for p in c.cls.parameters() if p.absent is not None)
     absent, key = float(strength.absent or 0.0), f"{c.name}.{strength.name}"
     values: Values = (
-        dict(problem.start) | {f.name: f.start for f in c.frees} | c.starts[int(rng.integers(len(c.starts)))]
+        dict(problem.start)
+        | {f.name: f.start for f in c.frees}
+        | c.starts[int(rng.integers(len(c.starts)))]
     )
-    best, ends = Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_)), dict[bool, float]()
+    best, ends = (
+        Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_)),
+        dict[bool, float](),
+    )
     for _ in range(TRIES):
         if wanted / 1.5 <= best.floors <= 1.5 * wanted:
             break
         factor = min(max(wanted / max(best.floors, 1e-3), 0.1), 10.0)
         own = getattr(best.effect, strength.name)
         ends[best.floors > wanted] = own
-        new = absent + (own - absent) * factor if math.isfinite(absent) else own / factor
-        if len(ends) == 2:  # a strength that is too low and one that is too high are known: halve the range
+        new = (
+            absent + (own - absent) * factor if math.isfinite(absent) else own / factor
+        )
+        if (
+            len(ends) == 2
+        ):  # a strength that is too low and one that is too high are known: halve the range
             new = sum(ends.values()) / 2
         new = min(max(new, strength.low), strength.high)
         if new == own:
             break
         tried = values | {key: new}
-        best = Hidden(effect=c.make(tried), floors=_left(problem, c, tried, recordings_))
+        best = Hidden(
+            effect=c.make(tried), floors=_left(problem, c, tried, recordings_)
+        )
     return best
 
 
-def _left(problem: RecordedProblem, c: Candidate, values: Values, recordings_: Sequence[Recording]) -> float:
+def _left(
+    problem: RecordedProblem,
+    c: Candidate,
+    values: Values,
+    recordings_: Sequence[Recording],
+) -> float:
     """Error without the effect after a refit [noise floors]; 0 if the machine diverges with it."""
     present = [problem.candidates[name].make(problem.start) for name in problem.present]
     said = [
-        dataclasses.replace(r, measured=problem.simulate(values, [*present, c.make(values)], r)) for r in recordings_
+        dataclasses.replace(
+            r, measured=problem.simulate(values, [*present, c.make(values)], r)
+        )
+        for r in recordings_
     ]
     if not all(np.isfinite(r.measured).all() for r in said):
         return 0.0
     return rms(fit(problem, said, problem.present, problem.start, STEPS).residuals)
 
 
-def recordings(case: MachineSurrogate, uses: Sequence[str] = ("fit", "validation", "test")) -> Measurements:
+def recordings(
+    case: MachineSurrogate, uses: Sequence[str] = ("fit", "validation", "test")
+) -> Measurements:
     """Simulated recordings of a case: the paper's sweep twice, a triangle, steps and a small chirp for the fit; other motions for
     validation and test. Motions that need too much effort are made smaller, or left out.
 
@@ -193,21 +241,44 @@ def recordings(case: MachineSurrogate, uses: Sequence[str] = ("fit", "validation
             except TaccorlError:
                 continue
             rng = np.random.default_rng(
-                [case.seed, 62, len(sides["fit"]), len(sides["validation"]), len(sides["test"])]
+                [
+                    case.seed,
+                    62,
+                    len(sides["fit"]),
+                    len(sides["validation"]),
+                    len(sides["test"]),
+                ]
             )
-            sides[use].append(_recorded(dataclasses.replace(ground, machine=hidden), planned, effort, motion, rng))
+            sides[use].append(
+                _recorded(
+                    dataclasses.replace(ground, machine=hidden),
+                    planned,
+                    effort,
+                    motion,
+                    rng,
+                )
+            )
     if not sides["fit"]:
         raise TaccorlError(
             f"{ground.part}: no motion within {ground.room.speed_rad_per_s:g} per second needs less than its effort limit"
         )
-    return Measurements(*(tuple(sides[use]) for use in ("fit", "validation", "test")), rule="by name")
+    return Measurements(
+        *(tuple(sides[use]) for use in ("fit", "validation", "test")), rule="by name"
+    )
 
 
 def _recorded(
-    ground: Ground, planned: Measurement, effort: np.ndarray, motion: Motion, rng: np.random.Generator
+    ground: Ground,
+    planned: Measurement,
+    effort: np.ndarray,
+    motion: Motion,
+    rng: np.random.Generator,
 ) -> Measurement:
     j, rows = planned.column(ground.part), planned.num_rows
-    peak, keep = float(np.abs(effort).max()), math.exp(-1.0 / (ground.rate_hz * DISTURBANCE_S))
+    peak, keep = (
+        float(np.abs(effort).max()),
+        math.exp(-1.0 / (ground.rate_hz * DISTURBANCE_S)),
+    )
     kicks, load = rng.standard_normal(rows), np.zeros_like(planned.target)
     kicks[0] = 0.0
     load[:, j] = DISTURBANCE_SHARE * peak * coloured(kicks, keep)
@@ -233,14 +304,28 @@ def write_machine(case: MachineSurrogate, folder: Path) -> Measurements:
     made, part = recordings(case), case.ground.part
     drive = case.ground.machine.drive(part)
     target = "qd_target" if drive.target_kind == "velocity" else "q_target"
-    units = {"q": drive.unit, target: drive.unit + ("/s" if target == "qd_target" else "")}
-    units |= {"tau": "N" if drive.unit == "m" else "Nm"} if case.ground.has_effort else {}
-    columns = {key: {"column": f"{part}.{key}", "unit": unit} for key, unit in units.items()}
-    spec = {"time": {"column": "t", "unit": "s"}, "domain": "surrogate", "origin": ORIGIN, "signals": {part: columns}}
+    units = {
+        "q": drive.unit,
+        target: drive.unit + ("/s" if target == "qd_target" else ""),
+    }
+    units |= (
+        {"tau": "N" if drive.unit == "m" else "Nm"} if case.ground.has_effort else {}
+    )
+    columns = {
+        key: {"column": f"{part}.{key}", "unit": unit} for key, unit in units.items()
+    }
+    spec = {
+        "time": {"column": "t", "unit": "s"},
+        "domain": "surrogate",
+        "origin": ORIGIN,
+        "signals": {part: columns},
+    }
 
     def table(m: Measurement) -> dict[str, np.ndarray]:
         values = {"q": m.measured, target: m.target, "tau": m.effort}
-        return {"t": m.time_s} | {f"{part}.{key}": values[key][:, m.column(part)] for key in units}
+        return {"t": m.time_s} | {
+            f"{part}.{key}": values[key][:, m.column(part)] for key in units
+        }
 
     write_tables(folder, SWEEPS, spec, made, table, case.truth())
     return made

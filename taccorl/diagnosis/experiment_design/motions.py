@@ -32,7 +32,11 @@ from taccorl.alignment.measurements.motions import (
 )
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.aimed import AIMED, ENDS, JUMPS, at_once, reach
-from taccorl.diagnosis.experiment_design.other_pose import OtherPose, chosen_pose, in_other_pose
+from taccorl.diagnosis.experiment_design.other_pose import (
+    OtherPose,
+    chosen_pose,
+    in_other_pose,
+)
 from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import GainsAre, Machine
@@ -44,7 +48,9 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
-MOTIONS = tuple(motion for motion in LIBRARY if motion.gain == 1.0 and not motion.payload_kg)
+MOTIONS = tuple(
+    motion for motion in LIBRARY if motion.gain == 1.0 and not motion.payload_kg
+)
 """Motions of the library that are played with the machine's present gains and without a payload."""
 MARGIN = 0.05
 """Share of the range that is kept free at both ends."""
@@ -91,7 +97,10 @@ class Ground:
     @property
     def span(self) -> tuple[float, float]:
         """Lowest and highest position of planned motions [rad, m]."""
-        return self.room.middle_rad - self.room.wide_rad, self.room.middle_rad + self.room.wide_rad
+        return (
+            self.room.middle_rad - self.room.wide_rad,
+            self.room.middle_rad + self.room.wide_rad,
+        )
 
     @property
     def rate_hz(self) -> float:
@@ -110,12 +119,24 @@ class Ground:
 
     def positions(self, motion: Motion, size: float = 1.0) -> np.ndarray:
         """(T,) positions of a motion [rad, m] at ``rate_hz``, its amplitudes multiplied by ``size``."""
-        room = dataclasses.replace(self.room, wide_rad=size * self.room.wide_rad, sweep_rad=size * self.room.sweep_rad)
+        room = dataclasses.replace(
+            self.room,
+            wide_rad=size * self.room.wide_rad,
+            sweep_rad=size * self.room.sweep_rad,
+        )
         made = motion.target(room)
         rows = round(len(made) * self.rate_hz / RATE_HZ)
-        return np.interp(np.arange(rows) / self.rate_hz, np.arange(len(made)) / RATE_HZ, made)
+        return np.interp(
+            np.arange(rows) / self.rate_hz, np.arange(len(made)) / RATE_HZ, made
+        )
 
-    def commanded(self, name: str, positions: np.ndarray, gain: float = 1.0, payload_kg: float = 0.0) -> Measurement:
+    def commanded(
+        self,
+        name: str,
+        positions: np.ndarray,
+        gain: float = 1.0,
+        payload_kg: float = 0.0,
+    ) -> Measurement:
         """A measurement that commands ``positions`` (T,) [rad, m], or their speed where the part takes velocities; not yet
         answered.
 
@@ -136,7 +157,9 @@ class Ground:
                 target_kinds=(drive.target_kind,),
             )
         j = like.column(self.part)
-        target, measured = (np.tile(values[0], (rows, 1)) for values in (like.target, like.measured))
+        target, measured = (
+            np.tile(values[0], (rows, 1)) for values in (like.target, like.measured)
+        )
         target[:, j] = positions
         if drive.target_kind == "velocity":
             target[:, j] = np.diff(positions, append=positions[-1]) * self.rate_hz
@@ -148,7 +171,16 @@ class Ground:
         holder = self.part.split("_", 1)[0] if self.of_piper else self.part
         held_kg = payload_kg or self.mounted_kg
         nothing = dict.fromkeys(
-            ("velocity", "effort", "load", "torque_ff", "supply_v", "enabled", "command_s"), np.empty(0)
+            (
+                "velocity",
+                "effort",
+                "load",
+                "torque_ff",
+                "supply_v",
+                "enabled",
+                "command_s",
+            ),
+            np.empty(0),
         )
         return dataclasses.replace(
             like,
@@ -157,8 +189,14 @@ class Ground:
             time_s=np.arange(rows) / self.rate_hz,
             target=target,
             measured=measured,
-            kp={signal: kp * gain if signal == self.part else kp for signal, kp in like.kp.items()},
-            kd={signal: kd * gain if signal == self.part else kd for signal, kd in like.kd.items()},
+            kp={
+                signal: kp * gain if signal == self.part else kp
+                for signal, kp in like.kp.items()
+            },
+            kd={
+                signal: kd * gain if signal == self.part else kd
+                for signal, kd in like.kd.items()
+            },
             payload_kg=like.payload_kg | ({holder: held_kg} if held_kg else {}),
             repeat_of=None,
             touch=None,
@@ -174,7 +212,9 @@ class Ground:
         settled = first[min(round(0.9 * REST_S * self.rate_hz), len(first) - 1)]
         measured = m.measured.copy()
         measured[:, j] = settled
-        answer = self.machine.answer(self.part, dataclasses.replace(m, measured=measured))
+        answer = self.machine.answer(
+            self.part, dataclasses.replace(m, measured=measured)
+        )
         measured[:, j] = answer.reported
         return dataclasses.replace(m, measured=measured), answer.effort
 
@@ -186,24 +226,42 @@ class Ground:
         for size in sizes:
             positions = self.positions(motion, size)
             low, high = float(positions.min()), float(positions.max())
-            if self.of_piper and drive.limits is not None and not drive.limits[0] <= low <= high <= drive.limits[1]:
-                raise TaccorlError(f"goes to {low:.2f} … {high:.2f} {drive.unit}, beyond the joint's limits")
-            m, effort = self.answered(self.commanded(motion.name, positions, motion.gain, motion.payload_kg))
+            if (
+                self.of_piper
+                and drive.limits is not None
+                and not drive.limits[0] <= low <= high <= drive.limits[1]
+            ):
+                raise TaccorlError(
+                    f"goes to {low:.2f} … {high:.2f} {drive.unit}, beyond the joint's limits"
+                )
+            m, effort = self.answered(
+                self.commanded(motion.name, positions, motion.gain, motion.payload_kg)
+            )
             peak = float(np.abs(effort).max())
             if np.isfinite(m.measured[:, m.column(self.part)]).all() and peak <= limit:
                 return m, effort
         if drive.effort_limit is None:
             raise TaccorlError("the model does not answer it with finite positions")
         smaller = f" even at {sizes[-1]:.0%} of its size" * (len(sizes) > 1)
-        raise TaccorlError(f"needs {peak:.3g} of {drive.effort_limit:g} {self.effort_unit}{smaller}")
+        raise TaccorlError(
+            f"needs {peak:.3g} of {drive.effort_limit:g} {self.effort_unit}{smaller}"
+        )
 
     @property
     def allowed_effort(self) -> float:
         """Largest effort of a planned motion [N·m, N]."""
         limit = self.machine.drive(self.part).effort_limit
-        return math.inf if limit is None else limit if self.of_piper else EFFORT_SHARE * limit
+        return (
+            math.inf
+            if limit is None
+            else limit
+            if self.of_piper
+            else EFFORT_SHARE * limit
+        )
 
-    def aimed(self, motion: Motion, effect: str, values: Values) -> tuple[Measurement, np.ndarray, float]:
+    def aimed(
+        self, motion: Motion, effect: str, values: Values
+    ) -> tuple[Measurement, np.ndarray, float]:
         """Scale the motion that ``AIMED`` has for an effect, so that it just exceeds the limit which the effect states (a torque,
         speed or angle). If range, speed or effort limit do not allow that, it is as large as they allow.
 
@@ -212,18 +270,27 @@ class Ground:
             in multiples of the limit (1: just at the limit).
 
         Raises TaccorlError: even the smallest needs more, or the part takes no positions."""
-        drive, room, allowed = self.machine.drive(self.part), self.room, self.allowed_effort
+        drive, room, allowed = (
+            self.machine.drive(self.part),
+            self.room,
+            self.allowed_effort,
+        )
         if drive.target_kind != "position" and motion.target is JUMPS.target:
             raise TaccorlError("targets of a velocity cannot jump in position")
         best: tuple[Measurement, np.ndarray, float] | None = None
         why = ""
-        for size in (0.5 / (0.5 - MARGIN),) if motion.target is ENDS.target else AIMED_SIZES:
+        for size in (
+            (0.5 / (0.5 - MARGIN),) if motion.target is ENDS.target else AIMED_SIZES
+        ):
             positions = self.positions(motion, size)
             m, effort = self.answered(self.commanded(motion.name, positions))
             answer = m.measured[:, m.column(self.part)]
             if not np.isfinite(answer).all():
                 break
-            peak, speed = at_once(positions, effort), float(np.abs(np.gradient(answer, 1.0 / self.rate_hz)).max())
+            peak, speed = (
+                at_once(positions, effort),
+                float(np.abs(np.gradient(answer, 1.0 / self.rate_hz)).max()),
+            )
             if peak > allowed or speed > SPEED_SLACK * room.speed_rad_per_s:
                 why = (
                     f"needs {peak:.3g} {self.effort_unit} and {speed:.3g} {drive.unit}/s, allowed are {allowed:.3g} and "
@@ -235,7 +302,9 @@ class Ground:
             if far >= BEYOND:
                 break
         if best is None:
-            raise TaccorlError(why or "the model does not answer it with finite positions")
+            raise TaccorlError(
+                why or "the model does not answer it with finite positions"
+            )
         return best
 
 
@@ -256,7 +325,9 @@ def ground_of(
 
     Raises TaccorlError: range or speed are not known, or the part is driven by torque."""
     if part not in machine.units:
-        raise TaccorlError(f"{machine.name}: no {machine.part_word} {part!r}; it has {', '.join(machine.units)}")
+        raise TaccorlError(
+            f"{machine.name}: no {machine.part_word} {part!r}; it has {', '.join(machine.units)}"
+        )
     drive = machine.drive(part)
     if drive.target_kind in ("torque", "effort"):
         raise TaccorlError(
@@ -269,18 +340,28 @@ def ground_of(
     if len(span) == 2:
         low, high = float(span[0]), float(span[1])
     elif seen:
-        low, high = min(float(np.nanmin(q)) for q in seen), max(float(np.nanmax(q)) for q in seen)
+        low, high = (
+            min(float(np.nanmin(q)) for q in seen),
+            max(float(np.nanmax(q)) for q in seen),
+        )
     if len(span) not in (0, 2) or not low < high:
         raise TaccorlError(
             f"--span: the range in which {part} may move [{drive.unit}] is not known: no recordings, and no limits in its file; "
             "give --span=[lowest, highest]"
         )
-    if drive.limits is not None and (low < drive.limits[0] - 1e-9 or high > drive.limits[1] + 1e-9) and len(span) == 2:
+    if (
+        drive.limits is not None
+        and (low < drive.limits[0] - 1e-9 or high > drive.limits[1] + 1e-9)
+        and len(span) == 2
+    ):
         raise TaccorlError(
             f"--span=[{low:g}, {high:g}]: beyond the limits of {part}, {list(drive.limits)} {drive.unit}"
         )
     if speed is None and moved:
-        speed = max(float(np.nanquantile(np.abs(np.gradient(m.moved(part), m.period_s)), 0.99)) for m in moved)
+        speed = max(
+            float(np.nanquantile(np.abs(np.gradient(m.moved(part), m.period_s)), 0.99))
+            for m in moved
+        )
     if speed is None or not speed > 0.0:
         raise TaccorlError(
             f"--speed: how fast {part} may move is not known without recordings; give --speed= in {drive.unit}/s"
@@ -306,23 +387,39 @@ def arm_ground(config: TwinConfig, signal: str, pose: np.ndarray) -> Ground:
     middle of its motions: within its limits, and with a sweep whose torque is within ``motions.TORQUE_NM``. Raises TaccorlError:
     there is no such joint, or it cannot move about its pose."""
     number, arm = joint_number(signal), signal.split("_", 1)[0]
-    body, middle = arm_joint.rigid(config, signal, pose, 0.0, []), float(pose[number - 1])
+    body, middle = (
+        arm_joint.rigid(config, signal, pose, 0.0, []),
+        float(pose[number - 1]),
+    )
     weight = body.gravity_sin * math.sin(middle) + body.gravity_cos * math.cos(middle)
     room = Room.of(number, middle, body.inertia, weight)
     if min(room.wide_rad, room.sweep_rad) <= 0:
-        raise TaccorlError(f"{signal} is at {middle:.3f} rad, at its limit; give a pose with room to both sides")
+        raise TaccorlError(
+            f"{signal} is at {middle:.3f} rad, at its limit; give a pose with room to both sides"
+        )
     rest = np.zeros((2, len(ROBOT.action_names)))
     rest[:, ROBOT.arm_slice(arm)] = pose
     machine = PiperTwin(config)
     kp, kd = ({signal: machine.numbers(signal)[name][0]} for name in ("kp", "kd"))
-    like = Measurement(name="rest", time_s=np.arange(2) / RATE_HZ, target=rest, measured=rest, kp=kp, kd=kd)
+    like = Measurement(
+        name="rest",
+        time_s=np.arange(2) / RATE_HZ,
+        target=rest,
+        measured=rest,
+        kp=kp,
+        kd=kd,
+    )
     return Ground(machine=machine, part=signal, room=room, like=like)
 
 
 def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
     """Pose (7,) of the PiPER's arm [rad, m] while this joint is moved: that of recordings that move it, else that of
     ``motions.POSES``."""
-    swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
+    swept = (
+        [m for m in measurements.fit if moves(m, signal)]
+        if measurements is not None
+        else []
+    )
     pose = np.array([*POSES[joint_number(signal) - 1], OPENING_M])
     for k, name in enumerate(_of_arm(signal)):
         if swept and name in swept[0].signals:
@@ -337,19 +434,25 @@ def posed(signal: str, pose: np.ndarray, positions: Mapping[str, float]) -> np.n
     for name, position in positions.items():
         if name == signal or name not in names:
             arm = signal.split("_", 1)[0]
-            raise TaccorlError(f"--pose: {name} is no other joint of the {arm} arm; {nearest(name, names)}")
+            raise TaccorlError(
+                f"--pose: {name} is no other joint of the {arm} arm; {nearest(name, names)}"
+            )
         column = ROBOT.action_names.index(name)
         low, high = float(ROBOT.action_low[column]), float(ROBOT.action_high[column])
         if not low <= position <= high:
             limits = f"{round(low, 6):g} … {round(high, 6):g}"
-            raise TaccorlError(f"--pose: {name} {position:g} is beyond its limits, {limits}")
+            raise TaccorlError(
+                f"--pose: {name} {position:g} is beyond its limits, {limits}"
+            )
         found[names.index(name)] = position
     return found
 
 
 def _of_arm(signal: str) -> list[str]:
     """The joints and the gripper of the PiPER's arm of ``signal``."""
-    return [f"{signal.split('_', 1)[0]}_{joint}" for joint in (*ROBOT.joints, "gripper")]
+    return [
+        f"{signal.split('_', 1)[0]}_{joint}" for joint in (*ROBOT.joints, "gripper")
+    ]
 
 
 class JointPart(Part):
@@ -377,23 +480,43 @@ class JointPart(Part):
         label: str = "",
         where: str = "",
     ) -> None:
-        self.machine, self.name, self.ground, self.floor = ground.machine, ground.part, ground, floor
+        self.machine, self.name, self.ground, self.floor = (
+            ground.machine,
+            ground.part,
+            ground,
+            floor,
+        )
         self.measurements, self.label, self.where = measurements, label, where
         self.gains: GainsAre = gains
-        of_piper, fit = ground.of_piper, () if measurements is None else measurements.fit
+        of_piper, fit = (
+            ground.of_piper,
+            () if measurements is None else measurements.fit,
+        )
         self.library = LIBRARY if of_piper else MOTIONS
         self.drive = self.machine.drive(self.name)
         self.rate_hz = RATE_HZ if of_piper else ground.rate_hz
         known = [m for m in fit if (moves if of_piper else _moved)(m, self.name)]
-        if of_piper and ground.like is not None:  # what a table lacks stands as in the planned motions
+        if (
+            of_piper and ground.like is not None
+        ):  # what a table lacks stands as in the planned motions
             rest = ground.like.target[0]
-            known = [m if m.signals == ROBOT.action_names else m.on_robot(rest) for m in known]
-        self.have_efforts = bool(known) and all(m.has_effort()[m.column(self.name)] for m in known)
+            known = [
+                m if m.signals == ROBOT.action_names else m.on_robot(rest)
+                for m in known
+            ]
+        self.have_efforts = bool(known) and all(
+            m.has_effort()[m.column(self.name)] for m in known
+        )
         self.efforts = efforts or (self.have_efforts and not of_piper)
         self.known = known if self.have_efforts or not self.efforts else []
         if of_piper and ground.like is not None:
-            at = {name: ground.like.target[0, ROBOT.action_names.index(name)] for name in _of_arm(self.name)}
-            self.pose = {name: round(float(q), 4) for name, q in at.items() if name != self.name}
+            at = {
+                name: ground.like.target[0, ROBOT.action_names.index(name)]
+                for name in _of_arm(self.name)
+            }
+            self.pose = {
+                name: round(float(q), 4) for name, q in at.items() if name != self.name
+            }
         elif ground.pose is not None:
             self.pose = dict(ground.pose.positions)
 
@@ -411,10 +534,20 @@ class JointPart(Part):
         else:
             raise TaccorlError("no motion of the library may be recorded")
         target = m.target[:, m.column(self.name)]
-        pose = {} if ground.pose is None else {name: ground.pose.positions[name] for name in ground.pose.driven}
+        pose = (
+            {}
+            if ground.pose is None
+            else {name: ground.pose.positions[name] for name in ground.pose.driven}
+        )
         held = {f"{name}.q_target": np.full(len(target), q) for name, q in pose.items()}
         peak = float(np.abs(effort).max())
-        return Planned(part=self, item=item, columns={self.column: target, **held}, peak=peak, made=(m, effort))
+        return Planned(
+            part=self,
+            item=item,
+            columns={self.column: target, **held},
+            peak=peak,
+            made=(m, effort),
+        )
 
     def scene(self, p: Planned) -> Scene:
         m, effort = p.made
@@ -423,62 +556,128 @@ class JointPart(Part):
         noisy[:, j] += self.floor * np.random.default_rng(0).standard_normal(m.num_rows)
         if self.efforts:
             noise = 0.0 if self.have_efforts else EFFORT_NOISE_SHARE * p.peak
-            efforts[:, j] = effort + noise * np.random.default_rng(1).standard_normal(m.num_rows)
+            efforts[:, j] = effort + noise * np.random.default_rng(1).standard_normal(
+                m.num_rows
+            )
         new = dataclasses.replace(m, measured=noisy, effort=efforts)
-        problem = self.machine.motion_problem(self.name, Measurements((*self.known, new)), self.gains)
+        problem = self.machine.motion_problem(
+            self.name, Measurements((*self.known, new)), self.gains
+        )
         own = [self.floor, *([EFFORT_NOISE_SHARE * p.peak] if self.efforts else [])]
         floors = problem.fit[0].floor if self.known else np.array(own)
-        recordings = [*problem.fit[:-1], dataclasses.replace(problem.fit[-1], floor=floors)]
+        recordings = [
+            *problem.fit[:-1],
+            dataclasses.replace(problem.fit[-1], floor=floors),
+        ]
         pose = self.ground.pose
-        return Scene(problem if pose is None else in_other_pose(problem, pose, m.name), recordings)
+        return Scene(
+            problem if pose is None else in_other_pose(problem, pose, m.name),
+            recordings,
+        )
 
     def aimed(self, rivals: Sequence[str]) -> Sequence[Motion]:
-        limited = [] if self.ground.of_piper else [name for name in rivals if name in AIMED]
+        limited = (
+            [] if self.ground.of_piper else [name for name in rivals if name in AIMED]
+        )
         every = [(motion, name) for name in limited for motion in AIMED[name]]
-        return [dataclasses.replace(motion, name=f"{motion.name}_{name}", aims=name) for motion, name in every]
+        return [
+            dataclasses.replace(motion, name=f"{motion.name}_{name}", aims=name)
+            for motion, name in every
+        ]
 
     def reach(self, p: Planned, told: Mapping[str, Explanation]) -> dict[str, float]:
         m, effort = p.made
-        target, answer = m.target[:, m.column(self.name)], m.measured[:, m.column(self.name)]
+        target, answer = (
+            m.target[:, m.column(self.name)],
+            m.measured[:, m.column(self.name)],
+        )
         if self.drive.target_kind == "velocity":
             target = np.cumsum(target) / self.ground.rate_hz
-        own = {} if self.ground.of_piper else {name: e.values for name, e in told.items() if name in AIMED}
-        return {name: reach(name, v, target, answer, effort, self.ground.rate_hz) for name, v in own.items()}
+        own = (
+            {}
+            if self.ground.of_piper
+            else {name: e.values for name, e in told.items() if name in AIMED}
+        )
+        return {
+            name: reach(name, v, target, answer, effort, self.ground.rate_hz)
+            for name, v in own.items()
+        }
 
     def elsewhere(self) -> Mapping[str, Callable[[], Part]]:
         found: dict[str, Callable[[], Part]] = {}
         if self.label:
             return found
         if self.drive.logs_effort and not self.efforts:
-            assumed = "" if self.have_efforts else f" (its noise taken as {EFFORT_NOISE_SHARE:.1%} of the largest)"
+            assumed = (
+                ""
+                if self.have_efforts
+                else f" (its noise taken as {EFFORT_NOISE_SHARE:.1%} of the largest)"
+            )
             where = f"with the motor's effort recorded, too{assumed}"
-            found["with_efforts"] = partial(self._elsewhere, self.ground, "with_efforts", where, efforts=True)
+            found["with_efforts"] = partial(
+                self._elsewhere, self.ground, "with_efforts", where, efforts=True
+            )
         machine, ground = self.machine, self.ground
-        if isinstance(machine, RobotMachine) and ground.pose is None and machine.robot.along_chain(self.name):
+        if (
+            isinstance(machine, RobotMachine)
+            and ground.pose is None
+            and machine.robot.along_chain(self.name)
+        ):
             found["other_pose"] = self._in_other_pose
         if isinstance(machine, Axis):
             found["mounted_mass"] = self._with_mass
         return found
 
-    def _elsewhere(self, ground: Ground, label: str, where: str, efforts: bool = False) -> "JointPart":
+    def _elsewhere(
+        self, ground: Ground, label: str, where: str, efforts: bool = False
+    ) -> "JointPart":
         options = {"efforts": efforts or self.efforts, "label": label, "where": where}
-        return JointPart(ground, self.floor, self.measurements, gains=self.gains, **options)
+        return JointPart(
+            ground, self.floor, self.measurements, gains=self.gains, **options
+        )
 
     def _in_other_pose(self) -> "JointPart":
         ground, machine = self.ground, self.machine
         assert isinstance(machine, RobotMachine)
-        pose = chosen_pose(machine, self.name, ground.like, ground.span, machine.robot.along_chain(self.name))
+        pose = chosen_pose(
+            machine,
+            self.name,
+            ground.like,
+            ground.span,
+            machine.robot.along_chain(self.name),
+        )
         stand = ", ".join(f"{name} {q:g}" for name, q in pose.positions.items())
-        return self._elsewhere(dataclasses.replace(ground, pose=pose), "other_pose", f"with other joints at {stand}")
+        return self._elsewhere(
+            dataclasses.replace(ground, pose=pose),
+            "other_pose",
+            f"with other joints at {stand}",
+        )
 
     def _with_mass(self) -> "JointPart":
         ground, machine, name = self.ground, self.machine, self.name
         assert isinstance(machine, Axis)
-        stated = [{}, {}] if ground.like is None else [ground.like.payload_kg, ground.like.lever_m]
-        now_kg, lever_m = stated[0].get(name, machine.config.payload_kg), stated[1].get(name, machine.config.lever_m)
+        stated = (
+            [{}, {}]
+            if ground.like is None
+            else [ground.like.payload_kg, ground.like.lever_m]
+        )
+        now_kg, lever_m = (
+            stated[0].get(name, machine.config.payload_kg),
+            stated[1].get(name, machine.config.lever_m),
+        )
         if self.drive.unit == "rad" and not lever_m > 0.0:
-            raise TaccorlError("no lever_m in its file or in the recordings says where a mass can be mounted")
-        more_kg = MOUNTED_SHARE * machine.config.inertia / (1.0 if self.drive.unit == "m" else lever_m**2)
-        ground = dataclasses.replace(ground, mounted_kg=float(f"{now_kg + more_kg:.3g}"))
+            raise TaccorlError(
+                "no lever_m in its file or in the recordings says where a mass can be mounted"
+            )
+        more_kg = (
+            MOUNTED_SHARE
+            * machine.config.inertia
+            / (1.0 if self.drive.unit == "m" else lever_m**2)
+        )
+        ground = dataclasses.replace(
+            ground, mounted_kg=float(f"{now_kg + more_kg:.3g}")
+        )
         at = "" if self.drive.unit == "m" else f" at {lever_m:g} m"
-        return self._elsewhere(ground, "mounted_mass", f"with a payload of {ground.mounted_kg:g} kg{at}")
+        return self._elsewhere(
+            ground, "mounted_mass", f"with a payload of {ground.mounted_kg:g} kg{at}"
+        )

@@ -66,13 +66,22 @@ class OtherPose:
     def driven(self) -> tuple[str, ...]:
         """Those of the other joints that take position targets, so that a table can hold them."""
         joints = self.robot.robot.config.joints
-        return tuple(n for n in self.positions if n in joints and joints[n].target_kind == "position")
+        return tuple(
+            n
+            for n in self.positions
+            if n in joints and joints[n].target_kind == "position"
+        )
 
     @property
     def unchecked(self) -> int:
         """Number of moving links without a shape in the model, whose collisions are not checked."""
         model = self.robot.robot.rigid.model
-        shaped = {int(b) for b in model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) > 0]}
+        shaped = {
+            int(b)
+            for b in model.geom_bodyid[
+                (model.geom_contype | model.geom_conaffinity) > 0
+            ]
+        }
         return len({int(b) for b in model.jnt_bodyid} - shaped)
 
     def way(self, rate_hz: float) -> dict[str, np.ndarray]:
@@ -80,9 +89,14 @@ class OtherPose:
         ``rate_hz``."""
         units = self.robot.units
         model = self.robot.robot.rigid.model
-        begin = {name: float(self.here[model.joint(name).qposadr[0]]) for name in self.driven}
+        begin = {
+            name: float(self.here[model.joint(name).qposadr[0]]) for name in self.driven
+        }
         far = {name: self.positions[name] - begin[name] for name in self.driven}
-        seconds = max((0.5 * np.pi * abs(d) / WAY_SPEED[units[name]] for name, d in far.items()), default=0.0)
+        seconds = max(
+            (0.5 * np.pi * abs(d) / WAY_SPEED[units[name]] for name, d in far.items()),
+            default=0.0,
+        )
         rows = np.arange(int(np.ceil(seconds * rate_hz)) + 1)
         share = 0.5 - 0.5 * np.cos(np.pi * rows / max(len(rows) - 1, 1))
         return {name: begin[name] + share * d for name, d in far.items()}
@@ -90,7 +104,9 @@ class OtherPose:
     def wrong(self) -> str:
         """Why the pose must not be recorded; empty if nothing speaks against it."""
         robot, model = self.robot.robot, copy.copy(self.robot.robot.rigid.model)
-        model.opt.disableflags = 0  # without constraints, as it was compiled, nothing touches
+        model.opt.disableflags = (
+            0  # without constraints, as it was compiled, nothing touches
+        )
         for name, position in self.positions.items():
             limits = robot.rigid.joints[name].limits
             if limits is not None and not limits[0] <= position <= limits[1]:
@@ -100,13 +116,26 @@ class OtherPose:
         mujoco.mj_forward(model, data)
         for name, joint in robot.config.joints.items():
             held = abs(float(data.qfrc_bias[model.joint(name).dofadr[0]]))
-            if name != self.part and joint.effort_limit is not None and held > HOLD_SHARE * joint.effort_limit:
+            if (
+                name != self.part
+                and joint.effort_limit is not None
+                and held > HOLD_SHARE * joint.effort_limit
+            ):
                 return f"{name} needs {held:.3g} of its effort_limit {joint.effort_limit:g} to hold the weight there"
-        allowed = {pair for pose in self._sweep(self.here) for pair in touching(model, data, pose)}
-        ways = self.here + np.linspace(0.0, 1.0, PLACES)[:, None] * (self.there - self.here)
+        allowed = {
+            pair
+            for pose in self._sweep(self.here)
+            for pair in touching(model, data, pose)
+        }
+        ways = self.here + np.linspace(0.0, 1.0, PLACES)[:, None] * (
+            self.there - self.here
+        )
         for pose in (*ways, *self._sweep(self.there)):
             for a, b in sorted(touching(model, data, pose) - allowed):
-                at = ", ".join(f"{n} {pose[model.joint(n).qposadr[0]]:.3g}" for n in (self.part, *self.positions))
+                at = ", ".join(
+                    f"{n} {pose[model.joint(n).qposadr[0]]:.3g}"
+                    for n in (self.part, *self.positions)
+                )
                 return f"{_name(model, a)} touches {_name(model, b)} at {at}"
         return ""
 
@@ -122,15 +151,25 @@ class OtherPose:
         """By how much a weight loads the part otherwise than in the present pose: the change of the sine and cosine of its weight
         with each small turn of the base, relative to their size in both poses, 0 … 1; and half the change of its inertia."""
         robot = self.robot.robot
-        before, after = (weights_by_turn(robot, self.part, [pose]) for pose in (self.here, self.there))
+        before, after = (
+            weights_by_turn(robot, self.part, [pose])
+            for pose in (self.here, self.there)
+        )
         size = np.linalg.norm(before) + np.linalg.norm(after)
-        first, then = (rigid_terms(robot.rigid.model, self.part, pose).inertia for pose in (self.here, self.there))
+        first, then = (
+            rigid_terms(robot.rigid.model, self.part, pose).inertia
+            for pose in (self.here, self.there)
+        )
         turned = float(np.linalg.norm(after - before) / size) if size > 0 else 0.0
         return turned + 0.5 * abs(then - first) / max(first, then)
 
 
 def stated_pose(
-    machine: Machine, part: str, like: Measurement | None, span: tuple[float, float], positions: Mapping[str, float]
+    machine: Machine,
+    part: str,
+    like: Measurement | None,
+    span: tuple[float, float],
+    positions: Mapping[str, float],
 ) -> OtherPose:
     """The pose with the other joints at ``positions`` [rad, m], others of them as in the recording ``like``.
 
@@ -143,7 +182,9 @@ def stated_pose(
     others = [name for name in pose.robot.units if name != part]
     for name in positions:
         if name not in others:
-            raise TaccorlError(f"--pose: {name} is no other joint of {machine.name}; {nearest(name, others)}")
+            raise TaccorlError(
+                f"--pose: {name} is no other joint of {machine.name}; {nearest(name, others)}"
+            )
     pose = dataclasses.replace(pose, positions=dict(positions))
     if why := pose.wrong():
         raise TaccorlError(f"--pose: {why}; give other positions")
@@ -151,7 +192,11 @@ def stated_pose(
 
 
 def chosen_pose(
-    machine: Machine, part: str, like: Measurement | None, span: tuple[float, float], others: Sequence[str]
+    machine: Machine,
+    part: str,
+    like: Measurement | None,
+    span: tuple[float, float],
+    others: Sequence[str],
 ) -> OtherPose:
     """Of ``TRIED`` random poses within ``FARTHEST`` of the present one the one with the greatest ``change`` that may be recorded.
 
@@ -168,13 +213,23 @@ def chosen_pose(
     for _ in range(TRIED):
         positions = {}
         for name in others:
-            now, far = float(begun.here[model.joint(name).qposadr[0]]), FARTHEST[joints[name].unit]
+            now, far = (
+                float(begun.here[model.joint(name).qposadr[0]]),
+                FARTHEST[joints[name].unit],
+            )
             low, high = joints[name].limits or (-np.inf, np.inf)
             room = 0.05 * (high - low) if np.isfinite(high - low) else 0.0
             positions[name] = float(
-                rng.uniform(max(now - far, min(low + room, now)), min(now + far, max(high - room, now)))
+                rng.uniform(
+                    max(now - far, min(low + room, now)),
+                    min(now + far, max(high - room, now)),
+                )
             )
-        poses.append(dataclasses.replace(begun, positions={n: round(x, 3) for n, x in positions.items()}))
+        poses.append(
+            dataclasses.replace(
+                begun, positions={n: round(x, 3) for n, x in positions.items()}
+            )
+        )
     why = ""
     for pose in sorted(poses, key=lambda pose: -pose.change()):
         if not (found := pose.wrong()):
@@ -185,16 +240,24 @@ def chosen_pose(
     )
 
 
-def _begun(machine: Machine, part: str, like: Measurement | None, span: tuple[float, float]) -> OtherPose:
+def _begun(
+    machine: Machine, part: str, like: Measurement | None, span: tuple[float, float]
+) -> OtherPose:
     if not isinstance(machine, RobotMachine):
         raise TaccorlError(f"--pose: {machine.name} has no other joints; remove it")
     if like is None:
-        raise TaccorlError(f"--pose: no recording states the present pose of {part}; give --measurements=")
+        raise TaccorlError(
+            f"--pose: no recording states the present pose of {part}; give --measurements="
+        )
     whole = machine.robot.joint(part).whole(like)
-    return OtherPose(machine, part, whole, machine.robot.joint(part).pose(whole), {}, span)
+    return OtherPose(
+        machine, part, whole, machine.robot.joint(part).pose(whole), {}, span
+    )
 
 
-def touching(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> set[tuple[int, int]]:
+def touching(
+    model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray
+) -> set[tuple[int, int]]:
     """Pairs of bodies, by their ids, whose shapes touch at ``pose`` (nq,) [rad, m]."""
     data.qpos[:] = pose
     mujoco.mj_fwdPosition(model, data)
@@ -209,22 +272,38 @@ def _name(model: mujoco.MjModel, body: int) -> str:
 def in_other_pose(problem: Startable, pose: OtherPose, new: str) -> Startable:
     """``problem`` with the recording ``new`` in another pose than the others. There an ``unbalance`` has the sine and cosine of a
     base that leans as little as explains it in the present pose; other effects are as they are."""
-    here, there = (weights_by_turn(pose.robot.robot, pose.part, [at]) for at in (pose.here, pose.there))
+    here, there = (
+        weights_by_turn(pose.robot.robot, pose.part, [at])
+        for at in (pose.here, pose.there)
+    )
     turned = there @ np.linalg.pinv(here, rcond=1e-6)
 
     def moved(e: Effect) -> Effect:
         if not isinstance(e, Unbalance):
             return e
-        sine, cosine = turned @ [e.torque_nm * np.cos(e.hangs_at_rad), -e.torque_nm * np.sin(e.hangs_at_rad)]
+        sine, cosine = turned @ [
+            e.torque_nm * np.cos(e.hangs_at_rad),
+            -e.torque_nm * np.sin(e.hangs_at_rad),
+        ]
         other = copy.copy(e)  # also beyond the largest torque of a search
-        other.torque_nm, other.hangs_at_rad = float(np.hypot(sine, cosine)), float(np.arctan2(-cosine, sine))
+        other.torque_nm, other.hangs_at_rad = (
+            float(np.hypot(sine, cosine)),
+            float(np.arctan2(-cosine, sine)),
+        )
         return other
 
-    def simulate_all(cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+    def simulate_all(
+        cases: Sequence[Case], recordings: Sequence[Recording]
+    ) -> list[list[np.ndarray]]:
         there = [(base, [moved(e) for e in effects]) for base, effects in cases]
-        return [problem.simulate_all(there if r.name == new else cases, [r])[0] for r in recordings]
+        return [
+            problem.simulate_all(there if r.name == new else cases, [r])[0]
+            for r in recordings
+        ]
 
     changed = copy.copy(problem)
     changed.simulate_all = simulate_all
-    changed.simulate = lambda base, effects, recording: simulate_all([(base, effects)], [recording])[0][0]
+    changed.simulate = lambda base, effects, recording: simulate_all(
+        [(base, effects)], [recording]
+    )[0][0]
     return changed

@@ -69,7 +69,11 @@ class Planned:
     @property
     def mean(self) -> float:
         """Mean discrimination over all pairs of rivals [floors]; 0 without a pair."""
-        return float(np.mean(list(self.discrimination.values()))) if self.discrimination else 0.0
+        return (
+            float(np.mean(list(self.discrimination.values())))
+            if self.discrimination
+            else 0.0
+        )
 
 
 class Explanation(NamedTuple):
@@ -92,7 +96,9 @@ class Scene:
     def __init__(self, problem: Startable, recordings: Sequence[Recording]) -> None:
         self.problem, self.recordings = problem, recordings
 
-    def told(self, rivals: Sequence[str], fitted: Mapping[str, Values]) -> dict[str, Explanation]:
+    def told(
+        self, rivals: Sequence[str], fitted: Mapping[str, Values]
+    ) -> dict[str, Explanation]:
         """Name of each rival → its explanation, with the numbers that were ``fitted`` with it, or typical values.
 
         Raises:
@@ -110,7 +116,10 @@ class Scene:
     ) -> tuple[Problem, Sequence[Recording]]:
         """Problem and recordings as ``truth`` with its ``effects`` gives them, for a fit of ``other``."""
         return self.problem, [
-            dataclasses.replace(r, measured=self.problem.simulate(truth.values, effects, r)) for r in self.recordings
+            dataclasses.replace(
+                r, measured=self.problem.simulate(truth.values, effects, r)
+            )
+            for r in self.recordings
         ]
 
     def left(self, truth: Explanation, other: Explanation) -> float:
@@ -118,7 +127,9 @@ class Scene:
         the file are in both, and their numbers are fitted, too."""
         rivals = (truth.effect.name, other.effect.name)
         present = [name for name in self.problem.present if name not in rivals]
-        own = [self.problem.candidates[name].make(self.problem.start) for name in present]
+        own = [
+            self.problem.candidates[name].make(self.problem.start) for name in present
+        ]
         problem, said = self.said(truth, other, [*own, truth.effect])
         model = fit(problem, said, (*present, other.effect.name), other.values, STEPS)
         return rms(stacked(problem, model.values, model.effects, said[-1:]))
@@ -206,7 +217,10 @@ class Plan:
 
     def at_first(self, pair: str) -> float:
         """The same on the recordings in the present condition."""
-        return max((p.discrimination[pair] for p in self.planned if not p.part.label), default=0.0)
+        return max(
+            (p.discrimination[pair] for p in self.planned if not p.part.label),
+            default=0.0,
+        )
 
     def one_way(self) -> Iterator[tuple[str, str, Planned, float]]:
         """Of hopeless pairs: the pair, one of its effects, and the recording that shows best if that one is the truth, with its
@@ -226,7 +240,9 @@ class Plan:
             tells = [p.name for p in self.planned if p.discrimination[pair] >= TELLS]
             first = [p.name for p in self.planned[:num]]
             needed |= set() if {*tells} & {*first} else {tells[0]}
-        rest = [p.name for p in self.planned if p.name not in needed][: max(num - len(needed), 0)]
+        rest = [p.name for p in self.planned if p.name not in needed][
+            : max(num - len(needed), 0)
+        ]
         return tuple(p for p in self.planned if p.name in needed or p.name in rest)
 
 
@@ -238,7 +254,9 @@ def in_file(machine: Machine, part: str) -> list[str]:
         name
         for name in names
         if any(
-            values[f"{name}.{p.name}"][0] != p.absent for p in effects.get(name).parameters() if p.absent is not None
+            values[f"{name}.{p.name}"][0] != p.absent
+            for p in effects.get(name).parameters()
+            if p.absent is not None
         )
     ]
 
@@ -250,7 +268,9 @@ def check_rivals(machine: Machine, part: str, rivals: Sequence[str]) -> None:
         TaccorlError: there are fewer than two, or the machine's file has one of them.
     """
     if len(set(rivals)) < max(len(rivals), 2):
-        raise TaccorlError(f"give two or more effects to separate, each once, found {', '.join(rivals) or 'none'}")
+        raise TaccorlError(
+            f"give two or more effects to separate, each once, found {', '.join(rivals) or 'none'}"
+        )
     if there := [name for name in in_file(machine, part) if name in rivals]:
         raise TaccorlError(
             f"the file of {machine.name} has {' and '.join(there)} at {part} already; what is in the file is fitted beside every "
@@ -282,15 +302,28 @@ def plan(
         try:
             more = scored(other := make(), rivals, fitted or {}, done)
         except TaccorlError as error:
-            found = dataclasses.replace(found, refused=found.refused | {label: str(error)})
+            found = dataclasses.replace(
+                found, refused=found.refused | {label: str(error)}
+            )
             continue
         shown = {(pair, truth) for pair, truth, _, _ in found.one_way()}
-        needed = [p.name for pair, truth, p, _ in more.one_way() if pair in pairs and (pair, truth) not in shown]
-        needed += [p.name for p in more.planned if any(p.discrimination[pair] >= TELLS for pair in pairs)]
+        needed = [
+            p.name
+            for pair, truth, p, _ in more.one_way()
+            if pair in pairs and (pair, truth) not in shown
+        ]
+        needed += [
+            p.name
+            for p in more.planned
+            if any(p.discrimination[pair] >= TELLS for pair in pairs)
+        ]
         found = dataclasses.replace(
             found,
-            planned=best_first([*found.planned, *(p for p in more.planned if p.name in needed)]),
-            tried=found.tried | {other.where: {pair: more.best(pair) for pair in pairs}},
+            planned=best_first(
+                [*found.planned, *(p for p in more.planned if p.name in needed)]
+            ),
+            tried=found.tried
+            | {other.where: {pair: more.best(pair) for pair in pairs}},
         )
     return found
 
@@ -316,12 +349,20 @@ def scored(
             told = scene.told(rivals, fitted)
             suspected = suspected or told
             pairs = itertools.combinations(rivals, 2)
-            ways = {f"{a} | {b}": (scene.left(told[a], told[b]), scene.left(told[b], told[a])) for a, b in pairs}
+            ways = {
+                f"{a} | {b}": (
+                    scene.left(told[a], told[b]),
+                    scene.left(told[b], told[a]),
+                )
+                for a, b in pairs
+            }
             planned.append(dataclasses.replace(offer, ways=ways))
             for name, far in part.reach(offer, told).items():
                 reaches[name] = max(far, reaches.get(name, 0.0))
         done(item.name, k, len(every))
-    return Plan(part.name, tuple(rivals), part.floor, best_first(planned), refused, reaches)
+    return Plan(
+        part.name, tuple(rivals), part.floor, best_first(planned), refused, reaches
+    )
 
 
 def best_first(planned: Sequence[Planned]) -> tuple[Planned, ...]:

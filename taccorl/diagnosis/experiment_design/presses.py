@@ -48,16 +48,40 @@ FINGER_SPEED_M_PER_S = 0.05
 GAIN_SPREAD = 0.1
 """Standard deviation of the taxels' gains for a gain map that is not known: a choice."""
 
-_LOOPS = ((2.5, AWAY_M), (6.0, 9e-4), (7.5, 4.5e-4), (9.0, 1e-3), (11.0, 2e-4), (13.0, 7e-4), (15.0, AWAY_M))
+_LOOPS = (
+    (2.5, AWAY_M),
+    (6.0, 9e-4),
+    (7.5, 4.5e-4),
+    (9.0, 1e-3),
+    (11.0, 2e-4),
+    (13.0, 7e-4),
+    (15.0, AWAY_M),
+)
 LIBRARY = (
-    Press(name="press_hold_release", knots=pad_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8)),
+    Press(
+        name="press_hold_release",
+        knots=pad_presses((3e-4, 6e-4, 1e-3), (0.12, 0.6), 0.8),
+    ),
     Press(name="deep_presses", knots=pad_presses((4e-4, 1e-3, 1.6e-3), (0.4,), 0.6)),
     Press(name="slow_ramp", knots=((0.0, AWAY_M), *_LOOPS, (17.5, AWAY_M))),
     Press(name="long_hold", knots=pad_presses((8e-4,), (0.3,), 8.0, after_s=5.0)),
-    Press(name="quick_taps", knots=pad_presses((1e-3,) * 12, (0.06,), 0.08, between_s=0.3)),
-    Press(name="light_touches", knots=pad_presses((5e-5, 1e-4, 2e-4, 3e-4), (0.8,), 0.5)),
-    Press(name="rod_across", knots=pad_presses((3e-4, 7e-4), (0.15, 0.6), 0.6), shape="rod", x_m=0.0, z_m=0.012),
-    Press(name="rests", knots=pad_presses((6e-4,), (0.3,), 0.8, before_s=10.0, after_s=10.0)),
+    Press(
+        name="quick_taps", knots=pad_presses((1e-3,) * 12, (0.06,), 0.08, between_s=0.3)
+    ),
+    Press(
+        name="light_touches", knots=pad_presses((5e-5, 1e-4, 2e-4, 3e-4), (0.8,), 0.5)
+    ),
+    Press(
+        name="rod_across",
+        knots=pad_presses((3e-4, 7e-4), (0.15, 0.6), 0.6),
+        shape="rod",
+        x_m=0.0,
+        z_m=0.012,
+    ),
+    Press(
+        name="rests",
+        knots=pad_presses((6e-4,), (0.3,), 0.8, before_s=10.0, after_s=10.0),
+    ),
 )
 """Presses from which ``taccorl excite --pads`` chooses."""
 
@@ -75,12 +99,22 @@ class PadsPart(Part):
 
     rate_hz = RATE_HZ
 
-    def __init__(self, config: TwinConfig, arm: str, measurements: Measurements | None = None) -> None:
+    def __init__(
+        self, config: TwinConfig, arm: str, measurements: Measurements | None = None
+    ) -> None:
         if arm not in ROBOT.arms:
             raise TaccorlError(f"no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
         self.machine, self.name, self.library = PiperTwin(config), part_of(arm), LIBRARY
-        self._config, self.arm, self._known = config, arm, _known(config, arm, measurements)
-        self._floors = TouchProblem(self._known, config).floor_count if self._known else _sensor_floor(config)
+        self._config, self.arm, self._known = (
+            config,
+            arm,
+            _known(config, arm, measurements),
+        )
+        self._floors = (
+            TouchProblem(self._known, config).floor_count
+            if self._known
+            else _sensor_floor(config)
+        )
         self.floor = float(np.median(self._floors))
 
     def offer(self, item: Press, suspected: Mapping[str, Explanation]) -> Planned:
@@ -90,7 +124,9 @@ class PadsPart(Part):
         names = f"{self.arm}_gripper.q_target", f"{self.arm}_gripper.opening"
         columns = dict(zip(names, (target, item.opening_m()), strict=True))
         made = imagined_press(self._config, self.arm, item)
-        return Planned(part=self, item=item, columns=columns, peak=float(force.max()), made=made)
+        return Planned(
+            part=self, item=item, columns=columns, peak=float(force.max()), made=made
+        )
 
     def scene(self, p: Planned) -> Scene:
         problem = TouchProblem([*self._known, p.made], self._config)
@@ -105,12 +141,18 @@ class PressScene(Scene):
     problem: TouchProblem
 
     def __init__(
-        self, problem: TouchProblem, known: Sequence[TouchMotion], plain: TouchMotion, model: TouchModel
+        self,
+        problem: TouchProblem,
+        known: Sequence[TouchMotion],
+        plain: TouchMotion,
+        model: TouchModel,
     ) -> None:
         super().__init__(problem, [problem.recording(m) for m in known])
         self._plain, self._model, self._still = plain, model, _said(model, plain)
 
-    def told(self, rivals: Sequence[str], fitted: Mapping[str, Values]) -> dict[str, Explanation]:
+    def told(
+        self, rivals: Sequence[str], fitted: Mapping[str, Values]
+    ) -> dict[str, Explanation]:
         """As of any scene; a gain map has no typical one: some gains are drawn."""
         for name in rivals:
             if not issubclass(registry.get(name), TouchEffect):
@@ -125,19 +167,31 @@ class PressScene(Scene):
         found = super().told(rivals, fitted)
         for name, e in found.items():
             if isinstance(e.effect, TaxelGainMap):
-                spread = np.random.default_rng(0).standard_normal((len(self.problem.pads), *ROBOT.pad.shape))
-                drawn = TaxelGainMap.of(np.clip(1.0 + GAIN_SPREAD * spread, 0.0, None), self.problem.pads)
+                spread = np.random.default_rng(0).standard_normal(
+                    (len(self.problem.pads), *ROBOT.pad.shape)
+                )
+                drawn = TaxelGainMap.of(
+                    np.clip(1.0 + GAIN_SPREAD * spread, 0.0, None), self.problem.pads
+                )
                 found[name] = e._replace(effect=drawn)
         return found
 
     def said(
         self, truth: Explanation, other: Explanation, effects: Sequence[Effect]
     ) -> tuple[Problem, Sequence[Recording]]:
-        louder = [np.abs(_said(self._model, self._plain, [e.effect], e.values) - self._still) for e in (truth, other)]
-        seen = dataclasses.replace(self._plain, measured=self._plain.measured + np.maximum(*louder))
+        louder = [
+            np.abs(_said(self._model, self._plain, [e.effect], e.values) - self._still)
+            for e in (truth, other)
+        ]
+        seen = dataclasses.replace(
+            self._plain, measured=self._plain.measured + np.maximum(*louder)
+        )
         recordings = [*self.recordings, self.problem.recording(seen)]
         return self.problem, [
-            dataclasses.replace(r, measured=self.problem.simulate(truth.values, effects, r)) for r in recordings
+            dataclasses.replace(
+                r, measured=self.problem.simulate(truth.values, effects, r)
+            )
+            for r in recordings
         ]
 
 
@@ -155,7 +209,9 @@ def travel_m(robot: RobotConfig) -> float:
     """Largest depth to which a pad can be pressed [m], limited by the gripper's force and the rubber's thickness."""
     return min(
         ROBOT.pad_thickness_m,
-        robot.grip_force_max_n / robot.pad_stiffness_n_per_m if robot.pads == "sprung" else np.inf,
+        robot.grip_force_max_n / robot.pad_stiffness_n_per_m
+        if robot.pads == "sprung"
+        else np.inf,
     )
 
 
@@ -180,7 +236,9 @@ def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
     exist yet."""
     opening = press.opening_m()
     time_s = np.arange(len(opening)) / RATE_HZ
-    target = np.tile([*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1))
+    target = np.tile(
+        [*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1)
+    )
     target[:, ROBOT.gripper_index(arm)] = opening
     stamps = np.arange(2 * FRAME_S, time_s[-1], FRAME_S)
     num_taxels = ROBOT.num_taxels
@@ -202,25 +260,37 @@ def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
     )
     motion = touch_motion(m, config, pressed)
     counts = _said(TouchModel(config), motion)
-    counts += sensor.noise_std_count * np.random.default_rng(0).standard_normal(counts.shape)
+    counts += sensor.noise_std_count * np.random.default_rng(0).standard_normal(
+        counts.shape
+    )
     return dataclasses.replace(motion, measured=np.round(counts).astype(np.int16))
 
 
 def _said(
-    model: TouchModel, motion: TouchMotion, effects: Sequence[Effect] = (), base: Values | None = None
+    model: TouchModel,
+    motion: TouchMotion,
+    effects: Sequence[Effect] = (),
+    base: Values | None = None,
 ) -> np.ndarray:
     """(T, P, R, C) counts above baseline without noise, of the twin's own k_n and k_d where ``base`` has none."""
     sensor, base = model.sensor, base or {}
-    k_n, k_d = base.get("k_n", sensor.normal_stiffness_per_m), base.get("k_d", sensor.normal_damping_s_per_m)
+    k_n, k_d = (
+        base.get("k_n", sensor.normal_stiffness_per_m),
+        base.get("k_d", sensor.normal_damping_s_per_m),
+    )
     return model.counts(motion, model.simulate(motion, k_n, k_d, effects))
 
 
-def _known(config: TwinConfig, arm: str, measurements: Measurements | None) -> list[TouchMotion]:
+def _known(
+    config: TwinConfig, arm: str, measurements: Measurements | None
+) -> list[TouchMotion]:
     """Matched contact replays of the recordings that say what these pads pressed."""
     if measurements is None:
         return []
     found = [
-        matched_contact(m, config, m.pressed) for m in measurements.fit if presses(m, arm) and m.pressed is not None
+        matched_contact(m, config, m.pressed)
+        for m in measurements.fit
+        if presses(m, arm) and m.pressed is not None
     ]
     if not found:
         raise TaccorlError(
@@ -233,7 +303,13 @@ def _known(config: TwinConfig, arm: str, measurements: Measurements | None) -> l
 def _sensor_floor(config: TwinConfig) -> np.ndarray:
     """Counts of a row: the twin's noise and the converter's step, in the mean over its frames; at least rounding."""
     rounding = 1 / math.sqrt(12)
-    return np.array(max(math.hypot(_flexitac(config).noise_std_count, rounding) / math.sqrt(FRAMES_A_ROW), rounding))
+    return np.array(
+        max(
+            math.hypot(_flexitac(config).noise_std_count, rounding)
+            / math.sqrt(FRAMES_A_ROW),
+            rounding,
+        )
+    )
 
 
 def _flexitac(config: TwinConfig) -> FlexiTacConfig:

@@ -21,12 +21,40 @@ from taccorl.alignment.machines.cell_model import (
     within_ends,
 )
 from taccorl.alignment.machines.cell_places import with_places
-from taccorl.alignment.machines.cell_tables import CellMeasurement, cells_of, load_cell_columns, read_cell_table
-from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
-from taccorl.alignment.measurements.folder import Measurements, read_measurements, repeat_pairs
+from taccorl.alignment.machines.cell_tables import (
+    CellMeasurement,
+    cells_of,
+    load_cell_columns,
+    read_cell_table,
+)
+from taccorl.alignment.machines.cells_file import (
+    CellsConfig,
+    cells_digest,
+    load_cells,
+    make_cells_effect,
+    save_cells,
+)
+from taccorl.alignment.measurements.folder import (
+    Measurements,
+    read_measurements,
+    repeat_pairs,
+)
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.comparison.result import USES, CellNumbers, Comparison, TouchTrace
-from taccorl.diagnosis.machines.machine import Addition, Counted, Finding, GainsAre, Machine, machines, numbers_of
+from taccorl.diagnosis.comparison.result import (
+    USES,
+    CellNumbers,
+    Comparison,
+    TouchTrace,
+)
+from taccorl.diagnosis.machines.machine import (
+    Addition,
+    Counted,
+    Finding,
+    GainsAre,
+    Machine,
+    machines,
+    numbers_of,
+)
 from taccorl.diagnosis.problems.cells_problem import (
     CellsProblem,
     median_reading,
@@ -74,7 +102,9 @@ class CellsMachine(Machine):
         c = self.config
         units = {"gain": f"{c.reading.unit}/{c.load.unit}", "offset": c.reading.unit}
         own = by_cell(c, {key: getattr(c, key) for key in units})
-        return {name: (x, units[name.split("_")[0]]) for name, x in own.items()} | numbers_of(c.effects)
+        return {
+            name: (x, units[name.split("_")[0]]) for name, x in own.items()
+        } | numbers_of(c.effects)
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -96,27 +126,45 @@ class CellsMachine(Machine):
             )
 
         def table(one: Path, beside: Path | None) -> CellMeasurement:
-            return read_cell_table(one, self.config, None if beside is None else load_cell_columns(beside, self.config))
+            return read_cell_table(
+                one,
+                self.config,
+                None if beside is None else load_cell_columns(beside, self.config),
+            )
 
-        fit_needed = fit_needed or not self.config.gain  # compare fits gain and offset that the file does not state
+        fit_needed = (
+            fit_needed or not self.config.gain
+        )  # compare fits gain and offset that the file does not state
         found = read_measurements(
-            path, columns=columns, validation_every=validation_every, table=table, fit_needed=fit_needed
+            path,
+            columns=columns,
+            validation_every=validation_every,
+            table=table,
+            fit_needed=fit_needed,
         )
         return with_places(self.config, found)
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        return check_cells(self.config, cells_of(measurements.all), [m.name for m in measurements.fit])
+        return check_cells(
+            self.config, cells_of(measurements.all), [m.name for m in measurements.fit]
+        )
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
         return (self.config.name,)
 
-    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+    def select(
+        self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]
+    ) -> tuple[str, ...]:
         if joints or pads:
             option = "joints" if joints else "pads"
-            raise TaccorlError(f"--{option}: {self.name} is a sensor of cells and has no {option}; remove --{option}")
+            raise TaccorlError(
+                f"--{option}: {self.name} is a sensor of cells and has no {option}; remove --{option}"
+            )
         return tuple(parts)
 
-    def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
+    def _compared(
+        self, measurements: Measurements, name: str, progress: Counted
+    ) -> Comparison:
         """Compare with gain and offset from the file; if it states none, with those fitted to the fit recordings, and the gain 0
         of dead cells."""
         config = self.config
@@ -125,14 +173,22 @@ class CellsMachine(Machine):
         calibration = of_file(config)
         if calibration is None:
             raw = cells_of(measurements.fit)
-            fitted = calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
-            calibration = without_dead(fitted, CellSet(config, raw).dead, median_reading(raw))
+            fitted = calibrated(
+                config, [(responses(config, m), m.measured) for m in fit_to]
+            )
+            calibration = without_dead(
+                fitted, CellSet(config, raw).dead, median_reading(raw)
+            )
         floor = reading_floor(config, prepared_all(config, measurements.all))
         gain, offset = (
-            np.array(numbers).reshape(config.shape) for numbers in file_numbers(config, calibration).values()
+            np.array(numbers).reshape(config.shape)
+            for numbers in file_numbers(config, calibration).values()
         )
         cells = CellNumbers(
-            names=config.names, gain=gain, offset=offset, places=calibration.gain.size // len(config.names)
+            names=config.names,
+            gain=gain,
+            offset=offset,
+            places=calibration.gain.size // len(config.names),
         )
         touches = []
         total = len(measurements.all)
@@ -143,10 +199,17 @@ class CellsMachine(Machine):
                 simulated = readings(config, responses(config, m), calibration)
                 if m.place.size:  # rows at no known place are not compared
                     rows = m.place >= 0
-                    kept = {name: getattr(m, name)[rows] for name in ("time_s", *m.columns)}
-                    m, simulated = dataclasses.replace(m, **kept, place=m.place[rows]), simulated[rows]
+                    kept = {
+                        name: getattr(m, name)[rows] for name in ("time_s", *m.columns)
+                    }
+                    m, simulated = (
+                        dataclasses.replace(m, **kept, place=m.place[rows]),
+                        simulated[rows],
+                    )
                 shape = (m.num_rows, 1, *config.shape)
-                loaded = np.asarray((m.target > LOADED * config.load.rated).any(axis=1, keepdims=True))
+                loaded = np.asarray(
+                    (m.target > LOADED * config.load.rated).any(axis=1, keepdims=True)
+                )
                 touches.append(
                     TouchTrace(
                         recording=m.name,
@@ -175,36 +238,62 @@ class CellsMachine(Machine):
             left_out=tuple(_cut_words(config, measurements)),
         )
 
-    def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> CellsProblem:
+    def problem(
+        self, part: str, measurements: Measurements, gains: GainsAre
+    ) -> CellsProblem:
         return CellsProblem(self.config, measurements)
 
-    def diagnose(self, part: str, measurements: Measurements, *, gains: GainsAre = "auto", **options: Any) -> Finding:
+    def diagnose(
+        self,
+        part: str,
+        measurements: Measurements,
+        *,
+        gains: GainsAre = "auto",
+        **options: Any,
+    ) -> Finding:
         measurements = with_places(self.config, measurements)
         problem = self.problem(part, measurements, gains)
         found = solved(part, problem, **options)
         unit, load = self.config.load.unit, self.config.load_of_reading
         remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
         d = _with_numbers(problem, found.diagnosis)
-        of_cells = warnings_of_all(self.config, cells_of(measurements.fit), cells_of(measurements.all))
-        of_effects = (*_of_whole_load(problem, d), *numbers_apart(problem, found.diagnosis))
-        d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *of_effects, *d.remarks))
+        of_cells = warnings_of_all(
+            self.config, cells_of(measurements.fit), cells_of(measurements.all)
+        )
+        of_effects = (
+            *_of_whole_load(problem, d),
+            *numbers_apart(problem, found.diagnosis),
+        )
+        d = dataclasses.replace(
+            d, remarks=(*(f.text for f in of_cells), *of_effects, *d.remarks)
+        )
         return dataclasses.replace(found, diagnosis=d, remark=remark)
 
     def effect(self, name: str, part: str, values: Mapping[str, Any]) -> Effect | None:
         if name in registry and "cells" not in registry.get(name).kinds():
             return None
-        return make_cells_effect(name, **{k: v for k, v in values.items() if k != "pads"})
+        return make_cells_effect(
+            name, **{k: v for k, v in values.items() if k != "pads"}
+        )
 
     def by_hand(
-        self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
+        self,
+        name: str,
+        joints: Sequence[str],
+        pads: Sequence[str],
+        values: Mapping[str, float],
     ) -> list[Addition]:
         """Add an effect with values by hand; gain and offset are not changed."""
         (part,) = self.select((self.config.name,), joints, pads)
         made = self.effect(name, part, {**values, "evidence": "by hand"})
         if made is None:
             known = [name for name in registry if "cells" in registry.get(name).kinds()]
-            raise TaccorlError(f"{name} is not an effect of a sensor of cells; {nearest(name, known)}")
-        numbers = by_cell(self.config, {key: getattr(self.config, key) for key in ("gain", "offset")})
+            raise TaccorlError(
+                f"{name} is not an effect of a sensor of cells; {nearest(name, known)}"
+            )
+        numbers = by_cell(
+            self.config, {key: getattr(self.config, key) for key in ("gain", "offset")}
+        )
         return [Addition(part, [made], numbers, {})]
 
     def with_additions(self, additions: Sequence[Addition]) -> "CellsMachine":
@@ -215,7 +304,11 @@ class CellsMachine(Machine):
             names = {e.name for e in addition.effects}
             kept = [e for e in config.effects if e.name not in names]
             numbers = {
-                key: [addition.base[f"{key}_{cell}"] for cell in config.names if f"{key}_{cell}" in addition.base]
+                key: [
+                    addition.base[f"{key}_{cell}"]
+                    for cell in config.names
+                    if f"{key}_{cell}" in addition.base
+                ]
                 for key in ("gain", "offset")
             }
             added = [e for e in addition.effects if not e.is_absent]
@@ -229,7 +322,9 @@ def _cut_words(config: CellsConfig, measurements: Measurements) -> list[str]:
     for m in cells_of(measurements.all):
         share = float(np.mean(~within_ends(config, m)))
         if share > 0:
-            words.append(f"{m.name}: {share:.1%} of the readings are at an end of the converter; they say nothing")
+            words.append(
+                f"{m.name}: {share:.1%} of the readings are at an end of the converter; they say nothing"
+            )
     return words
 
 
@@ -237,7 +332,11 @@ def _of_whole_load(problem: CellsProblem, d: Diagnosis) -> list[str]:
     """A remark for each effect whose numbers are not those of a cell, whose share of the load differs from place to place."""
     if problem.config.same_place_mm is None:
         return []
-    bent = [e.name for e in d.effects if any("reading" in f.unit for f in problem.candidates[e.name].frees)]
+    bent = [
+        e.name
+        for e in d.effects
+        if any("reading" in f.unit for f in problem.candidates[e.name].frees)
+    ]
     return [
         f"{name}: with several places it acts on the whole load, so its numbers are a mean over shares of the load; record one "
         "place alone for them"
@@ -251,6 +350,11 @@ def _with_numbers(problem: CellsProblem, d: Diagnosis) -> Diagnosis:
     return dataclasses.replace(
         d,
         base=problem.file_numbers(d.effects),
-        before=dataclasses.replace(d.before, values=present | problem.file_numbers(d.before.effects)),
-        offers=tuple(dataclasses.replace(o, base=problem.file_numbers(o.effects)) for o in d.offers),
+        before=dataclasses.replace(
+            d.before, values=present | problem.file_numbers(d.before.effects)
+        ),
+        offers=tuple(
+            dataclasses.replace(o, base=problem.file_numbers(o.effects))
+            for o in d.offers
+        ),
     )

@@ -25,12 +25,19 @@ def remarked[FindingT: Finding](f: FindingT, text: str) -> FindingT:
 
 def payloads(findings: Sequence[Finding]) -> list[Finding]:
     """Findings that add a payload."""
-    return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
+    return [
+        f
+        for f in findings
+        if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present
+    ]
 
 
 def lacked(f: Finding) -> tuple[str, ...]:
     """Names of the effects that a finding adds, and of the numbers in the robot's file that it calls wrong."""
-    return (*(n for n in f.diagnosis.names if n not in f.diagnosis.present), *numbers_off(f))
+    return (
+        *(n for n in f.diagnosis.names if n not in f.diagnosis.present),
+        *numbers_off(f),
+    )
 
 
 def numbers_off(f: Finding) -> tuple[str, ...]:
@@ -44,7 +51,11 @@ def without_numbers(f: Finding, owner: Finding) -> Finding:
     d, off = f.diagnosis, " and ".join(numbers_off(f))
     if not (owner.diagnosis.or_in and off):
         return f
-    d = dataclasses.replace(d, changed=(), status="nothing_missing" if d.status == "numbers_off" else d.status)
+    d = dataclasses.replace(
+        d,
+        changed=(),
+        status="nothing_missing" if d.status == "numbers_off" else d.status,
+    )
     text = f"{off} would remove a part of the error; so may the payload of {owner.part} in another body"
     return remarked(dataclasses.replace(f, diagnosis=d), text)
 
@@ -52,14 +63,25 @@ def without_numbers(f: Finding, owner: Finding) -> Finding:
 def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
     """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added. And the scale of
     its efforts where that is off instead."""
-    off = tuple(c.name for c in d.changed if c.name == EFFORT_SCALE and effect in c.instead)
-    return (*off, *(n for n in d.names if n not in d.present and effect in (n, *d.rivals.get(n, ()))))
+    off = tuple(
+        c.name for c in d.changed if c.name == EFFORT_SCALE and effect in c.instead
+    )
+    return (
+        *off,
+        *(
+            n
+            for n in d.names
+            if n not in d.present and effect in (n, *d.rivals.get(n, ()))
+        ),
+    )
 
 
 def without_tilt(f: Finding) -> Finding:
     """The finding without the remark on the tilt that it alone suggests."""
     remarks = tuple(text for text in f.diagnosis.remarks if not text.startswith(TILT))
-    return dataclasses.replace(f, diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks))
+    return dataclasses.replace(
+        f, diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks)
+    )
 
 
 def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
@@ -71,33 +93,65 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
         return tuple(name for name in names if name != "payload")
 
     rivals = {name: without(others) for name, others in d.rivals.items()}
-    told = [[dataclasses.replace(e, verdict=text) if e.name == "payload" else e for e in r.evidence] for r in d.rounds]
+    told = [
+        [
+            dataclasses.replace(e, verdict=text) if e.name == "payload" else e
+            for e in r.evidence
+        ]
+        for r in d.rounds
+    ]
     rounds = [
-        dataclasses.replace(r, ties=without(r.ties), evidence=tuple(e)) for r, e in zip(d.rounds, told, strict=True)
+        dataclasses.replace(r, ties=without(r.ties), evidence=tuple(e))
+        for r, e in zip(d.rounds, told, strict=True)
     ]
     offers = tuple(o for o in d.offers if "payload" not in o.added)
-    changed = tuple(dataclasses.replace(c, instead=without(c.instead)) for c in d.changed)
-    d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers, changed=changed)
+    changed = tuple(
+        dataclasses.replace(c, instead=without(c.instead)) for c in d.changed
+    )
+    d = dataclasses.replace(
+        d, rivals=rivals, rounds=tuple(rounds), offers=offers, changed=changed
+    )
     return remarked(dataclasses.replace(f, diagnosis=d), text)
 
 
-def placed(f: Finding, model: Fit, stands_for: Mapping[str, Sequence[str]], ties: Sequence[str]) -> Finding:
+def placed(
+    f: Finding, model: Fit, stands_for: Mapping[str, Sequence[str]], ties: Sequence[str]
+) -> Finding:
     """The finding of one joint with the values of ``model``, a fit of one payload to several joints: its mass, its intervals, and
     the numbers of the drive that every fit adjusts. A remark names the effects that the payload replaces: ``stands_for``,
     joint → effects that alone explain as much there. ``ties``: other bodies where the payload explains as much."""
     d, every = f.diagnosis, model.intervals()
-    ends = {name: interval for name, interval in every.items() if name.startswith("payload.")}
+    ends = {
+        name: interval
+        for name, interval in every.items()
+        if name.startswith("payload.")
+    }
     own = {name.removeprefix("payload."): interval for name, interval in ends.items()}
     mass = {"mass_kg": model.values["payload.mass_kg"], "interval": own}
-    effects_ = [dataclasses.replace(e, **mass) if isinstance(e, Payload) else e for e in d.effects]
+    effects_ = [
+        dataclasses.replace(e, **mass) if isinstance(e, Payload) else e
+        for e in d.effects
+    ]
     known = cast(Known, f.known)
     for old in [n for n in known.identifiable if n.name in ends]:
         low, high = ends[old.name]
         now = dataclasses.replace(old, value=model.values[old.name], low=low, high=high)
-        effects_ = [dataclasses.replace(e, evidence=e.evidence.replace(old.words(), now.words())) for e in effects_]
-        numbers = [tuple(now if n.name == now.name else n for n in of) for of in (known.identifiable, known.absolute)]
+        effects_ = [
+            dataclasses.replace(
+                e, evidence=e.evidence.replace(old.words(), now.words())
+            )
+            for e in effects_
+        ]
+        numbers = [
+            tuple(now if n.name == now.name else n for n in of)
+            for of in (known.identifiable, known.absolute)
+        ]
         known = dataclasses.replace(known, identifiable=numbers[0], absolute=numbers[1])
-    others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
+    others = [
+        f"{' and '.join(names)} of {part}"
+        for part, names in stands_for.items()
+        if "payload" not in names
+    ]
     places = [name for name in own if name in PAYLOAD_AT]
     text = (
         f"payload: its mass, {' and '.join(places)} are fitted to all joints that feel it and lack little besides"
@@ -107,12 +161,27 @@ def placed(f: Finding, model: Fit, stands_for: Mapping[str, Sequence[str]], ties
     if TORQUE_FF.name not in d.base:
         text += f"; {TORQUE_FF.name} of {f.part} is as the file states it"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
-    of_mass = d.or_number[0] == EFFORT_SCALE and any(EFFORT_SCALE in names for names in stands_for.values())
+    of_mass = d.or_number[0] == EFFORT_SCALE and any(
+        EFFORT_SCALE in names for names in stands_for.values()
+    )
     number = ("", 1.0) if of_mass else d.or_number
-    base = {name: model.values.get(f"{f.part}/{name}", value) for name, value in d.base.items()}
-    more = ends | {name: every[f"{f.part}/{name}"] for name in base if f"{f.part}/{name}" in every}
-    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **more}, base=base, or_number=number)
-    changed = tuple(dataclasses.replace(c, after=base.get(c.name, c.after)) for c in d.changed)
+    base = {
+        name: model.values.get(f"{f.part}/{name}", value)
+        for name, value in d.base.items()
+    }
+    more = ends | {
+        name: every[f"{f.part}/{name}"] for name in base if f"{f.part}/{name}" in every
+    }
+    d = dataclasses.replace(
+        d,
+        effects=tuple(effects_),
+        intervals={**d.intervals, **more},
+        base=base,
+        or_number=number,
+    )
+    changed = tuple(
+        dataclasses.replace(c, after=base.get(c.name, c.after)) for c in d.changed
+    )
     d = dataclasses.replace(d, changed=changed, or_in=tuple(ties))
     return remarked(dataclasses.replace(f, diagnosis=d, known=known), text)
 

@@ -17,10 +17,14 @@ def load_machine(path: Path | None) -> Machine:
     if path is None:
         return PiperTwin.nominal()
     if path.is_file() and path.suffix.lower() in (".xml", ".mjcf", ".urdf"):
-        raise SpecError(f"{path}: is a model, where a robot file is needed; `taccorl init-robot {path}` drafts one")
+        raise SpecError(
+            f"{path}: is a model, where a robot file is needed; `taccorl init-robot {path}` drafts one"
+        )
     kind, line = kind_of(path)
     if kind is None:
         return PiperTwin.load(path)
     if kind not in machines:
-        raise SpecError(f"{path}:{line}: kind: there is no kind of machine {kind!r}; {nearest(kind, machines)}")
+        raise SpecError(
+            f"{path}:{line}: kind: there is no kind of machine {kind!r}; {nearest(kind, machines)}"
+        )
     return machines.get(kind).load(path)

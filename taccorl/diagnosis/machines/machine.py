@@ -64,7 +64,9 @@ class Drive(NamedTuple):
 class Diagnosed(Protocol):
     """Function that diagnoses parts of a machine."""
 
-    def __call__(self, machine: "Machine", some: Sequence[str], leave_out: Sequence[str] = ()) -> list[Finding]:
+    def __call__(
+        self, machine: "Machine", some: Sequence[str], leave_out: Sequence[str] = ()
+    ) -> list[Finding]:
         """Findings of the parts ``some``, searched without the effects ``leave_out``."""
         ...
 
@@ -128,7 +130,12 @@ class Machine(ABC):
         """Read recordings of the machine, divided into fit, validation and test; arguments and errors are those of
         ``read_measurements``."""
         return read_measurements(
-            path, spec=spec, columns=columns, validation_every=validation_every, units=self.units, fit_needed=fit_needed
+            path,
+            spec=spec,
+            columns=columns,
+            validation_every=validation_every,
+            units=self.units,
+            fit_needed=fit_needed,
         )
 
     # measurements ----------------------------------------------------------------------------------------------------
@@ -145,15 +152,21 @@ class Machine(ABC):
         """Names of the parts that the fit recordings excite, so that they can be diagnosed. Raises TaccorlError: there are none;
         the message states what to record."""
 
-    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+    def select(
+        self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]
+    ) -> tuple[str, ...]:
         """Parts of the machine that ``--joints`` and ``--pads`` name; all ``parts`` if neither is given. Raises TaccorlError: the
         machine has no part of that name."""
         if pads:
-            raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; remove --pads")
+            raise TaccorlError(
+                f"--pads={pads[0]}: {self.name} has no pads; remove --pads"
+            )
         known = [*self.units] or parts
         for name in joints:
             if name not in known:
-                raise TaccorlError(f"--joints={name}: no such {self.part_word}; {nearest(name, known)}")
+                raise TaccorlError(
+                    f"--joints={name}: no such {self.part_word}; {nearest(name, known)}"
+                )
             if name not in parts:
                 raise TaccorlError(
                     f"--joints={name}: no fit recording moves this {self.part_word}; moved are: {listed(list(parts))}"
@@ -179,7 +192,9 @@ class Machine(ABC):
             raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
         return self._compared(measurements, name or self.name, progress)
 
-    def _compared(self, measurements: Measurements, name: str, progress: Counted) -> Comparison:
+    def _compared(
+        self, measurements: Measurements, name: str, progress: Counted
+    ) -> Comparison:
         """``compare``, for kinds without pads."""
         raise NotImplementedError
 
@@ -187,7 +202,9 @@ class Machine(ABC):
         """What ``diagnose`` of one part reads of ``measurements``; its worker gets no more."""
         return measurements
 
-    def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> PartProblem:
+    def problem(
+        self, part: str, measurements: Measurements, gains: GainsAre
+    ) -> PartProblem:
         """Search problem of one part. Kinds that override ``diagnose`` need not implement it."""
         raise NotImplementedError
 
@@ -210,7 +227,9 @@ class Machine(ABC):
             without: effects that are left out of the search.
             progress: function that is called with a text about the present step.
         """
-        return solved(part, self.problem(part, measurements, gains), search, without, progress)
+        return solved(
+            part, self.problem(part, measurements, gains), search, without, progress
+        )
 
     @property
     def fitted_gains(self) -> tuple[str, ...]:
@@ -231,13 +250,17 @@ class Machine(ABC):
 
     def drive(self, part: str) -> Drive:
         """Limits of one part's motion. Raises TaccorlError: the machine has no motions, or no such part."""
-        raise TaccorlError(f"{self.name}: no command plans motions for it; its parts are no joints or axes")
+        raise TaccorlError(
+            f"{self.name}: no command plans motions for it; its parts are no joints or axes"
+        )
 
     def answer(self, part: str, m: Measurement) -> JointResponse:
         """Simulated answer of one part to the targets of ``m``, from rest where ``m`` was measured first."""
         raise NotImplementedError
 
-    def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> RecordedProblem:
+    def motion_problem(
+        self, part: str, measurements: Measurements, gains: GainsAre
+    ) -> RecordedProblem:
         """Search problem of one joint or axis, for ``taccorl excite`` and ``taccorl surrogate``; equal to ``problem`` by default.
 
         Args:
@@ -259,7 +282,11 @@ class Machine(ABC):
         """
 
     def by_hand(
-        self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
+        self,
+        name: str,
+        joints: Sequence[str],
+        pads: Sequence[str],
+        values: Mapping[str, float],
     ) -> list[Addition]:
         """Additions for an effect with values by hand, one for each named part; for the only part if the machine has one.
 
@@ -271,10 +298,14 @@ class Machine(ABC):
             TaccorlError: the effect cannot act there, or no part is named.
         """
         if not joints and len(self.units) > 1:
-            raise TaccorlError(f"{name}: which {self.part_word}? --joints={next(iter(self.units))}")
+            raise TaccorlError(
+                f"{name}: which {self.part_word}? --joints={next(iter(self.units))}"
+            )
         return self._by_hand(name, self.select(tuple(self.units), joints, pads), values)
 
-    def _by_hand(self, name: str, parts: Sequence[str], values: Mapping[str, float]) -> list[Addition]:
+    def _by_hand(
+        self, name: str, parts: Sequence[str], values: Mapping[str, float]
+    ) -> list[Addition]:
         found = []
         for part in parts:
             effect = self.effect(name, part, {**values, "evidence": "by hand"})
@@ -292,7 +323,11 @@ class Machine(ABC):
         """
 
     def reconsidered(
-        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: "Diagnosed"
+        self,
+        findings: Sequence[Finding],
+        measurements: Measurements,
+        gains: GainsAre,
+        diagnosed: "Diagnosed",
     ) -> list[Finding]:
         """``findings``, with other findings of those parts that an effect found at another part changes.
 
@@ -304,7 +339,12 @@ class Machine(ABC):
 
     def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
         """Copy of the machine with everything that was found, and text: why a part of it could not be written, or empty."""
-        found = [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in findings]
+        found = [
+            Addition(
+                f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals
+            )
+            for f in findings
+        ]
         return self.with_additions(found), ""
 
     def changes_as_a_whole(self, findings: Sequence[Finding]) -> list[str]:
@@ -316,7 +356,12 @@ class Machine(ABC):
         firsts = [(f.part, f.diagnosis.before) for f in findings]
         return self.with_additions(
             [
-                Addition(part, b.effects, {f.name: b.values[f.name] for f in b.frees}, b.intervals())
+                Addition(
+                    part,
+                    b.effects,
+                    {f.name: b.values[f.name] for f in b.frees},
+                    b.intervals(),
+                )
                 for part, b in firsts
             ]
         )
@@ -329,10 +374,16 @@ class Machine(ABC):
 
 def numbers_of(effects: Iterable[Effect]) -> dict[str, tuple[float, str]]:
     """``EFFECT.PARAMETER`` → (value, unit) of these effects."""
-    return {f"{e.name}.{p.name}": (getattr(e, p.name), p.unit) for e in effects for p in e.parameters()}
+    return {
+        f"{e.name}.{p.name}": (getattr(e, p.name), p.unit)
+        for e in effects
+        for p in e.parameters()
+    }
 
 
-machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnosis.machines")
+machines: Registry[type[Machine]] = Registry(
+    "kind of machine", "taccorl.diagnosis.machines"
+)
 """Kinds of machines, by the word after ``kind:`` in a file."""
 
 
@@ -366,10 +417,16 @@ def diagnose_parts(
     ) -> list[Finding | None]:
         options = {"gains": gains, "search": search, "without": (*without, *leave_out)}
         items = {part: (part, machine.of_part(part, measurements)) for part in some}
-        return each(partial(_diagnosed, machine, progress, options), items, workers, done)
+        return each(
+            partial(_diagnosed, machine, progress, options), items, workers, done
+        )
 
-    def again(machine: Machine, some: Sequence[str], leave_out: Sequence[str] = ()) -> list[Finding]:
-        if len(found := [f for f in diagnosed(machine, some, leave_out) if f is not None]) < len(some):
+    def again(
+        machine: Machine, some: Sequence[str], leave_out: Sequence[str] = ()
+    ) -> list[Finding]:
+        if len(
+            found := [f for f in diagnosed(machine, some, leave_out) if f is not None]
+        ) < len(some):
             raise Stopped
         return found
 
@@ -381,10 +438,15 @@ def diagnose_parts(
 
 
 def _diagnosed(
-    machine: Machine, progress: Callable[[str, str], None], options: Mapping[str, Any], item: tuple[str, Measurements]
+    machine: Machine,
+    progress: Callable[[str, str], None],
+    options: Mapping[str, Any],
+    item: tuple[str, Measurements],
 ) -> Finding | None:
     part, measurements = item
     try:
-        return machine.diagnose(part, measurements, **options, progress=partial(progress, part))
+        return machine.diagnose(
+            part, measurements, **options, progress=partial(progress, part)
+        )
     except Stopped:
         return None

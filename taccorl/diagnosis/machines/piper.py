@@ -83,12 +83,19 @@ class PiperTwin(Machine):
                 "kd": (control.kd_nms_per_rad[k], "N·m·s/rad"),
                 "torque_ff": (control.torque_ff_nm[k], "N·m"),
             }
-            return own | numbers_of(e for e in self.config.effects if part in e.acts_on())
+            return own | numbers_of(
+                e for e in self.config.effects if part in e.acts_on()
+            )
         words = [arm for arm in ROBOT.arms if arm in part.split()] or ROBOT.arms
         places = {f"{arm}_{finger}" for arm in words for finger in ROBOT.fingers}
         units = {"k_n": "1/m", "k_d": "s/m"}
-        own = {name: (getattr(self.config.sensor, field), units[name]) for name, field in pads.FIELDS.items()}
-        return own | numbers_of(e for e in self.config.effects if places & {*e.acts_on()})
+        own = {
+            name: (getattr(self.config.sensor, field), units[name])
+            for name, field in pads.FIELDS.items()
+        }
+        return own | numbers_of(
+            e for e in self.config.effects if places & {*e.acts_on()}
+        )
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -97,10 +104,16 @@ class PiperTwin(Machine):
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
         """Check recordings for faults specific to the PiPER, such as a table without an arm's other joints: inertia and weight
         are then those of the rest pose. Returns recording → findings."""
-        return {m.name: [f for arm in ROBOT.arms for f in _pose_unknown(m, arm)] for m in measurements.all}
+        return {
+            m.name: [f for arm in ROBOT.arms for f in _pose_unknown(m, arm)]
+            for m in measurements.all
+        }
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
-        found = [*joints.swept_joints(measurements), *map(pads.part_of, pads.pressed_arms(measurements))]
+        found = [
+            *joints.swept_joints(measurements),
+            *map(pads.part_of, pads.pressed_arms(measurements)),
+        ]
         if not found:
             raise TaccorlError(
                 "no fit recording moves a joint by 2 mrad or more, or states what pads pressed; record sweeps or presses "
@@ -108,7 +121,9 @@ class PiperTwin(Machine):
             )
         return tuple(found)
 
-    def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
+    def select(
+        self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]
+    ) -> tuple[str, ...]:
         """Select parts by name: ``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm. Pads are named by
         their arm. Returns joints, then pads."""
         swept = [p for p in parts if p in _SIGNALS]
@@ -125,43 +140,75 @@ class PiperTwin(Machine):
         pressed: PressedObject | None = None,
         progress: Counted = lambda recording, done, total: None,
     ) -> Comparison:
-        return compare(self.config, measurements, name=name or self.name, pressed=pressed, progress=progress)
+        return compare(
+            self.config,
+            measurements,
+            name=name or self.name,
+            pressed=pressed,
+            progress=progress,
+        )
 
     def of_part(self, part: str, measurements: Measurements) -> Measurements:
-        return joints.of_joints(measurements, [part], touch=False) if part in _SIGNALS else measurements
+        return (
+            joints.of_joints(measurements, [part], touch=False)
+            if part in _SIGNALS
+            else measurements
+        )
 
-    def diagnose(self, part: str, measurements: Measurements, **options: Any) -> Finding:
+    def diagnose(
+        self, part: str, measurements: Measurements, **options: Any
+    ) -> Finding:
         if part in _SIGNALS:
             return joints.diagnose_joint(self.config, part, measurements, **options)
         options.pop("gains", None)  # of joints alone
-        return pads.diagnose_arm(self.config, part.removesuffix(" pads"), measurements, **options)
+        return pads.diagnose_arm(
+            self.config, part.removesuffix(" pads"), measurements, **options
+        )
 
     def effect(self, name: str, part: str, values: Mapping[str, Any]) -> Effect | None:
-        if {"arm", "joints", "pads"} & {*values}:  # as a report has it: it says itself where it acts
+        if {"arm", "joints", "pads"} & {
+            *values
+        }:  # as a report has it: it says itself where it acts
             return make_effect(name, **values)
         where = selectors(effects.get(name), part) if part in _SIGNALS else None
         return None if where is None else make_effect(name, **where, **values)
 
     def by_hand(
-        self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
+        self,
+        name: str,
+        joints: Sequence[str],
+        pads: Sequence[str],
+        values: Mapping[str, float],
     ) -> list[Addition]:
         kind = effects.get(name)
         if all(selectors(kind, signal) is None for signal in _SIGNALS):
             if joints:
-                raise TaccorlError(f"{name} is not an effect of joints; remove --joints")
-            where = [f"{arm}_{finger}" for arm in _arms_named(pads, ROBOT.arms) for finger in ROBOT.fingers]
+                raise TaccorlError(
+                    f"{name} is not an effect of joints; remove --joints"
+                )
+            where = [
+                f"{arm}_{finger}"
+                for arm in _arms_named(pads, ROBOT.arms)
+                for finger in ROBOT.fingers
+            ]
             made = make_effect(name, pads=where, **values, evidence="by hand")
             return [Addition(" and ".join(pads or ["all"]) + " pads", [made], {}, {})]
         if pads:
             raise TaccorlError(f"{name} is an effect of joints; remove --pads")
         if not joints:
-            raise TaccorlError(f"{name}: which joints? --joints=left_joint5, or joint5 for both arms")
+            raise TaccorlError(
+                f"{name}: which joints? --joints=left_joint5, or joint5 for both arms"
+            )
         return self._by_hand(name, _joints_named(joints, _SIGNALS), values)
 
     def with_additions(self, additions: Sequence[Addition]) -> "PiperTwin":
         """Add effects and numbers. k_n and k_d are common to all pads, so that values of several arms' pads must agree."""
         config = copy.deepcopy(self.config)
-        of_pads = {a.part: (a.base, a.intervals) for a in additions if a.base and a.part not in _SIGNALS}
+        of_pads = {
+            a.part: (a.base, a.intervals)
+            for a in additions
+            if a.base and a.part not in _SIGNALS
+        }
         if of_pads:
             pads.set_numbers(config, pads.agreed(of_pads))
         for a in additions:
@@ -172,19 +219,32 @@ class PiperTwin(Machine):
         return PiperTwin(config, self.name)
 
     def reconsidered(
-        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
+        self,
+        findings: Sequence[Finding],
+        measurements: Measurements,
+        gains: GainsAre,
+        diagnosed: Diagnosed,
     ) -> list[Finding]:
         """An effect of a whole arm with one number, ``gravity_mismatch``, that was found at a joint has the strength of the joint
         that determines it best. It is held at the arm's other joints, which are diagnosed again where it changes something. Where
         that leaves a larger error, it is not what the arm lacks: joints that named it are diagnosed without it."""
         for arm in ROBOT.arms:
-            mine = [cast(joints.JointFinding, f) for f in findings if f.part.startswith(f"{arm}_joint")]
+            mine = [
+                cast(joints.JointFinding, f)
+                for f in findings
+                if f.part.startswith(f"{arm}_joint")
+            ]
             if not (found := _of_whole_arm(mine)):
                 continue
             owner, effect = found[0]
             machine = self.with_additions([Addition(owner.part, [effect], {}, {})])
             named = [f.part for f, e in found if e.name == effect.name]
-            others = [f for f in mine if f is not owner and (f.part in named or machine.differs(self, f, measurements))]
+            others = [
+                f
+                for f in mine
+                if f is not owner
+                and (f.part in named or machine.differs(self, f, measurements))
+            ]
             again = diagnosed(machine, [f.part for f in others], [effect.name])
             ((value, _),) = numbers_of([effect]).values()
             told = f"{effect.name} {value:.3g} of the arm, as {owner.part} shows it"
@@ -201,11 +261,17 @@ class PiperTwin(Machine):
             findings = [changed.get(f.part, f) for f in findings]
         return list(findings)
 
-    def differs(self, other: "PiperTwin", finding: joints.JointFinding, measurements: Measurements) -> bool:
+    def differs(
+        self,
+        other: "PiperTwin",
+        finding: joints.JointFinding,
+        measurements: Measurements,
+    ) -> bool:
         """Whether the replays of a joint differ from those of ``other`` by more than half of the joint's noise floor."""
         part, most = finding.part, 0.5 * finding.floors[0].value
         return any(
-            np.abs(self.answer(part, m).reported - other.answer(part, m).reported).max() > most
+            np.abs(self.answer(part, m).reported - other.answer(part, m).reported).max()
+            > most
             for m in joints.of_joints(measurements, [part]).fit
         )
 
@@ -230,11 +296,16 @@ class PiperTwin(Machine):
 
     def answer(self, part: str, m: Measurement) -> JointResponse:
         """As ``Machine.answer``; its effort is the whole torque of the motor, the gravity compensation included."""
-        model, motion = JointModel(self.config, part), joint_motion(m, self.config, part)
+        model, motion = (
+            JointModel(self.config, part),
+            joint_motion(m, self.config, part),
+        )
         answer = model.simulate(motion, model.gains)
         return JointResponse(answer.reported, model.motor_nm(motion, answer))
 
-    def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> JointProblem:
+    def motion_problem(
+        self, part: str, measurements: Measurements, gains: GainsAre
+    ) -> JointProblem:
         return JointProblem(self.config, part, measurements, gains=gains)
 
     def option_of(self, part: str) -> list[str]:
@@ -256,11 +327,24 @@ def _of_whole_arm(findings: Sequence[Finding]) -> list[tuple[Finding, Effect]]:
     def unsure(item: tuple[Finding, Effect]) -> tuple[bool, float]:
         (f, effect), (number,) = item, item[1].parameters()
         low, high = effect.interval.get(number.name, (0.0, math.inf))
-        return effect.name in f.diagnosis.rivals, (high - low) / abs(getattr(effect, number.name) - number.absent)
+        return effect.name in f.diagnosis.rivals, (high - low) / abs(
+            getattr(effect, number.name) - number.absent
+        )
 
-    found = [(f, e) for f in findings for e in f.diagnosis.effects if e.name not in f.diagnosis.present]
-    of_arm = [(f, e) for f, e in found if isinstance(e, ArmEffect) and not isinstance(e, JointEffect)]
-    return sorted((pair for pair in of_arm if len(pair[1].parameters()) == 1), key=unsure)
+    found = [
+        (f, e)
+        for f in findings
+        for e in f.diagnosis.effects
+        if e.name not in f.diagnosis.present
+    ]
+    of_arm = [
+        (f, e)
+        for f, e in found
+        if isinstance(e, ArmEffect) and not isinstance(e, JointEffect)
+    ]
+    return sorted(
+        (pair for pair in of_arm if len(pair[1].parameters()) == 1), key=unsure
+    )
 
 
 def _joints_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
@@ -275,11 +359,17 @@ def _joints_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
         )
     chosen: list[str] = [] if names else list(known)
     for name in names:
-        joint = f"joint{int(name[1:]) + 1}" if name[:1] in "Jj" and name[1:].isdigit() else name
+        joint = (
+            f"joint{int(name[1:]) + 1}"
+            if name[:1] in "Jj" and name[1:].isdigit()
+            else name
+        )
         joint = f"joint{joint}" if joint.isdigit() else joint
         meant = [s for s in known if joint in (s, s.split("_", 1)[1])]
         if not meant:
-            raise TaccorlError(f"{name}: no such joint is swept in these recordings; {nearest(joint, known)}")
+            raise TaccorlError(
+                f"{name}: no such joint is swept in these recordings; {nearest(joint, known)}"
+            )
         chosen += [s for s in meant if s not in chosen]
     return chosen
 
@@ -292,13 +382,23 @@ def _arms_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
     """
     for name in names:
         if name not in ROBOT.arms:
-            raise TaccorlError(f"--pads={name}: no such arm; {nearest(name, ROBOT.arms)}")
+            raise TaccorlError(
+                f"--pads={name}: no such arm; {nearest(name, ROBOT.arms)}"
+            )
         if name not in known:
-            way_out = nearest(name, known) if known else "state `pressed` in measurements.yaml"
-            raise TaccorlError(f"--pads={name}: the recordings have no pads of that arm; {way_out}")
+            way_out = (
+                nearest(name, known)
+                if known
+                else "state `pressed` in measurements.yaml"
+            )
+            raise TaccorlError(
+                f"--pads={name}: the recordings have no pads of that arm; {way_out}"
+            )
     return [arm for arm in known if not names or arm in names]
 
 
 def _pose_unknown(m: Measurement, arm: str) -> list[DataFinding]:
     lacking = [f"{arm}_{j}" for j in ROBOT.joints if f"{arm}_{j}" not in m.signals]
-    return pose_unknown(lacking * (len(lacking) < len(ROBOT.joints)), "as on the bench", f"{arm} arm")
+    return pose_unknown(
+        lacking * (len(lacking) < len(ROBOT.joints)), "as on the bench", f"{arm} arm"
+    )

@@ -34,7 +34,15 @@ from taccorl.alignment.measurements.folder import Measurements, repeat_pairs
 from taccorl.alignment.measurements.noise_floor import residue_floor
 from taccorl.alignment.measurements.repeats import overlay
 from taccorl.diagnosis.problems.touch_problem import FIXED, MAX_CHANNELS
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, split_rows
+from taccorl.diagnosis.search.problem import (
+    Candidate,
+    Free,
+    Recording,
+    Values,
+    WithoutMaps,
+    candidate,
+    split_rows,
+)
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import CELLS, Effect
@@ -75,14 +83,19 @@ class CellsProblem(WithoutMaps):
         )
         self.floor = reading_floor(config, prepared_all(config, measurements.all))
         """(K,) noise floor in the unit of the reading."""
-        sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
+        sides = [
+            prepared_all(config, side)
+            for side in (measurements.fit, measurements.validation, measurements.test)
+        ]
         load = np.concatenate([m.target for m in sides[0]])
         self._load_noise = _own_noise([(m.target, m.rate_hz) for m in sides[0]])
         fit_to = cells_of(measurements.fit)
         self.dead = CellSet(config, fit_to).dead
         """(K,) bool: cells that are loaded and hardly respond. They are not compared."""
         self._level = median_reading(fit_to)
-        loaded = np.flatnonzero((load.max(axis=0) > LOADED * config.load.rated) & ~self.dead)
+        loaded = np.flatnonzero(
+            (load.max(axis=0) > LOADED * config.load.rated) & ~self.dead
+        )
         if len(loaded) == 0:
             raise TaccorlError(
                 f"{config.name}: no cell is loaded with {LOADED:.0%} of the rated load in a fit recording; press it harder"
@@ -93,7 +106,9 @@ class CellsProblem(WithoutMaps):
         self.fit: Sequence[Recording] = [self._recording(m) for m in sides[0]]
         self.validation: Sequence[Recording] = [self._recording(m) for m in sides[1]]
         self.test: Sequence[Recording] = [self._recording(m) for m in sides[2]]
-        self._calibrate_on: Sequence[Recording] = self.fit if self.validation else split_rows(self.fit)[0]
+        self._calibrate_on: Sequence[Recording] = (
+            self.fit if self.validation else split_rows(self.fit)[0]
+        )
         self._calibrations: dict[tuple, tuple[Calibration, dict[str, np.ndarray]]] = {}
         self.base: tuple[Free, ...] = ()
         seen = {
@@ -102,14 +117,24 @@ class CellsProblem(WithoutMaps):
         }
         gives = [
             *config.known_facts,
-            *(["temperature"] if all(m.temperature_c.size for side in sides for m in side) else []),
+            *(
+                ["temperature"]
+                if all(m.temperature_c.size for side in sides for m in side)
+                else []
+            ),
         ]
         self.candidates: dict[str, Candidate] = {
             name: candidate(cls, seen, pads=[CELLS], **FIXED.get(name, {}))
             for name in registry
-            if (cls := registry.get(name)).fitted and "cells" in cls.kinds() and cls.works_with(gives)
+            if (cls := registry.get(name)).fitted
+            and "cells" in cls.kinds()
+            and cls.works_with(gives)
         }
-        self.present = tuple(e.name for e in config.effects if not e.is_absent and e.name in self.candidates)
+        self.present = tuple(
+            e.name
+            for e in config.effects
+            if not e.is_absent and e.name in self.candidates
+        )
         self.start: Values = {
             f.name: getattr(e, f.name.split(".", 1)[1])
             for e in config.effects
@@ -135,13 +160,19 @@ class CellsProblem(WithoutMaps):
 
     def noisier(self, recording: Recording) -> Recording:
         m = recording.data
-        noise = np.random.default_rng(0).standard_normal(m.target.shape) * self._load_noise
+        noise = (
+            np.random.default_rng(0).standard_normal(m.target.shape) * self._load_noise
+        )
         noise = noise[:, :1] if self.config.load.shared else noise
         return dataclasses.replace(
-            recording, name=f"{recording.name}, noisier", data=dataclasses.replace(m, target=m.target + noise)
+            recording,
+            name=f"{recording.name}, noisier",
+            data=dataclasses.replace(m, target=m.target + noise),
         )
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+    def simulate(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+    ) -> np.ndarray:
         """(T, C) simulated readings in the unit of the file, with the gains and offsets of cells that fit best."""
         calibration, known = self._calibrated(effects)
         response = known.get(recording.name)
@@ -149,11 +180,18 @@ class CellsProblem(WithoutMaps):
             response = responses(self.config, recording.data, effects)
         return readings(self.config, response, calibration)[:, self.channels]
 
-    def _calibrated(self, effects: Sequence[Effect]) -> tuple[Calibration, dict[str, np.ndarray]]:
+    def _calibrated(
+        self, effects: Sequence[Effect]
+    ) -> tuple[Calibration, dict[str, np.ndarray]]:
         """Gain and offset of each cell beside ``effects``, and the responses of the recordings that they were fitted to."""
-        key = tuple((e.name, *(getattr(e, p.name) for p in e.parameters())) for e in effects)
+        key = tuple(
+            (e.name, *(getattr(e, p.name) for p in e.parameters())) for e in effects
+        )
         if key not in self._calibrations:
-            known = {r.name: responses(self.config, r.data, effects) for r in self._calibrate_on}
+            known = {
+                r.name: responses(self.config, r.data, effects)
+                for r in self._calibrate_on
+            }
             pairs = [(known[r.name], self._fitted_rows(r)) for r in self._calibrate_on]
             while len(self._calibrations) >= _KEPT:
                 self._calibrations.pop(next(iter(self._calibrations)))
@@ -162,7 +200,9 @@ class CellsProblem(WithoutMaps):
 
     def _fitted_rows(self, r: Recording) -> np.ndarray:
         """(T, K) readings of all cells in the rows that are fitted."""
-        return np.where(np.isfinite(r.measured).any(axis=1, keepdims=True), r.data.measured, np.nan)
+        return np.where(
+            np.isfinite(r.measured).any(axis=1, keepdims=True), r.data.measured, np.nan
+        )
 
     def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
         """Gain and offset of each cell as fitted together with ``effects``: ``gain_thumb`` [unit of the reading per unit of the
@@ -174,11 +214,14 @@ class CellsProblem(WithoutMaps):
         return by_cell(self.config, file_numbers(self.config, own))
 
 
-def without_dead(calibration: Calibration, dead: np.ndarray, level: np.ndarray) -> Calibration:
+def without_dead(
+    calibration: Calibration, dead: np.ndarray, level: np.ndarray
+) -> Calibration:
     """``calibration`` with the gain 0 and the offset ``level`` for cells that ``dead`` marks, all (K,)."""
     gain = calibration.gain
     return Calibration(
-        np.where(dead if gain.ndim == 1 else dead[:, None], 0.0, gain), np.where(dead, level, calibration.offset)
+        np.where(dead if gain.ndim == 1 else dead[:, None], 0.0, gain),
+        np.where(dead, level, calibration.offset),
     )
 
 
@@ -192,18 +235,36 @@ def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasur
     with at most 200 rows per second."""
 
     def usable(m: CellMeasurement) -> np.ndarray:
-        return within_ends(config, m) & (m.place[:, None] >= 0) if m.place.size else within_ends(config, m)
+        return (
+            within_ends(config, m) & (m.place[:, None] >= 0)
+            if m.place.size
+            else within_ends(config, m)
+        )
 
-    return [thinned(dataclasses.replace(m, measured=np.where(usable(m), m.measured, np.nan))) for m in measurements]
+    return [
+        thinned(
+            dataclasses.replace(m, measured=np.where(usable(m), m.measured, np.nan))
+        )
+        for m in measurements
+    ]
 
 
-def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
+def reading_floor(
+    config: CellsConfig, measurements: Sequence[CellMeasurement]
+) -> np.ndarray:
     """(K,) noise floor of each cell in the unit of the reading: its own noise and, times its gain, that of the load; if a press
     was repeated, at least the difference between repeats under the same load."""
     step = np.max([m.quantum for m in measurements], axis=0) / math.sqrt(12)
-    own, load = (_own_noise([(getattr(m, kind), m.rate_hz) for m in measurements]) for kind in ("measured", "target"))
-    gain = np.abs(calibrated(config, [(loads(m), m.measured) for m in measurements]).gain)
-    gain = gain if gain.ndim == 1 else np.sqrt(np.mean(np.square(gain), axis=1))  # of a place: RMS over places
+    own, load = (
+        _own_noise([(getattr(m, kind), m.rate_hz) for m in measurements])
+        for kind in ("measured", "target")
+    )
+    gain = np.abs(
+        calibrated(config, [(loads(m), m.measured) for m in measurements]).gain
+    )
+    gain = (
+        gain if gain.ndim == 1 else np.sqrt(np.mean(np.square(gain), axis=1))
+    )  # of a place: RMS over places
     floor = np.hypot(np.maximum(own, step), gain * load)
     squares, rows = np.zeros(len(floor)), np.zeros(len(floor))
     for one, repeat in repeat_pairs(measurements):
@@ -211,19 +272,28 @@ def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) 
         inside = (time_s >= repeat.time_s[0]) & (time_s <= repeat.time_s[-1])
         for k in range(len(floor)):
             again, pressed = (
-                np.interp(time_s[inside], repeat.time_s, x[:, k]) for x in (repeat.measured, repeat.target)
+                np.interp(time_s[inside], repeat.time_s, x[:, k])
+                for x in (repeat.measured, repeat.target)
             )
             same = np.ones(len(again), dtype=bool)
             if one.temperature_c.size and repeat.temperature_c.size:
-                warmer = np.interp(time_s[inside], repeat.time_s, repeat.temperature_c) - one.temperature_c[inside]
+                warmer = (
+                    np.interp(time_s[inside], repeat.time_s, repeat.temperature_c)
+                    - one.temperature_c[inside]
+                )
                 same = np.abs(warmer) < SAME_TEMPERATURE_K
-            same &= gain[k] * np.abs(pressed - one.target[inside, k]) < SAME_FLOORS * floor[k]
+            same &= (
+                gain[k] * np.abs(pressed - one.target[inside, k])
+                < SAME_FLOORS * floor[k]
+            )
             difference = (again - one.measured[inside, k])[same]
             squares[k] += np.nansum(np.square(difference)) / 2
             rows[k] += np.isfinite(difference).sum()
     repeated = np.sqrt(squares / np.maximum(rows, 1))
     columns = np.concatenate([m.measured for m in measurements]).T
-    spread = np.array([np.std(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in columns])
+    spread = np.array(
+        [np.std(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in columns]
+    )
     return np.maximum(np.maximum(floor, repeated), 1e-6 * spread + 1e-12)
 
 

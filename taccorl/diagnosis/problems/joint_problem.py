@@ -16,16 +16,36 @@ from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import FOLLOWED, WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import LANES
-from taccorl.alignment.controller.joint_model import SAME_RATE, JointModel, JointResponse, Numbers, PayloadLever
+from taccorl.alignment.controller.joint_model import (
+    SAME_RATE,
+    JointModel,
+    JointResponse,
+    Numbers,
+    PayloadLever,
+)
 from taccorl.alignment.controller.joint_motion import JointMotion, first_rows
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, floors_by_motion, noise_floor
+from taccorl.alignment.measurements.noise_floor import (
+    EXACT,
+    SignalFloor,
+    floors_by_motion,
+    noise_floor,
+)
 from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Case, Free, Recording, Values, WithoutMaps, candidate, holding
+from taccorl.diagnosis.search.problem import (
+    Candidate,
+    Case,
+    Free,
+    Recording,
+    Values,
+    WithoutMaps,
+    candidate,
+    holding,
+)
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.drive import SpeedDelay
@@ -40,7 +60,14 @@ KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
 """K_p, if it is fitted, with the paper's bounds."""
 KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
 """K_d, if it is fitted, with the paper's bounds."""
-TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0, unless="integral_action")
+TORQUE_FF = Free(
+    name="torque_ff",
+    unit="N·m",
+    start=0.0,
+    low=-40.0,
+    high=40.0,
+    unless="integral_action",
+)
 """Bounds of the fitted T_ref [N·m], wider than the paper's ± 8: a stiff joint with an error of 10 mrad has 18. An integral,
 which begins in balance, takes up any constant torque: beside it nothing determines T_ref."""
 WIDER = 100.0
@@ -53,18 +80,28 @@ _NOT_ON_PIPER = ("presliding", "unbalance")
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
 WEIGHS = 3.0
 """Least motion due to weight [noise floors of the angle, rms] at which it determines the scale of the torques. A choice."""
-EFFORT_SCALE = Free(name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True)
+EFFORT_SCALE = Free(
+    name="effort_scale", unit="1", start=1.0, low=0.1, high=10.0, log=True
+)
 """Ratio of reported effort to torque, which differs between versions of PiPER firmware."""
-SPEED_DELAY = Free(name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3)
+SPEED_DELAY = Free(
+    name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3
+)
 """τ of the effect speed_delay: how late a sampled loop damps the speed. It is fitted if something besides the inertia
 determines the scale of the torques; otherwise a change of K_p is equivalent (``taccorl.diagnosis.search.identifiable``)."""
-POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4)
+POSITION_AGE = Free(
+    name="position_age_s", unit="s", start=0.0, low=-1e-3, high=TIMING_S, scale=1e-4
+)
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
-LOOP = Free(name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4)
+LOOP = Free(
+    name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4
+)
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
-EFFORT_AGE = Free(name="effort_age_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-4)
+EFFORT_AGE = Free(
+    name="effort_age_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-4
+)
 """Age of the reported effort, which is never newer than the torque that acts, where the twin has no timing of the loop: at an
 acceleration of 20 rad/s² a quarter of a millisecond makes 0.4 N·m of K_d = 88 N·m·s/rad, as a little ``torque_lag``,
 ``command_delay`` or ``velocity_feedforward`` would."""
@@ -106,46 +143,86 @@ class JointProblem(WithoutMaps):
     ) -> None:
         joint = joint_of(machine, signal)
         self._left_out = _NOT_ON_PIPER if isinstance(machine, TwinConfig) else ()
-        whole = {use: tuple(map(joint.whole, getattr(measurements, use))) for use in ("fit", "validation", "test")}
+        whole = {
+            use: tuple(map(joint.whole, getattr(measurements, use)))
+            for use in ("fit", "validation", "test")
+        }
         measurements = dataclasses.replace(measurements, **whole)
         everything = measurements.all
-        silent = [m.name for m in everything if any(signal not in getattr(m, name) for name in joint.gain_names)]
+        silent = [
+            m.name
+            for m in everything
+            if any(signal not in getattr(m, name) for name in joint.gain_names)
+        ]
         if gains == "commanded" and silent:
             raise TaccorlError(
                 f"{silent[0]}: the commanded gains of {signal} are not stated; write {' and '.join(joint.gain_names)} into its "
                 "measurements.yaml, or fit them (gains=fitted)"
             )
-        self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
+        self.signal, self.commanded = (
+            signal,
+            not silent and (gains != "fitted" or not joint.gain_names),
+        )
         own, bare = joint.freed(held)
-        self.known, self.loop_s = joint.known_names, unlike_rows(joint.speed_delay_s * joint.exact_timing, everything)
+        self.known, self.loop_s = (
+            joint.known_names,
+            unlike_rows(joint.speed_delay_s * joint.exact_timing, everything),
+        )
         self._stated = {
-            f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
+            f"{effect.name}.{p.name}": getattr(effect, p.name)
+            for effect in own
+            for p in effect.parameters()
         }
         self.present = tuple(effect.name for effect in own)
         self.model = JointModel(bare)
         self._speed_where = self.model.joint.selectors(SpeedDelay) or {}
-        self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
-        self._first = int(self.model.joint.target_kind == "effort")  # then the position is the input, and no channel
+        self.effort = effort and all(
+            m.has_effort()[m.column(signal)] for m in everything
+        )
+        self._first = int(
+            self.model.joint.target_kind == "effort"
+        )  # then the position is the input, and no channel
         if self._first and not self.effort:
-            raise TaccorlError(f"{signal}: law effort needs the effort of every recording")
+            raise TaccorlError(
+                f"{signal}: law effort needs the effort of every recording"
+            )
         left = [unexplained(self.model, m, own) for m in everything if self._first]
-        self.floors = floors_of(everything, signal, effort=self.effort, unexplained=left)[self._first :]
+        self.floors = floors_of(
+            everything, signal, effort=self.effort, unexplained=left
+        )[self._first :]
         """Noise floors over all recordings; a recording whose motion was repeated has its own."""
-        self._own_floors = [floors_by_motion(everything, f.kind, left) for f in self.floors]
+        self._own_floors = [
+            floors_by_motion(everything, f.kind, left) for f in self.floors
+        ]
         sides = (measurements.fit, measurements.validation, measurements.test)
         recordings = [[self._recording(m) for m in side] for side in sides]
-        self.fit, self.validation, self.test = with_regimes(recordings, everything, self.floors[0])
+        self.fit, self.validation, self.test = with_regimes(
+            recordings, everything, self.floors[0]
+        )
         self.base, kd = self._base(), self.model.gains.kd
-        alone = self.commanded and not (self.effort or joint.winding or joint.facts.get("commands_speed"))
-        if alone and joint.target_kind == "position" and kd > 0.0 and "kd" not in self.known:
-            self.other_gain: Free | None = other_gain(kd, Scale(unit=joint.unit).unit_of(KD.unit))
+        alone = self.commanded and not (
+            self.effort or joint.winding or joint.facts.get("commands_speed")
+        )
+        if (
+            alone
+            and joint.target_kind == "position"
+            and kd > 0.0
+            and "kd" not in self.known
+        ):
+            self.other_gain: Free | None = other_gain(
+                kd, Scale(unit=joint.unit).unit_of(KD.unit)
+            )
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())
-        self.start: Values = self.model.gains._asdict() | dict(joint.winding) | self._stated
+        self.start: Values = (
+            self.model.gains._asdict() | dict(joint.winding) | self._stated
+        )
         if any(f.name == SPEED_DELAY.name for f in self.base):
             delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
             self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
-        self.base = holding(self.base, self.known, {f.name: f.start for f in self.base} | self.start)
+        self.base = holding(
+            self.base, self.known, {f.name: f.start for f in self.base} | self.start
+        )
 
     @property
     def noise(self) -> str:
@@ -160,12 +237,22 @@ class JointProblem(WithoutMaps):
             return f"gains as the file states them, stall torque and back-EMF fitted{known}"
         if self._first:
             return f"driven by the recorded effort{known}"
-        return ("commanded gains" if self.commanded else "gains fitted (not stated by the recordings)") + known
+        return (
+            "commanded gains"
+            if self.commanded
+            else "gains fitted (not stated by the recordings)"
+        ) + known
 
     @property
     def measured(self) -> str:
         """Text that names the channels whose errors are minimised and reported, such as positions."""
-        return "efforts" if self._first else "angles and efforts together" if self.effort else "angles"
+        return (
+            "efforts"
+            if self._first
+            else "angles and efforts together"
+            if self.effort
+            else "angles"
+        )
 
     @property
     def inertia_kgm2(self) -> float:
@@ -177,9 +264,15 @@ class JointProblem(WithoutMaps):
         torques", "recorded effort", "known gains", "known weight". Empty: positions identify only ratios to K_p
         (``diagnosis.search.identifiable``)."""
         commanded = self.commanded and not self.model.joint.winding
-        words = "commanded gains" if self.model.joint.gain_names else "commanded torques"
-        found = [words] * commanded + ["recorded effort"] * (self.effort and not commanded)
-        found += ["known gains"] * any(f.held for f in self.base if f.name in ("kp", "kd"))
+        words = (
+            "commanded gains" if self.model.joint.gain_names else "commanded torques"
+        )
+        found = [words] * commanded + ["recorded effort"] * (
+            self.effort and not commanded
+        )
+        found += ["known gains"] * any(
+            f.held for f in self.base if f.name in ("kp", "kd")
+        )
         unknown = {"gravity_mismatch", "payload"} & {*names}
         if not unknown and self._weighs():
             found.append("known weight")
@@ -187,7 +280,9 @@ class JointProblem(WithoutMaps):
 
     def _weight_shows(self, least_floors: float) -> bool:
         """Whether known weight that the controller holds moves the joint by more than so many noise floors."""
-        weights = np.concatenate([self.model.weight_nm(r.data, self._asked(r.data)) for r in self.fit])
+        weights = np.concatenate(
+            [self.model.weight_nm(r.data, self._asked(r.data)) for r in self.fit]
+        )
         level = self.floors[0].value * (1.0 if self._first else self.model.gains.kp)
         return float(np.std(weights)) > least_floors * level
 
@@ -196,39 +291,68 @@ class JointProblem(WithoutMaps):
         if not self._weight_shows(WEIGHS):
             return False
         motions: list[JointMotion] = [r.data for r in self.fit]
-        weights = np.concatenate([self.model.weight_nm(m, self._asked(m)) for m in motions])
+        weights = np.concatenate(
+            [self.model.weight_nm(m, self._asked(m)) for m in motions]
+        )
         torques = []
         for m in motions:
             angle = self.model.simulate(m, self.model.gains).reported
-            torques.append(self.model.inertia_kgm2(m) * np.gradient(np.gradient(angle, m.time_s), m.time_s))
+            torques.append(
+                self.model.inertia_kgm2(m)
+                * np.gradient(np.gradient(angle, m.time_s), m.time_s)
+            )
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
-    def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+    def simulate_all(
+        self, cases: Sequence[Case], recordings: Sequence[Recording]
+    ) -> list[list[np.ndarray]]:
         """For each recording and case (T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver
         would report it; with ``law: effort`` the effort alone. NaN after the last measured row. ``cases``: always fitted numbers,
         and effects in addition to those of the machine that are not fitted."""
         motions = [measured_part(recording) for recording in recordings]
-        answers = self.model.simulate_all(motions, [self._numbers(*case) for case in cases])
+        answers = self.model.simulate_all(
+            motions, [self._numbers(*case) for case in cases]
+        )
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
         channels = slice(self._first, 1 + self.effort)
         return [
-            [whole_rows([a.reported, scale * a.effort][channels], r) for a, scale in zip(those, scales, strict=True)]
+            [
+                whole_rows([a.reported, scale * a.effort][channels], r)
+                for a, scale in zip(those, scales, strict=True)
+            ]
             for those, r in zip(answers, recordings, strict=True)
         ]
 
     def _numbers(self, base: Mapping[str, float], effects: Sequence[Effect]) -> Numbers:
-        lever, half_s = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE)), 0.5 * base.get(LOOP.name, 0.0)
+        lever, half_s = (
+            PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE)),
+            0.5 * base.get(LOOP.name, 0.0),
+        )
         if SPEED_DELAY.name in base:
-            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s)]
-        stated_s, (gains, facts) = self.model.joint.stated_age_s, self.model.joint.numbers(base)
+            effects = [
+                *effects,
+                SpeedDelay(
+                    **self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s
+                ),
+            ]
+        stated_s, (gains, facts) = (
+            self.model.joint.stated_age_s,
+            self.model.joint.numbers(base),
+        )
         age_s = base.get(POSITION_AGE.name, stated_s) - stated_s + half_s
-        facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
+        facts |= (
+            {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
+        )
         if half_s:
             newer = 2.0 * bool(self.model.joint.facts["effort_after"])
-            speed_age = 2.0 * half_s * bool(gains.kd)  # what the position's age takes from K_d is of no speed
+            speed_age = (
+                2.0 * half_s * bool(gains.kd)
+            )  # what the position's age takes from K_d is of no speed
             facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
         scale = base.get(EFFORT_SCALE.name, 1.0)
-        return Numbers(gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), scale)
+        return Numbers(
+            gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), scale
+        )
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -237,7 +361,11 @@ class JointProblem(WithoutMaps):
             cls = registry.get(name)
             if "dry_friction" in cls.needs and name not in self.present:
                 continue
-            where = self.model.joint.selectors(cls) if cls.fitted and name not in self._left_out else None
+            where = (
+                self.model.joint.selectors(cls)
+                if cls.fitted and name not in self._left_out
+                else None
+            )
             scaled = self.commanded and not self.model.joint.winding
             if where is not None and (scaled or name not in _GAIN_LIKE):
                 c = candidate(self.model.joint.in_units(cls), seen, **where)
@@ -253,39 +381,69 @@ class JointProblem(WithoutMaps):
 
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
-        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (not self.model.joint.holds_torque_ff)
+        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (
+            not self.model.joint.holds_torque_ff
+        )
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
         # lower bound is a little below that value, so that a fit to such a drive does not end at the bound.
         delay = dataclasses.replace(SPEED_DELAY, low=-0.6 * joint.speed_delay_s)
         units = Scale(unit=joint.unit)
-        scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (self.effort and not self._left_out)
+        scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (
+            self.effort and not self._left_out
+        )
         if joint.target_kind == "effort":
-            return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in [*found, *scale])
+            return tuple(
+                dataclasses.replace(f, unit=units.unit_of(f.unit))
+                for f in [*found, *scale]
+            )
         if self.commanded:
-            aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
+            aged = (
+                joint.exact_timing and kp > 0.0 and not joint.winding
+            )  # a back-EMF takes it up, as fitted gains do
             at = joint.stated_age_s
-            aged_by = dataclasses.replace(POSITION_AGE, start=at, low=at + POSITION_AGE.low)
-            age = aged_by if joint.position_age_s or POSITION_AGE.name in self.known else LOOP
+            aged_by = dataclasses.replace(
+                POSITION_AGE, start=at, low=at + POSITION_AGE.low
+            )
+            age = (
+                aged_by
+                if joint.position_age_s or POSITION_AGE.name in self.known
+                else LOOP
+            )
             found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [age] * aged
             found += [EFFORT_AGE] * (self.effort and not joint.exact_timing)
         elif not joint.winding:
             starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
             gains = [_around(*starts[name]) for name in joint.gain_names]
-            found = gains + found + [delay] * (self.effort or self._weight_shows(1.0)) + scale
+            found = (
+                gains
+                + found
+                + [delay] * (self.effort or self._weight_shows(1.0))
+                + scale
+            )
             untimed = self.effort and not joint.position_age_s
             found += [LOOP if joint.exact_timing else EFFORT_AGE] * untimed
         found += [_within(name, value) for name, value in joint.winding.items()]
         payloads: list[JointMotion] = [
-            r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
+            r.data
+            for r in self.fit
+            if r.data.payload_kg > 0.0 and not r.data.payload_at_known
         ]
         found = [dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found]
-        return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
+        return (
+            *found,
+            *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()),
+        )
 
     def _recording(self, m: Measurement) -> Recording:
-        kinds, motion = ("position", "effort"), motion_of(m, self.signal, self.model.joint)
+        kinds, motion = (
+            ("position", "effort"),
+            motion_of(m, self.signal, self.model.joint),
+        )
         floors = [own[m.name][self.signal].value for own in self._own_floors]
-        return recording_of(m, self.signal, motion, kinds[self._first : 1 + self.effort], floors)
+        return recording_of(
+            m, self.signal, motion, kinds[self._first : 1 + self.effort], floors
+        )
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
@@ -293,8 +451,14 @@ class JointProblem(WithoutMaps):
         gains, facts = self.model.joint.numbers(values)
         position = self.model.joint.target_kind == "position"
         answers = [self.model.simulate(m, gains, facts=facts) for m in motions]
-        motor_nm = [np.abs(self.model.motor_nm(m, a)).max() for m, a in zip(motions, answers, strict=True)]
-        asked = [self._asked(m) if position else a.reported for m, a in zip(motions, answers, strict=True)]
+        motor_nm = [
+            np.abs(self.model.motor_nm(m, a)).max()
+            for m, a in zip(motions, answers, strict=True)
+        ]
+        asked = [
+            self._asked(m) if position else a.reported
+            for m, a in zip(motions, answers, strict=True)
+        ]
         return seen_in(motions, answers, asked) | {
             "peak_motor_nm": float(max(motor_nm)),
             "span_rad": float(np.ptp(np.concatenate(asked))),
@@ -309,13 +473,22 @@ def floor_words(floors: Sequence[SignalFloor]) -> str:
 
 
 def seen_in(
-    motions: Sequence[JointMotion], answers: Sequence[JointResponse], asked: Sequence[np.ndarray]
+    motions: Sequence[JointMotion],
+    answers: Sequence[JointResponse],
+    asked: Sequence[np.ndarray],
 ) -> dict[str, float]:
     """Scales of recordings, from which fits of effects begin. ``asked``: (T,) positions [rad, m] that each drive aims at."""
-    speeds = [np.abs(np.gradient(q, 1.0 / m.rate_hz)).max() for q, m in zip(asked, motions, strict=True)]
+    speeds = [
+        np.abs(np.gradient(q, 1.0 / m.rate_hz)).max()
+        for q, m in zip(asked, motions, strict=True)
+    ]
     measured = np.abs(np.concatenate([m.effort for m in motions]))
     return {
-        **({"peak_measured_nm": float(np.nanmax(measured))} if np.isfinite(measured).any() else {}),
+        **(
+            {"peak_measured_nm": float(np.nanmax(measured))}
+            if np.isfinite(measured).any()
+            else {}
+        ),
         "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
         "peak_speed_rad_per_s": float(max(speeds)),
         "span_rad": max(float(np.ptp(q)) for q in asked),
@@ -325,21 +498,32 @@ def seen_in(
     }
 
 
-def unexplained(model: JointModel, m: Measurement, own: Sequence[Effect] = ()) -> Measurement:
+def unexplained(
+    model: JointModel, m: Measurement, own: Sequence[Effect] = ()
+) -> Measurement:
     """``m`` with what ``model``, with the effects ``own``, leaves of the joint's effort."""
     motion, effort = motion_of(m, model.signal, model.joint), m.effort.astype(float)
-    effort[:, m.column(model.signal)] -= FOLLOWED * model.simulate(motion, model.gains, own).effort
+    effort[:, m.column(model.signal)] -= (
+        FOLLOWED * model.simulate(motion, model.gains, own).effort
+    )
     return dataclasses.replace(m, effort=effort)
 
 
 def recording_of(
-    m: Measurement, signal: str, motion: JointMotion, kinds: Sequence[str], floors: Sequence[float] | np.ndarray
+    m: Measurement,
+    signal: str,
+    motion: JointMotion,
+    kinds: Sequence[str],
+    floors: Sequence[float] | np.ndarray,
 ) -> Recording:
     """Channels ``kinds`` of a joint, with their noise floors (C,). An effort at a limit has none of the noise of positions and
     speeds that a drive multiplies by its gains, which is most of its floor; a quarter is assumed at least, a choice."""
     unit, share = m.units[m.column(signal)], np.ones((m.num_rows, len(kinds)))
     columns = {"position": motion.measured, "effort": motion.effort}
-    names = {"position": f"{signal} [{unit}]", "effort": f"{signal} effort [{UNITS[unit][1]}]"}
+    names = {
+        "position": f"{signal} [{unit}]",
+        "effort": f"{signal} effort [{UNITS[unit][1]}]",
+    }
     if kinds[-1] == "effort":
         rows, _, sd = plateau(m, m.column(signal))
         share[rows, -1] = min(max(sd / floors[-1], 0.25), 1.0)
@@ -362,23 +546,41 @@ def other_gain(kd: float, unit: str) -> Free:
 def unlike_rows(loop_s: float, recordings: Sequence[Measurement]) -> float:
     """``loop_s``, period of a drive's loop [s], if its rate is no multiple of the rows' of a recording; else 0."""
     counts = [1.0 / (m.rate_hz * loop_s) for m in recordings if loop_s > 0.0]
-    return loop_s if any(abs(n - max(round(n), 1)) > SAME_RATE * n for n in counts) else 0.0
+    return (
+        loop_s
+        if any(abs(n - max(round(n), 1)) > SAME_RATE * n for n in counts)
+        else 0.0
+    )
 
 
 def _around(gain: Free, start: float) -> Free:
     """A gain with wider bounds, which hold its start."""
-    low, high = min(gain.low / WIDER, 0.1 * start), gain.high if start < gain.high else 10.0 * start
+    low, high = (
+        min(gain.low / WIDER, 0.1 * start),
+        gain.high if start < gain.high else 10.0 * start,
+    )
     return dataclasses.replace(gain, start=start, low=low, high=high)
 
 
 def _within(name: str, value: float) -> Free:
     """A number of the winding about the one that the file states."""
     unit = "N·m" if name == "stall_nm" else "N·m·s/rad"
-    return Free(name=name, unit=unit, start=value, low=value / WINDING_WITHIN, high=value * WINDING_WITHIN, log=True)
+    return Free(
+        name=name,
+        unit=unit,
+        start=value,
+        low=value / WINDING_WITHIN,
+        high=value * WINDING_WITHIN,
+        log=True,
+    )
 
 
 def floors_of(
-    measurements: Sequence[Measurement], signal: str, *, effort: bool, unexplained: Sequence[Measurement] = ()
+    measurements: Sequence[Measurement],
+    signal: str,
+    *,
+    effort: bool,
+    unexplained: Sequence[Measurement] = (),
 ) -> list[SignalFloor]:
     """Noise floors of one signal: of the position, and of the effort if ``effort`` is true, in this order.
     ``unexplained``: as for ``noise_floor``.
@@ -390,7 +592,9 @@ def floors_of(
     for kind in ("position", "effort")[: 1 + effort]:
         floors = noise_floor(measurements, kind, unexplained)
         if signal not in floors:
-            raise TaccorlError(f"{signal}: its {kind} was not measured in any recording")
+            raise TaccorlError(
+                f"{signal}: its {kind} was not measured in any recording"
+            )
         found.append(floors[signal])
     return found
 
@@ -399,7 +603,11 @@ def floors_of(
 def measured_part(recording: Recording) -> JointMotion:
     """Motion of the recording, up to a few rows after the last measured one: a fit needs nothing after it."""
     seen = np.flatnonzero(np.isfinite(recording.measured).any(axis=1))
-    return first_rows(recording.data, int(seen[-1]) + 1 + MORE_ROWS) if len(seen) else recording.data
+    return (
+        first_rows(recording.data, int(seen[-1]) + 1 + MORE_ROWS)
+        if len(seen)
+        else recording.data
+    )
 
 
 def whole_rows(columns: Sequence[np.ndarray], recording: Recording) -> np.ndarray:

@@ -12,8 +12,16 @@ from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor
-from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
-from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
+from taccorl.diagnosis.problems.joint_problem import (
+    PAYLOAD_PLACE,
+    GainsAre,
+    JointProblem,
+)
+from taccorl.diagnosis.search.identifiable import (
+    Known,
+    absolute_numbers,
+    identifiable_numbers,
+)
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import PartFinding, solved
@@ -68,10 +76,15 @@ def moves(m: Measurement, signal: str) -> bool:
     if signal not in m.signals:
         return False
     positions = m.moved(signal)
-    return bool(np.isfinite(positions).any()) and float(np.nanmax(positions) - np.nanmin(positions)) > MOVES_RAD
+    return (
+        bool(np.isfinite(positions).any())
+        and float(np.nanmax(positions) - np.nanmin(positions)) > MOVES_RAD
+    )
 
 
-def of_joints(measurements: Measurements, signals: Sequence[str], *, touch: bool = True) -> Measurements:
+def of_joints(
+    measurements: Measurements, signals: Sequence[str], *, touch: bool = True
+) -> Measurements:
     """The measurements without recordings that move none of ``signals``; without those of pads if ``touch`` is False."""
     sides = {
         use: tuple(
@@ -81,7 +94,9 @@ def of_joints(measurements: Measurements, signals: Sequence[str], *, touch: bool
         )
         for use in ("fit", "validation", "test")
     }
-    unlisted = tuple(name for name in measurements.unlisted if name in [m.name for m in sides["fit"]])
+    unlisted = tuple(
+        name for name in measurements.unlisted if name in [m.name for m in sides["fit"]]
+    )
     return dataclasses.replace(measurements, **sides, unlisted=unlisted)
 
 
@@ -106,11 +121,16 @@ def diagnose_joint(
     """
     own = of_joints(measurements, [signal])
     if not own.fit:
-        raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
+        raise TaccorlError(
+            f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints"
+        )
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
     found = solved(signal, problem, search, without, progress)
     known = known_numbers(problem, found.diagnosis)
-    told = vars(found) | {"known": known, "diagnosis": with_intervals(found.diagnosis, known)}
+    told = vars(found) | {
+        "known": known,
+        "diagnosis": with_intervals(found.diagnosis, known),
+    }
     return JointFinding(**told, floors=tuple(problem.floors))
 
 
@@ -119,8 +139,15 @@ def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
     pinned_by = problem.pinned_by(found.names)
     kd = problem.model.gains.kd if problem.commanded else None
     return Known(
-        identifiable=identifiable_numbers(found.after, problem.commanded, bool(pinned_by), kd),
-        absolute=absolute_numbers(found.after, inertia_kgm2=problem.inertia_kgm2, pinned=bool(pinned_by), kd=kd),
+        identifiable=identifiable_numbers(
+            found.after, problem.commanded, bool(pinned_by), kd
+        ),
+        absolute=absolute_numbers(
+            found.after,
+            inertia_kgm2=problem.inertia_kgm2,
+            pinned=bool(pinned_by),
+            kd=kd,
+        ),
         pinned_by=pinned_by,
     )
 
@@ -132,14 +159,29 @@ def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
     for effect in found.effects:
         prefix = f"{effect.name}."
         own = [n.words() for n in known.identifiable if n.name.startswith(prefix)]
-        words = effect.evidence, f"identified: {', '.join(own)}" * bool(own), effect.reads_as
+        words = (
+            effect.evidence,
+            f"identified: {', '.join(own)}" * bool(own),
+            effect.reads_as,
+        )
         evidence = "; ".join(filter(None, words))
-        mine = [n for n in known.absolute if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()]
+        mine = [
+            n
+            for n in known.absolute
+            if n.name.startswith(prefix) and np.isfinite([n.low, n.high]).all()
+        ]
         ends = {n.name.removeprefix(prefix): (n.low, n.high) for n in mine}
-        effects.append(dataclasses.replace(effect, interval=effect.interval | ends, evidence=evidence))
+        effects.append(
+            dataclasses.replace(
+                effect, interval=effect.interval | ends, evidence=evidence
+            )
+        )
     remarks = (*found.remarks, *_payload_remarks(found))
     return dataclasses.replace(
-        found, effects=tuple(effects), intervals=found.intervals | known.intervals, remarks=remarks
+        found,
+        effects=tuple(effects),
+        intervals=found.intervals | known.intervals,
+        remarks=remarks,
     )
 
 
@@ -157,7 +199,10 @@ def _payload_remarks(found: Diagnosis) -> list[str]:
 
 
 def each[ItemT, FindingT](
-    diagnosed: Callable[[ItemT], FindingT], items: Mapping[str, ItemT], workers: int, done: Callable[[str], None]
+    diagnosed: Callable[[ItemT], FindingT],
+    items: Mapping[str, ItemT],
+    workers: int,
+    done: Callable[[str], None],
 ) -> list[FindingT]:
     """Results of ``diagnosed`` for the item of every part, in their order, computed in ``workers`` processes, on which they do
     not depend.
@@ -178,7 +223,9 @@ def each[ItemT, FindingT](
         done(parts[index])
 
     if workers > 1 and len(parts) > 1:
-        run_in_processes(diagnosed, list(items.values()), min(workers, len(parts)), str, take)
+        run_in_processes(
+            diagnosed, list(items.values()), min(workers, len(parts)), str, take
+        )
     else:
         for k, item in enumerate(items.values()):
             take(k, Done(diagnosed(item)))
@@ -191,27 +238,45 @@ def _failed(part: str, outcome: Failed, workers: int) -> Exception:
     if not outcome.process:
         return TaccorlError(outcome.reason.partition(": ")[2])
     killed = f": mostly for lack of memory, of which --workers=1 needs less than --workers={workers}"
-    return TaccorlError(f"{part}: {outcome.reason}{killed * ('SIGKILL' in outcome.reason)}; nothing was written")
+    return TaccorlError(
+        f"{part}: {outcome.reason}{killed * ('SIGKILL' in outcome.reason)}; nothing was written"
+    )
 
 
 def set_numbers(
-    config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
+    config: TwinConfig,
+    signal: str,
+    base: Mapping[str, float],
+    intervals: Mapping[str, Sequence[float]],
 ) -> None:
     """Change ``config`` in place: write fitted gains into one arm, and the delay of the speed unless its interval contains 0.
     Payload positions and effort scales belong to recordings, not to the twin. ``base``: fitted number → value. ``intervals``:
     fitted number → (low, high)."""
     arm, joint = signal.split("_", 1)
-    control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
+    control = config.arm_controllers.setdefault(
+        arm, copy.deepcopy(config.controller_of(arm))
+    )
     k = ROBOT.joints.index(joint)
-    fields = {"kp": control.kp_nm_per_rad, "kd": control.kd_nms_per_rad, "torque_ff": control.torque_ff_nm}
+    fields = {
+        "kp": control.kp_nm_per_rad,
+        "kd": control.kd_nms_per_rad,
+        "torque_ff": control.torque_ff_nm,
+    }
     for name, values in fields.items():
         if name in base:
             values[k] = float(base[name])
     if "speed_delay_s" in base:
         sure = intervals["speed_delay_s"][0] > 0.0
-        delay = make_effect("speed_delay", arm=arm, joints=[joint], delay_s=float(base["speed_delay_s"]) * sure)
+        delay = make_effect(
+            "speed_delay",
+            arm=arm,
+            joints=[joint],
+            delay_s=float(base["speed_delay_s"]) * sure,
+        )
         add_effect(config, delay)
-        config.effects = [e for e in config.effects if e is not delay or not e.is_absent]
+        config.effects = [
+            e for e in config.effects if e is not delay or not e.is_absent
+        ]
 
 
 def add_effect(config: TwinConfig, effect: Effect) -> None:
@@ -219,7 +284,11 @@ def add_effect(config: TwinConfig, effect: Effect) -> None:
     takes it out."""
     kept: list[Effect] = []
     for other in config.effects:
-        shared = set(other.acts_on()) & set(effect.acts_on()) if other.name == effect.name else set()
+        shared = (
+            set(other.acts_on()) & set(effect.acts_on())
+            if other.name == effect.name
+            else set()
+        )
         kept += _elsewhere(other, shared) if shared else [other]
     config.effects = [*kept, *([] if effect.is_absent else [effect])]
 
@@ -228,8 +297,19 @@ def _elsewhere(effect: Effect, taken: set[str]) -> list[Effect]:
     """Entries that do what ``effect`` does, but not to ``taken``."""
     rest = [thing for thing in effect.acts_on() if thing not in taken]
     if isinstance(effect, JointEffect):
-        arms = {arm: [t.removeprefix(f"{arm}_") for t in rest if t.startswith(f"{arm}_")] for arm in ROBOT.arms}
-        return [dataclasses.replace(effect, arm=arm, joints=joints) for arm, joints in arms.items() if joints]
+        arms = {
+            arm: [t.removeprefix(f"{arm}_") for t in rest if t.startswith(f"{arm}_")]
+            for arm in ROBOT.arms
+        }
+        return [
+            dataclasses.replace(effect, arm=arm, joints=joints)
+            for arm, joints in arms.items()
+            if joints
+        ]
     if isinstance(effect, ArmEffect):
         return [dataclasses.replace(effect, arm=arm) for arm in rest]
-    return [dataclasses.replace(effect, pads=rest)] if isinstance(effect, TouchEffect) and rest else []
+    return (
+        [dataclasses.replace(effect, pads=rest)]
+        if isinstance(effect, TouchEffect) and rest
+        else []
+    )

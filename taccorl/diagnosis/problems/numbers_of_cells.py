@@ -29,7 +29,12 @@ def numbers_apart(problem: CellsProblem, d: Diagnosis) -> list[str]:
     largest and least of them in the unit of the load; none if the diagnosis ended near the noise floor."""
     left = d.errors["after"]["validation"]
     judged, one_place = problem.validation, problem.config.same_place_mm is not None
-    if left <= SearchConfig().little or len(problem.channels) < 2 or not judged or one_place:
+    if (
+        left <= SearchConfig().little
+        or len(problem.channels) < 2
+        or not judged
+        or one_place
+    ):
         return []
     remarks = []
     for k, effect in enumerate(d.effects):
@@ -38,12 +43,16 @@ def numbers_apart(problem: CellsProblem, d: Diagnosis) -> list[str]:
             continue
         fit, validation = ([], [])  # (S, C) squares
         for factor in FACTORS:
-            scaled = dataclasses.replace(effect, **dict(_scaled(effect, f, factor) for f in own))
+            scaled = dataclasses.replace(
+                effect, **dict(_scaled(effect, f, factor) for f in own)
+            )
             effects = [*d.effects[:k], scaled, *d.effects[k + 1 :]]
             for squares, recordings in ((fit, problem.fit), (validation, judged)):
                 squares.append(_squares(problem, d, effects, recordings))
         best = np.argmin(fit, axis=0)
-        error = float(np.sqrt(np.mean(np.array(validation)[best, np.arange(len(best))])))
+        error = float(
+            np.sqrt(np.mean(np.array(validation)[best, np.arange(len(best))]))
+        )
         low, high = FACTORS[np.quantile(best, (0.1, 0.9)).round().astype(int)]
         if left**2 - error**2 < MOST_OF_IT * (left**2 - 1.0) or high < APART * low:
             continue
@@ -58,14 +67,29 @@ def _scaled(effect: Effect, free: Free, factor: float) -> tuple[str, float]:
 
 
 def _squares(
-    problem: CellsProblem, d: Diagnosis, effects: Sequence[Effect], recordings: Sequence[Recording]
+    problem: CellsProblem,
+    d: Diagnosis,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
 ) -> np.ndarray:
     """(C,) mean squared residual of each channel [floors²]."""
-    off = np.concatenate([(problem.simulate(d.base, effects, r) - r.measured) / r.floor for r in recordings])
+    off = np.concatenate(
+        [
+            (problem.simulate(d.base, effects, r) - r.measured) / r.floor
+            for r in recordings
+        ]
+    )
     return np.nanmean(np.square(off), axis=0)
 
 
-def _words(problem: CellsProblem, effect: Effect, free: Free, best: np.ndarray, left: float, error: float) -> str:
+def _words(
+    problem: CellsProblem,
+    effect: Effect,
+    free: Free,
+    best: np.ndarray,
+    left: float,
+    error: float,
+) -> str:
     config = problem.config
     names = [config.names[k] for k in problem.channels]
     ends = [

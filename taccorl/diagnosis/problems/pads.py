@@ -12,10 +12,19 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.diagnosis.comparison.replays import matched_contact
-from taccorl.diagnosis.problems.touch_problem import GainStatistics, TouchProblem, odd_cells
+from taccorl.diagnosis.problems.touch_problem import (
+    GainStatistics,
+    TouchProblem,
+    odd_cells,
+)
 from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
-from taccorl.diagnosis.search.problem import Progress, Recording, no_progress, split_rows
+from taccorl.diagnosis.search.problem import (
+    Progress,
+    Recording,
+    no_progress,
+    split_rows,
+)
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import PartFinding, solved
 from taccorl.errors import TaccorlError
@@ -41,7 +50,9 @@ def presses(m: Measurement, arm: str) -> bool:
 
 def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
     """Names of the arms for which at least one fit recording states which object their pads pressed."""
-    return tuple(arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit))
+    return tuple(
+        arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit)
+    )
 
 
 def diagnose_arm(
@@ -63,7 +74,8 @@ def diagnose_arm(
         TaccorlError: no fit recording states it, or no matched contact replay of the same pads can be made.
     """
     uses: dict[str, tuple[Measurement, ...]] = {
-        use: tuple(m for m in getattr(measurements, use) if presses(m, arm)) for use in ("fit", "validation", "test")
+        use: tuple(m for m in getattr(measurements, use) if presses(m, arm))
+        for use in ("fit", "validation", "test")
     }
     if not uses["fit"]:
         raise TaccorlError(
@@ -77,12 +89,27 @@ def diagnose_arm(
     found = solved(part_of(arm), problem, search, without, progress)
     gains = None
     if not found.rows_split:
-        gains = unjudged_gains(problem, found.diagnosis, problem.fit, problem.validation, search or SearchConfig())
+        gains = unjudged_gains(
+            problem,
+            found.diagnosis,
+            problem.fit,
+            problem.validation,
+            search or SearchConfig(),
+        )
     if gains is not None:
         return dataclasses.replace(found, remark=gain_words(gains, problem.not_shared))
-    maps = [e for e in found.diagnosis.effects if isinstance(e, TaxelGainMap) and len(e.gains) > 1]
-    named = [odd_cells(np.reshape(e.gains, (len(e.pads), *ROBOT.pad.shape)), e.pads) for e in maps]
-    return dataclasses.replace(found, remark=f"{TaxelGainMap.name}: {named[0]}" if any(named) else "")
+    maps = [
+        e
+        for e in found.diagnosis.effects
+        if isinstance(e, TaxelGainMap) and len(e.gains) > 1
+    ]
+    named = [
+        odd_cells(np.reshape(e.gains, (len(e.pads), *ROBOT.pad.shape)), e.pads)
+        for e in maps
+    ]
+    return dataclasses.replace(
+        found, remark=f"{TaxelGainMap.name}: {named[0]}" if any(named) else ""
+    )
 
 
 def unjudged_gains(
@@ -110,7 +137,9 @@ def unjudged_gains(
     # Of a map as a whole, not of each of its numbers: what its gains are is not claimed here, only that they differ.
     if config.refusal(gain_of(after, before), standard_score(before - after), np.inf):
         return None
-    return problem.gain_statistics(with_it.values, with_it.effects, [*fit_to, *validation])
+    return problem.gain_statistics(
+        with_it.values, with_it.effects, [*fit_to, *validation]
+    )
 
 
 def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
@@ -122,8 +151,12 @@ def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
     parts = []
     if gains.num_dead:
         share = gains.num_dead / max(gains.num_taxels, 1)
-        parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({share:.0%}) read nothing")
-    parts.append(f"the gains of {'the others' if parts else 'taxels'} spread by {gains.log_std:.0%}")
+        parts.append(
+            f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({share:.0%}) read nothing"
+        )
+    parts.append(
+        f"the gains of {'the others' if parts else 'taxels'} spread by {gains.log_std:.0%}"
+    )
     cells = f"; {gains.odd}" * bool(gains.odd)
     return (
         f"{' and '.join(parts)} (dead_taxels, taxel_gain_spread){cells}: this explains what is left. No taxel_gain_map could be "
@@ -157,7 +190,9 @@ def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:
     config.sensor = dataclasses.replace(config.sensor, **fields)
 
 
-def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence[float]]]]) -> dict[str, float]:
+def agreed(
+    fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence[float]]]],
+) -> dict[str, float]:
     """``k_n`` and ``k_d`` for all parts: means of the fitted values, weighted by their intervals.
 
     Args:
@@ -169,17 +204,25 @@ def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence
     found = {}
     for name in FIELDS:
         values = {part: base[name] for part, (base, _) in fitted.items()}
-        ends = {part: _ends(values[part], intervals.get(name)) for part, (_, intervals) in fitted.items()}
-        if max(low for low, _ in ends.values()) > min(high for _, high in ends.values()):
+        ends = {
+            part: _ends(values[part], intervals.get(name))
+            for part, (_, intervals) in fitted.items()
+        }
+        if max(low for low, _ in ends.values()) > min(
+            high for _, high in ends.values()
+        ):
             told = ", ".join(
-                f"{part} {values[part]:.4g} ({low:.4g} … {high:.4g})" for part, (low, high) in ends.items()
+                f"{part} {values[part]:.4g} ({low:.4g} … {high:.4g})"
+                for part, (low, high) in ends.items()
             )
             arms = " or ".join(f"--pads={part.split()[0]}" for part in fitted)
             raise TaccorlError(
                 f"{name} of {told}: the values differ, but a twin has one value for all of its pads. Use one arm's, {arms}; "
                 "readings of the other arm's pads will be wrong in the twin"
             )
-        widths = np.array([max(high - low, 1e-9 * abs(low) + 1e-12) for low, high in ends.values()])
+        widths = np.array(
+            [max(high - low, 1e-9 * abs(low) + 1e-12) for low, high in ends.values()]
+        )
         shares = widths**-2 / np.sum(widths**-2)
         found[name] = float(np.array(list(values.values())) @ shares)
     return found

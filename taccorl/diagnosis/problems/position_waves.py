@@ -26,7 +26,11 @@ MOST_WAVES = 3
 
 
 def position_waves(
-    motions: Sequence[JointMotion], inertias_kgm2: Sequence[float], *, length: float = 1.0, least_span: float = SPAN_RAD
+    motions: Sequence[JointMotion],
+    inertias_kgm2: Sequence[float],
+    *,
+    length: float = 1.0,
+    least_span: float = SPAN_RAD,
 ) -> dict[str, float]:
     """The strongest waves over the position, as facts for ``Cogging.starts``.
 
@@ -49,15 +53,27 @@ def position_waves(
         if seen.sum() < 4 * rows:
             continue
         q = np.interp(m.time_s, m.time_s[seen], m.measured[seen])
-        v, a = (savgol_filter(q, rows, 2, deriv=d, delta=1.0 / m.rate_hz) for d in (1, 2))
+        v, a = (
+            savgol_filter(q, rows, 2, deriv=d, delta=1.0 / m.rate_hz) for d in (1, 2)
+        )
         known = np.isfinite(m.effort).all()
         torque = inertia * a - (m.effort if known else 0.0)
         around = np.column_stack(
-            [v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q), *([] if known else [q, m.target])]
+            [
+                v,
+                np.sign(v),
+                np.sin(q),
+                np.cos(q),
+                np.ones_like(q),
+                *([] if known else [q, m.target]),
+            ]
         )
         scale = np.maximum(np.abs(around).max(axis=0), 1e-12)
         angles.append(q / length)
-        left.append(torque - around @ (np.linalg.lstsq(around / scale, torque, rcond=None)[0] / scale))
+        left.append(
+            torque
+            - around @ (np.linalg.lstsq(around / scale, torque, rcond=None)[0] / scale)
+        )
     if not angles:
         return {}
     q, left_over = np.concatenate(angles), np.concatenate(left)
@@ -70,12 +86,17 @@ def position_waves(
     size = FINER * (int(place.max()) + 1)
     spectrum = np.fft.rfft(np.bincount(place, left_over), size)
     periods = math.tau * np.arange(len(spectrum)) / (size * width)
-    power = np.where((periods >= bounds.low) & (periods <= bounds.high), np.abs(spectrum), 0.0)
+    power = np.where(
+        (periods >= bounds.low) & (periods <= bounds.high), np.abs(spectrum), 0.0
+    )
     found: dict[str, float] = {}
     for k in range(1, MOST_WAVES + 1):
         at = int(np.argmax(power))
         # r = sin(N q + φ) has the transform e^{iφ} / 2i about q = 0.
         phase = np.angle(spectrum[at]) + 0.5 * math.pi - periods[at] * low
-        found |= {f"wave_periods_{k}": float(periods[at]), f"wave_phase_{k}": math.remainder(float(phase), math.tau)}
+        found |= {
+            f"wave_periods_{k}": float(periods[at]),
+            f"wave_phase_{k}": math.remainder(float(phase), math.tau),
+        }
         power[np.abs(periods - periods[at]) < 2 * math.tau / span] = 0.0
     return found

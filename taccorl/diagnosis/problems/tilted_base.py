@@ -16,7 +16,11 @@ MOST_RAD = 0.2
 
 
 def tilt_like(
-    robot: Robot, joint: str, recordings: Sequence[Measurement], torque_nm: float, hangs_at_rad: float
+    robot: Robot,
+    joint: str,
+    recordings: Sequence[Measurement],
+    torque_nm: float,
+    hangs_at_rad: float,
 ) -> np.ndarray | None:
     """(3,) unit vector along gravity, in the model's frame, that loads a joint with A sin(q − q₀) more than the robot file has
     it, while the other joints stand as at the beginning of the recordings, of several on average; None if no tilt up to
@@ -31,16 +35,22 @@ def tilt_like(
     """
     now = robot.rigid.model.opt.gravity + robot.more_gravity
     wanted = torque_nm * np.array([np.cos(hangs_at_rad), -np.sin(hangs_at_rad)])
-    weights = weights_by_turn(robot, joint, [robot.joint(joint).pose(m) for m in recordings])
+    weights = weights_by_turn(
+        robot, joint, [robot.joint(joint).pose(m) for m in recordings]
+    )
     turn = np.linalg.lstsq(weights, wanted, rcond=1e-6)[0]
     left = float(np.linalg.norm(weights @ turn - wanted))
-    if np.linalg.norm(turn) > MOST_RAD or left > MOST_LEFT * float(np.linalg.norm(wanted)):
+    if np.linalg.norm(turn) > MOST_RAD or left > MOST_LEFT * float(
+        np.linalg.norm(wanted)
+    ):
         return None
     down = now - np.cross(turn, now)
     return down / np.linalg.norm(down)
 
 
-def weights_by_turn(robot: Robot, joint: str, poses: Sequence[np.ndarray]) -> np.ndarray:
+def weights_by_turn(
+    robot: Robot, joint: str, poses: Sequence[np.ndarray]
+) -> np.ndarray:
     """(2, 3) change of S and C in the torque S sin q + C cos q that holds the weight of a hinge [N·m], for a small turn of the
     base about each axis of the model's frame [rad]; the mean of several poses (nq,). 0 for a slide."""
     now = robot.rigid.model.opt.gravity + robot.more_gravity
@@ -52,12 +62,18 @@ def weights_by_turn(robot: Robot, joint: str, poses: Sequence[np.ndarray]) -> np
     return weights
 
 
-def change_between_poses(robot: Robot, joint: str, recordings: Sequence[Measurement], down: np.ndarray) -> float:
+def change_between_poses(
+    robot: Robot, joint: str, recordings: Sequence[Measurement], down: np.ndarray
+) -> float:
     """By how much the torque differs between the poses of the recordings by which a hinge is loaded more if gravity has the
     direction ``down`` (3,): largest distance of its S and C from their mean, as a share of the mean."""
     now = robot.rigid.model.opt.gravity + robot.more_gravity
     with under_gravity(robot.rigid.model, np.linalg.norm(now) * down - now) as model:
-        terms = [rigid_terms(model, joint, robot.joint(joint).pose(m)) for m in recordings]
+        terms = [
+            rigid_terms(model, joint, robot.joint(joint).pose(m)) for m in recordings
+        ]
     loads = np.array([(t.gravity_sin, t.gravity_cos) for t in terms])
     mean = loads.mean(axis=0)
-    return float(np.linalg.norm(loads - mean, axis=1).max() / max(np.linalg.norm(mean), 1e-12))
+    return float(
+        np.linalg.norm(loads - mean, axis=1).max() / max(np.linalg.norm(mean), 1e-12)
+    )

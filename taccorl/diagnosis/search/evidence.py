@@ -28,10 +28,18 @@ class Blocks:
         return Blocks(self.squares - other.squares, self.weights)
 
 
-def block_squares(problem: Problem, model: Fit, recordings: Sequence[Recording]) -> Blocks:
+def block_squares(
+    problem: Problem, model: Fit, recordings: Sequence[Recording]
+) -> Blocks:
     """Squared residuals of ``recordings`` in blocks of ``correlation.BLOCK_S``, all channels of a block together."""
-    squares, layout = np.square(stacked(problem, model.values, model.effects, recordings)), layout_of(recordings)
-    total, count = block_sums(squares, layout), block_sums(np.ones(len(squares)), layout)
+    squares, layout = (
+        np.square(stacked(problem, model.values, model.effects, recordings)),
+        layout_of(recordings),
+    )
+    total, count = (
+        block_sums(squares, layout),
+        block_sums(np.ones(len(squares)), layout),
+    )
     return Blocks(total / count, count / max(len(squares), 1))
 
 
@@ -53,7 +61,10 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     number of rows is that of independent residuals of ``child``. ``more_parameters``: those that ``parent`` lacks."""
     rows = child.effective_rows
     noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
-    fallen = float(parent.residuals @ parent.residuals - child.residuals @ child.residuals) / noise
+    fallen = (
+        float(parent.residuals @ parent.residuals - child.residuals @ child.residuals)
+        / noise
+    )
     return fallen * rows / len(child.residuals) - more_parameters * float(np.log(rows))
 
 

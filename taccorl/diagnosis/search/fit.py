@@ -21,7 +21,14 @@ from taccorl.alignment.measurements.correlation import (
     rate_of,
     unstacked,
 )
-from taccorl.diagnosis.search.problem import Case, Free, Problem, Recording, Values, chosen
+from taccorl.diagnosis.search.problem import (
+    Case,
+    Free,
+    Problem,
+    Recording,
+    Values,
+    chosen,
+)
 from taccorl.sim.effects.effect import Effect
 
 FAR = 1e5
@@ -107,20 +114,32 @@ class Fit:
         if p == 0:
             return np.zeros((0, 0))
         inverse = inverse_of(self.jacobian.T @ self.jacobian)
-        variance = float(self.residuals @ self.residuals) / max(n - p, 1) * n / self.effective_rows
+        variance = (
+            float(self.residuals @ self.residuals)
+            / max(n - p, 1)
+            * n
+            / self.effective_rows
+        )
         plain = variance * inverse
         variances = np.diag(plain)
         pull = self.jacobian * self.residuals[:, None]
         pulls = block_sums(pull, self.layout)
         if (count := len(pulls)) >= max(MANY_BLOCKS, 2 * p):
-            variances = np.maximum(variances, np.square(pulls @ inverse).sum(axis=0) * count / (count - p))
+            variances = np.maximum(
+                variances, np.square(pulls @ inverse).sum(axis=0) * count / (count - p)
+            )
         if (count := len(self.layout)) >= MANY_RECORDINGS:
             ends = np.cumsum([int(rows.measured.sum()) for rows in self.layout])
             pulls = np.array([part.sum(axis=0) for part in np.split(pull, ends[:-1])])
             few = (student.ppf(0.975, count - 1) / student.ppf(0.975, np.inf)) ** 2
-            variances = np.maximum(variances, few * np.square(pulls @ inverse).sum(axis=0) * count / (count - 1))
+            variances = np.maximum(
+                variances,
+                few * np.square(pulls @ inverse).sum(axis=0) * count / (count - 1),
+            )
         if left_over:
-            rest = max(self.error**2 - LEFT_OVER**2, 0.0) / min(ENTRIES_LEFT_OVER, self.effective_rows)
+            rest = max(self.error**2 - LEFT_OVER**2, 0.0) / min(
+                ENTRIES_LEFT_OVER, self.effective_rows
+            )
             rest = max(rest, lasting_square(self.residuals, self.layout))
             variances = np.maximum(variances, rest * n * np.diag(inverse))
         if self.moved is not None:
@@ -132,29 +151,45 @@ class Fit:
         """Parameter → 95 % interval in its unit, limited to its bounds."""
         spread = self.quantile * np.sqrt(np.diag(self.covariance()))
         middle = [f.coordinate(self.values[f.name]) for f in self.frees]
-        return {f.name: (f.value(m - s), f.value(m + s)) for f, m, s in zip(self.frees, middle, spread, strict=True)}
+        return {
+            f.name: (f.value(m - s), f.value(m + s))
+            for f, m, s in zip(self.frees, middle, spread, strict=True)
+        }
 
     @property
     def at_an_end(self) -> tuple[Free, ...]:
         """Fitted numbers that ended at a limit of their range, except those whose start value was that same limit."""
 
         def end(f: Free) -> float:
-            return min((f.low, f.high), key=lambda end: abs(f.coordinate(self.values[f.name]) - f.coordinate(end)))
+            return min(
+                (f.low, f.high),
+                key=lambda end: abs(
+                    f.coordinate(self.values[f.name]) - f.coordinate(end)
+                ),
+            )
 
-        return tuple(f for f in self.frees if f.name in self.at_bound and f.start != end(f))
+        return tuple(
+            f for f in self.frees if f.name in self.at_bound and f.start != end(f)
+        )
 
     @property
     def fled(self) -> tuple[Free, ...]:
         """Always fitted numbers at an end of a range of decades, such as a mass that went to nothing. The end of a tolerance, as
         of a delay or a stated gain, says no more than that another number makes up for it."""
-        return tuple(f for f in self.at_an_end if "." not in f.name and f.log and f.high >= DECADES * f.low)
+        return tuple(
+            f
+            for f in self.at_an_end
+            if "." not in f.name and f.log and f.high >= DECADES * f.low
+        )
 
     @property
     def ended(self) -> tuple[Free, ...]:
         """Numbers that the recordings drove to an end of their range: of ``at_an_end``, whose interval is not all of it."""
         at = self.at_an_end
         ends = self.intervals() if at else {}
-        return tuple(f for f in at if ends[f.name][0] > f.low or ends[f.name][1] < f.high)
+        return tuple(
+            f for f in at if ends[f.name][0] > f.low or ends[f.name][1] < f.high
+        )
 
     @property
     def quantile(self) -> float:
@@ -164,7 +199,9 @@ class Fit:
         return float(student.ppf(0.975, max(blocks - len(self.frees), 3)))
 
 
-def over_own_scale(problem: Problem, model: Fit, fitted_to: Sequence[Recording]) -> tuple[Fit, np.ndarray]:
+def over_own_scale(
+    problem: Problem, model: Fit, fitted_to: Sequence[Recording]
+) -> tuple[Fit, np.ndarray]:
     """``model`` with central differences over the range in which its intervals are sought, in place of its derivatives, and the
     (p,) half widths of that range, from ``FINE`` to ``WIDE``.
 
@@ -179,15 +216,24 @@ def over_own_scale(problem: Problem, model: Fit, fitted_to: Sequence[Recording])
     for _ in range(_SCALE_ROUNDS):
         squares = model.jacobian.T @ model.jacobian
         wider = np.diag(model.covariance()) / np.diag(inverse_of(squares))
-        before, steps = steps, np.clip(np.sqrt(wider / np.maximum(np.diag(squares), 1e-300)), FINE, WIDE)
+        before, steps = (
+            steps,
+            np.clip(np.sqrt(wider / np.maximum(np.diag(squares), 1e-300)), FINE, WIDE),
+        )
         if np.abs(np.log(steps / before)).max() < np.log(_SAME_SCALE):
             break
-        model = dataclasses.replace(model, jacobian=_secants(problem, model, fitted_to, fitted_to, steps))
+        model = dataclasses.replace(
+            model, jacobian=_secants(problem, model, fitted_to, fitted_to, steps)
+        )
     return model, steps
 
 
 def _secants(
-    problem: Problem, model: Fit, fitted_to: Sequence[Recording], recordings: Sequence[Recording], steps: np.ndarray
+    problem: Problem,
+    model: Fit,
+    fitted_to: Sequence[Recording],
+    recordings: Sequence[Recording],
+    steps: np.ndarray,
 ) -> np.ndarray:
     """(n, p) central differences of the residuals of ``recordings`` by the coordinates of ``model.frees``, over ``steps`` (p,) to
     both sides, less at a bound. ``fitted_to``: recordings of ``model``, which determine prepared numbers such as maps."""
@@ -197,8 +243,12 @@ def _secants(
     def case(k: int, to: float) -> Case:
         there = middle.copy()
         there[k] = to
-        values = model.values | {f.name: f.value(c) for f, c in zip(model.frees, there, strict=True)}
-        return values, problem.prepare(values, [c.make(values) for c in candidates], fitted_to)
+        values = model.values | {
+            f.name: f.value(c) for f, c in zip(model.frees, there, strict=True)
+        }
+        return values, problem.prepare(
+            values, [c.make(values) for c in candidates], fitted_to
+        )
 
     below = np.maximum(middle - steps, [f.coordinate(f.low) for f in model.frees])
     above = np.minimum(middle + steps, [f.coordinate(f.high) for f in model.frees])
@@ -208,28 +258,43 @@ def _secants(
 
 
 def moved_by(
-    problem: Problem, model: Fit, fitted_to: Sequence[Recording], others: Sequence[Recording], steps: np.ndarray
+    problem: Problem,
+    model: Fit,
+    fitted_to: Sequence[Recording],
+    others: Sequence[Recording],
+    steps: np.ndarray,
 ) -> np.ndarray:
     """(p,) Gauss–Newton step from ``model`` to the fit of all recordings, those of ``fitted_to`` and ``others``, 0 for numbers at
     their bound, with ``_moved_by_noise`` as the root of the sum of squares. ``steps``: (p,) half widths of the differences."""
     columns = _secants(problem, model, fitted_to, others, steps)
     inside = np.array([f.name not in model.at_bound for f in model.frees])
-    together = (model.jacobian.T @ model.jacobian + columns.T @ columns)[np.ix_(inside, inside)]
+    together = (model.jacobian.T @ model.jacobian + columns.T @ columns)[
+        np.ix_(inside, inside)
+    ]
     here = stacked(problem, model.values, model.effects, others)
     moved = np.zeros(len(inside))
     moved[inside] = -inverse_of(together) @ (columns.T @ here)[inside]
     return np.hypot(moved, _moved_by_noise(problem, model, fitted_to))
 
 
-def _moved_by_noise(problem: Problem, model: Fit, fitted_to: Sequence[Recording]) -> np.ndarray:
+def _moved_by_noise(
+    problem: Problem, model: Fit, fitted_to: Sequence[Recording]
+) -> np.ndarray:
     """(p,) standard deviation of the coordinates because a response passes on peaks of its inputs' noise, as play does: half of
     the bias, by how another noise as large moves them (simulation extrapolation, Cook and Stefanski 1994), if it grows as the
     standard deviation of the noise does."""
     more = [problem.noisier(r) for r in fitted_to]
     if all(one is r for one, r in zip(more, fitted_to, strict=True)):
         return np.zeros(len(model.frees))
-    moved = model.jacobian.T @ (stacked(problem, model.values, model.effects, more) - model.residuals)
-    return 0.5 / (np.sqrt(2.0) - 1.0) * inverse_of(model.jacobian.T @ model.jacobian) @ moved
+    moved = model.jacobian.T @ (
+        stacked(problem, model.values, model.effects, more) - model.residuals
+    )
+    return (
+        0.5
+        / (np.sqrt(2.0) - 1.0)
+        * inverse_of(model.jacobian.T @ model.jacobian)
+        @ moved
+    )
 
 
 def inverse_of(squares: np.ndarray) -> np.ndarray:
@@ -240,30 +305,46 @@ def inverse_of(squares: np.ndarray) -> np.ndarray:
 
 def rms(residuals: np.ndarray) -> float:
     """Root mean square of ``residuals`` (n,), in their unit; NaN if there are none."""
-    return float(np.sqrt(np.mean(np.square(residuals)))) if len(residuals) else float("nan")
+    return (
+        float(np.sqrt(np.mean(np.square(residuals))))
+        if len(residuals)
+        else float("nan")
+    )
 
 
 def residuals(
-    problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+    problem: Problem,
+    base: Mapping[str, float],
+    effects: Sequence[Effect],
+    recording: Recording,
 ) -> np.ndarray:
     """(T, C) simulation − measurement [floors] of one recording; NaN where not measured. ``base``: always fitted numbers."""
     left = np.full(recording.measured.shape, np.nan)
-    left.flat[_entries(recording).measured] = stacked(problem, base, effects, [recording])
+    left.flat[_entries(recording).measured] = stacked(
+        problem, base, effects, [recording]
+    )
     return left
 
 
 def stacked(
-    problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    problem: Problem,
+    base: Mapping[str, float],
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
 ) -> np.ndarray:
     """(n,) residuals of all recordings [floors], one after another, without entries that were not measured. ``base``: always
     fitted numbers."""
     return stacked_all(problem, [(base, effects)], recordings)[0]
 
 
-def stacked_all(problem: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> np.ndarray:
+def stacked_all(
+    problem: Problem, cases: Sequence[Case], recordings: Sequence[Recording]
+) -> np.ndarray:
     """(N, n) ``stacked`` with each of N ``cases``."""
     columns = []
-    for recording, found in zip(recordings, problem.simulate_all(cases, recordings), strict=True):
+    for recording, found in zip(
+        recordings, problem.simulate_all(cases, recordings), strict=True
+    ):
         measured, values, floors = _entries(recording)
         left = np.array(found).reshape(len(cases), -1).take(measured, axis=1)
         left -= values
@@ -285,12 +366,17 @@ class _Entries(NamedTuple):
 def _entries(recording: Recording) -> _Entries:
     measured = np.isfinite(recording.measured)
     floors = np.broadcast_to(recording.floor * recording.share, measured.shape)
-    return _Entries(np.flatnonzero(measured), recording.measured[measured], floors[measured])
+    return _Entries(
+        np.flatnonzero(measured), recording.measured[measured], floors[measured]
+    )
 
 
 def layout_of(recordings: Sequence[Recording]) -> tuple[Rows, ...]:
     """Rows and channels of each recording in the stacked residuals."""
-    return tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s), r.short_noise) for r in recordings)
+    return tuple(
+        Rows(np.isfinite(r.measured), rate_of(r.time_s), r.short_noise)
+        for r in recordings
+    )
 
 
 def fit(
@@ -315,7 +401,9 @@ def fit(
     candidates = chosen(problem, names)
     every = (*problem.base, *(f for c in candidates for f in c.frees))
     absent = [f.name for f in every if f.optional and start.get(f.name, f.start) <= 0.0]
-    held = {f.name: f.start for f in every if f.held or f.unless in names} | dict.fromkeys(absent, 0.0)
+    held = {
+        f.name: f.start for f in every if f.held or f.unless in names
+    } | dict.fromkeys(absent, 0.0)
     frees = tuple(f for f in every if f.name not in held)
     low = np.array([f.coordinate(f.low) for f in frees])
     high = np.array([f.coordinate(f.high) for f in frees])
@@ -326,17 +414,26 @@ def fit(
     layout = layout_of(recordings)
 
     def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
-        values = held | {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
-        return values, problem.prepare(values, [c.make(values) for c in candidates], recordings)
+        values = held | {
+            f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)
+        }
+        return values, problem.prepare(
+            values, [c.make(values) for c in candidates], recordings
+        )
 
     def simulated(points: Sequence[np.ndarray]) -> None:
         missing = [point for point in points if point.tobytes() not in newest]
         if missing:
             found = stacked_all(problem, [at(point) for point in missing], recordings)
-            newest.update((point.tobytes(), left) for point, left in zip(missing, found, strict=True))
+            newest.update(
+                (point.tobytes(), left)
+                for point, left in zip(missing, found, strict=True)
+            )
 
     def beside(coordinates: np.ndarray) -> list[np.ndarray]:
-        return list(coordinates + np.diag(np.where(coordinates + step <= high, step, -step)))
+        return list(
+            coordinates + np.diag(np.where(coordinates + step <= high, step, -step))
+        )
 
     def left(coordinates: np.ndarray) -> np.ndarray:
         if coordinates.tobytes() not in newest:
@@ -348,19 +445,42 @@ def fit(
         here, points = left(coordinates), beside(coordinates)
         simulated(points)
         ways = np.where(coordinates + step <= high, step, -step)
-        return (np.array([newest[point.tobytes()] - here for point in points]) / ways[:, None]).T
+        return (
+            np.array([newest[point.tobytes()] - here for point in points])
+            / ways[:, None]
+        ).T
 
     if len(frees) == 0:
         values, effects = at(first)
         here = left(first)
-        return Fit(tuple(names), values, here, layout, np.empty((len(here), 0)), (), (), "", tuple(effects))
-    means, deviations = np.array(prior).reshape(-1, 2).T if prior else (np.zeros(0), np.zeros(0))
+        return Fit(
+            tuple(names),
+            values,
+            here,
+            layout,
+            np.empty((len(here), 0)),
+            (),
+            (),
+            "",
+            tuple(effects),
+        )
+    means, deviations = (
+        np.array(prior).reshape(-1, 2).T if prior else (np.zeros(0), np.zeros(0))
+    )
 
     def asked(coordinates: np.ndarray) -> np.ndarray:
-        return np.concatenate([left(coordinates), (coordinates - means) / deviations]) if prior else left(coordinates)
+        return (
+            np.concatenate([left(coordinates), (coordinates - means) / deviations])
+            if prior
+            else left(coordinates)
+        )
 
     def asked_slopes(coordinates: np.ndarray) -> np.ndarray:
-        return np.vstack([slopes(coordinates), np.diag(1.0 / deviations)]) if prior else slopes(coordinates)
+        return (
+            np.vstack([slopes(coordinates), np.diag(1.0 / deviations)])
+            if prior
+            else slopes(coordinates)
+        )
 
     # SciPy's first step is at most as long as the start is far from 0: all coordinates start at 1 there.
     shift = first - 1.0
@@ -384,33 +504,55 @@ def fit(
         layout=layout,
         jacobian=found.jac[: len(found.fun) - len(prior)],
         frees=frees,
-        at_bound=tuple(f.name for f, is_near in zip(frees, near, strict=True) if is_near),
-        trouble="" if found.status > 0 else f"not converged: still improving after {most} steps",
+        at_bound=tuple(
+            f.name for f, is_near in zip(frees, near, strict=True) if is_near
+        ),
+        trouble=""
+        if found.status > 0
+        else f"not converged: still improving after {most} steps",
         effects=tuple(effects),
     )
 
 
-def out_of_dents(problem: Problem, model: Fit, recordings: Sequence[Recording], most: int, step: float = COARSE) -> Fit:
+def out_of_dents(
+    problem: Problem,
+    model: Fit,
+    recordings: Sequence[Recording],
+    most: int,
+    step: float = COARSE,
+) -> Fit:
     """``model``, or fits (``fit``) from the best of points beside it, as long as they leave less.
 
     Where a link bounces in its play, sticks or is limited, the error has dents in which the solver stops, a fifth of the play off
     the truth. One coordinate at a time is moved by ``_ASIDE``; the others stay, or follow as the derivatives have it, such as a
     spring beside its play. ``recordings``: those of ``model``."""
-    own = [k for k, f in enumerate(model.frees) if any("." in f.name for f in model.frees)]
+    own = [
+        k for k, f in enumerate(model.frees) if any("." in f.name for f in model.frees)
+    ]
     candidates = chosen(problem, model.names)
     for _ in range(_DENTS if own else 0):
         here = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
-        inverse, alone = inverse_of(model.jacobian.T @ model.jacobian), np.eye(len(here))
+        inverse, alone = (
+            inverse_of(model.jacobian.T @ model.jacobian),
+            np.eye(len(here)),
+        )
         ways = [way for k in own for way in (alone[k], inverse[k] / inverse[k, k])]
         points = [here + aside * way for way in ways for aside in _ASIDE]
         beside = [
-            model.values | {f.name: f.value(c) for f, c in zip(model.frees, point, strict=True)} for point in points
+            model.values
+            | {f.name: f.value(c) for f, c in zip(model.frees, point, strict=True)}
+            for point in points
         ]
-        cases = [(v, problem.prepare(v, [c.make(v) for c in candidates], recordings)) for v in beside]
+        cases = [
+            (v, problem.prepare(v, [c.make(v) for c in candidates], recordings))
+            for v in beside
+        ]
         errors = np.mean(np.square(stacked_all(problem, cases, recordings)), axis=1)
         if errors.min() > (_DEEPER * model.error) ** 2:
             break
-        found = fit(problem, recordings, model.names, beside[int(errors.argmin())], most, step)
+        found = fit(
+            problem, recordings, model.names, beside[int(errors.argmin())], most, step
+        )
         if found.error > _DEEPER * model.error:
             break
         model = found
@@ -425,4 +567,7 @@ def best_fit(
     most: int = 40,
 ) -> Fit:
     """The fit (``fit``) that leaves least, of one from each of ``starts``."""
-    return min((fit(problem, recordings, names, start, most) for start in starts), key=lambda f: f.error)
+    return min(
+        (fit(problem, recordings, names, start, most) for start in starts),
+        key=lambda f: f.error,
+    )

@@ -10,7 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.diagnosis.search.evidence import Blocks, above_floor, bic_gain, block_squares, gain_of, standard_score
+from taccorl.diagnosis.search.evidence import (
+    Blocks,
+    above_floor,
+    bic_gain,
+    block_squares,
+    gain_of,
+    standard_score,
+)
 from taccorl.diagnosis.search.fit import (
     FINE,
     WIDE,
@@ -25,7 +32,15 @@ from taccorl.diagnosis.search.fit import (
     stacked,
 )
 from taccorl.diagnosis.search.identifiable import POSITION_AGE_S, not_told_from_none
-from taccorl.diagnosis.search.problem import Candidate, Problem, Progress, Recording, Values, chosen, with_held
+from taccorl.diagnosis.search.problem import (
+    Candidate,
+    Problem,
+    Progress,
+    Recording,
+    Values,
+    chosen,
+    with_held,
+)
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe, is_likely, probe
 from taccorl.diagnosis.search.settle import settled
@@ -82,11 +97,23 @@ class Model:
         return self.squares.mean**0.5
 
 
-def model_of(problem: Problem, found: Fit, validation: Sequence[Recording], full: bool = True) -> Model:
+def model_of(
+    problem: Problem, found: Fit, validation: Sequence[Recording], full: bool = True
+) -> Model:
     """``found`` with its errors on ``validation``."""
     maps = sum(c.num_maps for c in chosen(problem, found.names))
-    out = tuple(p for p in places(problem, found, validation, SearchConfig().little) if p.error > p.most)
-    return Model(found, block_squares(problem, found, validation), len(found.frees) + maps, full, out)
+    out = tuple(
+        p
+        for p in places(problem, found, validation, SearchConfig().little)
+        if p.error > p.most
+    )
+    return Model(
+        found,
+        block_squares(problem, found, validation),
+        len(found.frees) + maps,
+        full,
+        out,
+    )
 
 
 def refusal(a: Model, b: Model, config: SearchConfig) -> str:
@@ -96,20 +123,29 @@ def refusal(a: Model, b: Model, config: SearchConfig) -> str:
     number of parameters justifies. That regimes stand out with ``b`` and none with ``a`` is no chance.
     """
     cleared = bool(b.stands_out) and not a.stands_out
-    gain, score = gain_of(a.squares, b.squares), np.inf if cleared else standard_score(b.squares - a.squares)
+    gain, score = (
+        gain_of(a.squares, b.squares),
+        np.inf if cleared else standard_score(b.squares - a.squares),
+    )
     more = a.numbers - b.numbers
-    return config.refusal(gain, score, bic_gain(b.fit, a.fit, more) if more > 0 else np.inf)
+    return config.refusal(
+        gain, score, bic_gain(b.fit, a.fit, more) if more > 0 else np.inf
+    )
 
 
 def better(a: Model, b: Model, config: SearchConfig) -> bool:
     """Whether the search prefers ``a``: its validation error is clearly below that of ``b`` (``refusal``), or neither is
     clearly below the other and ``a`` has fewer fitted numbers."""
-    return not refusal(a, b, config) or (bool(refusal(b, a, config)) and a.numbers < b.numbers)
+    return not refusal(a, b, config) or (
+        bool(refusal(b, a, config)) and a.numbers < b.numbers
+    )
 
 
 def best(models: Iterable[Model], config: SearchConfig) -> Model:
     """Of the models that the one with the least error is not clearly better than, the one with the fewest numbers."""
-    order = sorted(models, key=lambda m: (above_floor(m.squares), m.numbers, m.squares.mean))
+    order = sorted(
+        models, key=lambda m: (above_floor(m.squares), m.numbers, m.squares.mean)
+    )
     as_good = [m for m in order if m is order[0] or refusal(order[0], m, config)]
     return min(as_good, key=lambda m: (m.numbers, m.squares.mean))
 
@@ -133,7 +169,11 @@ class Fits:
         config: SearchConfig,
         report: Progress,
     ) -> None:
-        self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
+        self.problem, self.fit_to, self.validation = (
+            problem,
+            list(fit_to),
+            list(validation),
+        )
         self.present, self.config, self.report = present, config, report
         self.models: dict[frozenset[str], Model] = {}
         self.probes: dict[tuple[frozenset[str], str], Probe] = {}
@@ -141,14 +181,19 @@ class Fits:
         self._probed: dict[frozenset[str], int] = {}
         self._repeats: dict[tuple[Model, Model], str] = {}
         there = chosen(problem, present)
-        self.given = {f.name: start.get(f.name, f.start) for f in (*problem.base, *(f for x in there for f in x.frees))}
+        self.given = {
+            f.name: start.get(f.name, f.start)
+            for f in (*problem.base, *(f for x in there for f in x.frees))
+        }
         """Value of every number of the problem as the machine's file has it, before any fit."""
         self.state = ""
         """Text of how far the search is, before that of each step."""
         self.progress("fitting the numbers that are always fitted")
         self._keep(self.fitted(present, [self.given], most=60), full=True)
         self.as_it_was = dataclasses.replace(
-            self.first, values=self.given, effects=tuple(x.make(self.given) for x in there)
+            self.first,
+            values=self.given,
+            effects=tuple(x.make(self.given) for x in there),
         )
         """The twin with the numbers that it has, not fitted."""
 
@@ -170,7 +215,12 @@ class Fits:
         """Report the present step, after the effects that are in the model and the error that they leave."""
         self.report(f"{self.state}{text}")
 
-    def fitted(self, names: Sequence[str], starts: Sequence[Mapping[str, float]], most: int = STEPS) -> Fit:
+    def fitted(
+        self,
+        names: Sequence[str],
+        starts: Sequence[Mapping[str, float]],
+        most: int = STEPS,
+    ) -> Fit:
         """The best of several fits of the effects ``names``; at most ``most`` steps in each."""
         return best_fit(self.problem, self.fit_to, names, starts, most)
 
@@ -188,7 +238,9 @@ class Fits:
     def without(self, model: Model, name: str, again: bool = False) -> Model:
         """The model with one effect less, the others refitted; ``again``: from where ``model`` ended, so that both had the same
         refits, even if it was fitted before."""
-        return self.whole(tuple(n for n in model.names if n != name), model.fit.values, again)
+        return self.whole(
+            tuple(n for n in model.names if n != name), model.fit.values, again
+        )
 
     def whole(self, names: Sequence[str], start: Values, again: bool = False) -> Model:
         """The model of exactly these effects, fitted fully from ``start`` unless it already is; ``again``: in any case."""
@@ -198,7 +250,9 @@ class Fits:
         self.progress(f"fitting {' and '.join(names) or 'no effect'}")
         return self._keep(self.fitted(names, [start]), full=True)
 
-    def children(self, parent: Model, names: Sequence[str], most: int = PROBED) -> list[Model]:
+    def children(
+        self, parent: Model, names: Sequence[str], most: int = PROBED
+    ) -> list[Model]:
         """Models with one effect of ``names`` more, those of the likeliest effects fitted fully."""
         key = frozenset(parent.names)
         free = [n for n in names if n not in key]
@@ -212,13 +266,19 @@ class Fits:
         has = " and ".join(self.added(parent)) or "no effect added"
         self.state = f"{has}, validation error {parent.error:.2f} noise floors; "
         self.progress(f"probing {len(free)} effects")
-        probes = probe(self.problem, self.fit_to, parent.fit, chosen(self.problem, free))
+        probes = probe(
+            self.problem, self.fit_to, parent.fit, chosen(self.problem, free)
+        )
         seen: dict[str, list[Probe]] = {}
         for p in sorted(probes, key=lambda p: -p.explained):
             seen.setdefault(p.name, []).append(p)
             self.probes.setdefault((key, p.name), p)
         order = list(seen)
-        names = [n for k, n in enumerate(order) if k < most or (is_likely(candidates[n]) and most == PROBED)]
+        names = [
+            n
+            for k, n in enumerate(order)
+            if k < most or (is_likely(candidates[n]) and most == PROBED)
+        ]
         starts = {
             n: [
                 parent.fit.values | p.scaled(candidates[n])
@@ -231,62 +291,113 @@ class Fits:
         for k, n in enumerate(names, 1):
             there = self.models.get(key | {n})
             self.progress(f"first refit with {n}, {k} of {len(names)}")
-            short[n] = there.fit if there is not None and there.full else self._short(parent.fit, n, starts[n][0])
+            short[n] = (
+                there.fit
+                if there is not None and there.full
+                else self._short(parent.fit, n, starts[n][0])
+            )
         if short and min(f.error for f in short.values()) > FAR_OFF:
             self.progress("refitting from beside what is far off")
-            short |= {n: out_of_dents(self.problem, short[n], self.fit_to, FIRST_STEPS) for n in names[:4]}
-        most_removed = parent.fit.error**2 - min((f.error for f in short.values()), default=0.0) ** 2
-        for n in [n for n in names if short[n].trouble]:  # along a ridge of several numbers a few steps do not go far
+            short |= {
+                n: out_of_dents(self.problem, short[n], self.fit_to, FIRST_STEPS)
+                for n in names[:4]
+            }
+        most_removed = (
+            parent.fit.error**2
+            - min((f.error for f in short.values()), default=0.0) ** 2
+        )
+        for n in [
+            n for n in names if short[n].trouble
+        ]:  # along a ridge of several numbers a few steps do not go far
             if parent.fit.error**2 - short[n].error ** 2 > 0.5 * most_removed > 0.0:
                 self.progress(f"further steps with {n}")
-                short[n] = self.fitted(short[n].names, [short[n].values], 3 * FIRST_STEPS)
+                short[n] = self.fitted(
+                    short[n].names, [short[n].values], 3 * FIRST_STEPS
+                )
         by_error = sorted(names, key=lambda n: short[n].error)
         least = short[by_error[0]].error
         for n in by_error:
             there = self.models.get(key | {n})
             if there is not None and there.full:
                 continue
-            bends = bool(candidates[n].cls.optional) and short[n].error < 0.95 * parent.fit.error
+            bends = (
+                bool(candidates[n].cls.optional)
+                and short[n].error < 0.95 * parent.fit.error
+            )
             near = short[n].error <= NEAR_BEST * max(least, 1.0)
             if near or bends or n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL]):
-                self.progress(f"refitting with {n}, {by_error.index(n) + 1} of at most {len(names)}")
-                self.grown(self._keep(self._full(parent.fit, n, [short[n].values, *starts[n][1:]]), full=True))
+                self.progress(
+                    f"refitting with {n}, {by_error.index(n) + 1} of at most {len(names)}"
+                )
+                self.grown(
+                    self._keep(
+                        self._full(parent.fit, n, [short[n].values, *starts[n][1:]]),
+                        full=True,
+                    )
+                )
             else:
                 self._keep(short[n], full=False)
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
         """``parent`` with one effect more, after a few steps for each of its numbers; from where the numbers began if those of
         ``parent``, which have made up for the effect, do not go with it, or went to an end of their range and are far off."""
-        steps = FIRST_STEPS * max(sum(not f.optional for f in self.problem.candidates[name].frees), 1)
+        steps = FIRST_STEPS * max(
+            sum(not f.optional for f in self.problem.candidates[name].frees), 1
+        )
         model = self.fitted((*parent.names, name), [start], steps)
         more = [start | self.given] * (model.error > STUCK * parent.error)
         if parent.at_an_end and model.error > FAR_OFF:
             more.append(self._afresh(parent, name))
         # At a whole row a delayed target comes before that row's effort is measured, or after it: the error jumps there.
         row_s = min(float(np.median(np.diff(r.time_s))) for r in self.fit_to)
-        for delay in [f.name for f in self.problem.candidates[name].frees if f.name.endswith(".delay_s")]:
+        for delay in [
+            f.name
+            for f in self.problem.candidates[name].frees
+            if f.name.endswith(".delay_s")
+        ]:
             whole = int(model.values[delay] / row_s)
-            more += [model.values | self.given | {delay: (k + PAST_ROW) * row_s} for k in (whole, whole + 1)]
-        return min((model, *(self.fitted((*parent.names, name), [one], steps) for one in more)), key=lambda m: m.error)
+            more += [
+                model.values | self.given | {delay: (k + PAST_ROW) * row_s}
+                for k in (whole, whole + 1)
+            ]
+        return min(
+            (
+                model,
+                *(self.fitted((*parent.names, name), [one], steps) for one in more),
+            ),
+            key=lambda m: m.error,
+        )
 
     def _full(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
         """``parent`` with one effect more; never worse than ``parent``, which it contains."""
         frees = [f for f in self.problem.candidates[name].frees if not f.optional]
         model = self.fitted((*parent.names, name), starts)
         more = []
-        if model.error > STUCK * parent.error:  # stuck: from where the effect is hardly there
-            faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
+        if (
+            model.error > STUCK * parent.error
+        ):  # stuck: from where the effect is hardly there
+            faint = {f.name: f.start for f in frees} | {
+                frees[0].name: frees[0].low if frees[0].log else 0.0
+            }
             more.append(parent.values | faint)
         if parent.error > FAR_OFF:
             more.append(self._afresh(parent, name))
-        if model.error > self.config.floor:  # the numbers may have gone far to make up for it: from where they began
+        if (
+            model.error > self.config.floor
+        ):  # the numbers may have gone far to make up for it: from where they began
             more.append(starts[0] | self.given)
-        return min((model, *(self.fitted((*parent.names, name), [one]) for one in more)), key=lambda m: m.error)
+        return min(
+            (model, *(self.fitted((*parent.names, name), [one]) for one in more)),
+            key=lambda m: m.error,
+        )
 
     def _afresh(self, parent: Fit, name: str) -> Values:
         """The best start of an effect's own beside the numbers that the file has, after one step."""
         own = self.problem.candidates[name]
-        starts = [parent.values | {f.name: f.start for f in own.frees} | one | self.given for one in own.starts]
+        starts = [
+            parent.values | {f.name: f.start for f in own.frees} | one | self.given
+            for one in own.starts
+        ]
         return self.fitted((*parent.names, name), starts, 1).values
 
     def grown(self, model: Model) -> Model:
@@ -296,11 +407,22 @@ class Fits:
             return model
         for c in chosen(self.problem, model.names):
             open_ = [n for n, same in c.cls.optional.items() if same not in model.names]
-            typical = {f"{c.name}.{p.name}": p.typical for p in c.cls.parameters() if p.name in open_}
-            if not typical or any(model.fit.values.get(n, 1.0) > 0.0 for n in typical) or c.frees[0].held:
+            typical = {
+                f"{c.name}.{p.name}": p.typical
+                for p in c.cls.parameters()
+                if p.name in open_
+            }
+            if (
+                not typical
+                or any(model.fit.values.get(n, 1.0) > 0.0 for n in typical)
+                or c.frees[0].held
+            ):
                 continue
             self.progress(f"refitting with {' and '.join(typical)}")
-            starts = [model.fit.values | {n: v * by for n, v in typical.items()} for by in FAINT]
+            starts = [
+                model.fit.values | {n: v * by for n, v in typical.items()}
+                for by in FAINT
+            ]
             other = self.model_of(self.fitted(model.names, starts))
             if not refusal(other, model, self.config) and not self.flaw(other):
                 self.models[frozenset(model.names)] = model = other
@@ -312,9 +434,16 @@ class Fits:
         if self.at_floor(model) or model.polished or not self.added(model):
             return model
         self.progress(f"refitting {' and '.join(model.names)} from beside their values")
-        wide = fit(self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE)
-        least = min((model.fit, wide, self.fitted(model.names, [wide.values])), key=lambda f: f.error)
-        found = self._keep(out_of_dents(self.problem, least, self.fit_to, STEPS), full=True)
+        wide = fit(
+            self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE
+        )
+        least = min(
+            (model.fit, wide, self.fitted(model.names, [wide.values])),
+            key=lambda f: f.error,
+        )
+        found = self._keep(
+            out_of_dents(self.problem, least, self.fit_to, STEPS), full=True
+        )
         found.polished = True
         return found
 
@@ -325,7 +454,11 @@ class Fits:
         fine = self._fine(out_of_dents(self.problem, model, self.fit_to, STEPS))
         if fine.trouble:
             further = self._fine(fine)
-            fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
+            fell = (
+                (fine.error**2 - further.error**2)
+                / further.error**2
+                * further.effective_rows
+            )
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
         if not fine.frees:
             return fine
@@ -333,8 +466,12 @@ class Fits:
         fine, steps = over_own_scale(problem, fine, self.fit_to)
         if self.validation:
             moved = moved_by(problem, fine, self.fit_to, self.validation, steps)
-            fine = dataclasses.replace(fine, moved=np.hypot(moved, self._moved_by_late_targets(problem, fine)))
-        found = settled(problem, fine, self.given, self.present, self.fit_to, self.validation)
+            fine = dataclasses.replace(
+                fine, moved=np.hypot(moved, self._moved_by_late_targets(problem, fine))
+            )
+        found = settled(
+            problem, fine, self.given, self.present, self.fit_to, self.validation
+        )
         return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
 
     def _moved_by_late_targets(self, problem: Problem, model: Fit) -> np.ndarray:
@@ -344,10 +481,19 @@ class Fits:
         period_s = model.values.get("loop_s", 0.0) or problem.loop_s
         moved = np.zeros(len(model.frees))
         if period_s > 0.0:
-            late = stacked(problem, model.values | {"loop_waits_s": period_s}, model.effects, self.fit_to)
+            late = stacked(
+                problem,
+                model.values | {"loop_waits_s": period_s},
+                model.effects,
+                self.fit_to,
+            )
             inside = np.array([f.name not in model.at_bound for f in model.frees])
             columns = model.jacobian[:, inside]
-            moved[inside] = 0.5 * inverse_of(columns.T @ columns) @ (columns.T @ (late - model.residuals))
+            moved[inside] = (
+                0.5
+                * inverse_of(columns.T @ columns)
+                @ (columns.T @ (late - model.residuals))
+            )
         return np.where([f.name == "speed_delay_s" for f in model.frees], 0.0, moved)
 
     def _without_ended(self, model: Fit) -> tuple[Problem, Fit]:
@@ -364,16 +510,29 @@ class Fits:
         return (problem, other) if lost <= 0.05 * won else (self.problem, model)
 
     def _fine(self, model: Fit, problem: Problem | None = None) -> Fit:
-        return fit(problem or self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
+        return fit(
+            problem or self.problem,
+            self.fit_to,
+            model.names,
+            model.values,
+            self.config.last_steps,
+            FINE,
+        )
 
     def error(self, model: Fit) -> float:
         """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""
         return rms(stacked(self.problem, model.values, model.effects, self.validation))
 
-    def errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
+    def errors(
+        self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]
+    ) -> dict[str, float]:
         """fit, validation and, if there are any, test → RMS error [floors]."""
         uses = {"fit": self.fit_to, "validation": self.validation, "test": list(test)}
-        return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
+        return {
+            use: rms(stacked(self.problem, values, effects, recs))
+            for use, recs in uses.items()
+            if recs
+        }
 
     def at_floor(self, model: Model) -> bool:
         """Whether neither the validation nor the fit recordings have an error that another effect could explain, and none of
@@ -382,19 +541,34 @@ class Fits:
         c, error = self.config, model.error
         is_little = bool(self.added(model)) and max(error, model.fit.error) <= c.little
         is_low = error <= c.floor and model.fit.error <= c.little
-        if not (is_low or (is_little and error**2 - 1.0 <= c.little_share * self.base.error**2)):
+        if not (
+            is_low
+            or (is_little and error**2 - 1.0 <= c.little_share * self.base.error**2)
+        ):
             return False
         return not self.standing_out(model)
 
-    def standing_out(self, model: Model, others: Sequence[Recording] = ()) -> tuple[Place, ...]:
+    def standing_out(
+        self, model: Model, others: Sequence[Recording] = ()
+    ) -> tuple[Place, ...]:
         """Regimes of the fit and validation recordings, or of ``others`` in their place, that stand out, the worst first.
         ``little_share`` of what added effects removed there is left, as in ``at_floor``."""
         if model.standing_out is not None and not others:
             return model.standing_out
-        recordings, little = others or (*self.fit_to, *self.validation), self.config.little
-        now, before = (list(places(self.problem, m.fit, recordings, little)) for m in (model, self.base))
+        recordings, little = (
+            others or (*self.fit_to, *self.validation),
+            self.config.little,
+        )
+        now, before = (
+            list(places(self.problem, m.fit, recordings, little))
+            for m in (model, self.base)
+        )
         share = self.config.little_share * bool(self.added(model))
-        found = [p for p, b in zip(now, before, strict=True) if p.error**2 > p.most**2 + share * b.error**2]
+        found = [
+            p
+            for p, b in zip(now, before, strict=True)
+            if p.error**2 > p.most**2 + share * b.error**2
+        ]
         own = tuple(sorted(found, key=lambda p: -p.error / p.most))
         model.standing_out = model.standing_out if others else own
         return own
@@ -411,10 +585,14 @@ class Fits:
         found = model.fit
         for c in chosen(self.problem, self.added(model)):
             for p in c.cls.parameters():
-                f = next((f for f in found.frees if f.name == f"{c.name}.{p.name}"), None)
+                f = next(
+                    (f for f in found.frees if f.name == f"{c.name}.{p.name}"), None
+                )
                 if f is None or f.optional or f.name not in found.at_bound:
                     continue
-                place, low, high = (f.coordinate(x) for x in (found.values[f.name], f.low, f.high))
+                place, low, high = (
+                    f.coordinate(x) for x in (found.values[f.name], f.low, f.high)
+                )
                 end = p.low if place - low < high - place else p.high
                 value = f"{p.name} {found.values[f.name]:.3g}{f' {p.unit}' * (p.unit != '1')}"
                 if p.absent == end:
@@ -423,13 +601,23 @@ class Fits:
                     return f"the fit ends at the weakest effect of its range, {value}"
             if simpler := _simpler_form(c, found.values):
                 return f"no more than {simpler}"
-            ended = len(c.frees) == 1 and any(f.name == c.frees[0].name for f in found.ended)
-            if ended and not self.at_floor(model):  # the truth may lie at the end of a range, but then nothing is left
+            ended = len(c.frees) == 1 and any(
+                f.name == c.frees[0].name for f in found.ended
+            )
+            if ended and not self.at_floor(
+                model
+            ):  # the truth may lie at the end of a range, but then nothing is left
                 return f"no explanation: {c.frees[0].name} ends at {found.values[c.frees[0].name]:.3g}, an end of its range"
         fled = [f.name for f in found.fled if f.name not in self.base.fit.at_bound]
-        decided = fled and self._without_ended(found)[0] is self.problem  # else as good where they began
+        decided = (
+            fled and self._without_ended(found)[0] is self.problem
+        )  # else as good where they began
         ends = " and ".join(f"{name} {found.values[name]:.3g}" for name in fled)
-        return f"no explanation: the fit ends with {ends} at the end of its range" if decided else ""
+        return (
+            f"no explanation: the fit ends with {ends} at the end of its range"
+            if decided
+            else ""
+        )
 
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
@@ -442,10 +630,17 @@ class Fits:
         if why := self.flaw(model) or refusal(model, parent, self.config):
             return why
         name = next(n for n in model.names if n not in parent.names)
-        gain, score = gain_of(model.squares, parent.squares), standard_score(parent.squares - model.squares)
+        gain, score = (
+            gain_of(model.squares, parent.squares),
+            standard_score(parent.squares - model.squares),
+        )
         near, much = parent.error <= self.config.little, gain >= self.config.sure_gain
         sure = much or score >= self.config.sure_score
-        why = not_told_from_none(model.fit, name, left_over and not sure, POSITION_AGE_S) if near or not sure else ""
+        why = (
+            not_told_from_none(model.fit, name, left_over and not sure, POSITION_AGE_S)
+            if near or not sure
+            else ""
+        )
         return why or (self._unrepeated(model, parent) if near and not much else "")
 
     def _unrepeated(self, model: Model, parent: Model) -> str:
@@ -453,12 +648,24 @@ class Fits:
         to; empty if it does."""
         if (key := (model, parent)) not in self._repeats:
             self.progress(f"does {model.names[-1]} repeat on other recordings")
-            fits = [fit(self.problem, self.validation, m.names, m.fit.values, STEPS) for m in key]
+            fits = [
+                fit(self.problem, self.validation, m.names, m.fit.values, STEPS)
+                for m in key
+            ]
             with_it, without = (model_of(self.problem, f, self.fit_to) for f in fits)
-            surely = standard_score(without.squares - with_it.squares) >= self.config.min_score
-            self._repeats[key] = "" if surely else refusal(with_it, without, self.config)
+            surely = (
+                standard_score(without.squares - with_it.squares)
+                >= self.config.min_score
+            )
+            self._repeats[key] = (
+                "" if surely else refusal(with_it, without, self.config)
+            )
         why = self._repeats[key]
-        return f"fitted to the validation recordings, it does not repeat on the others: {why}" if why else ""
+        return (
+            f"fitted to the validation recordings, it does not repeat on the others: {why}"
+            if why
+            else ""
+        )
 
     def evidence(self, model: Model, parent: Model, verdict: str) -> Evidence:
         """What a report says of the newest effect of ``model``, with the ``verdict`` of the search on it."""
@@ -493,8 +700,17 @@ def _simpler_form(c: Candidate, values: Values) -> str:
     if any(abs(own[p.name]) > NEARLY for p in c.cls.parameters() if p.typical == 0.0):
         return ""
     ends = {p.name: (p.low, p.high) for p in c.cls.parameters()}
-    limits = [(simpler, name, ends[name][0]) for simpler, name in c.cls.reduces_to.items()]
+    limits = [
+        (simpler, name, ends[name][0]) for simpler, name in c.cls.reduces_to.items()
+    ]
     for same in [same for n, same in c.cls.optional.items() if same and own[n] > 0.0]:
-        limits += [(f"{same} and {wide}", name, ends[name][1]) for wide, name in c.cls.equals_when_wide.items()]
-    found = [(words, name) for words, name, limit in limits if abs(own[name] - limit) <= NEARLY]
+        limits += [
+            (f"{same} and {wide}", name, ends[name][1])
+            for wide, name in c.cls.equals_when_wide.items()
+        ]
+    found = [
+        (words, name)
+        for words, name, limit in limits
+        if abs(own[name] - limit) <= NEARLY
+    ]
     return " or ".join(f"{words}: {name} {own[name]:.3g}" for words, name in found)

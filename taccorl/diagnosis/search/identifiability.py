@@ -40,7 +40,10 @@ class Identifiability:
 
 
 def identifiability(
-    problem: Problem, recordings: Sequence[Recording], start: Values, present: Sequence[str] = ()
+    problem: Problem,
+    recordings: Sequence[Recording],
+    start: Values,
+    present: Sequence[str] = (),
 ) -> Identifiability:
     """Fit the always fitted numbers from ``start``, with the effects ``present``, and probe all candidates."""
     here = fit(problem, recordings, present, start)
@@ -52,7 +55,11 @@ def identifiability(
     ]
     probes = probe(problem, recordings, here, typical)
     shown = [p for p in probes if p.visible >= VISIBLE]
-    pairs = [(a.name, b.name, alike(a, b)) for k, a in enumerate(shown) for b in shown[k + 1 :]]
+    pairs = [
+        (a.name, b.name, alike(a, b))
+        for k, a in enumerate(shown)
+        for b in shown[k + 1 :]
+    ]
     return Identifiability(
         visible={p.name: p.visible for p in probes},
         pairs=tuple(sorted((p for p in pairs if p[2] > ALIKE), key=lambda p: -p[2])),
@@ -66,5 +73,8 @@ def _ridges(model: Fit) -> list[tuple[str, str, float]]:
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = spread / np.outer(size, size)
     over = np.argwhere(np.triu(np.abs(correlation) > RIDGE, 1))
-    pairs = [(model.frees[i].name, model.frees[j].name, float(correlation[i, j])) for i, j in over]
+    pairs = [
+        (model.frees[i].name, model.frees[j].name, float(correlation[i, j]))
+        for i, j in over
+    ]
     return sorted(pairs, key=lambda p: -abs(p[2]))

@@ -52,7 +52,14 @@ OVER_KP = {
     "1": "rad/(N·m)",
 }
 """Unit of a number → unit of its ratio to K_p [N·m/rad]."""
-OVER_KP_OF_SLIDE = {"N": "m", "N/m": "1", "N·s/m": "s", "N·s²/m²": "s²/m", "kg": "s²", "1": "m/N"}
+OVER_KP_OF_SLIDE = {
+    "N": "m",
+    "N/m": "1",
+    "N·s/m": "s",
+    "N·s²/m²": "s²/m",
+    "kg": "s²",
+    "1": "m/N",
+}
 """Likewise with K_p of a slide [N/m]."""
 INERTIA = "kg·m²"
 """Unit of inertias among the fitted numbers."""
@@ -94,7 +101,9 @@ class Known:
         return {n.name: (n.low, n.high) for n in self.absolute}
 
 
-def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | None = None) -> tuple[Identified, ...]:
+def identifiable_numbers(
+    fit: Fit, commanded: bool, effort: bool, kd: float | None = None
+) -> tuple[Identified, ...]:
     """The numbers that the recordings identify, with intervals by the delta method from ``fit.covariance()``: ratios to K_p, and
     absolute numbers where something fixes the scale of the torques.
 
@@ -123,7 +132,9 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
     return tuple(found)
 
 
-def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float | None = None) -> tuple[Identified, ...]:
+def absolute_numbers(
+    fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float | None = None
+) -> tuple[Identified, ...]:
     """Every fitted number, in the order of ``fit.frees``, with its interval, which covers τ between 0 and ``TIMING_S`` if nothing
     fixes the scale of the torques.
 
@@ -136,16 +147,24 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
     if not {"kp", "kd"} <= {f.name for f in fit.frees}:
         return tuple(plain)
     over = _over_kp(fit)
-    kd_high = fit.intervals()["kd"][1]  # of a gain that nothing determines, the end of its range
-    inertia = inertia_kgm2 + sum(fit.values[f.name] for f in fit.frees if f.unit == INERTIA and f.name in over)
+    kd_high = fit.intervals()["kd"][
+        1
+    ]  # of a gain that nothing determines, the end of its range
+    inertia = inertia_kgm2 + sum(
+        fit.values[f.name] for f in fit.frees if f.unit == INERTIA and f.name in over
+    )
     most = 1.0 + kd_high * TIMING_S / inertia
     open_ = [
         name for name in over if not pinned or name in GAINS
     ]  # efforts fix torques, and the loop's timing still shifts gains
-    return tuple(_scaled(n, _absent(over[n.name]), most) if n.name in open_ else n for n in plain)
+    return tuple(
+        _scaled(n, _absent(over[n.name]), most) if n.name in open_ else n for n in plain
+    )
 
 
-def not_told_from_none(fit: Fit, effect: str, left_over: bool, age_s: float = 0.0) -> str:
+def not_told_from_none(
+    fit: Fit, effect: str, left_over: bool, age_s: float = 0.0
+) -> str:
     """Text on an effect whose strength the recordings do not tell from none: the 95 % intervals of all of its fitted parameters
     that have an absent value hold that value. Empty if one does not, or if no such parameter was fitted.
 
@@ -156,7 +175,10 @@ def not_told_from_none(fit: Fit, effect: str, left_over: bool, age_s: float = 0.
         left_over: whether intervals widen by what the model leaves above the floor (``Fit.covariance``).
         age_s: how much longer than it is a delay or lag may seem to be, by the loop's timing.
     """
-    covariance, index = fit.covariance(left_over), {f.name: k for k, f in enumerate(fit.frees)}
+    covariance, index = (
+        fit.covariance(left_over),
+        {f.name: k for k, f in enumerate(fit.frees)},
+    )
     kp, texts = index.get("kp"), []
     for p in next(e for e in fit.effects if e.name == effect).parameters():
         name = f"{effect}.{p.name}"
@@ -168,13 +190,20 @@ def not_told_from_none(fit: Fit, effect: str, left_over: bool, age_s: float = 0.
         far = 1.0 if relative else f.coordinate(value) - f.coordinate(p.absent)
         variance = covariance[k, k]
         if p.over == "kp" and kp is not None:
-            variance = min(variance, variance + far**2 * covariance[kp, kp] - 2.0 * far * covariance[k, kp])
+            variance = min(
+                variance,
+                variance + far**2 * covariance[kp, kp] - 2.0 * far * covariance[k, kp],
+            )
         late_s = age_s * name.endswith(LATE)
-        if abs(far) * (1.0 - late_s / value if late_s else 1.0) > fit.quantile * math.sqrt(max(variance, 0.0)):
+        if abs(far) * (
+            1.0 - late_s / value if late_s else 1.0
+        ) > fit.quantile * math.sqrt(max(variance, 0.0)):
             return ""
         low, high = fit.intervals()[name]
         low = max(low - late_s, 0.0) if late_s else low
-        texts.append(f"{p.name} {value:.3g} (95 % {low:.3g} … {high:.3g}) is not told from {p.absent:g}")
+        texts.append(
+            f"{p.name} {value:.3g} (95 % {low:.3g} … {high:.3g}) is not told from {p.absent:g}"
+        )
     return f"{' and '.join(texts)}, where the effect is absent" if texts else ""
 
 
@@ -199,14 +228,22 @@ def identified_value(name: str, values: Mapping[str, float]) -> float:
 
 def _over_kp(fit: Fit) -> dict[str, Parameter | None]:
     """Numbers of the fit that positions identify only over K_p → their parameter; None for the controller's own."""
-    own: dict[str, Parameter | None] = {f.name: None for f in fit.frees if f.name in GAINS}
+    own: dict[str, Parameter | None] = {
+        f.name: None for f in fit.frees if f.name in GAINS
+    }
     for effect in fit.effects:
-        own |= {f"{effect.name}.{p.name}": p for p in effect.parameters() if p.over == "kp"}
+        own |= {
+            f"{effect.name}.{p.name}": p for p in effect.parameters() if p.over == "kp"
+        }
     return {f.name: own[f.name] for f in fit.frees if f.name in own}
 
 
 def _absent(p: Parameter | None) -> float:
-    return p.absent if p is not None and p.absent is not None and math.isfinite(p.absent) else 0.0
+    return (
+        p.absent
+        if p is not None and p.absent is not None and math.isfinite(p.absent)
+        else 0.0
+    )
 
 
 def _ratio_name(name: str, p: Parameter | None) -> str:
@@ -221,7 +258,9 @@ def _plain(fit: Fit, frees: Iterable[Free]) -> list[Identified]:
     """All but those whose interval is the whole range in which they were fitted: these are not determined."""
     intervals = fit.intervals()
     return [
-        Identified(name=f.name, value=fit.values[f.name], low=low, high=high, unit=f.unit)
+        Identified(
+            name=f.name, value=fit.values[f.name], low=low, high=high, unit=f.unit
+        )
         for f in frees
         for low, high in [intervals[f.name]]
         if low > f.low or high < f.high
@@ -240,13 +279,20 @@ def _ratio(fit: Fit, name: str, ratio_name: str, covariance: np.ndarray) -> Iden
     unit = table.get(x.unit, f"{x.unit} {other}")
     if x.log and kp.log and value == fit.values[name] / fit.values["kp"] and value > 0:
         spread = 1.96 * math.sqrt(max(part[0, 0] + part[1, 1] - 2.0 * part[0, 1], 0.0))
-        low, high = (math.exp(min(math.log(value) + way, _MOST)) for way in (-spread, spread))
+        low, high = (
+            math.exp(min(math.log(value) + way, _MOST)) for way in (-spread, spread)
+        )
         return Identified(name=ratio_name, value=value, low=low, high=high, unit=unit)
     slopes = np.array(
-        [_slope(x, fit.values[name]) / fit.values["kp"], -value * _slope(kp, fit.values["kp"]) / fit.values["kp"]]
+        [
+            _slope(x, fit.values[name]) / fit.values["kp"],
+            -value * _slope(kp, fit.values["kp"]) / fit.values["kp"],
+        ]
     )
     spread = 1.96 * math.sqrt(max(float(slopes @ part @ slopes), 0.0))
-    return Identified(name=ratio_name, value=value, low=value - spread, high=value + spread, unit=unit)
+    return Identified(
+        name=ratio_name, value=value, low=value - spread, high=value + spread, unit=unit
+    )
 
 
 def _slope(f: Free, value: float) -> float:

@@ -32,8 +32,12 @@ def limits_of_known(
         added = [n for n in found.names if n not in found.present]
         model = model_of(problem, found.after, validation)
         starts = [s for c in more for s in freed.candidates[c].starts] or [{}]
-        begun = [begun | s for s in starts for begun in (found.before.values, found.start)]
-        alone = model_of(freed, best_fit(freed, fit_to, (*found.present, *more), begun), validation)
+        begun = [
+            begun | s for s in starts for begun in (found.before.values, found.start)
+        ]
+        alone = model_of(
+            freed, best_fit(freed, fit_to, (*found.present, *more), begun), validation
+        )
         if added and alone.numbers <= model.numbers and refusal(model, alone, config):
             remarks.append(
                 f"{_words(problem, name)}; {_numbers(alone.fit, name)} in place of {' and '.join(added)} leaves "
@@ -42,8 +46,14 @@ def limits_of_known(
             continue
         if model.error <= config.floor and model.fit.error <= config.little:
             continue
-        begun = [begun | s for s in starts for begun in (model.fit.values, model.fit.values | found.start)]
-        beside = model_of(freed, best_fit(freed, fit_to, (*found.names, *more), begun), validation)
+        begun = [
+            begun | s
+            for s in starts
+            for begun in (model.fit.values, model.fit.values | found.start)
+        ]
+        beside = model_of(
+            freed, best_fit(freed, fit_to, (*found.names, *more), begun), validation
+        )
         if not refusal(beside, model, config):
             remarks.append(
                 f"{_words(problem, name)}; freeing it would lower the validation error from {model.error:.2f} to "
@@ -57,7 +67,9 @@ def _freed(problem: Problem, name: str) -> tuple[Problem | None, tuple[str, ...]
     names = {f.name for f in _held(problem, name)}
     if not names:
         return (problem, (name,)) if name in problem.candidates else (None, ())
-    freed = with_frees(problem, lambda f: dataclasses.replace(f, held=f.held and f.name not in names))
+    freed = with_frees(
+        problem, lambda f: dataclasses.replace(f, held=f.held and f.name not in names)
+    )
     return freed, ()
 
 
@@ -68,7 +80,9 @@ def _held(problem: Problem, name: str) -> list[Free]:
 
 def _words(problem: Problem, name: str) -> str:
     held = _held(problem, name)
-    values = " and ".join(f"{f.name} {f.start:.4g}{'' if f.unit == '1' else f' {f.unit}'}" for f in held)
+    values = " and ".join(
+        f"{f.name} {f.start:.4g}{'' if f.unit == '1' else f' {f.unit}'}" for f in held
+    )
     return (
         f"{values} {'is' if len(held) == 1 else 'are'} marked as known"
         if held

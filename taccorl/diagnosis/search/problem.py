@@ -63,22 +63,41 @@ def free(p: Parameter, cls: type[Effect]) -> Free:
     """The parameter ``p`` of the effect ``cls`` as a fitted number; on a logarithmic scale if it cannot change sign."""
     one_sided = p.low > 0 or (p.low == 0 and p.absent in (None, 0.0))
     low = max(p.low, _SMALLEST * p.typical) if one_sided else p.low
-    shift = abs(p.typical - p.absent) if p.absent is not None and math.isfinite(p.absent) else 0.0
+    shift = (
+        abs(p.typical - p.absent)
+        if p.absent is not None and math.isfinite(p.absent)
+        else 0.0
+    )
     scale = shift or 0.1 * (p.high - p.low)
     optional = p.name in cls.optional
     start = 0.0 if optional else p.typical
     name = f"{cls.name}.{p.name}"
-    found = Free(name=name, unit=p.unit, start=start, low=low, high=p.high, log=one_sided, scale=scale)
-    return dataclasses.replace(found, optional=optional, unless=cls.optional.get(p.name, ""))
+    found = Free(
+        name=name,
+        unit=p.unit,
+        start=start,
+        low=low,
+        high=p.high,
+        log=one_sided,
+        scale=scale,
+    )
+    return dataclasses.replace(
+        found, optional=optional, unless=cls.optional.get(p.name, "")
+    )
 
 
-def holding(frees: Sequence[Free], known: Sequence[str], stated: Mapping[str, float]) -> tuple[Free, ...]:
+def holding(
+    frees: Sequence[Free], known: Sequence[str], stated: Mapping[str, float]
+) -> tuple[Free, ...]:
     """``frees``, of which those with a value in ``stated`` are held at it if ``known`` has their name or that of their effect."""
 
     def is_known(f: Free) -> bool:
         return f.name in stated and (f.name in known or f.name.split(".")[0] in known)
 
-    return tuple(dataclasses.replace(f, start=stated[f.name], held=True) if is_known(f) else f for f in frees)
+    return tuple(
+        dataclasses.replace(f, start=stated[f.name], held=True) if is_known(f) else f
+        for f in frees
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,15 +123,23 @@ class Candidate:
     @property
     def strengths(self) -> tuple[str, ...]:
         """Full names of the parameters that have a value at which the effect is absent."""
-        return tuple(f"{self.name}.{p.name}" for p in self.cls.parameters() if p.absent is not None)
+        return tuple(
+            f"{self.name}.{p.name}"
+            for p in self.cls.parameters()
+            if p.absent is not None
+        )
 
     def make(self, values: Mapping[str, float]) -> Effect:
         """Make the effect with the parameters in ``values``, whose keys are full names."""
-        numbers: dict[str, Any] = {f.name.split(".", 1)[1]: values[f.name] for f in self.frees}
+        numbers: dict[str, Any] = {
+            f.name.split(".", 1)[1]: values[f.name] for f in self.frees
+        }
         return self.cls(**self.selectors, **numbers)
 
 
-def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) -> Candidate:
+def candidate(
+    cls: type[Effect], seen: Mapping[str, float], **selectors: Any
+) -> Candidate:
     """Candidate for an effect, from its class.
 
     Args:
@@ -120,7 +147,10 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
         selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
     """
     frees = tuple(free(p, cls) for p in cls.parameters() if p.name not in selectors)
-    starts = [{f"{cls.name}.{k}": v for k, v in start.items() if k not in selectors} for start in cls.starts(seen)]
+    starts = [
+        {f"{cls.name}.{k}": v for k, v in start.items() if k not in selectors}
+        for start in cls.starts(seen)
+    ]
     unlike = {tuple(start.items()): start for start in starts}.values()
     return Candidate(cls=cls, frees=frees, starts=tuple(unlike), selectors=selectors)
 
@@ -141,7 +171,9 @@ class Recording:
     """Name and unit of each channel, such as "left_joint5 [rad]"."""
     data: Any = field(repr=False)
     """Data that the problem needs to simulate it."""
-    regimes: Mapping[str, tuple[np.ndarray, float]] = field(default_factory=dict, repr=False)
+    regimes: Mapping[str, tuple[np.ndarray, float]] = field(
+        default_factory=dict, repr=False
+    )
     """Regime of motion → its rows, (T,) bool, and the noise of positions there by repeats [floors], at least 1."""
     short_noise: bool = False
     """True: noise does not last, so that what is left for longer than half a second is a misfit. False: as where joints or
@@ -150,13 +182,18 @@ class Recording:
     """(T, C) noise of an entry as a share of the floor of its channel."""
 
     def __post_init__(self) -> None:
-        if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):
+        if self.measured.shape != (
+            len(self.time_s),
+            len(self.channels),
+        ) or self.floor.shape != (len(self.channels),):
             raise TaccorlError(
                 f"recording {self.name}: measured is {self.measured.shape} and floor {self.floor.shape} for "
                 f"{len(self.time_s)} rows of {len(self.channels)} channels"
             )
         if not (np.isfinite(self.floor).all() and (self.floor > 0).all()):
-            raise TaccorlError(f"recording {self.name}: the noise floor {self.floor} must be finite and above 0")
+            raise TaccorlError(
+                f"recording {self.name}: the noise floor {self.floor} must be finite and above 0"
+            )
 
 
 Case = tuple[Mapping[str, float], Sequence[Effect]]
@@ -182,7 +219,9 @@ class Problem(Protocol):
     ``base``: supply, resistance and torque constant of a motor whose effort was not logged. ``simulate`` uses them in place
     of the numbers of ``base`` that follow from them. Empty for other problems."""
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+    def simulate(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+    ) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
 
         Args:
@@ -191,7 +230,9 @@ class Problem(Protocol):
         """
         ...
 
-    def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+    def simulate_all(
+        self, cases: Sequence[Case], recordings: Sequence[Recording]
+    ) -> list[list[np.ndarray]]:
         """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
         ...
 
@@ -204,7 +245,10 @@ class Problem(Protocol):
         ...
 
     def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+        self,
+        base: Mapping[str, float],
+        effects: Sequence[Effect],
+        recordings: Sequence[Recording],
     ) -> list[Effect]:
         """Copy of ``effects`` in which values estimated in closed form from the fit recordings (maps of taxels) are set."""
         ...
@@ -220,14 +264,22 @@ class WithoutMaps:
     of_file: tuple[Free, ...] = ()
 
     def simulate(
-        self: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
+        self: Problem,
+        base: Mapping[str, float],
+        effects: Sequence[Effect],
+        recording: Recording,
     ) -> np.ndarray:
         """``simulate_all`` of one case and one recording, (T, C). Subclasses define one of the two."""
         return self.simulate_all([(base, effects)], [recording])[0][0]
 
-    def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+    def simulate_all(
+        self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]
+    ) -> list[list[np.ndarray]]:
         """Simulate one case after another, (T, C) each."""
-        return [[self.simulate(base, effects, r) for base, effects in cases] for r in recordings]
+        return [
+            [self.simulate(base, effects, r) for base, effects in cases]
+            for r in recordings
+        ]
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Does nothing."""
@@ -237,13 +289,18 @@ class WithoutMaps:
         return recording
 
     def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+        self,
+        base: Mapping[str, float],
+        effects: Sequence[Effect],
+        recordings: Sequence[Recording],
     ) -> list[Effect]:
         """Return ``effects`` unchanged."""
         return list(effects)
 
 
-def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
+def split_rows(
+    recordings: Sequence[Recording], share: float = 0.6
+) -> tuple[list[Recording], list[Recording]]:
     """Split recordings without validation marks: (for fitting, for validation), each with all rows of all recordings.
 
     In the first, ``measured`` is NaN after the first ``share`` of the rows; in the second it is NaN before. Both parts are
@@ -264,7 +321,8 @@ def with_frees(problem: Problem, change: Callable[[Free], Free]) -> Problem:
     copied = copy.copy(problem)
     copied.base = tuple(map(change, problem.base))
     copied.candidates = {
-        name: dataclasses.replace(c, frees=tuple(map(change, c.frees))) for name, c in problem.candidates.items()
+        name: dataclasses.replace(c, frees=tuple(map(change, c.frees)))
+        for name, c in problem.candidates.items()
     }
     return copied
 
@@ -273,7 +331,11 @@ def with_held(problem: Problem, stated: Mapping[str, float]) -> Problem:
     """Copy of ``problem`` in which the numbers in ``stated`` are held at their values there."""
 
     def held(f: Free) -> Free:
-        return dataclasses.replace(f, start=stated[f.name], held=True) if f.name in stated else f
+        return (
+            dataclasses.replace(f, start=stated[f.name], held=True)
+            if f.name in stated
+            else f
+        )
 
     return with_frees(problem, held)
 
@@ -288,7 +350,9 @@ def with_scale(problem: Problem) -> Problem | None:
     if not any(f.name == EFFORT_SCALE and f.held for f in problem.base):
         return None
     held = {"inertia": True, EFFORT_SCALE: False}
-    return with_frees(problem, lambda f: dataclasses.replace(f, held=held.get(f.name, f.held)))
+    return with_frees(
+        problem, lambda f: dataclasses.replace(f, held=held.get(f.name, f.held))
+    )
 
 
 def with_other_number(problem: Problem) -> dict[str, Problem]:
@@ -325,5 +389,7 @@ def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
                     f"{name}: no search fits this effect, so that no recording can be planned for it; remove it. Recording "
                     f"that shows it: {effects.get(name).to_record}"
                 )
-            raise TaccorlError(f"no effect {name!r} for this part; {nearest(name, problem.candidates)}")
+            raise TaccorlError(
+                f"no effect {name!r} for this part; {nearest(name, problem.candidates)}"
+            )
     return [problem.candidates[name] for name in names]

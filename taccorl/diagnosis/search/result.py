@@ -11,7 +11,13 @@ from taccorl.diagnosis.search.standing_out import Place
 from taccorl.sim.effects.effect import Effect
 
 Status = Literal[
-    "nothing_missing", "numbers_off", "gains_moved", "at_floor", "something_else", "too_many", "not_converged"
+    "nothing_missing",
+    "numbers_off",
+    "gains_moved",
+    "at_floor",
+    "something_else",
+    "too_many",
+    "not_converged",
 ]
 """How a search ended; ``WORDS`` explains each value."""
 WORDS: dict[Status, str] = {
@@ -65,7 +71,9 @@ class SearchConfig:
             return f"takes away {max(gain, 0.0):.1%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:
             return f"no more than chance: {score:.2f} standard errors, less than {self.min_score:g}"
-        if bic < (0.0 if gain >= self.sure_gain or score >= self.sure_score else self.min_bic):
+        if bic < (
+            0.0 if gain >= self.sure_gain or score >= self.sure_score else self.min_bic
+        ):
             return f"improves the fit too little for its number of parameters: ΔBIC {bic:.0f}"
         return ""
 
@@ -248,8 +256,14 @@ class Diagnosis:
     def baseline(self) -> Literal["before", "fitted"]:
         """Key of ``errors`` with which ``after`` is compared: ``before`` (numbers of the file) or ``fitted`` (refitted, no effect
         added), by the smaller validation error; ``fitted`` too where effects take less than a tenth away from ``before``."""
-        before, fitted, after = (self.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
-        return "fitted" if fitted <= before or (self.names != self.present and 0.9 * before < after) else "before"
+        before, fitted, after = (
+            self.errors[stage]["validation"] for stage in ("before", "fitted", "after")
+        )
+        return (
+            "fitted"
+            if fitted <= before or (self.names != self.present and 0.9 * before < after)
+            else "before"
+        )
 
     @property
     def words(self) -> str:
@@ -260,12 +274,19 @@ class Diagnosis:
     def untested(self) -> tuple[str, ...]:
         """Added effects without which test recordings have the same error, or a smaller one (``gains_nothing``)."""
         after = self.errors["after"].get("test", 0.0)
-        return tuple(name for name, without in self.test_without.items() if gains_nothing(without, after))
+        return tuple(
+            name
+            for name, without in self.test_without.items()
+            if gains_nothing(without, after)
+        )
 
 
 def may_go_on(d: Diagnosis) -> bool:
     """Whether the search ended only because it was to add no further effect, fewer than ``SearchConfig().max_effects``."""
-    return d.status == "too_many" and len(d.effects) - len(d.present) < SearchConfig().max_effects
+    return (
+        d.status == "too_many"
+        and len(d.effects) - len(d.present) < SearchConfig().max_effects
+    )
 
 
 def gains_nothing(before: float, after: float) -> bool:
@@ -280,4 +301,6 @@ def gains_nothing(before: float, after: float) -> bool:
 
 def of_test(before: float, after: float) -> str:
     """Text of the change of a test error [floors], such as ``14.10 → 14.10 floors: no gain``."""
-    return f"{before:.2f} → {after:.2f} floors" + ": no gain" * gains_nothing(before, after)
+    return f"{before:.2f} → {after:.2f} floors" + ": no gain" * gains_nothing(
+        before, after
+    )

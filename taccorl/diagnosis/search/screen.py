@@ -62,7 +62,10 @@ def is_likely(c: Candidate) -> bool:
 
 
 def probe(
-    problem: Problem, recordings: Sequence[Recording], parent: Fit, candidates: Sequence[Candidate]
+    problem: Problem,
+    recordings: Sequence[Recording],
+    parent: Fit,
+    candidates: Sequence[Candidate],
 ) -> list[Probe]:
     """Probe every start of every candidate, in addition to the effects of ``parent``; one item per start, in the order of
     ``candidates``.
@@ -72,7 +75,9 @@ def probe(
     """
     # A number at its bound makes up for half of what its slope says; it does not hide an effect of the other half (a delay of
     # the loop is less inertia, an armature is more).
-    taken_up = _basis(parent.jacobian[:, [f.name not in parent.at_bound for f in parent.frees]])
+    taken_up = _basis(
+        parent.jacobian[:, [f.name not in parent.at_bound for f in parent.frees]]
+    )
     left = parent.residuals - taken_up @ (taken_up.T @ parent.residuals)
     power = float(left @ left)
     most = TOO_STRONG * max(parent.error, 1.0)
@@ -81,9 +86,23 @@ def probe(
         found, cases = [], []
         for c, start in trials:
             values = parent.values | {f.name: f.start for f in c.frees} | start
-            cases.append((values, problem.prepare(values, [*parent.effects, c.make(values)], recordings)))
-        for first in range(0, len(cases), 8 * problem.at_once):  # not all, which may not fit into memory
-            change = stacked_all(problem, cases[first : first + 8 * problem.at_once], recordings) - parent.residuals
+            cases.append(
+                (
+                    values,
+                    problem.prepare(
+                        values, [*parent.effects, c.make(values)], recordings
+                    ),
+                )
+            )
+        for first in range(
+            0, len(cases), 8 * problem.at_once
+        ):  # not all, which may not fit into memory
+            change = (
+                stacked_all(
+                    problem, cases[first : first + 8 * problem.at_once], recordings
+                )
+                - parent.residuals
+            )
             found += list(change - (change @ taken_up) @ taken_up.T)
         return found
 
@@ -93,7 +112,10 @@ def probe(
         weaker = {}
         for k, (c, start) in enumerate(trials):
             size = float(np.sqrt(np.mean(np.square(signatures[k]))))
-            if size > most and (less := _weaker(c, start, 0.5 * most / size)) is not None:
+            if (
+                size > most
+                and (less := _weaker(c, start, 0.5 * most / size)) is not None
+            ):
                 weaker[k] = trials[k] = c, less
         for k, signature in zip(weaker, signatures_of([*weaker.values()]), strict=True):
             signatures[k] = signature
@@ -108,7 +130,9 @@ def probe(
         reach = FAR_OFF if can_fade(c) else 2.0
         within = min(max(best, 1.0 / reach), reach)
         share = (
-            (2.0 * within * along - within * within * own) / power if best > 0 else WRONG_SIGN * best * along / power
+            (2.0 * within * along - within * within * own) / power
+            if best > 0
+            else WRONG_SIGN * best * along / power
         )
         probes.append(Probe(c.name, start, signature, max(share, 0.0), best))
     return probes
@@ -123,7 +147,11 @@ def _weaker(c: Candidate, start: Values, share: float) -> Values | None:
     free = next(f for f in c.frees if f.name == name)
     now = start.get(name, free.start)
     less = strength.absent + max(share, 0.03) * (now - strength.absent)
-    return start | {name: less} if abs(free.value(free.coordinate(less)) - less) < 1e-9 * abs(less) + 1e-15 else None
+    return (
+        start | {name: less}
+        if abs(free.value(free.coordinate(less)) - less) < 1e-9 * abs(less) + 1e-15
+        else None
+    )
 
 
 def _strength(c: Candidate) -> Parameter:

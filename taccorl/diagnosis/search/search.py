@@ -33,7 +33,14 @@ from taccorl.diagnosis.search.changed_numbers import (
 )
 from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit
-from taccorl.diagnosis.search.fits import PROBED_BESIDE, Fits, Model, best, better, refusal
+from taccorl.diagnosis.search.fits import (
+    PROBED_BESIDE,
+    Fits,
+    Model,
+    best,
+    better,
+    refusal,
+)
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import (
     EFFORT_SCALE,
@@ -45,7 +52,15 @@ from taccorl.diagnosis.search.problem import (
     no_progress,
     with_other_number,
 )
-from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
+from taccorl.diagnosis.search.result import (
+    Changed,
+    Diagnosis,
+    Offer,
+    Round,
+    SearchConfig,
+    Status,
+    of_test,
+)
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
 
@@ -86,10 +101,23 @@ def diagnose(
         Stopped: by ``progress``, before an effect was added.
     """
     began = time.process_time()
-    how = (fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
+    how = (
+        fit_to,
+        validation,
+        start or {},
+        tuple(present),
+        config or SearchConfig(),
+        progress,
+    )
     fits = Fits(problem, *how)
-    others = {} if fits.at_floor(fits.base) else {n: Fits(p, *how) for n, p in with_other_number(problem).items()}
-    number, other = next(((n, own) for n, own in others.items() if own.at_floor(own.base)), ("", None))
+    others = (
+        {}
+        if fits.at_floor(fits.base)
+        else {n: Fits(p, *how) for n, p in with_other_number(problem).items()}
+    )
+    number, other = next(
+        ((n, own) for n, own in others.items() if own.at_floor(own.base)), ("", None)
+    )
     if other is not None and other.base.numbers <= fits.base.numbers:
         fits, other = other, None
     fits.problem.learn(fits.first.values)
@@ -103,13 +131,28 @@ def diagnose(
     rounds = beam.rounds(answer, steps, rivals)
     changed, model = changed_numbers(fits, answer.fit, beam.names)
     stages = {"before": fits.as_it_was, "fitted": fits.first, "after": model}
-    errors = {stage: fits.errors(one.values, one.effects, test) for stage, one in stages.items()}
-    without_it = {
-        name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
+    errors = {
+        stage: fits.errors(one.values, one.effects, test)
+        for stage, one in stages.items()
     }
-    if fits.problem is problem:  # the scale was fitted anyway, beside gains that are stated
-        changed = tuple(c for c in changed if c.name != EFFORT_SCALE or abs(np.log(c.after)) > np.log(SCALE_OFF))
-    tied = other is not None and fits.added(answer) and refusal(answer, other.base, fits.config)
+    without_it = {
+        name: fits.errors(m.fit.values, m.fit.effects, test)["test"]
+        for name, m in beam.parts(answer)
+        if test
+    }
+    if (
+        fits.problem is problem
+    ):  # the scale was fitted anyway, beside gains that are stated
+        changed = tuple(
+            c
+            for c in changed
+            if c.name != EFFORT_SCALE or abs(np.log(c.after)) > np.log(SCALE_OFF)
+        )
+    tied = (
+        other is not None
+        and fits.added(answer)
+        and refusal(answer, other.base, fits.config)
+    )
     standing = fits.standing_out(answer) or fits.standing_out(answer, test)
     return Diagnosis(
         status=_status(fits, answer, changed, bool(standing)),
@@ -118,18 +161,26 @@ def diagnose(
         changed=changed,
         effects=tuple(_described(fits, model, errors, without_it)),
         offers=tuple(_offers(beam, answer, rivals, test)),
-        or_number=(number, other.first.values[number] / other.given[number]) if other and tied else ("", 1.0),
+        or_number=(number, other.first.values[number] / other.given[number])
+        if other and tied
+        else ("", 1.0),
         present=fits.present,
         base=_base(model),
         start=fits.given,
         intervals=model.intervals(),
         rounds=rounds,
         rivals=rivals,
-        twins={n: dict(fits.problem.candidates[n].cls.near_twins) for n in fits.added(model)},
+        twins={
+            n: dict(fits.problem.candidates[n].cls.near_twins)
+            for n in fits.added(model)
+        },
         removed=tuple(removed),
         errors=errors,
         test_without=without_it,
-        steps=(("", fits.base.error), *((r.added, r.validation_error) for r in rounds if r.added)),
+        steps=(
+            ("", fits.base.error),
+            *((r.added, r.validation_error) for r in rounds if r.added),
+        ),
         remarks=(
             *remarks,
             *beam.remarks,
@@ -163,7 +214,11 @@ class Beam:
         without them: it had preferred them to others."""
         found = self.search()
         (answer, removed, _) = result = self.pruned(found)
-        flawed = removed and not self.fits.added(answer) and self.fits.flaw(self.fits.models[frozenset(found.names)])
+        flawed = (
+            removed
+            and not self.fits.added(answer)
+            and self.fits.flaw(self.fits.models[frozenset(found.names)])
+        )
         return self.pruned(self.search()) if flawed else result
 
     def search(self) -> Model:
@@ -177,7 +232,9 @@ class Beam:
             if not (names := fits.added(answer)):
                 raise
             fits.report = no_progress
-            self.config = fits.config = dataclasses.replace(self.config, max_effects=len(names))
+            self.config = fits.config = dataclasses.replace(
+                self.config, max_effects=len(names)
+            )
             self.remarks.append(
                 f"Stopped after {' and '.join(names)}: what may be beside or in place of it was not tried."
             )
@@ -191,15 +248,31 @@ class Beam:
         for depth in range(c.max_effects):
             if any(fits.at_floor(m) for m in level):
                 break
-            grown = {id(k): (k, m) for m in level for k in fits.children(m, self.names) if k.full}
-            found = best([answer, *(k for k, m in grown.values() if not fits.why_not(k, m))], c)
+            grown = {
+                id(k): (k, m)
+                for m in level
+                for k in fits.children(m, self.names)
+                if k.full
+            }
+            found = best(
+                [answer, *(k for k, m in grown.values() if not fits.why_not(k, m))], c
+            )
             if found is not answer:
-                better_ones = [k for k, m in grown.values() if not fits.why_not(k, m) and not refusal(k, answer, c)]
+                better_ones = [
+                    k
+                    for k, m in grown.values()
+                    if not fits.why_not(k, m) and not refusal(k, answer, c)
+                ]
                 more = self.much(level[0])  # which may hide on validation recordings
                 yield (answer := self._both(fits.polished(found)))
-                if depth > 0:  # what was added first may only have been the nearest to two that are missing
+                if (
+                    depth > 0
+                ):  # what was added first may only have been the nearest to two that are missing
                     answer = self._exchanged(answer, further=False)
-                rest = sorted((k for k in better_ones if k.names != found.names), key=lambda k: above_floor(k.squares))
+                rest = sorted(
+                    (k for k in better_ones if k.names != found.names),
+                    key=lambda k: above_floor(k.squares),
+                )
                 rest += [k for k in more if k.fit.error < answer.fit.error]
                 level = [answer, *rest[: c.width - 1]]
             elif depth == 0:
@@ -216,10 +289,18 @@ class Beam:
         fits, most = self.fits, self.config.max_effects
         for name in fits.added(answer):
             cls = fits.problem.candidates[name].cls
-            both = [n for n in (*cls.reduces_to, *cls.equals_when_wide) if n in self.names]
-            names = tuple(dict.fromkeys(n for own in answer.names for n in (both if own == name else [own])))
+            both = [
+                n for n in (*cls.reduces_to, *cls.equals_when_wide) if n in self.names
+            ]
+            names = tuple(
+                dict.fromkeys(
+                    n for own in answer.names for n in (both if own == name else [own])
+                )
+            )
             more = len(names) - len(answer.names)
-            if len(both) > 1 and more <= (0 if fits.at_floor(answer) else most - len(fits.added(answer))):
+            if len(both) > 1 and more <= (
+                0 if fits.at_floor(answer) else most - len(fits.added(answer))
+            ):
                 fits.grown(fits.whole(names, answer.fit.values))
         return best([answer, *self.sound(answer)], self.config)
 
@@ -227,7 +308,10 @@ class Beam:
         """The best of ``answer``, at the floor, and of the simpler forms of its effects with another effect: two effects often
         look like one with many numbers, Coulomb friction and a soft gear like Stribeck friction."""
         fits = self.fits
-        if not fits.at_floor(answer) or len(fits.added(answer)) >= self.config.max_effects:
+        if (
+            not fits.at_floor(answer)
+            or len(fits.added(answer)) >= self.config.max_effects
+        ):
             return answer
         for name in fits.added(answer):
             for simpler in fits.problem.candidates[name].cls.reduces_to:
@@ -239,7 +323,11 @@ class Beam:
     def much(self, parent: Model) -> list[Model]:
         """Extensions of ``parent`` that remove much of the fit error, the best first."""
         most = (1.0 - self.config.sure_gain) * parent.fit.error**2
-        found = [m for m in self.fits.children(parent, self.names) if m.fit.error**2 <= most and not self.fits.flaw(m)]
+        found = [
+            m
+            for m in self.fits.children(parent, self.names)
+            if m.fit.error**2 <= most and not self.fits.flaw(m)
+        ]
         return sorted(found, key=lambda m: m.fit.error)[: self.config.width]
 
     def _exchanged(self, answer: Model, further: bool = True) -> Model:
@@ -249,7 +337,12 @@ class Beam:
             parts = self.parts(answer)
             for _, part in parts if len(parts) > 1 else ():
                 fits.children(part, self.names, PROBED_BESIDE)
-            if further and not fits.at_floor(answer) and len(parts) < self.config.max_effects and parts:
+            if (
+                further
+                and not fits.at_floor(answer)
+                and len(parts) < self.config.max_effects
+                and parts
+            ):
                 fits.children(answer, self.names)
             found = fits.polished(best([answer, *self.sound(answer)], self.config))
             if found.names == answer.names:
@@ -259,13 +352,20 @@ class Beam:
 
     def parts(self, model: Model) -> list[tuple[str, Model]]:
         """(added effect, the model without it)."""
-        return [(name, self.fits.without(model, name)) for name in self.fits.added(model)]
+        return [
+            (name, self.fits.without(model, name)) for name in self.fits.added(model)
+        ]
 
     def sound(self, answer: Model) -> list[Model]:
         """Fully fitted models that are ``better`` than the same model without any one of their effects, where that was fitted."""
         fits, found = self.fits, []
         for key, m in list(fits.models.items()):
-            if m is answer or not m.full or len(fits.added(m)) > self.config.max_effects or fits.flaw(m):
+            if (
+                m is answer
+                or not m.full
+                or len(fits.added(m)) > self.config.max_effects
+                or fits.flaw(m)
+            ):
                 continue
             parts = [fits.models.get(key - {n}) for n in fits.added(m)]
             if all(p is None or not p.full or better(m, p, self.config) for p in parts):
@@ -276,9 +376,15 @@ class Beam:
         """The model in its last refit, without effects and optional numbers that are superfluous there; names of the effects that
         went; remarks on those that stay although their strength is open."""
         fits, c, removed = self.fits, self.config, []
-        plain = {f"{x}.{n}": 0.0 for x in answer.names for n in fits.problem.candidates[x].cls.optional}
+        plain = {
+            f"{x}.{n}": 0.0
+            for x in answer.names
+            for n in fits.problem.candidates[x].cls.optional
+        }
         if any(answer.fit.values[n] > 0.0 for n in plain):
-            rigid = fits.model_of(fits.fitted(answer.names, [answer.fit.values | plain]))
+            rigid = fits.model_of(
+                fits.fitted(answer.names, [answer.fit.values | plain])
+            )
             answer = rigid if better(rigid, answer, c) else answer
         while True:
             last = fits.model_of(fits.finished(answer.fit))
@@ -286,31 +392,50 @@ class Beam:
             parts = [(n, fits.without(last, n, again=True)) for n in fits.added(last)]
             # What is left above the floor widens intervals where no known effect explains it, not where none may be added.
             left_over = len(parts) < c.max_effects
-            gone = [(gain_of(last.squares, p.squares), n, p) for n, p in parts if fits.why_not(last, p, left_over)]
+            gone = [
+                (gain_of(last.squares, p.squares), n, p)
+                for n, p in parts
+                if fits.why_not(last, p, left_over)
+            ]
             if not gone:
                 break
             _, name, answer = min(gone, key=lambda item: item[:2])
             removed.append(name)
         as_it_was = fits.model_of(fits.as_it_was)
-        worse = as_it_was.squares.mean < fits.base.squares.mean and refusal(last, as_it_was, c)
+        worse = as_it_was.squares.mean < fits.base.squares.mean and refusal(
+            last, as_it_was, c
+        )
         if parts and worse and not self._acts_in_fit_alone(last):
-            removed += [n for n, _ in parts]  # they only undo what the refit of the always fitted numbers made worse
+            removed += [
+                n for n, _ in parts
+            ]  # they only undo what the refit of the always fitted numbers made worse
             return fits.model_of(fits.finished(fits.base.fit)), removed, []
-        return last, removed, [text for n, p in parts if (text := self._entangled(last, n, p))]
+        return (
+            last,
+            removed,
+            [text for n, p in parts if (text := self._entangled(last, n, p))],
+        )
 
     def _acts_in_fit_alone(self, model: Model) -> bool:
         """Whether the added effects remove most of the fit error, and do nothing in the validation recordings: a limit."""
         fits, fit = self.fits, model.fit
         kept = tuple(e for e in fit.effects if e.name in fits.present)
         error = fits.errors(fit.values, kept, ())["validation"]
-        return fit.error**2 < MOST * fits.base.fit.error**2 and abs(error / model.error - 1.0) < HARDLY
+        return (
+            fit.error**2 < MOST * fits.base.fit.error**2
+            and abs(error / model.error - 1.0) < HARDLY
+        )
 
     def _entangled(self, model: Model, name: str, without: Model) -> str:
         """Sentence on an effect whose strength is not known, although it removes much of the error; empty if it is known."""
         if not not_told_from_none(model.fit, name, left_over=False):
             return ""
         frees, spread = model.fit.frees, model.fit.covariance()
-        own = next(k for k, f in enumerate(frees) if f.name in self.fits.problem.candidates[name].strengths)
+        own = next(
+            k
+            for k, f in enumerate(frees)
+            if f.name in self.fits.problem.candidates[name].strengths
+        )
         size = np.sqrt(np.diag(spread))
         others = [k for k in range(len(frees)) if k != own]
         other = max(others, key=lambda k: abs(spread[own, k]) / size[k], default=own)
@@ -327,7 +452,9 @@ class Beam:
         """(effect, error that it leaves [floors]) at the worst of the regimes that stand out, the least first."""
         found = {}
         for worst in standing[:1]:
-            own = [r for r in recordings if r.name == worst.recording]  # both parts of one whose rows were split
+            own = [
+                r for r in recordings if r.name == worst.recording
+            ]  # both parts of one whose rows were split
             for name, m in self._beside(answer).items():
                 at = places(self.fits.problem, m.fit, own, self.config.little)
                 found[name] = max(p.error for p in at if p.words() == worst.words())
@@ -336,15 +463,26 @@ class Beam:
     def ties(self, answer: Model) -> list[Model]:
         """Fitted models with other effects that the result is not clearly better than."""
         own = set(answer.names)
-        others = [m for m in self.sound(answer) if own - set(m.names) and set(m.names) - own]
-        return sorted((m for m in others if refusal(answer, m, self.config)), key=lambda m: above_floor(m.squares))
+        others = [
+            m for m in self.sound(answer) if own - set(m.names) and set(m.names) - own
+        ]
+        return sorted(
+            (m for m in others if refusal(answer, m, self.config)),
+            key=lambda m: above_floor(m.squares),
+        )
 
-    def rivals(self, answer: Model, steps: Sequence[Step]) -> dict[str, tuple[str, ...]]:
+    def rivals(
+        self, answer: Model, steps: Sequence[Step]
+    ) -> dict[str, tuple[str, ...]]:
         """Added effect → effects that explain as much in its place, alone or in place of others, too. What does so where the
         effect was added is fitted beside the other effects of ``answer``, too, which may tell it apart."""
         for parent, pick, name in steps:
             for n, m in self._beside(parent).items():
-                tied = m.full and not self.fits.why_not(m, parent) and refusal(pick, m, self.config)
+                tied = (
+                    m.full
+                    and not self.fits.why_not(m, parent)
+                    and refusal(pick, m, self.config)
+                )
                 if tied and n not in answer.names:
                     exchanged = tuple(n if own == name else own for own in answer.names)
                     self.fits.whole(exchanged, answer.fit.values | m.fit.values)
@@ -363,17 +501,28 @@ class Beam:
         left = fits.added(answer)
         while left:
             starts = parent.fit.values
-            models = {n: fits.whole((*parent.names, n), starts) if len(left) > 1 else answer for n in left}
+            models = {
+                n: fits.whole((*parent.names, n), starts) if len(left) > 1 else answer
+                for n in left
+            }
             name = min(left, key=lambda n: above_floor(models[n].squares))
             left.remove(name)
             found.append((parent, models[name], name))
             parent = models[name]
         return found
 
-    def rounds(self, answer: Model, steps: Sequence[Step], rivals: Mapping[str, Sequence[str]]) -> tuple[Round, ...]:
+    def rounds(
+        self, answer: Model, steps: Sequence[Step], rivals: Mapping[str, Sequence[str]]
+    ) -> tuple[Round, ...]:
         """Each of ``steps``, and what else was tried there; ``rivals``: as in ``Diagnosis``."""
-        found = [self._round(parent, pick, name, rivals.get(name, ())) for parent, pick, name in steps]
-        open_ = not self.fits.at_floor(answer) and len(self.fits.added(answer)) < self.config.max_effects
+        found = [
+            self._round(parent, pick, name, rivals.get(name, ()))
+            for parent, pick, name in steps
+        ]
+        open_ = (
+            not self.fits.at_floor(answer)
+            and len(self.fits.added(answer)) < self.config.max_effects
+        )
         if open_ and self._beside(answer):
             found.append(self._round(answer, None, "", ()))
         return tuple(found)
@@ -381,9 +530,15 @@ class Beam:
     def _beside(self, parent: Model) -> dict[str, Model]:
         """Effect → fitted model with it beside those of ``parent``."""
         key, fitted = frozenset(parent.names), self.fits.models
-        return {n: m for n in self.names if n not in key and (m := fitted.get(key | {n})) is not None}
+        return {
+            n: m
+            for n in self.names
+            if n not in key and (m := fitted.get(key | {n})) is not None
+        }
 
-    def _round(self, parent: Model, pick: Model | None, added: str, tied: Sequence[str]) -> Round:
+    def _round(
+        self, parent: Model, pick: Model | None, added: str, tied: Sequence[str]
+    ) -> Round:
         fits, c, key = self.fits, self.config, frozenset(parent.names)
         models = self._beside(parent) | ({added: pick} if pick is not None else {})
         verdicts = {}
@@ -398,15 +553,22 @@ class Beam:
             elif why or pick is None:
                 verdicts[n] = why
             elif m.full and refusal(pick, m, c):
-                verdicts[n] = f"explains as much as {added}, but less beside what was added later"
+                verdicts[n] = (
+                    f"explains as much as {added}, but less beside what was added later"
+                )
             else:
-                verdicts[n] = f"explains {'more' if m.squares.mean < pick.squares.mean else 'less'} than {added}"
+                verdicts[n] = (
+                    f"explains {'more' if m.squares.mean < pick.squares.mean else 'less'} than {added}"
+                )
         order = sorted(models, key=lambda n: models[n].squares.mean)
         probed = sorted(
-            (n for k, n in fits.probes if k == key and n not in models), key=lambda n: -fits.probes[key, n].explained
+            (n for k, n in fits.probes if k == key and n not in models),
+            key=lambda n: -fits.probes[key, n].explained,
         )
         return Round(
-            evidence=tuple(fits.evidence(models[n], parent, verdicts[n]) for n in order),
+            evidence=tuple(
+                fits.evidence(models[n], parent, verdicts[n]) for n in order
+            ),
             not_refitted=tuple(probed),
             added=added or None,
             ties=tuple(n for n in tied if n in models),
@@ -415,18 +577,29 @@ class Beam:
         )
 
 
-def _offers(beam: Beam, answer: Model, rivals: Mapping[str, Sequence[str]], test: Sequence[Recording]) -> list[Offer]:
+def _offers(
+    beam: Beam,
+    answer: Model,
+    rivals: Mapping[str, Sequence[str]],
+    test: Sequence[Recording],
+) -> list[Offer]:
     """Fits of every part of the added effects, and of those in which an effect that ties with one takes its place: alone, and
     beside all others."""
     fits = beam.fits
     added = fits.added(answer)
-    sets = [names for count in range(1, len(added)) for names in itertools.combinations(added, count)]
+    sets = [
+        names
+        for count in range(1, len(added))
+        for names in itertools.combinations(added, count)
+    ]
     for name in added:
         for tie in rivals.get(name, ()):
             sets += [(tie,), tuple(tie if n == name else n for n in added)]
     found = []
     for names in dict.fromkeys(sets):
-        fits.progress(f"fitting {' and '.join(names)} without the others, for add-effect")
+        fits.progress(
+            f"fitting {' and '.join(names)} without the others, for add-effect"
+        )
         own = fits.finished(fits.whole((*fits.present, *names), answer.fit.values).fit)
         found.append(
             Offer(
@@ -447,30 +620,48 @@ def _base(model: Fit) -> Values:
     return {f.name: model.values[f.name] for f in model.frees if "." not in f.name}
 
 
-def _status(fits: Fits, answer: Model, changed: Sequence[Changed], standing_out: bool) -> Status:
+def _status(
+    fits: Fits, answer: Model, changed: Sequence[Changed], standing_out: bool
+) -> Status:
     added, config = fits.added(answer), fits.config
     if answer.fit.trouble:
         return "not_converged"
     if fits.at_floor(answer) and added:
         return "at_floor"
-    if not (added or standing_out) and max(answer.error, answer.fit.error) <= config.little:
+    if (
+        not (added or standing_out)
+        and max(answer.error, answer.fit.error) <= config.little
+    ):
         if moved_gains(fits, fits.first):
             return "gains_moved"
         return "numbers_off" if changed else "nothing_missing"
     return "too_many" if len(added) >= config.max_effects else "something_else"
 
 
-def _described(fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: Mapping[str, float]) -> list[Effect]:
+def _described(
+    fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: Mapping[str, float]
+) -> list[Effect]:
     """The effects of ``model``. Each states its 95 % intervals and, as evidence, the validation error before and after, and the
     test error: before and after if it is the only one, else without and with it."""
     intervals = model.intervals()
     as_it_was, after = fits.error(fits.as_it_was), fits.error(model)
-    stage = "fitted" if fits.added(model) and (fits.base.error <= as_it_was or 0.9 * as_it_was < after) else "before"
+    stage = (
+        "fitted"
+        if fits.added(model)
+        and (fits.base.error <= as_it_was or 0.9 * as_it_was < after)
+        else "before"
+    )
     before = fits.base.error if stage == "fitted" else as_it_was
-    how = ", ".join(model.names) if fits.added(model) else "numbers of the file refitted"
+    how = (
+        ", ".join(model.names) if fits.added(model) else "numbers of the file refitted"
+    )
     for effect in model.effects:
         prefix = f"{effect.name}."
-        effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
+        effect.interval = {
+            k.removeprefix(prefix): v
+            for k, v in intervals.items()
+            if k.startswith(prefix)
+        }
         effect.evidence = (
             f"validation error {before:.2f} to {after:.2f} noise floors with {how}; recordings "
             f"{', '.join(r.name for r in fits.validation)}"
@@ -485,7 +676,11 @@ def _described(fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: 
 def _undetermined(model: Fit) -> tuple[str, ...]:
     """Numbers of which the recordings say nothing: their interval is the whole range."""
     ends = model.intervals()
-    return tuple(f.name for f in model.frees if ends[f.name][0] <= f.low and ends[f.name][1] >= f.high)
+    return tuple(
+        f.name
+        for f in model.frees
+        if ends[f.name][0] <= f.low and ends[f.name][1] >= f.high
+    )
 
 
 def _of_pairs(beam: Beam, answer: Model) -> list[str]:

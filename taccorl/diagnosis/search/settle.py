@@ -57,7 +57,8 @@ def settled(
     prior = list(zip(means, deviations / np.sqrt(weights), strict=True))
     found = fit(problem, fitted_to, model.names, model.values, step=FINE, prior=prior)
     before, after = (
-        rms(stacked(problem, m.values, m.effects, validation)) if validation else 0.0 for m in (model, found)
+        rms(stacked(problem, m.values, m.effects, validation)) if validation else 0.0
+        for m in (model, found)
     )
     if not (_is_as_good(found.error, model.error) and _is_as_good(after, before)):
         return model
@@ -72,6 +73,10 @@ def _is_as_good(error: float, before: float) -> bool:
 def _deviation(problem: Problem, f: Free, present: Sequence[str]) -> float:
     """D of a coordinate."""
     effect = f.name.rpartition(".")[0]
-    if effect and effect not in present and f.name in problem.candidates[effect].strengths:
+    if (
+        effect
+        and effect not in present
+        and f.name in problem.candidates[effect].strengths
+    ):
         return NO_PRIOR
     return PRIOR_SHARE * (f.coordinate(f.high) - f.coordinate(f.low))

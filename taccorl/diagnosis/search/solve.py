@@ -12,7 +12,14 @@ from taccorl.diagnosis.search.fit import residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.known_numbers import limits_of_known
-from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress, split_rows
+from taccorl.diagnosis.search.problem import (
+    Problem,
+    Progress,
+    Recording,
+    Values,
+    no_progress,
+    split_rows,
+)
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
@@ -120,7 +127,11 @@ def solve(
         )
     progress("which effects the recordings can show")
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
-    absent = [name for name in problem.known if name in problem.candidates and name not in problem.present]
+    absent = [
+        name
+        for name in problem.known
+        if name in problem.candidates and name not in problem.present
+    ]
     found = diagnose(
         problem,
         fit_to,
@@ -132,9 +143,14 @@ def solve(
         config=search,
         progress=progress,
     )
-    found = dataclasses.replace(found, remarks=(*_of_loop(problem, found, (*fit_to, *validation)), *found.remarks))
+    found = dataclasses.replace(
+        found,
+        remarks=(*_of_loop(problem, found, (*fit_to, *validation)), *found.remarks),
+    )
     if problem.known:
-        limits = limits_of_known(problem, problem.known, found, fit_to, validation, search or SearchConfig())
+        limits = limits_of_known(
+            problem, problem.known, found, fit_to, validation, search or SearchConfig()
+        )
         found = dataclasses.replace(found, remarks=(*found.remarks, *limits))
     return Solved(found, can_tell, fit_to, validation, rows_split)
 
@@ -156,29 +172,66 @@ def solved(
     Raises:
         TaccorlError: nothing was measured in the validation rows.
     """
-    found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without, progress)
-    recordings = {use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")}
-    stated = {"noise": problem.noise, "numbers": problem.numbers, "measured": problem.measured}
-    judged = {"diagnosis": found.diagnosis, "can_tell": found.can_tell, "rows_split": found.rows_split}
+    found = solve(
+        part,
+        problem,
+        problem.fit,
+        problem.validation,
+        problem.test,
+        search,
+        without,
+        progress,
+    )
+    recordings = {
+        use: tuple(r.name for r in getattr(problem, use))
+        for use in ("fit", "validation", "test")
+    }
+    stated = {
+        "noise": problem.noise,
+        "numbers": problem.numbers,
+        "measured": problem.measured,
+    }
+    judged = {
+        "diagnosis": found.diagnosis,
+        "can_tell": found.can_tell,
+        "rows_split": found.rows_split,
+    }
     return PartFinding(part=part, recordings=recordings, **stated, **judged)
 
 
-def _of_loop(problem: Problem, found: Diagnosis, recordings: Sequence[Recording]) -> list[str]:
+def _of_loop(
+    problem: Problem, found: Diagnosis, recordings: Sequence[Recording]
+) -> list[str]:
     """Sentence where an error is left of the size that targets make which wait for the next period of a drive's loop."""
     model, period_s = found.after, problem.loop_s or found.base.get("loop_s", 0.0)
     if not period_s or found.status not in ("something_else", "too_many"):
         return []
-    squares = np.zeros(3)  # of what is left, of the change by one wait, of what a wait of each half second explains
+    squares = np.zeros(
+        3
+    )  # of what is left, of the change by one wait, of what a wait of each half second explains
     for r in recordings:
-        cases = [(model.values | {"loop_waits_s": wait_s}, model.effects) for wait_s in (0.0, period_s)]
+        cases = [
+            (model.values | {"loop_waits_s": wait_s}, model.effects)
+            for wait_s in (0.0, period_s)
+        ]
         left, late = (np.nan_to_num(residuals(problem, *case, r)) for case in cases)
-        starts = np.arange(0, len(left), max(1, round(0.5 / (r.time_s[1] - r.time_s[0]))))
+        starts = np.arange(
+            0, len(left), max(1, round(0.5 / (r.time_s[1] - r.time_s[0])))
+        )
         rows = np.sum([left**2, (late - left) ** 2, left * (late - left)], axis=2)
         own, change, along = np.add.reduceat(rows, starts, axis=1)
-        squares += [own.sum(), change.sum(), (along**2 / np.maximum(change, 1e-9)).sum()]
-    if squares[1] / 12.0 < WAITS**2 * squares[0] or (not problem.loop_s and squares[2] < SHARE * squares[0]):
+        squares += [
+            own.sum(),
+            change.sum(),
+            (along**2 / np.maximum(change, 1e-9)).sum(),
+        ]
+    if squares[1] / 12.0 < WAITS**2 * squares[0] or (
+        not problem.loop_s and squares[2] < SHARE * squares[0]
+    ):
         return []
-    spread = math.sqrt(squares[1] / 12.0 / sum(np.isfinite(r.measured).sum() for r in recordings))
+    spread = math.sqrt(
+        squares[1] / 12.0 / sum(np.isfinite(r.measured).sum() for r in recordings)
+    )
     return [
         f"A target waits 0 … {1e3 * period_s:.2g} ms for the next period of the loop ({1.0 / period_s:.4g} Hz"
         f"{' by the fit' * (not problem.loop_s)}), each row's another time if no multiple of the rows' rate: this can leave "

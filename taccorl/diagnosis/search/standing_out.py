@@ -39,7 +39,9 @@ class Place:
         return f"{self.recording}, {self.regime}"
 
 
-def places(problem: Problem, model: Fit, recordings: Sequence[Recording], little: float) -> Iterator[Place]:
+def places(
+    problem: Problem, model: Fit, recordings: Sequence[Recording], little: float
+) -> Iterator[Place]:
     """The error of ``model`` in each regime of each recording with at least ``LEAST_ROWS`` rows, whether it stands out or not.
     ``little``: ``SearchConfig.little``, the error [floors] that equations of a robot may leave."""
     tests = max(1, sum(len(r.regimes) for r in recordings))
@@ -53,6 +55,12 @@ def places(problem: Problem, model: Fit, recordings: Sequence[Recording], little
             own = left[rows & seen]
             if len(own) >= LEAST_ROWS:
                 free = max(1.0, share * len(own))
-                most = little * noise * math.sqrt(float(chi2.isf(CHANCE / tests, free)) / free)
+                most = (
+                    little
+                    * noise
+                    * math.sqrt(float(chi2.isf(CHANCE / tests, free)) / free)
+                )
                 error = float(np.sqrt(np.mean(own**2)))
-                yield Place(recording=r.name, regime=regime, error=error, most=most, n=len(own))
+                yield Place(
+                    recording=r.name, regime=regime, error=error, most=most, n=len(own)
+                )

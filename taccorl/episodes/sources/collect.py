@@ -51,8 +51,15 @@ class CollectPlan(Plan):
         return f"nothing was written. To view a failure: taccorl collect --task={self.task} --keep_failures=true"
 
     def config(self, item: int) -> dict[str, Any]:
-        source = {"type": self.source.get_choice_name(type(self.source)), **dataclasses.asdict(self.source)}
-        own = {"source": source, "seed": self.attempt_seed(item), "videos": self.stored_as == "video"}
+        source = {
+            "type": self.source.get_choice_name(type(self.source)),
+            **dataclasses.asdict(self.source),
+        }
+        own = {
+            "source": source,
+            "seed": self.attempt_seed(item),
+            "videos": self.stored_as == "video",
+        }
         own |= {"part_poses": self.part_poses, "keep_failures": self.keep_failures}
         return canonical(self.scene | own | told_origin(self.origin))
 
@@ -60,13 +67,20 @@ class CollectPlan(Plan):
     def steps(self) -> tuple[Step, ...]:
         return (Step(_DEMONSTRATION, self._attempt),)
 
-    def _attempt(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
+    def _attempt(
+        self, item: int, config: dict[str, Any], inputs: list[Path]
+    ) -> Attempt:
         sim, spec, _ = self.opened()
         return dataclasses.replace(attempt(self, sim, spec, item), provenance=config)
 
     def entry(self, item: int, done: Attempt) -> Entry:
         kept = done.outcome == "success" or (self.keep_failures and done.rows > 0)
-        entry = {"attempt": item, "seed": self.attempt_seed(item), "outcome": done.outcome, "kept": kept}
+        entry = {
+            "attempt": item,
+            "seed": self.attempt_seed(item),
+            "outcome": done.outcome,
+            "kept": kept,
+        }
         entry |= {"rows": done.rows, "seconds": done.rows / CONTROL_HZ}
         return entry | ({"reason": done.reason} if done.reason else {})
 
@@ -74,36 +88,76 @@ class CollectPlan(Plan):
         return entry["kept"]
 
     def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
-        seeds = {} if entries is None else {"attempts": [e["seed"] for e in entries if e["kept"]]}
-        return super().dataset_config(entries) | seeds | {"twin": self.scene["twin"]} | self.kept_pictures
+        seeds = (
+            {}
+            if entries is None
+            else {"attempts": [e["seed"] for e in entries if e["kept"]]}
+        )
+        return (
+            super().dataset_config(entries)
+            | seeds
+            | {"twin": self.scene["twin"]}
+            | self.kept_pictures
+        )
 
     def items_of(self, report: dict[str, Any]) -> Sequence[int] | None:
-        return range(report["attempts"]) if report["outcomes"].get("success", 0) == self.episodes else None
+        return (
+            range(report["attempts"])
+            if report["outcomes"].get("success", 0) == self.episodes
+            else None
+        )
 
 
-def attempt(plan: CollectPlan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> Attempt:
+def attempt(
+    plan: CollectPlan,
+    sim: Simulation,
+    spec: DatasetSpec,
+    k: int,
+    *,
+    dense: bool = False,
+) -> Attempt:
     """Run attempt ``k`` up to success, failure, the time limit, or the end of the demonstrator's actions. ``dense``: also keep a
     trajectory at 200 Hz.
     """
     seed = plan.attempt_seed(k)
     sim.reset([seed])
     recorder = EpisodeRecorder(sim, spec, np.random.default_rng([seed, 2]), dense=dense)
-    outcome, reason = act(sim, plan.source.actions(sim, np.random.default_rng([seed, 1])), recorder)
-    return Attempt(outcome=outcome, reason=reason, name=f"{plan.task} seed {seed}", recorder=recorder)
+    outcome, reason = act(
+        sim, plan.source.actions(sim, np.random.default_rng([seed, 1])), recorder
+    )
+    return Attempt(
+        outcome=outcome,
+        reason=reason,
+        name=f"{plan.task} seed {seed}",
+        recorder=recorder,
+    )
 
 
-def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print) -> list[Path]:
+def collect_recordings(
+    plan: CollectPlan, out: Path, progress: Progress = print
+) -> list[Path]:
     """Collect ``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` … in the format of the robot's drivers; returns
     their paths. Failures, if they are kept, get numbers of the same sequence, but do not count. Raises TaccorlError: ``out`` is
     not empty, or three of four attempts of an expert fail."""
     if not is_free(out):
         parts = listed(sorted(path.name for path in out.glob("*.part")))
-        stopped = f", {parts} of a run that was stopped: unfinished, it may be deleted" if parts else ""
-        raise TaccorlError(f"{out} holds files already{stopped}; nothing was changed: give another folder")
+        stopped = (
+            f", {parts} of a run that was stopped: unfinished, it may be deleted"
+            if parts
+            else ""
+        )
+        raise TaccorlError(
+            f"{out} holds files already{stopped}; nothing was changed: give another folder"
+        )
     sim = plan.make()
     spec = row_spec(sim, pictures=False, executed=True)
-    origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
-    needed, written = Needed(plan, advice=lambda _: f"the recordings made so far are in {out}"), list[Path]()
+    origin = Origin(
+        "surrogate", f"recording of the {plan.origin.text}"
+    )  # it stands for a robot's
+    needed, written = (
+        Needed(plan, advice=lambda _: f"the recordings made so far are in {out}"),
+        list[Path](),
+    )
 
     def record(k: int) -> Entry:
         done = attempt(plan, sim, spec, k, dense=True)
@@ -111,7 +165,9 @@ def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print)
         if plan.keeps(entry) and done.recorder is not None:
             path = out / f"{plan.task}_{len(written):03d}.mcap"
             part, success = path.with_suffix(".part"), done.outcome == "success"
-            write_twin_mcap(part, sim, done.recorder.trajectory(), success=success, origin=origin)
+            write_twin_mcap(
+                part, sim, done.recorder.trajectory(), success=success, origin=origin
+            )
             written.append(part.replace(path))
         return entry
 

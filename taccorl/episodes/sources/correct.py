@@ -39,7 +39,11 @@ from taccorl.tasks.experts.scripted import ScriptedExpert
 TAKEOVERS = ("failures", "all")
 """Values of ``CorrectionPlan.takeover``."""
 _CORRECTION = Stage("correction", version=6)
-_DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of a takeover: default_rng([scene seed, which, number of the takeover])
+_DRAW, _PADS, _EXPERT = (
+    1,
+    2,
+    3,
+)  # generators of a takeover: default_rng([scene seed, which, number of the takeover])
 _STALL_STEPS = CONTROL_HZ  # 1 s
 _STILL = ROBOT.per_action(0.02, 0.001)
 """(A,) [rad, m]: joints and grippers whose range over a second is smaller than this count as still."""
@@ -84,16 +88,22 @@ class CorrectionPlan(Plan):
     """Batches of the policy's episodes in the scenes ``scene_seeds``: folders of ``write_policy_episodes``."""
 
     word: ClassVar[str] = "takeover"
-    dataset: ClassVar[Stage] = Stage("corrections", version=3, manifest=DATASET_MANIFEST)
+    dataset: ClassVar[Stage] = Stage(
+        "corrections", version=3, manifest=DATASET_MANIFEST
+    )
 
     def __post_init__(self) -> None:
         """Raises TaccorlError: a setting has an unknown value (the message names the nearest), a number is out of its range, or
         the task's expert cannot take over."""
         task = tasks.get(self.task)(self.difficulty)
         if not expert_of(task).can_resume():
-            raise TaccorlError(f"--task={self.task}: its expert cannot take over; implement its remaining()")
+            raise TaccorlError(
+                f"--task={self.task}: its expert cannot take over; implement its remaining()"
+            )
         if self.takeover not in TAKEOVERS:
-            raise TaccorlError(f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}")
+            raise TaccorlError(
+                f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}"
+            )
         for name in ("per_episode", "episode_length"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise TaccorlError(f"--{name}={value}: at least 1")
@@ -102,7 +112,9 @@ class CorrectionPlan(Plan):
     @property
     def scene_seeds(self) -> list[int]:
         """Scene seeds of the episodes. They do not depend on the number of episodes, and differ from those of other commands."""
-        return [seed_of(self.seed, f"correct {self.task}", k) for k in range(self.episodes)]
+        return [
+            seed_of(self.seed, f"correct {self.task}", k) for k in range(self.episodes)
+        ]
 
     def scene_config(self) -> dict[str, Any]:
         """Settings on which the policy's episodes depend, besides the policy and their seeds; part of the store's key."""
@@ -120,7 +132,10 @@ class CorrectionPlan(Plan):
         for batch in self.acted:
             for index, entry in enumerate(_table(batch.path)):
                 if self.takeover == "all" or entry["outcome"] != "success":
-                    found += [Takeover(batch, index, len(outcomes), number) for number in range(self.per_episode)]
+                    found += [
+                        Takeover(batch, index, len(outcomes), number)
+                        for number in range(self.per_episode)
+                    ]
                 outcomes.append(entry["outcome"])
         return found, outcomes
 
@@ -128,8 +143,16 @@ class CorrectionPlan(Plan):
         return Listed(self.takeovers()[0])
 
     def config(self, item: "Takeover") -> dict[str, Any]:
-        own = {"policy_digest": self.policy_digest, "before_grasp": self.before_grasp, "hands": asdict(self.hands)}
-        own |= {"videos": self.stored_as == "video", "part_poses": self.part_poses, "origin": TWIN_ORIGIN.text}
+        own = {
+            "policy_digest": self.policy_digest,
+            "before_grasp": self.before_grasp,
+            "hands": asdict(self.hands),
+        }
+        own |= {
+            "videos": self.stored_as == "video",
+            "part_poses": self.part_poses,
+            "origin": TWIN_ORIGIN.text,
+        }
         own |= {"root_seed": self.seed, "episode": item.episode, "number": item.number}
         return canonical(self.scene | own)
 
@@ -140,31 +163,67 @@ class CorrectionPlan(Plan):
     def steps(self) -> tuple[Step, ...]:
         return (Step(_CORRECTION, self._attempt),)
 
-    def _attempt(self, item: "Takeover", config: dict[str, Any], inputs: list[Path]) -> Attempt:
+    def _attempt(
+        self, item: "Takeover", config: dict[str, Any], inputs: list[Path]
+    ) -> Attempt:
         sim, spec, _ = self.opened()
-        done = correct_episode(self, sim, spec, read_policy_episode(inputs[0], item.index), item.number)
+        done = correct_episode(
+            self, sim, spec, read_policy_episode(inputs[0], item.index), item.number
+        )
         return replace(done, provenance=config | done.provenance)
 
     def entry(self, item: "Takeover", done: Attempt) -> Entry:
         acted = _table(item.acted.path)[item.index]
-        entry = {"episode": item.episode, "number": item.number, "scene_seed": acted["seed"]}
-        entry |= {"policy_outcome": acted["outcome"], "policy_steps": acted["steps"], "outcome": done.outcome}
-        entry |= {"reason": done.reason, "takeover_step": None, "cause": ""} | done.facts
+        entry = {
+            "episode": item.episode,
+            "number": item.number,
+            "scene_seed": acted["seed"],
+        }
+        entry |= {
+            "policy_outcome": acted["outcome"],
+            "policy_steps": acted["steps"],
+            "outcome": done.outcome,
+        }
+        entry |= {
+            "reason": done.reason,
+            "takeover_step": None,
+            "cause": "",
+        } | done.facts
         return entry | {"rows": done.rows}
 
     def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
-        own = {"policy": self.policy, "policy_digest": self.policy_digest, "seed": self.seed}
-        own |= {"per_episode": self.per_episode, "before_grasp": self.before_grasp, "part_poses": self.part_poses}
-        own |= {"hands": asdict(self.hands), "episodes": self.episodes, "takeover": self.takeover}
+        own = {
+            "policy": self.policy,
+            "policy_digest": self.policy_digest,
+            "seed": self.seed,
+        }
+        own |= {
+            "per_episode": self.per_episode,
+            "before_grasp": self.before_grasp,
+            "part_poses": self.part_poses,
+        }
+        own |= {
+            "hands": asdict(self.hands),
+            "episodes": self.episodes,
+            "takeover": self.takeover,
+        }
         return canonical(super().dataset_config(entries) | own | self.kept_pictures)
 
-    def may_be_made_of(self, report: dict[str, Any], keys: set[str], store: Store) -> bool:
+    def may_be_made_of(
+        self, report: dict[str, Any], keys: set[str], store: Store
+    ) -> bool:
         return True  # the policy has not acted yet; its digest and the seed state what it does
 
     def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
         """Counts of outcomes of the policy and the expert, as JSON values."""
-        policy, over = self.takeovers()[1], [e for e in entries if e["takeover_step"] is not None]
-        outcomes = [e["outcome"] + (f": {e['reason']}" * (e["outcome"] == "not taken over")) for e in entries]
+        policy, over = (
+            self.takeovers()[1],
+            [e for e in entries if e["takeover_step"] is not None],
+        )
+        outcomes = [
+            e["outcome"] + (f": {e['reason']}" * (e["outcome"] == "not taken over"))
+            for e in entries
+        ]
         return super().report(entries) | {
             "policy": self.policy,
             "policy_digest": self.policy_digest,
@@ -205,7 +264,10 @@ class Takeover:
 
 def write_policy_episodes(episodes: Sequence[PolicyEpisode], folder: Path) -> None:
     """Write the policy's episodes into ``folder``: episodes.json, and the rows of all episodes one after another."""
-    table = [{"seed": e.seed, "outcome": e.outcome, "steps": len(e.actions)} for e in episodes]
+    table = [
+        {"seed": e.seed, "outcome": e.outcome, "steps": len(e.actions)}
+        for e in episodes
+    ]
     write_json(folder / "episodes.json", table)
     np.save(folder / "actions.npy", np.concatenate([e.actions for e in episodes]))
     np.save(folder / "states.npy", np.concatenate([e.states for e in episodes]))
@@ -218,10 +280,14 @@ def read_policy_episode(folder: Path, k: int) -> PolicyEpisode:
     first, steps = sum(e["steps"] for e in table[:k]), table[k]["steps"]
     actions = np.load(folder / "actions.npy", mmap_mode="r")[first : first + steps]
     states, subtasks = (
-        np.array(np.load(folder / name, mmap_mode="r")[first + k : first + k + steps + 1])
+        np.array(
+            np.load(folder / name, mmap_mode="r")[first + k : first + k + steps + 1]
+        )
         for name in ("states.npy", "subtasks.npy")
     )
-    return PolicyEpisode(table[k]["seed"], table[k]["outcome"], np.array(actions), states, subtasks)
+    return PolicyEpisode(
+        table[k]["seed"], table[k]["outcome"], np.array(actions), states, subtasks
+    )
 
 
 def _table(folder: Path) -> list[dict[str, Any]]:
@@ -229,7 +295,11 @@ def _table(folder: Path) -> list[dict[str, Any]]:
 
 
 def correct_episode(
-    plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, episode: PolicyEpisode, number: int = 0
+    plan: CorrectionPlan,
+    sim: Simulation,
+    spec: DatasetSpec,
+    episode: PolicyEpisode,
+    number: int = 0,
 ) -> Attempt:
     """Execute the policy's episode up to its takeover ``number``, then let the expert complete the task within the task's full
     time limit.
@@ -239,14 +309,30 @@ def correct_episode(
     """
     step, cause = takeover_step(episode, number, before_grasp=plan.before_grasp)
     if not _reproduce(sim, episode, step):
-        return Attempt(outcome="not reproduced", reason="the policy's actions lead to another state")
+        return Attempt(
+            outcome="not reproduced",
+            reason="the policy's actions lead to another state",
+        )
     sim.judge.restart_clock()
-    recorder = EpisodeRecorder(sim, spec, np.random.default_rng([episode.seed, _PADS, number]))
-    expert = expert_of(sim.task)(sim, np.random.default_rng([episode.seed, _EXPERT, number]), plan.hands)
+    recorder = EpisodeRecorder(
+        sim, spec, np.random.default_rng([episode.seed, _PADS, number])
+    )
+    expert = expert_of(sim.task)(
+        sim, np.random.default_rng([episode.seed, _EXPERT, number]), plan.hands
+    )
     outcome, reason = act(sim, _taking_over(expert), recorder)
     facts = {"takeover_step": step, "cause": cause}
-    correction = {"scene_seed": episode.seed, **facts, "policy": plan.policy, "policy_digest": plan.policy_digest}
-    correction |= {"policy_outcome": episode.outcome, "felt": [list(event) for event in expert.events], INTENDED: True}
+    correction = {
+        "scene_seed": episode.seed,
+        **facts,
+        "policy": plan.policy,
+        "policy_digest": plan.policy_digest,
+    }
+    correction |= {
+        "policy_outcome": episode.outcome,
+        "felt": [list(event) for event in expert.events],
+        INTENDED: True,
+    }
     return Attempt(
         outcome=outcome,
         reason=reason,
@@ -262,14 +348,19 @@ def _taking_over(expert: ScriptedExpert) -> Actions:
     yield from targets_of(expert)
 
 
-def takeover_step(episode: PolicyEpisode, number: int, *, before_grasp: bool) -> tuple[int, str]:
+def takeover_step(
+    episode: PolicyEpisode, number: int, *, before_grasp: bool
+) -> tuple[int, str]:
     """Step of takeover ``number`` of the policy's episode, and its cause.
 
     The step is drawn uniformly between the end of each arm's first subtask (both parts are held) and the policy's end, and over
     all of its steps where that never happens, or with ``before_grasp``. Takeover 0 is where the policy stalls, if that is
     earlier; the others are drawn before the stall.
     """
-    num, share = len(episode.actions), np.random.default_rng([episode.seed, _DRAW, number]).uniform()
+    num, share = (
+        len(episode.actions),
+        np.random.default_rng([episode.seed, _DRAW, number]).uniform(),
+    )
     held = np.flatnonzero((episode.subtasks[:num] >= 1).all(axis=1))
     first = 0 if before_grasp or not held.size else int(held[0])
     stall = first_stall(episode)
@@ -279,7 +370,9 @@ def takeover_step(episode: PolicyEpisode, number: int, *, before_grasp: bool) ->
     step = first + int(share * (end - first))
     if number == 0 and stall is not None and stall <= step:
         return stall, "stall"
-    return step, "drawn" if (episode.subtasks[step] >= 1).all() else "drawn before the grasp"
+    return step, "drawn" if (
+        episode.subtasks[step] >= 1
+    ).all() else "drawn before the grasp"
 
 
 def _reproduce(sim: Simulation, episode: PolicyEpisode, step: int) -> bool:
@@ -311,4 +404,6 @@ def is_stall(states: np.ndarray, subtasks: np.ndarray) -> bool:
     ``subtasks``: (n, 2) index of each arm's subtask in these rows."""
     if len(states) <= _STALL_STEPS:
         return False
-    return bool((np.ptp(states, axis=0) < _STILL).all() and (subtasks[-1] == subtasks[0]).all())
+    return bool(
+        (np.ptp(states, axis=0) < _STILL).all() and (subtasks[-1] == subtasks[0]).all()
+    )

@@ -22,14 +22,24 @@ import mujoco
 import numpy as np
 
 from taccorl.episodes.attempt import Actions, Source
-from taccorl.episodes.sources.teleop_actions import find_finished, give_time, replay, scene_of, write_actions
+from taccorl.episodes.sources.teleop_actions import (
+    find_finished,
+    give_time,
+    replay,
+    scene_of,
+    write_actions,
+)
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
-_AFTER_S = 1.0  # what is called finished is watched for so long, as in the experts' episodes
-_CATCH_UP_STEP = ROBOT.per_action(0.6, 0.1) / CONTROL_HZ  # rad/s and m/s until arms and leader first agree
+_AFTER_S = (
+    1.0  # what is called finished is watched for so long, as in the experts' episodes
+)
+_CATCH_UP_STEP = (
+    ROBOT.per_action(0.6, 0.1) / CONTROL_HZ
+)  # rad/s and m/s until arms and leader first agree
 _LATE_S = 0.2  # a machine that is later than this is too slow for real time: it does not try to catch up
 
 
@@ -37,7 +47,11 @@ class Command(enum.Enum):
     """Commands of the person: name of the key, its code (GLFW's), its function. MuJoCo's viewer leaves these keys free: it takes
     all letters, 0–5, F1–F7 and most punctuation (tests/episodes/test_teleop.py)."""
 
-    GO = ("Enter", 257, "begin; when done: finish (all holds still for 1 s while the task is judged)")
+    GO = (
+        "Enter",
+        257,
+        "begin; when done: finish (all holds still for 1 s while the task is judged)",
+    )
     DISCARD = ("F9", 298, "discard, and the same scene from its beginning")
 
     def __init__(self, key: str, code: int, meaning: str) -> None:
@@ -55,18 +69,28 @@ class ViewerWindow:
         # A copy: what somebody changes in the viewer's panels must not reach the simulation.
         self._model = copy.copy(sim.model)
         self._data = mujoco.MjData(self._model)
-        self._pressed: queue.SimpleQueue[int] = queue.SimpleQueue()  # filled in the window's thread
+        self._pressed: queue.SimpleQueue[int] = (
+            queue.SimpleQueue()
+        )  # filled in the window's thread
         self._said: list[str] = []
         self._next_s = 0.0
         try:
             self._viewer = mujoco.viewer.launch_passive(
-                self._model, self._data, key_callback=self._pressed.put, show_left_ui=False, show_right_ui=False
+                self._model,
+                self._data,
+                key_callback=self._pressed.put,
+                show_left_ui=False,
+                show_right_ui=False,
             )
         except RuntimeError as error:  # macOS: not run under mjpython
             raise TaccorlError(f"MuJoCo's viewer does not open: {error}") from error
         with self._viewer.lock():  # from behind the arms, so that left is left
             self._viewer.cam.lookat[:] = (0.3, 0.0, 0.1)
-            self._viewer.cam.azimuth, self._viewer.cam.elevation, self._viewer.cam.distance = 0.0, -40.0, 1.3
+            (
+                self._viewer.cam.azimuth,
+                self._viewer.cam.elevation,
+                self._viewer.cam.distance,
+            ) = 0.0, -40.0, 1.3
 
     def tick(self, sim: Simulation, lines: Sequence[str]) -> None:
         """Wait for the next control step, then show simulation 0 and the text ``lines``. Raises TaccorlError: the person has
@@ -77,17 +101,28 @@ class ViewerWindow:
         time.sleep(max(0.0, self._next_s - now_s))
         self._next_s += 1 / CONTROL_HZ
         if not self._viewer.is_running():
-            raise TaccorlError("the window was closed. Run the same command again to continue.")
-        mujoco.mj_setState(self._model, self._data, sim.batch.state[0], mujoco.mjtState.mjSTATE_INTEGRATION)
+            raise TaccorlError(
+                "the window was closed. Run the same command again to continue."
+            )
+        mujoco.mj_setState(
+            self._model,
+            self._data,
+            sim.batch.state[0],
+            mujoco.mjtState.mjSTATE_INTEGRATION,
+        )
         self._viewer.sync(state_only=True)
         if self._said != list(lines):
             self._said = list(lines)
-            self._viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines), ""))
+            self._viewer.set_texts(
+                (None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines), "")
+            )
 
     def commands(self) -> list[Command]:
         """Commands of the keys pressed since the last call; other keys are MuJoCo's."""
         codes = [self._pressed.get() for _ in range(self._pressed.qsize())]
-        return [command for code in codes for command in Command if command.code == code]
+        return [
+            command for code in codes for command in Command if command.code == code
+        ]
 
     def close(self) -> None:
         self._viewer.close()
@@ -99,16 +134,25 @@ def _check_display() -> None:
         "Let the scripted expert demonstrate (--source.type=expert), or run this where there is a screen: at the machine "
         "itself, through ssh -X, or with an X server such as Xvfb."
     )
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise TaccorlError(f"no display for MuJoCo's viewer: DISPLAY and WAYLAND_DISPLAY are not set. {way_out}")
+    if sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise TaccorlError(
+            f"no display for MuJoCo's viewer: DISPLAY and WAYLAND_DISPLAY are not set. {way_out}"
+        )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         import glfw
 
         opens = glfw.init()
     if not opens:
-        why = "; ".join(str(warning.message) for warning in caught) or "GLFW does not say why"
-        raise TaccorlError(f"no display: DISPLAY={os.environ.get('DISPLAY', '')} does not respond ({why}). {way_out}")
+        why = (
+            "; ".join(str(warning.message) for warning in caught)
+            or "GLFW does not say why"
+        )
+        raise TaccorlError(
+            f"no display: DISPLAY={os.environ.get('DISPLAY', '')} does not respond ({why}). {way_out}"
+        )
 
 
 OpenLeader = Callable[["LeaderSource"], Any]
@@ -170,9 +214,13 @@ class LeaderSource(Source):
         if file is None:
             self._demonstrate(self._session(sim), folder, scene["seed"])
             file = find_finished(folder, scene)
-            assert file is not None, "a demonstration that has just been finished is there"
+            assert file is not None, (
+                "a demonstration that has just been finished is there"
+            )
         else:
-            print(f"re-executing {file.path}; move it away, or give another --seed, to demonstrate anew")
+            print(
+                f"re-executing {file.path}; move it away, or give another --seed, to demonstrate anew"
+            )
         return replay(file, sim)
 
     def _session(self, sim: Simulation) -> _Session:
@@ -191,7 +239,9 @@ class LeaderSource(Source):
 
     def _open(self) -> Any:
         if not _drivers:
-            raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
+            raise TaccorlError(
+                "leader: no function that opens leader arms is set; call teleop.use_leader_driver first"
+            )
         device = _drivers[0](self)
         keys = "\n".join(f"  {command.key:8}{command.meaning}" for command in Command)
         print(f"{self.teleop}: connected. Keys, in the window:\n{keys}")
@@ -217,12 +267,19 @@ class LeaderSource(Source):
     def _drive(self, session: _Session) -> list[np.ndarray] | None:
         """Actions of one attempt in real time; None if it is to be done again."""
         sim, window = session.sim, session.window
-        hands, actions, watched, done = LeaderHands(sim, session.device), list[np.ndarray](), 0, False
+        hands, actions, watched, done = (
+            LeaderHands(sim, session.device),
+            list[np.ndarray](),
+            0,
+            False,
+        )
         while not sim.judge.success[0] and watched < _AFTER_S * CONTROL_HZ:
             failure = str(sim.judge.failure[0])
             lines = [sim.task.instruction, *hands.lines]
             if failure:
-                lines.append(f"{failure}! {Command.DISCARD.key}: again; {Command.GO.key}: keep as failed")
+                lines.append(
+                    f"{failure}! {Command.DISCARD.key}: again; {Command.GO.key}: keep as failed"
+                )
             window.tick(sim, lines)
             asked, commands = hands.read(), window.commands()
             if Command.DISCARD in commands:
@@ -252,13 +309,19 @@ class LeaderHands:
         """Read the leader arms: the action (14,) [rad, m] of the next control step, float32."""
         read = self._device.read()
         wanted = np.clip(read, ROBOT.action_low, ROBOT.action_high)
-        beyond = [name for name, off in zip(ROBOT.action_names, read != wanted, strict=True) if off]
+        beyond = [
+            name
+            for name, off in zip(ROBOT.action_names, read != wanted, strict=True)
+            if off
+        ]
         self.lines = [f"beyond the twin's range: {', '.join(beyond)}"] if beyond else []
         if not self._caught_up:
             away = wanted - self._now
             step = np.clip(away, -_CATCH_UP_STEP, _CATCH_UP_STEP)
             self._caught_up = bool((step == away).all())
             wanted = wanted if self._caught_up else self._now + step
-            self.lines.append(f"catching up with the leader: {np.abs(away).max():.2f} to go")
+            self.lines.append(
+                f"catching up with the leader: {np.abs(away).max():.2f} to go"
+            )
         self._now = wanted
         return wanted.astype(np.float32)

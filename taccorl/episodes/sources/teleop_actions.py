@@ -50,14 +50,21 @@ def write_actions(folder: Path, sim: Simulation, actions: Sequence[np.ndarray]) 
     """Write the float32 ``actions`` (14,) that simulation 0 of ``sim`` has executed since its reset, and the outcome that they
     had, to a new file ``folder/TASK_SEED_NNN.jsonl``; it survives a power cut, and is there as a whole or not at all."""
     scene, limit_s = scene_of(sim), sim.judge.limit_steps / CONTROL_HZ
-    about = {"names": list(ROBOT.action_names), "units": "rad, gripper openings in m", "control_hz": CONTROL_HZ}
+    about = {
+        "names": list(ROBOT.action_names),
+        "units": "rad, gripper openings in m",
+        "control_hz": CONTROL_HZ,
+    }
     about |= {"created": datetime.now(UTC).isoformat(timespec="seconds")}
     about |= {"mujoco": mujoco.__version__, "taccorl": taccorl.__version__}
     # A float32 is written as the float64 of the same value, which JSON gives back exactly.
     rows = (np.asarray(action, np.float32).tolist() for action in actions)
     end = {"end": "finished", "outcome": outcome_of(sim)}
     lines = [{"format": FORMAT, **scene, "time_limit_s": limit_s, **about}, *rows, end]
-    names = (folder / f"{scene['task']}_{scene['seed']}_{k:03d}.jsonl" for k in itertools.count())
+    names = (
+        folder / f"{scene['task']}_{scene['seed']}_{k:03d}.jsonl"
+        for k in itertools.count()
+    )
     path = next(name for name in names if not name.exists())
     write_durably(path, "".join(f"{json.dumps(line)}\n" for line in lines))
     return path
@@ -87,14 +94,20 @@ class ActionFile:
             ):  # the last one is whole
                 values.append(json.loads(line))
         except (OSError, ValueError) as error:
-            raise TaccorlError(f"{path}:{len(values) + 1}: is damaged: {error}") from error
+            raise TaccorlError(
+                f"{path}:{len(values) + 1}: is damaged: {error}"
+            ) from error
         header = values[0] if values else None
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise TaccorlError(f"{path}: is not an action file: its first line must contain {FORMAT!r}")
+            raise TaccorlError(
+                f"{path}: is not an action file: its first line must contain {FORMAT!r}"
+            )
         last = values.pop() if isinstance(values[-1], dict) and len(values) > 1 else {}
         for k, row in enumerate(rows := values[1:], 2):
             if not isinstance(row, list) or len(row) != len(ROBOT.action_names):
-                raise TaccorlError(f"{path}:{k}: expected {len(ROBOT.action_names)} numbers, found {str(row)[:60]}")
+                raise TaccorlError(
+                    f"{path}:{k}: expected {len(ROBOT.action_names)} numbers, found {str(row)[:60]}"
+                )
         actions = np.array(rows, np.float32).reshape(-1, len(ROBOT.action_names))
         return cls(Path(path), header, actions, last.get("end"), last.get("outcome"))
 
@@ -102,9 +115,13 @@ class ActionFile:
 def find_finished(folder: Path, scene: dict[str, Any]) -> ActionFile | None:
     """The newest finished demonstration of the same scene, recorded with this version of MuJoCo; None without one."""
     wanted = {**scene, "mujoco": mujoco.__version__}
-    for path in sorted(folder.glob(f"{scene['task']}_{scene['seed']}_*.jsonl"), reverse=True):
+    for path in sorted(
+        folder.glob(f"{scene['task']}_{scene['seed']}_*.jsonl"), reverse=True
+    ):
         file = ActionFile.read(path)
-        if file.end == "finished" and all(file.header.get(key) == value for key, value in wanted.items()):
+        if file.end == "finished" and all(
+            file.header.get(key) == value for key, value in wanted.items()
+        ):
             return file
     return None
 

@@ -99,7 +99,13 @@ class SmallBackbone(CompiledBackbone):
     small changes of weights are not lost."""
 
     def __init__(
-        self, size: Size, *, image_px: int, num_cameras: int, freeze_vision_encoder: bool, train_expert_only: bool
+        self,
+        size: Size,
+        *,
+        image_px: int,
+        num_cameras: int,
+        freeze_vision_encoder: bool,
+        train_expert_only: bool,
     ) -> None:
         nn.Module.__init__(self)
         self.freeze_vision_encoder = freeze_vision_encoder
@@ -114,8 +120,15 @@ class SmallBackbone(CompiledBackbone):
             "hidden_activation": "gelu_pytorch_tanh",
             "dtype": "float32",
         }
-        text = {"model_type": "gemma", "hidden_size": size.text_width, "intermediate_size": size.text_mlp, **shared}
-        no_patches = Patches(px=image_px, width=8, depth=0, heads=1, mlp=8)  # its tower is replaced below
+        text = {
+            "model_type": "gemma",
+            "hidden_size": size.text_width,
+            "intermediate_size": size.text_mlp,
+            **shared,
+        }
+        no_patches = Patches(
+            px=image_px, width=8, depth=0, heads=1, mlp=8
+        )  # its tower is replaced below
         patches = size.vision if isinstance(size.vision, Patches) else no_patches
         vision = {
             "model_type": "siglip_vision_model",
@@ -165,7 +178,10 @@ class SmallBackbone(CompiledBackbone):
         if not self.tells_cameras_apart:
             return super().embed_images(images)
         tower: Any = self.paligemma.model.vision_tower
-        return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images])]
+        return [
+            tokens.to(images[0].dtype)
+            for tokens in tower([image.to(torch.float32) for image in images])
+        ]
 
 
 def without_language_heads(backbone: PaliGemmaWithExpertModel) -> None:

@@ -16,7 +16,12 @@ _BLACK = 8 / 255  # mean of bars; a video's compression leaves up to 3 / 255
 
 
 def without_bars(
-    pictures: Any, resolution: tuple[int, int] | None, name: str, *, channels_last: bool = False, check: bool = True
+    pictures: Any,
+    resolution: tuple[int, int] | None,
+    name: str,
+    *,
+    channels_last: bool = False,
+    check: bool = True,
 ) -> Any:
     """Cut the black bars off square ``pictures``, so that they have the aspect of ``resolution``, the policy's (rows, columns).
     Pictures that are not square, and all if ``resolution`` is square or None, are returned unchanged. ``pictures``: array or
@@ -32,7 +37,11 @@ def without_bars(
     middle = pictures[(*inside, slice(None)) if channels_last else inside]
     white = 255 if pictures.dtype in (np.uint8, torch.uint8) else 1
     num_cut = math.prod(pictures.shape) - math.prod(middle.shape)
-    if check and (mean := (float(pictures.sum()) - float(middle.sum())) / num_cut / white) > _BLACK:
+    if (
+        check
+        and (mean := (float(pictures.sum()) - float(middle.sum())) / num_cut / white)
+        > _BLACK
+    ):
         raise TaccorlError(
             f"{name}: of {rows}×{columns} pictures --policy.image_resolution=[{resolution[0]},{resolution[1]}] uses the middle "
             f"{height}×{width}, but outside of it they are not black (mean {255 * mean:.0f} of 255), so they are not letterboxed "

@@ -60,7 +60,9 @@ class NormReLU(nn.GroupNorm):
         return compute(x, beside, self.num_groups, self.weight, self.bias)
 
 
-def _norm_relu(x: Tensor, beside: Tensor | None, groups: int, weight: Tensor, bias: Tensor) -> Tensor:
+def _norm_relu(
+    x: Tensor, beside: Tensor | None, groups: int, weight: Tensor, bias: Tensor
+) -> Tensor:
     normed = F.group_norm(x, groups, weight, bias)
     return F.relu(normed if beside is None else normed + beside).to(x.dtype)
 
@@ -80,7 +82,9 @@ class Residual(nn.Module):
         )
         self.out = NormReLU(more)
         same = channels == more and stride == 1
-        self.beside = nn.Identity() if same else nn.Conv2d(channels, more, 1, stride, bias=False)
+        self.beside = (
+            nn.Identity() if same else nn.Conv2d(channels, more, 1, stride, bias=False)
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``x`` (B, K, R, C) → maps with the block's number of channels; rows and columns are divided by its stride."""
@@ -105,29 +109,50 @@ class CameraEncoder(nn.Module):
         self.maps = nn.Conv2d(first, size.points, 1)
         self.sharpness = nn.Parameter(torch.ones(size.points))  # times _SHARPNESS
         self.pooled = nn.Linear(first * math.prod(size.pooled_cells), size.pooled_width)
-        self.hidden = nn.Linear(2 * size.points * (1 + 2 * _OCTAVES) + size.pooled_width, width)
+        self.hidden = nn.Linear(
+            2 * size.points * (1 + 2 * _OCTAVES) + size.pooled_width, width
+        )
         self.out = nn.Linear(width, size.tokens * width)
 
     def points(self, maps_BKRC: Tensor) -> Tensor:
         """Positions (B, 2K) of the maxima of the K maps by spatial softmax: all x, to the right, then all y, downwards; −1 …
         1."""
         maps_BKRC = maps_BKRC.to(torch.float32)
-        weights_BKN = (maps_BKRC.flatten(2) * (_SHARPNESS * self.sharpness)[:, None]).softmax(-1)
+        weights_BKN = (
+            maps_BKRC.flatten(2) * (_SHARPNESS * self.sharpness)[:, None]
+        ).softmax(-1)
         weights_BKRC = weights_BKN.view_as(maps_BKRC)
-        y_R, x_C = (torch.linspace(-1, 1, n, device=maps_BKRC.device) for n in maps_BKRC.shape[2:])
-        return torch.cat([(weights_BKRC.sum(2) * x_C).sum(-1), (weights_BKRC.sum(3) * y_R).sum(-1)], dim=1)
+        y_R, x_C = (
+            torch.linspace(-1, 1, n, device=maps_BKRC.device)
+            for n in maps_BKRC.shape[2:]
+        )
+        return torch.cat(
+            [(weights_BKRC.sum(2) * x_C).sum(-1), (weights_BKRC.sum(3) * y_R).sum(-1)],
+            dim=1,
+        )
 
     def forward(self, images_B3RC: Tensor) -> Tensor:
         """Encode ``images_B3RC`` (B, 3, R, C), −1 … 1, into tokens (B, M, D)."""
-        if images_B3RC.is_cuda:  # the convolutions' own layout: converted once, not in each of them
+        if (
+            images_B3RC.is_cuda
+        ):  # the convolutions' own layout: converted once, not in each of them
             images_B3RC = images_B3RC.contiguous(memory_format=torch.channels_last)
         features_BKRC = self.features(images_B3RC)
         points_BP = self.points(self.maps(features_BKRC))
         half_turns = math.pi * 2.0 ** torch.arange(_OCTAVES, device=points_BP.device)
         waves_BPO = points_BP[:, :, None] * half_turns
-        pooled_BD = self.pooled(F.adaptive_avg_pool2d(features_BKRC, self._cells).flatten(1))
-        told = [points_BP, waves_BPO.sin().flatten(1), waves_BPO.cos().flatten(1), pooled_BD]
-        return self.out(F.gelu(self.hidden(torch.cat(told, dim=1)))).unflatten(1, self.token_shape)
+        pooled_BD = self.pooled(
+            F.adaptive_avg_pool2d(features_BKRC, self._cells).flatten(1)
+        )
+        told = [
+            points_BP,
+            waves_BPO.sin().flatten(1),
+            waves_BPO.cos().flatten(1),
+            pooled_BD,
+        ]
+        return self.out(F.gelu(self.hidden(torch.cat(told, dim=1)))).unflatten(
+            1, self.token_shape
+        )
 
 
 class CameraTower(nn.Module):
@@ -135,9 +160,13 @@ class CameraTower(nn.Module):
 
     def __init__(self, num_cameras: int, size: CameraSize, width: int) -> None:
         super().__init__()
-        self.cameras = nn.ModuleList(CameraEncoder(size, width) for _ in range(num_cameras))
+        self.cameras = nn.ModuleList(
+            CameraEncoder(size, width) for _ in range(num_cameras)
+        )
 
     def forward(self, images: list[Tensor]) -> list[Tensor]:
         """Return the tokens (B, M, D) of each camera's pictures; ``images`` holds (B, 3, R, C), −1 … 1, for each camera in the
         order of the policy's features."""
-        return [camera(image) for camera, image in zip(self.cameras, images, strict=True)]
+        return [
+            camera(image) for camera, image in zip(self.cameras, images, strict=True)
+        ]

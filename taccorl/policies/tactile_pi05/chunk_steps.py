@@ -35,7 +35,9 @@ class ChunkSteps(nn.Module):
         self.register_buffer("std_HA", torch.ones(horizon, num_actions))
 
     @classmethod
-    def of_statistics(cls, statistics: Any, config: Any, num_actions: int) -> "ChunkSteps":
+    def of_statistics(
+        cls, statistics: Any, config: Any, num_actions: int
+    ) -> "ChunkSteps":
         """Make the normalisation of chunks of A = ``num_actions`` values from LeRobot's ``statistics`` of a dataset; if they are
         None, or without ``STEP_STATISTICS``, μ and σ stay 0 and 1 until a checkpoint is loaded. ``config``: the policy's.
         Raises TaccorlError: actions are normalised by an unknown method."""
@@ -43,15 +45,22 @@ class ChunkSteps(nn.Module):
         told = (statistics or {}).get(ACTION, {})
         if any(name not in told for name in STEP_STATISTICS):
             return steps
-        mean, std = (torch.as_tensor(told[name], dtype=torch.float32) for name in STEP_STATISTICS)
+        mean, std = (
+            torch.as_tensor(told[name], dtype=torch.float32) for name in STEP_STATISTICS
+        )
         mode = config.normalization_mapping.get("ACTION", NormalizationMode.IDENTITY)
-        limits = {NormalizationMode.QUANTILES: ("q01", "q99"), NormalizationMode.MIN_MAX: ("min", "max")}
+        limits = {
+            NormalizationMode.QUANTILES: ("q01", "q99"),
+            NormalizationMode.MIN_MAX: ("min", "max"),
+        }
         if mode not in limits:
             raise TaccorlError(
                 f"--policy.normalize_steps=true: with --policy.normalization_mapping of ACTION {mode.value}; give QUANTILES or "
                 "MIN_MAX, or turn it off (--policy.normalize_steps=false)"
             )
-        low, high = (torch.as_tensor(told[name], dtype=torch.float32) for name in limits[mode])
+        low, high = (
+            torch.as_tensor(told[name], dtype=torch.float32) for name in limits[mode]
+        )
         half = ((high - low) / 2).clamp(min=1e-8)
         steps.mean_HA.copy_((mean - low) / half - 1)
         steps.std_HA.copy_((std / half).clamp(min=LEAST_STD))

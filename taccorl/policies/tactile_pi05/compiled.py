@@ -22,7 +22,9 @@ from lerobot.utils.constants import OPENPI_ATTENTION_MASK_VALUE
 from torch import Tensor
 
 # B batch, T tokens of prefix and suffix, K the same as keys, filled up, N heads, D width of a head
-_KEYS_MULTIPLE = 8  # rows of 16 bytes in bfloat16, which tensor cores take without a copy
+_KEYS_MULTIPLE = (
+    8  # rows of 16 bytes in bfloat16, which tensor cores take without a copy
+)
 _MAX_COMPILATIONS = 32
 
 _log = logging.getLogger(__name__)
@@ -38,7 +40,9 @@ class Compiled:
     def __call__(self, *args: Any) -> Any:
         if not _is_on_gpu(args):
             return self._plain(*args)
-        from torch._dynamo import config  # slow to import, and nothing but training needs it
+        from torch._dynamo import (
+            config,
+        )  # slow to import, and nothing but training needs it
         from torch._dynamo.exc import TorchDynamoException
 
         if self._compiled is None:
@@ -75,7 +79,12 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
         activation recomputation (gradient checkpointing) LeRobot's is used."""
         models: Any = self.paligemma.model.language_model, self.gemma_expert.model
         checkpoints = any(model.gradient_checkpointing for model in models)
-        return self.compiles_layers and self.training and device.type == "cuda" and not checkpoints
+        return (
+            self.compiles_layers
+            and self.training
+            and device.type == "cuda"
+            and not checkpoints
+        )
 
     def embed_images(self, images: list[Tensor]) -> list[Tensor]:
         """Return the tokens (B, T, D) of each camera's pictures; ``images`` holds (B, 3, rows, columns), −1 … 1, for each
@@ -101,18 +110,36 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
         use_cache: Any = None,
         adarms_cond: Any = None,
     ) -> Any:
-        if any(x is None for x in inputs_embeds) or not self.fuses(inputs_embeds[1].device):
-            return super().forward(attention_mask, position_ids, past_key_values, inputs_embeds, use_cache, adarms_cond)
+        if any(x is None for x in inputs_embeds) or not self.fuses(
+            inputs_embeds[1].device
+        ):
+            return super().forward(
+                attention_mask,
+                position_ids,
+                past_key_values,
+                inputs_embeds,
+                use_cache,
+                adarms_cond,
+            )
         text: Any = self.paligemma.model.language_model
         expert: Any = self.gemma_expert.model
         (prefix, suffix), condition = inputs_embeds, adarms_cond[1]
         angles = text.rotary_emb(prefix, position_ids)
         missing = -attention_mask.shape[-1] % _KEYS_MULTIPLE
-        mask_BT1K = F.pad(attention_mask, (0, missing), value=OPENPI_ATTENTION_MASK_VALUE).transpose(1, 2)
+        mask_BT1K = F.pad(
+            attention_mask, (0, missing), value=OPENPI_ATTENTION_MASK_VALUE
+        ).transpose(1, 2)
         for text_layer, expert_layer in zip(text.layers, expert.layers, strict=True):
             is_last = expert_layer is expert.layers[-1]
             prefix, suffix = _compiled_joint_layer(
-                text_layer, expert_layer, prefix, suffix, condition, *angles, mask_BT1K, is_last
+                text_layer,
+                expert_layer,
+                prefix,
+                suffix,
+                condition,
+                *angles,
+                mask_BT1K,
+                is_last,
             )
         suffix, _ = layernorm_forward(expert.norm, suffix, condition)
         return [None, suffix], None
@@ -147,7 +174,9 @@ def joint_layer(
     """
     text, expert = text_layer.self_attn, expert_layer.self_attn
     normed_prefix, prefix_gate = layernorm_forward(text_layer.input_layernorm, prefix)
-    normed_suffix, suffix_gate = layernorm_forward(expert_layer.input_layernorm, suffix, condition)
+    normed_suffix, suffix_gate = layernorm_forward(
+        expert_layer.input_layernorm, suffix, condition
+    )
     num_prefix = prefix.shape[1]
     start = num_prefix if suffix_only else 0
 
@@ -155,32 +184,53 @@ def joint_layer(
     if not suffix_only:
         queries_BTND = torch.cat([text.q_proj(normed_prefix), queries_BTND], dim=1)
     queries_BTND = queries_BTND.unflatten(-1, (-1, text.head_dim))
-    queries_BTND = _rotated(queries_BTND, cos_BTD[:, start:, None], sin_BTD[:, start:, None])
+    queries_BTND = _rotated(
+        queries_BTND, cos_BTD[:, start:, None], sin_BTD[:, start:, None]
+    )
     keys = torch.cat([text.k_proj(normed_prefix), expert.k_proj(normed_suffix)], dim=1)
-    values = torch.cat([text.v_proj(normed_prefix), expert.v_proj(normed_suffix)], dim=1)
+    values = torch.cat(
+        [text.v_proj(normed_prefix), expert.v_proj(normed_suffix)], dim=1
+    )
     missing = mask_BT1K.shape[-1] - keys.shape[1]
     keys_BKD = F.pad(_rotated(keys, cos_BTD, sin_BTD), (0, 0, 0, missing))
     values_BKD = F.pad(values, (0, 0, 0, missing))
 
     scores = (queries_BTND.flatten(1, 2) @ keys_BKD.transpose(1, 2)) * text.scaling
     scores_BTNK = scores.unflatten(1, queries_BTND.shape[1:3]) + mask_BT1K[:, start:]
-    weights_BTNK = torch.softmax(scores_BTNK, dim=-1, dtype=torch.float32).to(queries_BTND.dtype)
-    attended = (weights_BTNK.flatten(1, 2) @ values_BKD).unflatten(1, queries_BTND.shape[1:3]).flatten(2)
+    weights_BTNK = torch.softmax(scores_BTNK, dim=-1, dtype=torch.float32).to(
+        queries_BTND.dtype
+    )
+    attended = (
+        (weights_BTNK.flatten(1, 2) @ values_BKD)
+        .unflatten(1, queries_BTND.shape[1:3])
+        .flatten(2)
+    )
 
-    suffix = _after_attention(expert_layer, suffix, attended[:, num_prefix - start :], suffix_gate, condition)
+    suffix = _after_attention(
+        expert_layer, suffix, attended[:, num_prefix - start :], suffix_gate, condition
+    )
     if suffix_only:
         return None, suffix
-    return _after_attention(text_layer, prefix, attended[:, :num_prefix], prefix_gate, None), suffix
+    return _after_attention(
+        text_layer, prefix, attended[:, :num_prefix], prefix_gate, None
+    ), suffix
 
 
 def _rotated(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return x * cos + modeling_gemma.rotate_half(x) * sin
 
 
-def _after_attention(layer: Any, hidden: Any, attended: Tensor, gate: Any, condition: Any) -> Any:
+def _after_attention(
+    layer: Any, hidden: Any, attended: Tensor, gate: Any, condition: Any
+) -> Any:
     hidden = _gated_residual(hidden, layer.self_attn.o_proj(attended), gate)
     normed, gate = layernorm_forward(layer.post_attention_layernorm, hidden, condition)
-    return _gated_residual(hidden, layer.mlp(normed.to(layer.mlp.up_proj.weight.dtype)), gate)
+    return _gated_residual(
+        hidden, layer.mlp(normed.to(layer.mlp.up_proj.weight.dtype)), gate
+    )
 
 
-_compiled_vision_layer, _compiled_joint_layer = Compiled(vision_layer), Compiled(joint_layer)
+_compiled_vision_layer, _compiled_joint_layer = (
+    Compiled(vision_layer),
+    Compiled(joint_layer),
+)

@@ -13,11 +13,19 @@ from lerobot.utils.constants import OBS_STATE
 from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES, arm_names
-from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
+from taccorl.policies.tactile_pi05.image_randomization import (
+    COTRAINING_NOISE_STD,
+    ImageRandomizationConfig,
+)
 from taccorl.policies.tactile_pi05.match_dataset import match_cameras, match_dataset
 from taccorl.policies.tactile_pi05.optim import FusedAdamW, WarmupThenCosine
 from taccorl.policies.tactile_pi05.part_poses import bodies_of, num_part_numbers
-from taccorl.policies.tactile_pi05.touch_format import TACTILE, TactileFormat, TouchInput, touch_of
+from taccorl.policies.tactile_pi05.touch_format import (
+    TACTILE,
+    TactileFormat,
+    TouchInput,
+    touch_of,
+)
 from taccorl.sim.part_poses import PARTS_KEY
 
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
@@ -149,19 +157,28 @@ class TactilePI05Config(PI05Config):
         # LeRobot's make_policy writes the dataset's names over those of the checkpoint before the policy sees either.
         self.action_names_given = list(self.action_feature_names or ())
         if self.backbone not in _BACKBONES:
-            raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
+            raise TaccorlError(
+                f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}"
+            )
         if self.base_checkpoint and self.backbone != "full":
             raise TaccorlError(
                 f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights can only be used with "
                 f"--policy.backbone=full, not with {self.backbone}, which is trained from scratch"
             )
-        poses = (
-            "the poses are part of the state's token; --policy.discrete_state_input=true puts the state into the prompt"
-        )
+        poses = "the poses are part of the state's token; --policy.discrete_state_input=true puts the state into the prompt"
         no_touch = "; for a policy without touch: --policy.tactile=false"
-        counts = ("tactile_history", "tactile_stride", "prefix_tokens", "suffix_tokens", "contact_min_active")
+        counts = (
+            "tactile_history",
+            "tactile_stride",
+            "prefix_tokens",
+            "suffix_tokens",
+            "contact_min_active",
+        )
         for name, is_right, why in (
-            *((name, getattr(self, name) >= 1, f"at least 1{no_touch}") for name in counts),
+            *(
+                (name, getattr(self, name) >= 1, f"at least 1{no_touch}")
+                for name in counts
+            ),
             (
                 "normalize_steps",
                 not self.normalize_steps or self.use_relative_actions,
@@ -171,7 +188,10 @@ class TactilePI05Config(PI05Config):
                 (name, not getattr(self, name) or not self.has_discrete_state, poses)
                 for name in ("hand_poses", "part_poses")
             ),
-            *((name, 0 <= getattr(self, name) < math.inf, "0 or more") for name in ("pose_loss", "inference_noise")),
+            *(
+                (name, 0 <= getattr(self, name) < math.inf, "0 or more")
+                for name in ("pose_loss", "inference_noise")
+            ),
             (
                 "pose_loss",
                 not self.pose_loss or not self.has_discrete_state,
@@ -184,9 +204,21 @@ class TactilePI05Config(PI05Config):
                 "poses are predicted from pictures and touch, but the policy has neither: --policy.pictures=false and "
                 "--policy.tactile=false",
             ),
-            ("average_decay", self.average_decay is None or 0 <= self.average_decay < 1, "0 or more, and below 1"),
-            ("touch_dropout", 0 <= self.touch_dropout < 1, f"0 or more, and below 1{no_touch}"),
-            ("contact_threshold", 0 <= self.contact_threshold < math.inf, "0 or more, in normalised readings"),
+            (
+                "average_decay",
+                self.average_decay is None or 0 <= self.average_decay < 1,
+                "0 or more, and below 1",
+            ),
+            (
+                "touch_dropout",
+                0 <= self.touch_dropout < 1,
+                f"0 or more, and below 1{no_touch}",
+            ),
+            (
+                "contact_threshold",
+                0 <= self.contact_threshold < math.inf,
+                "0 or more, in normalised readings",
+            ),
             (
                 "noise_threshold",
                 0 <= self.noise_threshold <= self.contact_threshold,
@@ -196,7 +228,9 @@ class TactilePI05Config(PI05Config):
         ):
             if not is_right:
                 value = getattr(self, name)
-                raise TaccorlError(f"--policy.{name}={str(value).lower() if value is True else value}: {why}")
+                raise TaccorlError(
+                    f"--policy.{name}={str(value).lower() if value is True else value}: {why}"
+                )
         self.image_changes()
 
     def image_changes(self) -> ImageRandomizationConfig | None:
@@ -204,14 +238,20 @@ class TactilePI05Config(PI05Config):
         out of its range, or set without the randomisation."""
         if self.image_randomization:
             return ImageRandomizationConfig(
-                crop=self.image_crop, rotation_deg=self.image_rotation_deg, noise_std=self.image_noise_std
+                crop=self.image_crop,
+                rotation_deg=self.image_rotation_deg,
+                noise_std=self.image_noise_std,
             )
         for name, none in (("image_crop", 1.0), ("image_rotation_deg", 0.0)):
             if getattr(self, name) not in (none, getattr(type(self), name)):
                 raise TaccorlError(
                     f"--policy.{name}={getattr(self, name):g} has no effect with --policy.image_randomization=false"
                 )
-        return ImageRandomizationConfig.absent(noise_std=self.image_noise_std) if self.image_noise_std else None
+        return (
+            ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
+            if self.image_noise_std
+            else None
+        )
 
     @property
     def crop_in_use(self) -> float:
@@ -222,13 +262,21 @@ class TactilePI05Config(PI05Config):
     def normalizes_steps(self) -> bool:
         """Whether each step of a chunk is normalised by itself: ``normalize_steps`` or the backbone's default; only with
         relative actions."""
-        wanted = self.backbone != "full" if self.normalize_steps is None else self.normalize_steps
+        wanted = (
+            self.backbone != "full"
+            if self.normalize_steps is None
+            else self.normalize_steps
+        )
         return wanted and self.use_relative_actions
 
     @property
     def decay_of_average(self) -> float:
         """Value of ``average_decay``, with the backbone's default resolved."""
-        return (0.999 if self.backbone == "small" else 0.0) if self.average_decay is None else self.average_decay
+        return (
+            (0.999 if self.backbone == "small" else 0.0)
+            if self.average_decay is None
+            else self.average_decay
+        )
 
     @property
     def tokenizer_name(self) -> str:
@@ -238,25 +286,38 @@ class TactilePI05Config(PI05Config):
     @property
     def has_discrete_state(self) -> bool:
         """Value of ``discrete_state_input``, with the backbone's default resolved."""
-        return self.backbone == "full" if self.discrete_state_input is None else self.discrete_state_input
+        return (
+            self.backbone == "full"
+            if self.discrete_state_input is None
+            else self.discrete_state_input
+        )
 
     @property
     def knows_hands(self) -> bool:
         """Value of ``hand_poses``, with the backbone's default resolved."""
         if self.hand_poses is None:
-            return not self.has_discrete_state and tuple(self.action_feature_names or ()) == arm_names()
+            return (
+                not self.has_discrete_state
+                and tuple(self.action_feature_names or ()) == arm_names()
+            )
         return self.hand_poses
 
     @property
     def state_dim(self) -> int:
         """S: size of the state token's input: the robot's state and, by option, poses of hands and parts."""
-        return self.robot_state_dim + (num_part_numbers(self.num_bodies) if self.part_poses else 0)
+        return self.robot_state_dim + (
+            num_part_numbers(self.num_bodies) if self.part_poses else 0
+        )
 
     @property
     def robot_state_dim(self) -> int:
         """Size of the robot's state and, with ``hand_poses``, of the hands' poses."""
-        assert self.input_features is not None, "the policy's __init__ has made sure of features"
-        return self.input_features[OBS_STATE].shape[0] + NUM_HAND_POSES * self.knows_hands
+        assert self.input_features is not None, (
+            "the policy's __init__ has made sure of features"
+        )
+        return (
+            self.input_features[OBS_STATE].shape[0] + NUM_HAND_POSES * self.knows_hands
+        )
 
     @property
     def num_bodies(self) -> int:
@@ -283,7 +344,11 @@ class TactilePI05Config(PI05Config):
         ``taccorl.training.reading``."""
         offsets = list(range(1 - self.window_rows, 1, self.tactile_stride))
         known = self.known_touch or touch_of(features)
-        return {key: offsets for key in known if key in features} if self.tactile and self.tactile_history > 1 else {}
+        return (
+            {key: offsets for key in known if key in features}
+            if self.tactile and self.tactile_history > 1
+            else {}
+        )
 
     def get_optimizer_preset(self) -> FusedAdamW:
         return FusedAdamW(**dataclasses.asdict(super().get_optimizer_preset()))
@@ -303,7 +368,11 @@ class TactilePI05Config(PI05Config):
         clocks) would be normalised without use."""
         super().validate_features()
         given = self.input_features or {}
-        kept = {k: f for k, f in given.items() if (f.type is FeatureType.VISUAL and self.pictures) or k == OBS_STATE}
+        kept = {
+            k: f
+            for k, f in given.items()
+            if (f.type is FeatureType.VISUAL and self.pictures) or k == OBS_STATE
+        }
         if self.part_poses and self.part_names is not None:
             kept[PARTS_KEY] = PolicyFeature(FeatureType.ENV, (len(self.part_names),))
         for key in (self.known_touch or (TACTILE,)) if self.tactile else ():
@@ -314,13 +383,20 @@ class TactilePI05Config(PI05Config):
     @property
     def known_touch(self) -> tuple[str, ...]:
         """Features of touch that a dataset, a checkpoint or options have stated."""
-        return (*((TACTILE,) if self.tactile_format else ()), *(self.tactile_layouts or ()))
+        return (
+            *((TACTILE,) if self.tactile_format else ()),
+            *(self.tactile_layouts or ()),
+        )
 
     def require_touch(self) -> dict[str, TouchInput]:
         """Features of touch that the policy uses, in the order of their values in a reading. Raises TaccorlError: neither a
         dataset nor a checkpoint has stated them."""
         told = self.tactile_format
-        found = {} if told is None else {TACTILE: TouchInput(told.layout, told.gain_per_count)}
+        found = (
+            {}
+            if told is None
+            else {TACTILE: TouchInput(told.layout, told.gain_per_count)}
+        )
         for key, shape in sorted((self.tactile_layouts or {}).items()):
             found[key] = TouchInput((math.prod(shape[:-2]), *shape[-2:]), None)
         if not found:

@@ -29,7 +29,9 @@ _STRIDE = 2
 _PAD_WIDTH = 128  # numbers that describe one pad
 _LOG_COUNTS, _LINEAR_COUNTS = 10, 200  # units of the two scales [counts]
 _LINEAR_LIMITS = (-1.0, 3.0)
-_COUNTS_PER_DEVIATION = 100  # c of one standard deviation of readings without a stated unit
+_COUNTS_PER_DEVIATION = (
+    100  # c of one standard deviation of readings without a stated unit
+)
 
 
 class TactileEncoder(nn.Module):
@@ -37,20 +39,33 @@ class TactileEncoder(nn.Module):
 
     The network of the feature with a stated unit is ``pad``; the others have their feature's name, with / for each dot."""
 
-    def __init__(self, inputs: Mapping[str, TouchInput], history: int, num_tokens: int, width: int) -> None:
+    def __init__(
+        self,
+        inputs: Mapping[str, TouchInput],
+        history: int,
+        num_tokens: int,
+        width: int,
+    ) -> None:
         """``inputs``: feature → its layout and unit, in the order of their values in a reading. ``history``: L, readings in a
         window. ``num_tokens``: M. ``width``: D."""
         super().__init__()
         self.token_shape = (num_tokens, width)
-        self.inputs = {"pad" if touch.gain_per_count else key.replace(".", "/"): touch for key, touch in inputs.items()}
+        self.inputs = {
+            "pad" if touch.gain_per_count else key.replace(".", "/"): touch
+            for key, touch in inputs.items()
+        }
         for name, touch in self.inputs.items():
             self.add_module(name, _network(touch.layout[1:], 2 * history))
-        self.hidden = nn.Linear(sum(touch.layout[0] for touch in inputs.values()) * _PAD_WIDTH, width)
+        self.hidden = nn.Linear(
+            sum(touch.layout[0] for touch in inputs.values()) * _PAD_WIDTH, width
+        )
         self.out = nn.Linear(width, num_tokens * width)
 
     def forward(self, readings_BLK: Tensor) -> Tensor:
         """(B, L, K) normalised readings, oldest first → (B, M, D)."""
-        parts = readings_BLK.split([touch.num_values for touch in self.inputs.values()], dim=-1)
+        parts = readings_BLK.split(
+            [touch.num_values for touch in self.inputs.values()], dim=-1
+        )
         pads = []
         for (name, touch), part_BLK in zip(self.inputs.items(), parts, strict=True):
             readings_BPLRC = part_BLK.unflatten(-1, touch.layout).transpose(1, 2)
@@ -58,7 +73,11 @@ class TactileEncoder(nn.Module):
             maps = channels.flatten(0, 1)
             if maps.is_cuda and maps.ndim == 4:
                 maps = maps.contiguous(memory_format=torch.channels_last)
-            pads.append(self.get_submodule(name)(maps).unflatten(0, channels.shape[:2]).flatten(1))
+            pads.append(
+                self.get_submodule(name)(maps)
+                .unflatten(0, channels.shape[:2])
+                .flatten(1)
+            )
         pads_BD = torch.cat(pads, dim=1)
         return self.out(F.gelu(self.hidden(pads_BD))).unflatten(1, self.token_shape)
 
@@ -68,9 +87,13 @@ def scales(readings: Tensor, gain_per_count: float | None) -> tuple[Tensor, Tens
     ``gain_per_count``: as in ``TouchInput``."""
     if gain_per_count is None:
         counts, limit = readings * _COUNTS_PER_DEVIATION, _LINEAR_LIMITS[1]
-        return counts.sign() * (counts.abs() / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(-limit, limit)
+        return counts.sign() * (counts.abs() / _LOG_COUNTS).log1p(), (
+            counts / _LINEAR_COUNTS
+        ).clamp(-limit, limit)
     counts = readings / gain_per_count
-    return (counts.clamp(min=0) / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(*_LINEAR_LIMITS)
+    return (counts.clamp(min=0) / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(
+        *_LINEAR_LIMITS
+    )
 
 
 def _network(cells: tuple[int, ...], channels: int) -> nn.Sequential:
@@ -116,15 +139,23 @@ class TouchIntoContext(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, context_BTD: torch.Tensor, touch_BMD: torch.Tensor) -> torch.Tensor:
+    def forward(
+        self, context_BTD: torch.Tensor, touch_BMD: torch.Tensor
+    ) -> torch.Tensor:
         """Contribution (B, T, D) of touch, to be added to the context."""
         context = self.norm_context(context_BTD)
         touch = self.norm_touch(touch_BMD)
         q, k, v = (
             linear(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for linear, x in ((self.query, context), (self.key, touch), (self.value, touch))
+            for linear, x in (
+                (self.query, context),
+                (self.key, touch),
+                (self.value, touch),
+            )
         )
-        return self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        return self.out(
+            F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+        )
 
 
 class Fusion(nn.Module):
@@ -139,14 +170,20 @@ class Fusion(nn.Module):
         self.width = width
         self.inputs = nn.Linear(num_inputs, width)
         self.layers = nn.Sequential(
-            nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+            nn.LayerNorm(width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
         )
         self.condition = nn.Linear(width, condition_width)
 
     def forward(self, tokens: list[Tensor], touch_BF: Tensor | None) -> Tensor:
         """Compute the output (B, F) of tokens (B, M, D) of any number and width, in float32; ``touch_BF`` is added to the first
         layer."""
-        hidden_BF = self.inputs(torch.cat([x.flatten(1).to(torch.float32) for x in tokens], dim=1))
+        hidden_BF = self.inputs(
+            torch.cat([x.flatten(1).to(torch.float32) for x in tokens], dim=1)
+        )
         return self.layers(hidden_BF if touch_BF is None else hidden_BF + touch_BF)
 
 
@@ -166,7 +203,11 @@ class StateToken(nn.Module):
     def forward(self, state_BS: Tensor) -> Tensor:
         """Encode normalised states (B, S), mostly within −1 … 1, into tokens (B, 1, width)."""
         state_BS = state_BS.clamp(-self._LIMIT, self._LIMIT)
-        half_turns = math.pi * 2.0 ** torch.arange(self._OCTAVES, device=state_BS.device)
+        half_turns = math.pi * 2.0 ** torch.arange(
+            self._OCTAVES, device=state_BS.device
+        )
         waves_BSO = state_BS[:, :, None] * half_turns
-        told = torch.cat([state_BS, waves_BSO.sin().flatten(1), waves_BSO.cos().flatten(1)], dim=1)
+        told = torch.cat(
+            [state_BS, waves_BSO.sin().flatten(1), waves_BSO.cos().flatten(1)], dim=1
+        )
         return self.out(F.gelu(self.hidden(told.to(self.hidden.weight.dtype))))[:, None]

@@ -2,13 +2,17 @@
 
 import torch
 
-CONTACT_THRESHOLD = 0.4  # λ_f, paper's co-training table; with fixed_scale 1/75 a count it is 30 counts
+CONTACT_THRESHOLD = (
+    0.4  # λ_f, paper's co-training table; with fixed_scale 1/75 a count it is 30 counts
+)
 MIN_ACTIVE = 1  # m, paper's co-training table
 
 # B batch, L history, K taxels
 
 
-def contact(readings_BLK: torch.Tensor, threshold: float, min_active: int) -> torch.Tensor:
+def contact(
+    readings_BLK: torch.Tensor, threshold: float, min_active: int
+) -> torch.Tensor:
     """(B,) bool: c_t = [max over the window of Σ_k [|f_rk| > λ_f] ≥ m].
 
     Args:

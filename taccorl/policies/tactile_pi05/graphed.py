@@ -25,7 +25,9 @@ class KeptConstants(TorchFunctionMode):
         super().__init__()
         self._kept: dict[tuple[str, str], Tensor] = {}
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         if func is not torch.tensor:
             return func(*args, **(kwargs or {}))
         key = repr(args), repr(sorted((kwargs or {}).items()))
@@ -41,7 +43,9 @@ class GraphedCall:
     def __init__(self, compute: Callable[..., Tensor]) -> None:
         """``compute``: function of tensors that returns one tensor, copies nothing to the CPU and draws no random number."""
         self._compute = compute
-        self._recorded: dict[Any, tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]] = {}
+        self._recorded: dict[
+            Any, tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]
+        ] = {}
         self._constants = KeptConstants()
 
     def __call__(self, *inputs: Tensor) -> Tensor:
@@ -54,7 +58,9 @@ class GraphedCall:
         graph.replay()
         return out.clone()
 
-    def _record(self, inputs: tuple[Tensor, ...]) -> tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]:
+    def _record(
+        self, inputs: tuple[Tensor, ...]
+    ) -> tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]:
         held = [x.clone() for x in inputs]
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())

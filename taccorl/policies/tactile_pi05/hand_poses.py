@@ -64,7 +64,9 @@ def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]
         data.qpos[:] = 0
         mujoco.mj_kinematics(model, data)
         joints = [model.joint(f"{arm}_{name}") for name in ROBOT.joints]
-        frames = [_frame(data.xpos[j.bodyid[0]], data.xmat[j.bodyid[0]]) for j in joints]
+        frames = [
+            _frame(data.xpos[j.bodyid[0]], data.xmat[j.bodyid[0]]) for j in joints
+        ]
         site = model.site(f"{arm}_tcp").id
         frames.append(_frame(data.site_xpos[site], data.site_xmat[site]))
         before, chain = np.eye(4), []
@@ -84,9 +86,13 @@ def _frame(position_m: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
     """Return the poses world-from-TCP (B, 4, 4) [m], one tensor for each arm. ``state_BS``: joint angles [rad] and gripper
     openings [m], arm by arm. ``chains``: (arms, 7, 4, 4), see ``arm_chains``."""
-    joints_BAJ = torch.stack([state_BS[:, ROBOT.joint_slice(arm)] for arm in ROBOT.arms], dim=1)  # A arms, J joints
+    joints_BAJ = torch.stack(
+        [state_BS[:, ROBOT.joint_slice(arm)] for arm in ROBOT.arms], dim=1
+    )  # A arms, J joints
     cos_BAJ, sin_BAJ = joints_BAJ.cos(), joints_BAJ.sin()
-    turns_BAJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BAJ.shape, 1, 1)
+    turns_BAJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(
+        *joints_BAJ.shape, 1, 1
+    )
     turns_BAJ44[..., 0, 0], turns_BAJ44[..., 0, 1] = cos_BAJ, -sin_BAJ
     turns_BAJ44[..., 1, 0], turns_BAJ44[..., 1, 1] = sin_BAJ, cos_BAJ
     steps_BAJ44 = _product(chains[:, :-1], turns_BAJ44)
@@ -143,10 +149,14 @@ class ArmStep(KeepsFeatures, ObservationProcessorStep):
         state_BS = torch.as_tensor(observation[OBS_STATE])
         if state_BS.shape[-1] != len(arm_names()):
             names = f"the {len(arm_names())} of {', '.join(arm_names())}"
-            raise TaccorlError(f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but {need.format(names)}")
+            raise TaccorlError(
+                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but {need.format(names)}"
+            )
         chains = self._chains.get(state_BS.device)
         if chains is None:
-            chains = self._chains[state_BS.device] = torch.tensor(self.chains, device=state_BS.device)
+            chains = self._chains[state_BS.device] = torch.tensor(
+                self.chains, device=state_BS.device
+            )
         return state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains
 
 
@@ -159,7 +169,12 @@ class HandPosesStep(ArmStep):
         state has other joints than the arms."""
         need = "hand poses are computed from {}: another robot needs --policy.hand_poses=false"
         told = hand_poses(*self.states(observation, need))
-        return {**observation, HAND_POSES: told.reshape(*observation[OBS_STATE].shape[:-1], NUM_HAND_POSES)}
+        return {
+            **observation,
+            HAND_POSES: told.reshape(
+                *observation[OBS_STATE].shape[:-1], NUM_HAND_POSES
+            ),
+        }
 
     def get_config(self) -> dict[str, Any]:
         return {"chains": self.chains}

@@ -61,7 +61,9 @@ class ImageRandomizationConfig:
             ("noise_std", 0 <= self.noise_std < math.inf, "0 or more"),
         ):
             if not is_right:
-                raise TaccorlError(f"image randomisation: {row} is {getattr(self, row)}; give {right}")
+                raise TaccorlError(
+                    f"image randomisation: {row} is {getattr(self, row)}; give {right}"
+                )
         for row in ("brightness", "contrast", "saturation"):
             low, high = getattr(self, row)
             if not 0 <= low <= high < math.inf:
@@ -73,7 +75,16 @@ class ImageRandomizationConfig:
     def absent(cls, **rows: Any) -> "ImageRandomizationConfig":
         """Configuration without any change except those of the given fields."""
         one = (1.0, 1.0)
-        return cls(**{"crop": 1.0, "rotation_deg": 0.0, "brightness": one, "contrast": one, "saturation": one, **rows})
+        return cls(
+            **{
+                "crop": 1.0,
+                "rotation_deg": 0.0,
+                "brightness": one,
+                "contrast": one,
+                "saturation": one,
+                **rows,
+            }
+        )
 
     def __str__(self) -> str:
         rows = [f"crop {100 * self.crop:g} %", f"rotation ± {self.rotation_deg:g}°"]
@@ -101,11 +112,15 @@ class ImageRandomization(nn.Module):
         flat = _flat(images)
         if not len(flat):
             return images
-        changed = torch.cat([self._changed(part, *self._draw(part)) for part in _parts(flat)])
+        changed = torch.cat(
+            [self._changed(part, *self._draw(part)) for part in _parts(flat)]
+        )
         return changed.reshape(images.shape).to(images.dtype)
 
     @torch.no_grad()
-    def with_draws(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None = None) -> Tensor:
+    def with_draws(
+        self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None = None
+    ) -> Tensor:
         """As ``forward``, with given random numbers; returns (N, 3, R, C) float32. ``draws_7N``: ``NUM_DRAWS`` uniform numbers
         0 … 1 of each image; 0.5: middle crop, no rotation. ``noise_N3RC``: standard normal numbers, overwritten; None: no
         noise."""
@@ -113,7 +128,12 @@ class ImageRandomization(nn.Module):
         if not len(flat):
             return flat
         noise = repeat(None) if noise_N3RC is None else _parts(noise_N3RC)
-        parts = zip(_parts(flat), draws_7N.split(1 if _one_by_one(flat) else len(flat), dim=1), noise, strict=False)
+        parts = zip(
+            _parts(flat),
+            draws_7N.split(1 if _one_by_one(flat) else len(flat), dim=1),
+            noise,
+            strict=False,
+        )
         return torch.cat([self._changed(*part) for part in parts])
 
     @torch.no_grad()
@@ -123,7 +143,11 @@ class ImageRandomization(nn.Module):
         if self.config.crop == 1:
             return images
         flat = _flat(images)
-        return self._cut_and_turned(flat, *flat.new_full((3, len(flat)), 0.5)).reshape(images.shape).to(images.dtype)
+        return (
+            self._cut_and_turned(flat, *flat.new_full((3, len(flat)), 0.5))
+            .reshape(images.shape)
+            .to(images.dtype)
+        )
 
     @torch.no_grad()
     def of_cameras(self, cameras: Sequence[Tensor]) -> list[Tensor]:
@@ -131,7 +155,9 @@ class ImageRandomization(nn.Module):
         one tensor of the same shape for each. On a GPU, images of one size are computed together: in a third of the kernels
         for three cameras, with the same random numbers. Raises TaccorlError: as ``forward``."""
         sizes = {images.shape[-2:] for images in cameras}
-        if len(sizes) != 1 or any(images.device.type == "cpu" or not len(images) for images in cameras):
+        if len(sizes) != 1 or any(
+            images.device.type == "cpu" or not len(images) for images in cameras
+        ):
             return [self(images) for images in cameras]
         return self._together(cameras)
 
@@ -139,33 +165,58 @@ class ImageRandomization(nn.Module):
         flat = [_flat(images) for images in cameras]
         draws, noise = zip(*(self._draw(images) for images in flat), strict=True)
         joined_noise = None if noise[0] is None else torch.cat(noise)
-        changed = self._changed(torch.cat(flat), torch.cat(draws, dim=1), joined_noise).split([len(x) for x in flat])
-        return [new.reshape(old.shape).to(old.dtype) for new, old in zip(changed, cameras, strict=True)]
+        changed = self._changed(
+            torch.cat(flat), torch.cat(draws, dim=1), joined_noise
+        ).split([len(x) for x in flat])
+        return [
+            new.reshape(old.shape).to(old.dtype)
+            for new, old in zip(changed, cameras, strict=True)
+        ]
 
     def _draw(self, images_N3RC: Tensor) -> tuple[Tensor, Tensor | None]:
         """(7, N) numbers 0 … 1, and normal noise of the images' shape if there is any."""
         draws_7N = torch.rand(NUM_DRAWS, len(images_N3RC), device=images_N3RC.device)
-        return draws_7N, torch.randn_like(images_N3RC) if self.config.noise_std else None
+        return draws_7N, torch.randn_like(
+            images_N3RC
+        ) if self.config.noise_std else None
 
-    def _changed(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None) -> Tensor:
+    def _changed(
+        self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None
+    ) -> Tensor:
         config = self.config
         if config.crop < 1 or config.rotation_deg:
             images_N3RC = self._cut_and_turned(images_N3RC, *draws_7N[:3])
         colours = (config.brightness, config.contrast, config.saturation)
         if any(row != (1, 1) for row in colours):
-            factors = [low + (high - low) * draw for (low, high), draw in zip(colours, draws_7N[3:6], strict=True)]
-            images_N3RC = _jittered(images_N3RC, torch.stack(factors), (draws_7N[6] * len(_ORDERS)).long())
+            factors = [
+                low + (high - low) * draw
+                for (low, high), draw in zip(colours, draws_7N[3:6], strict=True)
+            ]
+            images_N3RC = _jittered(
+                images_N3RC, torch.stack(factors), (draws_7N[6] * len(_ORDERS)).long()
+            )
         if noise_N3RC is not None:
-            images_N3RC = noise_N3RC.mul_(config.noise_std).add_(images_N3RC).clamp_(0, 1)
+            images_N3RC = (
+                noise_N3RC.mul_(config.noise_std).add_(images_N3RC).clamp_(0, 1)
+            )
         return images_N3RC
 
-    def _cut_and_turned(self, images_N3RC: Tensor, down_N: Tensor, right_N: Tensor, turn_N: Tensor) -> Tensor:
+    def _cut_and_turned(
+        self, images_N3RC: Tensor, down_N: Tensor, right_N: Tensor, turn_N: Tensor
+    ) -> Tensor:
         """Crops of whole pixels, rounded down as openpi does (212 of 224), back at full size, turned about the middle. The draws
         are from 0 to 1."""
         rows, columns = images_N3RC.shape[-2:]
-        height, width = max(1, int(self.config.crop * rows)), max(1, int(self.config.crop * columns))
-        angle_N11 = torch.deg2rad(self.config.rotation_deg * (2 * turn_N - 1))[:, None, None]
-        u_1C = torch.arange(columns, device=images_N3RC.device)[None] - (columns - 1) / 2
+        height, width = (
+            max(1, int(self.config.crop * rows)),
+            max(1, int(self.config.crop * columns)),
+        )
+        angle_N11 = torch.deg2rad(self.config.rotation_deg * (2 * turn_N - 1))[
+            :, None, None
+        ]
+        u_1C = (
+            torch.arange(columns, device=images_N3RC.device)[None] - (columns - 1) / 2
+        )
         v_R1 = torch.arange(rows, device=images_N3RC.device)[:, None] - (rows - 1) / 2
         # Where each pixel comes from, counted from the middle: that of the crop is that of the picture.
         u_NRC = angle_N11.cos() * u_1C - angle_N11.sin() * v_R1
@@ -174,16 +225,26 @@ class ImageRandomization(nn.Module):
         left_N11 = (right_N * (columns - width + 1)).floor()[:, None, None]
         top_N11 = (down_N * (rows - height + 1)).floor()[:, None, None]
         grid_NRC2 = torch.stack(
-            [_sampled_at(u_NRC, width, columns, left_N11), _sampled_at(v_NRC, height, rows, top_N11)], dim=-1
+            [
+                _sampled_at(u_NRC, width, columns, left_N11),
+                _sampled_at(v_NRC, height, rows, top_N11),
+            ],
+            dim=-1,
         )
-        sampled_N3RC = grid_sample(images_N3RC, grid_NRC2, padding_mode="border", align_corners=False)
+        sampled_N3RC = grid_sample(
+            images_N3RC, grid_NRC2, padding_mode="border", align_corners=False
+        )
         return sampled_N3RC.mul_(seen_NRC[:, None])
 
 
 def at_resolution(images: Tensor, resolution: tuple[int, int]) -> Tensor:
     """Images (N, 3, R, C) of float at ``resolution`` (rows, columns), resized as LeRobot's pi05 does, with black bars if the
     shape differs."""
-    if tuple(images.shape[-2:]) == tuple(resolution) or images.ndim != 4 or images.shape[1] != 3:  # see ``_flat``
+    if (
+        tuple(images.shape[-2:]) == tuple(resolution)
+        or images.ndim != 4
+        or images.shape[1] != 3
+    ):  # see ``_flat``
         return images
     return resize_with_pad_torch(images.to(torch.float32), *resolution)
 
@@ -227,7 +288,12 @@ def _jittered(images_N3RC: Tensor, factors_3N: Tensor, orders_N: Tensor) -> Tens
     for which_N in orders_3N:
         factor_N111 = factors_3N.gather(0, which_N[None])[0][:, None, None, None]
         grey_N1RC = rgb_to_grayscale(images_N3RC)
-        is_contrast, is_saturation = (which_N == 1)[:, None, None, None], (which_N == 2)[:, None, None, None]
-        base_N1RC = is_saturation * grey_N1RC + is_contrast * grey_N1RC.mean(dim=(-2, -1), keepdim=True)
+        is_contrast, is_saturation = (
+            (which_N == 1)[:, None, None, None],
+            (which_N == 2)[:, None, None, None],
+        )
+        base_N1RC = is_saturation * grey_N1RC + is_contrast * grey_N1RC.mean(
+            dim=(-2, -1), keepdim=True
+        )
         images_N3RC.mul_(factor_N111).add_(base_N1RC.mul_(1 - factor_N111)).clamp_(0, 1)
     return images_N3RC

@@ -58,7 +58,11 @@ def match_cameras(config: Any, meta: Any, renamed: Mapping[str, str]) -> None:
     """Check that the dataset has every camera that a checkpoint was trained with; ``renamed`` maps a feature of the dataset to
     its name for the policy (``--rename_map``). Raises TaccorlError: one is missing; without this, the full backbone would
     see a black picture in its place."""
-    known = [k for k, f in (config.input_features or {}).items() if f.type is FeatureType.VISUAL and config.pictures]
+    known = [
+        k
+        for k, f in (config.input_features or {}).items()
+        if f.type is FeatureType.VISUAL and config.pictures
+    ]
     known = [k for k in known if not k.startswith(f"{OBS_IMAGES}.empty_camera_")]
     found = {renamed.get(key, key) for key in meta.camera_keys}
     if missing := [key for key in known if key not in found]:
@@ -69,14 +73,18 @@ def match_cameras(config: Any, meta: Any, renamed: Mapping[str, str]) -> None:
         )
     if known and (unused := sorted(found - set(known))):
         _log.warning(
-            "dataset %s: %s is not used, because the checkpoint was trained without it", meta.repo_id, ", ".join(unused)
+            "dataset %s: %s is not used, because the checkpoint was trained without it",
+            meta.repo_id,
+            ", ".join(unused),
         )
 
 
 def _match_touch(config: Any, meta: Any, where: str) -> None:
     """Take the features of touch and their formats from the dataset, or compare them with those already known."""
     touch, known = touch_of(meta.features), config.known_touch
-    if missing := [key for key in known or (() if touch else (TACTILE,)) if key not in touch]:
+    if missing := [
+        key for key in known or (() if touch else (TACTILE,)) if key not in touch
+    ]:
         raise TaccorlError(
             f"{where} has no {', '.join(missing)}, which --policy.tactile=true needs: --policy.tactile=false trains on "
             f"vision only; taccorl ingest makes datasets with touch. "
@@ -87,14 +95,30 @@ def _match_touch(config: Any, meta: Any, where: str) -> None:
         _match_format(config, touch[TACTILE], where)
     if not known:
         layouts = {key: None for key in touch if key not in config.known_touch}
-    layouts = {key: layout_of(touch[key], shape, f"{where}: {key}") for key, shape in layouts.items()}
+    layouts = {
+        key: layout_of(touch[key], shape, f"{where}: {key}")
+        for key, shape in layouts.items()
+    }
     config.tactile_layouts = layouts or None
     for key, shape in layouts.items():
-        _log.info("%s: %s (%s) has no stated unit: normalised by its statistics", where, key, by(shape))
-    unused = [k for k, f in meta.features.items() if is_touch(k, f) and k not in config.known_touch]
+        _log.info(
+            "%s: %s (%s) has no stated unit: normalised by its statistics",
+            where,
+            key,
+            by(shape),
+        )
+    unused = [
+        k
+        for k, f in meta.features.items()
+        if is_touch(k, f) and k not in config.known_touch
+    ]
     if unused:
         _log.warning("%s: the policy does not use %s", where, ", ".join(unused))
-    own = [] if config.tactile_format and not layouts else ["contact_threshold", "contact_min_active"]
+    own = (
+        []
+        if config.tactile_format and not layouts
+        else ["contact_threshold", "contact_min_active"]
+    )
     own += [] if config.tactile_format else ["noise_threshold"]
     for name in own:
         if getattr(config, name) != getattr(type(config), name):
@@ -107,8 +131,15 @@ def _match_touch(config: Any, meta: Any, where: str) -> None:
 def _match_format(config: Any, feature: dict[str, Any], where: str) -> None:
     found = TactileFormat.of_feature(feature, where)
     if config.tactile_format is not None and config.tactile_format != found:
-        ours, theirs = dataclasses.asdict(config.tactile_format), dataclasses.asdict(found)
-        said = "; ".join(f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint" for k in ours if ours[k] != theirs[k])
+        ours, theirs = (
+            dataclasses.asdict(config.tactile_format),
+            dataclasses.asdict(found),
+        )
+        said = "; ".join(
+            f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint"
+            for k in ours
+            if ours[k] != theirs[k]
+        )
         raise TaccorlError(
             f"{where}: its format of touch differs from that of the checkpoint: {said}. Ingest the recordings in the "
             "same format, or train a new policy"
@@ -122,7 +153,9 @@ def _match_joints(config: Any, meta: Any, where: str) -> None:
     if config.action_names_given and config.action_names_given != list(
         meta.features.get(ACTION, {}).get("names") or ()
     ):
-        known.setdefault(ACTION, config.action_names_given)  # all that a checkpoint of an earlier taccorl states
+        known.setdefault(
+            ACTION, config.action_names_given
+        )  # all that a checkpoint of an earlier taccorl states
     for key in (ACTION, OBS_STATE):
         names = _names_of(meta.features.get(key, {}))
         if not names:
@@ -135,7 +168,9 @@ def _match_joints(config: Any, meta: Any, where: str) -> None:
             continue
         found[key] = names
         if key in known and known[key] != names:
-            what = "in another order" if sorted(known[key]) == sorted(names) else "others"
+            what = (
+                "in another order" if sorted(known[key]) == sorted(names) else "others"
+            )
             raise TaccorlError(
                 f"{where}: the elements of {key} are {what} than those of the checkpoint, which would learn and send each "
                 f"value for another joint. Dataset: {', '.join(names)}. Checkpoint: {', '.join(known[key])}. Ingest the "
@@ -152,7 +187,11 @@ def _match_parts(config: Any, meta: Any, where: str) -> None:
     if PARTS_KEY not in meta.features:
         if not config.part_poses and config.part_names is not None:
             return  # a checkpoint goes on without its pose loss
-        option = "--policy.part_poses=true" if config.part_poses else f"--policy.pose_loss={config.pose_loss:g}"
+        option = (
+            "--policy.part_poses=true"
+            if config.part_poses
+            else f"--policy.pose_loss={config.pose_loss:g}"
+        )
         raise TaccorlError(
             f"{option}: {where} has no {PARTS_KEY}: make it with taccorl collect --part_poses=true. It has: "
             f"{', '.join(k for k in meta.features if k.startswith('observation.'))}"
@@ -163,7 +202,11 @@ def _match_parts(config: Any, meta: Any, where: str) -> None:
             f"{where}: its {PARTS_KEY} is of {', '.join(bodies_of(names))}, but that of the checkpoint is of "
             f"{', '.join(bodies_of(config.part_names))}: it is another task"
         )
-    rows = int(np.ravel(meta.stats[PARTS_KEY]["count"])[0]) if PARTS_KEY in (meta.stats or {}) else meta.total_frames
+    rows = (
+        int(np.ravel(meta.stats[PARTS_KEY]["count"])[0])
+        if PARTS_KEY in (meta.stats or {})
+        else meta.total_frames
+    )
     if config.part_poses and rows < meta.total_frames:
         raise TaccorlError(
             f"--policy.part_poses=true: {where} has no {PARTS_KEY} in {meta.total_frames - rows} of {meta.total_frames} "
@@ -176,5 +219,9 @@ def _names_of(feature: Mapping[str, Any]) -> list[str]:
     """Names of a feature's elements; LeRobot also has them grouped, as in ``{"motors": […]}``. Empty: the dataset states none."""
     names = feature.get("names") or []
     if isinstance(names, Mapping):
-        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
+        names = [
+            name
+            for group in names.values()
+            for name in (group if isinstance(group, list) else [group])
+        ]
     return [str(name) for name in names]

@@ -19,7 +19,9 @@ from taccorl.errors import TaccorlError
 IS_SIM = "observation.is_sim"
 """Feature that is 1 for a simulated row and 0 for a real one (or one of a surrogate that stands for the real robot); shape
 (1,)."""
-_ROUNDING = 1e-9  # LeRobot's mean of the means of episodes, all of them 1, may be off by this
+_ROUNDING = (
+    1e-9  # LeRobot's mean of the means of episodes, all of them 1, may be off by this
+)
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,9 @@ class Mixture:
     def __post_init__(self) -> None:
         """Raises TaccorlError: a domain with a weight above 0 has no rows."""
         if not 0 <= self.sim_weight <= 1:
-            raise TaccorlError(f"--policy.sim_weight={self.sim_weight}: α is a share, 0 … 1")
+            raise TaccorlError(
+                f"--policy.sim_weight={self.sim_weight}: α is a share, 0 … 1"
+            )
         for name, weight, share, other in (
             ("simulated", self.sim_weight, self.sim_share, 0),
             ("real", 1 - self.sim_weight, 1 - self.sim_share, 1),
@@ -46,19 +50,26 @@ class Mixture:
                 )
 
     @classmethod
-    def of_statistics(cls, stats: Mapping[str, Mapping[str, Any]] | None, sim_weight: float) -> "Mixture | None":
+    def of_statistics(
+        cls, stats: Mapping[str, Mapping[str, Any]] | None, sim_weight: float
+    ) -> "Mixture | None":
         """Make the weights from a dataset's statistics. ``stats``: the dataset's statistics in LeRobot's form; None or without
         ``observation.is_sim``: one domain. Raises TaccorlError: a domain with a weight above 0 has no rows, or α is not in 0
         … 1."""
         if not stats or IS_SIM not in stats:
             return None
         share = float(torch.as_tensor(stats[IS_SIM]["mean"]).reshape(()))
-        return cls(sim_weight, float(round(share)) if abs(share - round(share)) < _ROUNDING else share)
+        return cls(
+            sim_weight,
+            float(round(share)) if abs(share - round(share)) < _ROUNDING else share,
+        )
 
     def weights(self, is_sim_B: Tensor) -> Tensor:
         """(B,) weight w of each row; 0 for a domain whose loss has weight 0."""
         sim = self.sim_weight / self.sim_share if self.sim_weight > 0 else 0.0
-        real = (1 - self.sim_weight) / (1 - self.sim_share) if self.sim_weight < 1 else 0.0
+        real = (
+            (1 - self.sim_weight) / (1 - self.sim_share) if self.sim_weight < 1 else 0.0
+        )
         return torch.where(is_sim_B, sim, real)
 
     def means(self, losses_B: Tensor, is_sim_B: Tensor) -> dict[str, Tensor]:

@@ -16,7 +16,13 @@ import torch
 from lerobot.configs import RTCAttentionSchedule as Schedule
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_IMAGES,
+    OBS_LANGUAGE_ATTENTION_MASK,
+    OBS_LANGUAGE_TOKENS,
+    OBS_STATE,
+)
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
@@ -24,15 +30,28 @@ from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest, seal_checkp
 from taccorl.policies.tactile_pi05.averaged import Averaged
 from taccorl.policies.tactile_pi05.black_bars import without_bars
 from taccorl.policies.tactile_pi05.chunk_steps import ChunkSteps
-from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import RAW_STATE, STATE_SINCE_PLAN, TactilePI05Config
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
+    RAW_STATE,
+    STATE_SINCE_PLAN,
+    TactilePI05Config,
+)
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
-from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED, at_resolution
+from taccorl.policies.tactile_pi05.image_randomization import (
+    PICTURES_CHANGED,
+    at_resolution,
+)
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
-from taccorl.policies.tactile_pi05.weights import base_of, find_weights, load_base_weights, load_checkpoint, load_merged
+from taccorl.policies.tactile_pi05.weights import (
+    base_of,
+    find_weights,
+    load_base_weights,
+    load_checkpoint,
+    load_merged,
+)
 
 # B batch, S state, L history, K values of touch, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
@@ -82,25 +101,42 @@ class TactilePI05Policy(PI05Policy):
                     f"{IS_SIM}: it has one domain only. Merge both domains with taccorl merge --real=… --sim=…, or remove the "
                     "weight"
                 )
-            _log.info("dataset %s has no %s: one domain, sim_weight is not used", dataset_meta.repo_id, IS_SIM)
+            _log.info(
+                "dataset %s has no %s: one domain, sim_weight is not used",
+                dataset_meta.repo_id,
+                IS_SIM,
+            )
         if dataset_meta is not None:
             config.sim_share = self.mixture.sim_share if self.mixture else None
         config.validate_features()
         self.config: TactilePI05Config = config
         self.init_rtc_processor()
         if config.base_checkpoint and from_base:
-            find_weights(config.base_checkpoint, f"--policy.base_checkpoint={config.base_checkpoint}")
+            find_weights(
+                config.base_checkpoint,
+                f"--policy.base_checkpoint={config.base_checkpoint}",
+            )
         self.model = TactilePI05Pytorch(config, rtc_processor=self.rtc_processor)
         if config.base_checkpoint and from_base:
             load_base_weights(self, config.base_checkpoint)
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         fusion = self.model.fusion
-        self.pose_head = PoseHead(fusion.width, config.num_bodies) if config.pose_loss and fusion is not None else None
-        self.steps = (
-            ChunkSteps.of_statistics(dataset_stats, config, self._num_actions) if config.normalizes_steps else None
+        self.pose_head = (
+            PoseHead(fusion.width, config.num_bodies)
+            if config.pose_loss and fusion is not None
+            else None
         )
-        self.averaged = Averaged(self.model, config.decay_of_average) if config.decay_of_average else None
+        self.steps = (
+            ChunkSteps.of_statistics(dataset_stats, config, self._num_actions)
+            if config.normalizes_steps
+            else None
+        )
+        self.averaged = (
+            Averaged(self.model, config.decay_of_average)
+            if config.decay_of_average
+            else None
+        )
         self.to(config.device)
         changes = config.image_changes()
         self._change_images = changes.build() if changes else None
@@ -109,16 +145,27 @@ class TactilePI05Policy(PI05Policy):
 
     @classmethod
     def from_pretrained(
-        cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
+        cls,
+        pretrained_name_or_path: Any,
+        *,
+        config: Any = None,
+        revision: str | None = None,
+        **kwargs: Any,
     ) -> "TactilePI05Policy":
         """Load a checkpoint of this policy, or an adapter (PEFT) merged into its base, in evaluation mode. (LeRobot's own loader
         for pi05 continues with random weights if it cannot read them.) Raises TaccorlError: it cannot be read, or its weights
         are not exactly this policy's."""
-        hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
+        hub = {
+            k: kwargs.pop(k)
+            for k in ("cache_dir", "token", "local_files_only", "force_download")
+            if k in kwargs
+        }
         for ignored in ("strict", "proxies", "resume_download"):
             kwargs.pop(ignored, None)
         if config is None:
-            config = TactilePI05Config.from_pretrained(pretrained_name_or_path, revision=revision, **hub)
+            config = TactilePI05Config.from_pretrained(
+                pretrained_name_or_path, revision=revision, **hub
+            )
         source = str(pretrained_name_or_path)
         if base_of(Path(source)):
             return load_merged(cls, Path(source), config, **kwargs).eval()
@@ -143,12 +190,18 @@ class TactilePI05Policy(PI05Policy):
         super().init_rtc_processor()
         if self.rtc_processor is not None:
             theirs = self.rtc_processor.rtc_config
-            most = min(theirs.max_guidance_weight, float(self.config.num_inference_steps))
+            most = min(
+                theirs.max_guidance_weight, float(self.config.num_inference_steps)
+            )
             how = theirs.prefix_attention_schedule
             how = Schedule.ZEROS if how == Schedule.LINEAR else how
-            self.rtc_processor.rtc_config = replace(theirs, max_guidance_weight=most, prefix_attention_schedule=how)
+            self.rtc_processor.rtc_config = replace(
+                theirs, max_guidance_weight=most, prefix_attention_schedule=how
+            )
 
-    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
+    def forward(
+        self, batch: dict[str, Tensor], reduction: str = "mean"
+    ) -> tuple[Tensor, dict]:
         """Return the co-training loss (see ``mixture``) over ``_losses_and_fused``, and values for the log (name → float).
 
         A row's loss is the mean over its action steps except those beyond the episode's end (LeRobot's pi05 includes them).
@@ -159,28 +212,45 @@ class TactilePI05Policy(PI05Policy):
         counts_BH = losses_BHA.new_ones(rows, horizon)
         if ACTION_IS_PAD in batch:
             valid_BH = ~batch[ACTION_IS_PAD].to(losses_BHA.device)
-            counts_BH = valid_BH * (horizon / valid_BH.sum(dim=1, keepdim=True).clamp(min=1))
+            counts_BH = valid_BH * (
+                horizon / valid_BH.sum(dim=1, keepdim=True).clamp(min=1)
+            )
         losses_BHA = losses_BHA * counts_BH[:, :, None]
         num_actions = self._num_actions
         told: dict[str, Tensor] = {}
         if self.mixture is not None:
             is_sim_B = self._is_sim(batch)
-            told |= self.mixture.means(losses_BHA[:, :, :num_actions].mean(dim=(1, 2)).detach(), is_sim_B)
+            told |= self.mixture.means(
+                losses_BHA[:, :, :num_actions].mean(dim=(1, 2)).detach(), is_sim_B
+            )
             losses_BHA = losses_BHA * self.mixture.weights(is_sim_B)[:, None, None]
         losses_BHA = losses_BHA[:, :, :num_actions]
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
-        if self.training and PART_POSES in batch and self.pose_head is not None and fused_BF is not None:
+        if (
+            self.training
+            and PART_POSES in batch
+            and self.pose_head is not None
+            and fused_BF is not None
+        ):
             told["flow_loss"] = loss.detach().mean()
-            pose_B, told["pose_error_mm"] = self.pose_head.errors(fused_BF, batch[PART_POSES])
-            loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
+            pose_B, told["pose_error_mm"] = self.pose_head.errors(
+                fused_BF, batch[PART_POSES]
+            )
+            loss = loss + self.config.pose_loss * (
+                pose_B if reduction == "none" else pose_B.mean()
+            )
             told["pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()
         if contact_B is not None:
             told["contact_rate"] = contact_B.float().mean()
-        said: dict[str, Any] = dict(zip(told, torch.stack(list(told.values())).tolist(), strict=True))
+        said: dict[str, Any] = dict(
+            zip(told, torch.stack(list(told.values())).tolist(), strict=True)
+        )
         return loss, said
 
-    def _losses_and_fused(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    def _losses_and_fused(
+        self, batch: dict[str, Tensor]
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """(B, H, 32) squared errors of the velocity at a random time; (B,) bool contact, None: vision only; and the fusion's
         output (B, F), None for backbones without. Draws noise and time from torch's generator as LeRobot's pi05 does."""
         images, image_masks = self._preprocess_images(batch)
@@ -191,9 +261,18 @@ class TactilePI05Policy(PI05Policy):
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
 
         def compute(rows: Any) -> tuple[Tensor, ...]:
-            seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
-            losses_BHA = self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
-            return (losses_BHA,) if self.model.fused is None else (losses_BHA, self.model.fused)
+            seen = (
+                [image[rows] for image in images],
+                [mask[rows] for mask in image_masks],
+            )
+            losses_BHA = self.model(
+                *seen, *(x[rows] for x in (*prompt, actions, noise, time))
+            )
+            return (
+                (losses_BHA,)
+                if self.model.fused is None
+                else (losses_BHA, self.model.fused)
+            )
 
         (losses_BHA, *fused), contact_B = self._by_contact(batch, compute)
         return losses_BHA, contact_B, fused[0] if fused else None
@@ -201,11 +280,17 @@ class TactilePI05Policy(PI05Policy):
     @property
     def _num_actions(self) -> int:
         """A; the rest fills up to π0.5's 32."""
-        assert self.config.output_features is not None, "validate_features, which __init__ calls, has set them"
+        assert self.config.output_features is not None, (
+            "validate_features, which __init__ calls, has set them"
+        )
         return self.config.output_features[ACTION].shape[0]
 
     def _by_contact(
-        self, batch: dict[str, Tensor], compute: Callable[[Any], tuple[Tensor, ...]], *, together: bool = False
+        self,
+        batch: dict[str, Tensor],
+        compute: Callable[[Any], tuple[Tensor, ...]],
+        *,
+        together: bool = False,
     ) -> tuple[tuple[Tensor, ...], Tensor | None]:
         """The tensors that ``compute(rows)`` gives for all rows, which feel what they touch; and (B,) contact. In training,
         ``touch_dropout`` hides touch from some rows; contact includes these.
@@ -224,10 +309,16 @@ class TactilePI05Policy(PI05Policy):
         if masked or together or contact_B.device.type != "cpu" or felt_B.all():
             with self.model.sensing(state, readings, felt_B, masked=masked):
                 return compute(slice(None)), contact_B
-        kinds = [rows for rows in (felt_B.nonzero()[:, 0], (~felt_B).nonzero()[:, 0]) if len(rows)]
+        kinds = [
+            rows
+            for rows in (felt_B.nonzero()[:, 0], (~felt_B).nonzero()[:, 0])
+            if len(rows)
+        ]
         parts = []
         for rows in kinds:
-            with self.model.sensing(None if state is None else state[rows], readings[rows], felt_B[rows]):
+            with self.model.sensing(
+                None if state is None else state[rows], readings[rows], felt_B[rows]
+            ):
                 parts.append(compute(rows))
         order = torch.cat(kinds).argsort()
         return tuple(torch.cat(x)[order] for x in zip(*parts, strict=True)), contact_B
@@ -236,7 +327,10 @@ class TactilePI05Policy(PI05Policy):
         """(B,) contact without the rows that ``touch_dropout`` hides."""
         if not self.config.touch_dropout:
             return contact_B
-        return contact_B & (torch.rand(len(contact_B), device=contact_B.device) >= self.config.touch_dropout)
+        return contact_B & (
+            torch.rand(len(contact_B), device=contact_B.device)
+            >= self.config.touch_dropout
+        )
 
     def _is_sim(self, batch: dict[str, Tensor]) -> Tensor:
         if IS_SIM not in batch:
@@ -249,9 +343,14 @@ class TactilePI05Policy(PI05Policy):
     def select_action(self, batch: dict[str, Tensor]) -> Tensor:
         """The next action (B, A), normalised, of each environment, from its preprocessed observation, a row of ``batch``. Must be
         called at every control step, because it stores the touch readings."""
-        for key, touch in self.config.require_touch().items() if self.config.tactile else ():
+        for key, touch in (
+            self.config.require_touch().items() if self.config.tactile else ()
+        ):
             if key in batch and batch[key][0].numel() == touch.num_values:
-                batch = {**batch, key: self._remember(key, batch[key].reshape(-1, touch.num_values))}
+                batch = {
+                    **batch,
+                    key: self._remember(key, batch[key].reshape(-1, touch.num_values)),
+                }
         state = batch.get(RAW_STATE)
         if not self._action_queue:
             self._plans_state = state
@@ -272,19 +371,32 @@ class TactilePI05Policy(PI05Policy):
         noise = kwargs.pop("noise", None)
         if noise is None:
             shape = len(prompt[0]), self.config.chunk_size, self.config.max_action_dim
-            noise = self.config.inference_noise * self.model.sample_noise(shape, prompt[0].device)
+            noise = self.config.inference_noise * self.model.sample_noise(
+                shape, prompt[0].device
+            )
 
         if self._may_graph(prompt[0].device) and not kwargs:
             sensed = self._state(batch), *self._readings(batch)
-            return self._finished(self._graphed_chunk(images, image_masks, *prompt, noise, *sensed))
+            return self._finished(
+                self._graphed_chunk(images, image_masks, *prompt, noise, *sensed)
+            )
         images = self._tokens(images)
 
         def compute(rows: Any) -> tuple[Tensor]:
-            seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
-            return (self.model.sample_actions(*seen, *(x[rows] for x in prompt), noise=noise[rows], **kwargs),)
+            seen = (
+                [image[rows] for image in images],
+                [mask[rows] for mask in image_masks],
+            )
+            return (
+                self.model.sample_actions(
+                    *seen, *(x[rows] for x in prompt), noise=noise[rows], **kwargs
+                ),
+            )
 
         if self.steps is not None and kwargs.get("prev_chunk_left_over") is not None:
-            kwargs["prev_chunk_left_over"] = self.steps.normalized(kwargs["prev_chunk_left_over"])
+            kwargs["prev_chunk_left_over"] = self.steps.normalized(
+                kwargs["prev_chunk_left_over"]
+            )
         (actions,), _ = self._by_contact(batch, compute, together=self._rtc_enabled())
         return self._finished(actions)
 
@@ -311,9 +423,14 @@ class TactilePI05Policy(PI05Policy):
 
         def compute(*x: Tensor) -> Tensor:
             rest = iter(x[2 * num + 3 :])
-            with self.model.sensing(*(None if y is None else next(rest) for y in sensed), masked=True):
+            with self.model.sensing(
+                *(None if y is None else next(rest) for y in sensed), masked=True
+            ):
                 return self.model.sample_actions(
-                    list(x[:num]), list(x[num : 2 * num]), *x[2 * num : 2 * num + 2], noise=x[2 * num + 2]
+                    list(x[:num]),
+                    list(x[num : 2 * num]),
+                    *x[2 * num : 2 * num + 2],
+                    noise=x[2 * num + 2],
                 )
 
         if self._graph is None:
@@ -350,7 +467,9 @@ class TactilePI05Policy(PI05Policy):
         itself, padded to π0.5's 32."""
         if self.steps is None:
             return super().prepare_action(batch)
-        return super().prepare_action({**batch, ACTION: self.steps.normalized(batch[ACTION])})
+        return super().prepare_action(
+            {**batch, ACTION: self.steps.normalized(batch[ACTION])}
+        )
 
     def _finished(self, actions_BHA: Tensor) -> Tensor:
         """The chunk without what fills it up, as LeRobot's normaliser takes it back."""
@@ -372,7 +491,11 @@ class TactilePI05Policy(PI05Policy):
     def _tokens(self, images: list[Tensor]) -> list[Tensor]:
         """Key points' tokens of all rows at once: few rows are rounded elsewhere. Pictures for patches remain pictures."""
         backbone = self.model.paligemma_with_expert
-        return backbone.embed_images(images) if images and backbone.tells_cameras_apart else images
+        return (
+            backbone.embed_images(images)
+            if images and backbone.tells_cameras_apart
+            else images
+        )
 
     def _state(self, batch: dict[str, Tensor]) -> Tensor | None:
         """(B, 1, D) the state's token, of all rows at once: few rows are rounded elsewhere. None where the prompt has it."""
@@ -390,17 +513,27 @@ class TactilePI05Policy(PI05Policy):
             state_BS = torch.cat([state_BS, batch[HAND_POSES].to(torch.float32)], dim=1)
         return state_BS
 
-    def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
+    def _readings(
+        self, batch: dict[str, Tensor]
+    ) -> tuple[Tensor | None, Tensor | None]:
         """(B, L, K) readings and (B,) contact, True if the unit of a feature is not stated; None and None for vision only.
         Raises TaccorlError: no touch, or another number of readings or values than the policy takes."""
         if not self.config.tactile:
             return None, None
-        parts, inputs, history = [], self.config.require_touch(), self.config.tactile_history
+        parts, inputs, history = (
+            [],
+            self.config.require_touch(),
+            self.config.tactile_history,
+        )
         for key, touch in inputs.items():
             if key not in batch:
-                raise TaccorlError(f"--policy.tactile=true, but the batch has no {key}; it has: {', '.join(batch)}")
+                raise TaccorlError(
+                    f"--policy.tactile=true, but the batch has no {key}; it has: {', '.join(batch)}"
+                )
             values, num = batch[key], touch.num_values
-            if values[0].numel() != history * num or (history > 1 and values.shape[1] != history):
+            if values[0].numel() != history * num or (
+                history > 1 and values.shape[1] != history
+            ):
                 raise TaccorlError(
                     f"{key}: {tuple(values.shape)}, but the policy needs (batch, {history}, {num}): a window of {history} "
                     "readings. In training it comes from LeRobot's reader as taccorl.lerobot_plugin extends it, which "
@@ -413,16 +546,26 @@ class TactilePI05Policy(PI05Policy):
             parts.append(readings)
         readings_BLK = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
         if any(touch.gain_per_count is None for touch in inputs.values()):
-            return readings_BLK, torch.ones(len(readings_BLK), dtype=torch.bool, device=readings_BLK.device)
-        return readings_BLK, contact(readings_BLK, self.config.contact_threshold, self.config.contact_min_active)
+            return readings_BLK, torch.ones(
+                len(readings_BLK), dtype=torch.bool, device=readings_BLK.device
+            )
+        return readings_BLK, contact(
+            readings_BLK, self.config.contact_threshold, self.config.contact_min_active
+        )
 
-    def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    def _preprocess_images(
+        self, batch: dict[str, Tensor]
+    ) -> tuple[list[Tensor], list[Tensor]]:
         """Prepare pictures for the network: changed at random in training; in use cropped to the middle (``image_crop``).
         Raises TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the
         others."""
         if not self.config.image_features:
             return [], []
-        missing = [k for k in self.config.image_features if k not in batch and not k.startswith(_EMPTY_CAMERA)]
+        missing = [
+            k
+            for k in self.config.image_features
+            if k not in batch and not k.startswith(_EMPTY_CAMERA)
+        ]
         if missing and self.model.paligemma_with_expert.tells_cameras_apart:
             raise TaccorlError(
                 f"--policy.backbone={self.config.backbone} has weights for each camera, but the batch has no "
@@ -439,14 +582,26 @@ class TactilePI05Policy(PI05Policy):
         cameras = [key for key in self.config.image_features if key in batch]
         images = [without_bars(batch[key], size, key, check=check) for key in cameras]
         changes = self._change_images
-        if changes is not None and PICTURES_CHANGED not in batch and (self.training or changes.config.crop < 1):
+        if (
+            changes is not None
+            and PICTURES_CHANGED not in batch
+            and (self.training or changes.config.crop < 1)
+        ):
             images = [at_resolution(image, size) for image in images]
-            images = changes.of_cameras(images) if self.training else [changes.middle(image) for image in images]
+            images = (
+                changes.of_cameras(images)
+                if self.training
+                else [changes.middle(image) for image in images]
+            )
         return {**batch, **dict(zip(cameras, images, strict=True))}
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()
-        return {**targets, "modules_to_save": ["model.tactile"]} if self.config.tactile else targets
+        return (
+            {**targets, "modules_to_save": ["model.tactile"]}
+            if self.config.tactile
+            else targets
+        )
 
     def _validate_peft_config(self, peft_config: Any) -> None:
         """Note the start, by its own path, as the adapter's base. Raises TaccorlError: there is no start, or the policy acts with
@@ -458,12 +613,18 @@ class TactilePI05Policy(PI05Policy):
                 "which an adapter has not: start from a checkpoint that was trained with --policy.average_decay=0"
             )
         if not (given := config.pretrained_path or config.base_checkpoint):
-            raise TaccorlError("--peft: nothing to adapt: give --policy.path=… or --policy.base_checkpoint=…")
+            raise TaccorlError(
+                "--peft: nothing to adapt: give --policy.path=… or --policy.base_checkpoint=…"
+            )
         # Not by a link such as checkpoints/last, which moves on.
         start = Path(given).resolve() if Path(given).exists() else Path(given)
         if config.pretrained_path:
             config.pretrained_path = start
         else:
             config.base_checkpoint = self.name_or_path = str(start)
-            if config.tactile and "model.tactile" not in (peft_config.modules_to_save or ()):
-                raise TaccorlError("--peft.full_training_modules: needs model.tactile: its weights are not in the base")
+            if config.tactile and "model.tactile" not in (
+                peft_config.modules_to_save or ()
+            ):
+                raise TaccorlError(
+                    "--peft.full_training_modules: needs model.tactile: its weights are not in the base"
+                )

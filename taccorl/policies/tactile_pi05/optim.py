@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, OptimizerParams
-from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
+from lerobot.optim.schedulers import (
+    CosineDecayWithWarmupSchedulerConfig,
+    LRSchedulerConfig,
+)
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 

@@ -19,7 +19,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.hand_poses import HAND_TO_HAND_M, WORLD_M, ArmStep, tcp_poses
+from taccorl.policies.tactile_pi05.hand_poses import (
+    HAND_TO_HAND_M,
+    WORLD_M,
+    ArmStep,
+    tcp_poses,
+)
 from taccorl.sim.part_poses import PARTS_KEY, POSE_NAMES
 
 PART_POSES = "observation.part_poses"
@@ -61,21 +66,29 @@ def part_poses(poses_BN: Tensor, tcps: list[Tensor]) -> Tensor:
     poses_BP9 = poses_BN.to(torch.float32).unflatten(-1, (-1, _POSE))
     position_BP3 = poses_BP9[..., :3]
     x_BP3, y_BP3 = poses_BP9[..., 3:6], poses_BP9[..., 6:9]
-    rotation_BP33 = torch.stack([x_BP3, y_BP3, torch.linalg.cross(x_BP3, y_BP3)], dim=-1)
+    rotation_BP33 = torch.stack(
+        [x_BP3, y_BP3, torch.linalg.cross(x_BP3, y_BP3)], dim=-1
+    )
     numbers = [torch.cat([position_BP3 / WORLD_M, x_BP3, y_BP3], dim=-1).flatten(1)]
 
-    i_Q, j_Q = torch.triu_indices(poses_BP9.shape[1], poses_BP9.shape[1], 1, device=poses_BP9.device)
+    i_Q, j_Q = torch.triu_indices(
+        poses_BP9.shape[1], poses_BP9.shape[1], 1, device=poses_BP9.device
+    )
     frame_BQ33 = rotation_BP33[:, j_Q]
     offset_BQ3 = _turned_back(frame_BQ33, position_BP3[:, i_Q] - position_BP3[:, j_Q])
     turn = [_turned_back(frame_BQ33, axis_BP3[:, i_Q]) for axis_BP3 in (x_BP3, y_BP3)]
     fine = [(offset_BQ3 / unit_m).tanh() for unit_m in FINE_M]
-    numbers.append(torch.cat([offset_BQ3 / PART_TO_PART_M, *fine, *turn], dim=-1).flatten(1))
+    numbers.append(
+        torch.cat([offset_BQ3 / PART_TO_PART_M, *fine, *turn], dim=-1).flatten(1)
+    )
 
     for tcp_B44 in tcps:
         frame_B133 = tcp_B44[:, None, :3, :3]
         offset_BP3 = _turned_back(frame_B133, position_BP3 - tcp_B44[:, None, :3, 3])
         turn = [_turned_back(frame_B133, axis_BP3) for axis_BP3 in (x_BP3, y_BP3)]
-        numbers.append(torch.cat([offset_BP3 / PART_TO_PART_M, *turn], dim=-1).flatten(1))
+        numbers.append(
+            torch.cat([offset_BP3 / PART_TO_PART_M, *turn], dim=-1).flatten(1)
+        )
     return torch.cat(numbers, dim=1)
 
 
@@ -91,8 +104,12 @@ def relative_poses_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
     first, pairs = _POSE * num_bodies, num_pairs(num_bodies)
     in_hands_BV9 = part_poses_BN[:, first + _PAIR * pairs :].unflatten(-1, (-1, _POSE))
     if pairs:
-        between_BQ = part_poses_BN[:, first : first + _PAIR * pairs].unflatten(-1, (pairs, _PAIR))
-        between_BQ9 = torch.cat([between_BQ[..., :3], between_BQ[..., _PAIR - _POSE + 3 :]], dim=-1)
+        between_BQ = part_poses_BN[:, first : first + _PAIR * pairs].unflatten(
+            -1, (pairs, _PAIR)
+        )
+        between_BQ9 = torch.cat(
+            [between_BQ[..., :3], between_BQ[..., _PAIR - _POSE + 3 :]], dim=-1
+        )
         in_hands_BV9 = torch.cat([between_BQ9, in_hands_BV9], dim=1)
     units_m = in_hands_BV9.new_tensor([PART_TO_PART_M] * 3 + [LEVER_M] * (_POSE - 3))
     return units_m * in_hands_BV9
@@ -150,7 +167,9 @@ class PoseHead(nn.Module):
 
     def forward(self, fused_BF: Tensor) -> Tensor:
         """Predict relative poses (B, V, 9), in units of ``PART_TO_PART_M``, from the fusion's output (B, F)."""
-        return self.out(F.silu(self.hidden(fused_BF))).unflatten(-1, (self.num_vectors, _POSE))
+        return self.out(F.silu(self.hidden(fused_BF))).unflatten(
+            -1, (self.num_vectors, _POSE)
+        )
 
     def errors(self, fused_BF: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smooth L1 loss (B,), quadratic below ``TARGET_BETA``, of errors in units of ``TARGET_M`` · (1 + d /
@@ -164,7 +183,9 @@ class PoseHead(nn.Module):
         error_BV9 = PART_TO_PART_M * self(fused_BF).to(torch.float32) - target_BV9
         distance_BV1 = target_BV9[..., :3].norm(dim=2, keepdim=True)
         scaled_BV9 = error_BV9 / (TARGET_M * (1 + distance_BV1 / NEAR_M))
-        losses_BV9 = F.smooth_l1_loss(scaled_BV9, torch.zeros_like(scaled_BV9), beta=TARGET_BETA, reduction="none")
+        losses_BV9 = F.smooth_l1_loss(
+            scaled_BV9, torch.zeros_like(scaled_BV9), beta=TARGET_BETA, reduction="none"
+        )
         near_BV = (distance_BV1[..., 0] < NEAR_M) * known_B[:, None]
         squared_BV = error_BV9[..., :3].detach().square().sum(-1) * near_BV
         rms_m = (squared_BV.sum() / near_BV.sum().clamp(min=1)).sqrt()

@@ -61,7 +61,9 @@ class TactileReadingStep(KeepsFeatures, ObservationProcessorStep):
     def __post_init__(self) -> None:
         """Raises TaccorlError: unknown scheme."""
         if self.scheme != SCHEME:
-            raise TaccorlError(f"touch is normalised by {self.scheme!r}: only {SCHEME!r} is supported")
+            raise TaccorlError(
+                f"touch is normalised by {self.scheme!r}: only {SCHEME!r} is supported"
+            )
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Touch of any shape and numeric type → float32 readings of the same shape. Raises TaccorlError: the statistics of a
@@ -77,7 +79,10 @@ class TactileReadingStep(KeepsFeatures, ObservationProcessorStep):
                     f"the statistics of {key} are not known: make the processors from a dataset's statistics or a checkpoint"
                 )
             else:
-                center, scale = (self.statistics[f"{key}.{name}"].to(values.device) for name in ("center", "scale"))
+                center, scale = (
+                    self.statistics[f"{key}.{name}"].to(values.device)
+                    for name in ("center", "scale")
+                )
                 observation[key] = (values - center) / scale
         return observation
 
@@ -94,23 +99,33 @@ class TactileReadingStep(KeepsFeatures, ObservationProcessorStep):
         self.statistics = dict(state)
 
 
-def center_and_scale(statistics: Mapping[str, Mapping[str, Any]], key: str, *, is_grid: bool) -> tuple[Tensor, Tensor]:
+def center_and_scale(
+    statistics: Mapping[str, Mapping[str, Any]], key: str, *, is_grid: bool
+) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of the feature ``key``, float32: of each element of a vector, (n,); of all elements of a grid
     together, (), which keeps its pattern. ``statistics``: of a dataset: feature → min, max, mean, std. LeRobot has one of
     each column for grids. Raises TaccorlError: there are none, they are not finite, or the feature never changes."""
     try:
         mean, std, low, high = (
-            torch.as_tensor(np.asarray(statistics[key][name], np.float64)) for name in ("mean", "std", "min", "max")
+            torch.as_tensor(np.asarray(statistics[key][name], np.float64))
+            for name in ("mean", "std", "min", "max")
         )
     except KeyError as error:
         raise TaccorlError(
             f"the dataset's meta/stats.json has no {error} of {key}: taccorl check --repair=COPY"
         ) from error
-    center, scale = mean, std.clamp(min=_LEAST_SCALE * float(std.square().mean().sqrt()))
+    center, scale = (
+        mean,
+        std.clamp(min=_LEAST_SCALE * float(std.square().mean().sqrt())),
+    )
     if is_grid:
         center = mean.mean()
         scale = (std.square() + (mean - center).square()).mean().sqrt()
-    if not (center.isfinite().all() and scale.isfinite().all()) or torch.equal(low, high) or not std.any():
+    if (
+        not (center.isfinite().all() and scale.isfinite().all())
+        or torch.equal(low, high)
+        or not std.any()
+    ):
         raise TaccorlError(
             f"{key} cannot be normalised by the dataset's meta/stats.json: its mean is {float(center.mean()):g}, its standard "
             f"deviation {float(scale.mean()):g}. taccorl check names values that never change or are not finite. Leave it out: "
@@ -130,7 +145,11 @@ class RawStateStep(KeepsFeatures):
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         if OBS_STATE in observation and transition.get(TransitionKey.ACTION) is None:
-            return _with(transition, TransitionKey.OBSERVATION, {**observation, RAW_STATE: observation[OBS_STATE]})
+            return _with(
+                transition,
+                TransitionKey.OBSERVATION,
+                {**observation, RAW_STATE: observation[OBS_STATE]},
+            )
         return transition
 
 
@@ -142,7 +161,11 @@ class TakeStateSincePlanStep(KeepsFeatures):
         moved = getattr(transition.get(TransitionKey.ACTION), STATE_SINCE_PLAN, None)
         if moved is not None:
             told = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
-            return _with(transition, TransitionKey.COMPLEMENTARY_DATA, {**told, STATE_SINCE_PLAN: moved})
+            return _with(
+                transition,
+                TransitionKey.COMPLEMENTARY_DATA,
+                {**told, STATE_SINCE_PLAN: moved},
+            )
         return transition
 
 
@@ -153,10 +176,14 @@ class FromPlansStateStep(RelativeActionsProcessorStep):
     _registry_name = None  # not LeRobot's step of that name
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        moved = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get(STATE_SINCE_PLAN)
+        moved = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get(
+            STATE_SINCE_PLAN
+        )
         action = transition.get(TransitionKey.ACTION)
         if moved is not None and isinstance(action, torch.Tensor):
-            at_plan = to_relative_actions(action, moved, self._build_mask(action.shape[-1]))
+            at_plan = to_relative_actions(
+                action, moved, self._build_mask(action.shape[-1])
+            )
             return _with(transition, TransitionKey.ACTION, at_plan)
         return transition
 
@@ -168,45 +195,81 @@ def _with(transition: EnvTransition, key: TransitionKey, value: Any) -> EnvTrans
 
 
 def make_tactile_pi05_pre_post_processors(
-    config: TactilePI05Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
+    config: TactilePI05Config,
+    dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None,
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Make the preprocessor and the postprocessor, in this order, of ``--policy.type=tactile_pi05``: pi05's steps, with touch
     before the prompt. ``dataset_stats``: feature → statistic (min, q01 …) → tensor of the feature's shape; None: none are
     known yet. Raises TaccorlError: the format of touch is unknown, or the tokenizer cannot be loaded or has more tokens than
     the backbone."""
-    tokenizer = PromptTokenizerStep(tokenizer_name=config.tokenizer_name, max_length=config.tokenizer_max_length)
-    if config.backbone in SIZES and len(tokenizer.input_tokenizer) > SIZES[config.backbone].vocabulary:
+    tokenizer = PromptTokenizerStep(
+        tokenizer_name=config.tokenizer_name, max_length=config.tokenizer_max_length
+    )
+    if (
+        config.backbone in SIZES
+        and len(tokenizer.input_tokenizer) > SIZES[config.backbone].vocabulary
+    ):
         raise TaccorlError(
             f"--policy.tokenizer={config.tokenizer_name}: has {len(tokenizer.input_tokenizer)} tokens, more than the "
             f"{SIZES[config.backbone].vocabulary} of --policy.backbone={config.backbone}: remove --policy.tokenizer"
         )
-    names = {"exclude_joints": config.relative_exclude_joints, "action_names": config.action_feature_names}
-    relative = RelativeActionsProcessorStep(enabled=config.use_relative_actions, **names)
+    names = {
+        "exclude_joints": config.relative_exclude_joints,
+        "action_names": config.action_feature_names,
+    }
+    relative = RelativeActionsProcessorStep(
+        enabled=config.use_relative_actions, **names
+    )
     common = make_default_policy_processor_steps(config, dataset_stats)
-    before: list[ProcessorStep] = [common.rename_observations, common.add_batch_dim, relative]
+    before: list[ProcessorStep] = [
+        common.rename_observations,
+        common.add_batch_dim,
+        relative,
+    ]
     before += [RawStateStep()] if config.use_relative_actions else []
     before += [HandPosesStep()] if config.knows_hands else []
     if config.part_poses or config.pose_loss:
-        before.append(PartPosesStep(names=config.require_part_names(), required=config.part_poses))
+        before.append(
+            PartPosesStep(names=config.require_part_names(), required=config.part_poses)
+        )
     before.append(common.normalize)
     before += [_tactile_step(config, dataset_stats)] if config.tactile else []
     if config.has_discrete_state:
-        before.append(Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim))
+        before.append(
+            Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)
+        )
     before += [tokenizer, common.to_device]
-    absolute = AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative)
+    absolute = AbsoluteActionsProcessorStep(
+        enabled=config.use_relative_actions, relative_step=relative
+    )
     after: list[ProcessorStep] = [common.unnormalize, absolute, common.to_cpu]
     if config.use_relative_actions:
-        after = [TakeStateSincePlanStep(), common.unnormalize, absolute, FromPlansStateStep(**names), common.to_cpu]
+        after = [
+            TakeStateSincePlanStep(),
+            common.unnormalize,
+            absolute,
+            FromPlansStateStep(**names),
+            common.to_cpu,
+        ]
     return make_policy_processor_pipelines(input_steps=before, output_steps=after)
 
 
-def _tactile_step(config: TactilePI05Config, dataset_stats: Mapping[str, Any] | None) -> TactileReadingStep:
+def _tactile_step(
+    config: TactilePI05Config, dataset_stats: Mapping[str, Any] | None
+) -> TactileReadingStep:
     found: dict[str, Tensor] = {}
-    without_unit = {key: touch for key, touch in config.require_touch().items() if touch.gain_per_count is None}
+    without_unit = {
+        key: touch
+        for key, touch in config.require_touch().items()
+        if touch.gain_per_count is None
+    }
     for key, touch in without_unit.items() if dataset_stats is not None else ():
         told = center_and_scale(dataset_stats or {}, key, is_grid=len(touch.layout) > 2)
         found[f"{key}.center"], found[f"{key}.scale"] = told
     step = TactileReadingStep(without_unit=list(without_unit), statistics=found)
     if config.tactile_format is not None:
-        step.scheme, step.gain_per_count = config.tactile_format.scheme, config.tactile_format.gain_per_count
+        step.scheme, step.gain_per_count = (
+            config.tactile_format.scheme,
+            config.tactile_format.gain_per_count,
+        )
     return step

@@ -27,14 +27,20 @@ from taccorl.robots import ROBOT
 from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.spaces import IMAGE_KEYS
 
-_OWN_STREAM = 0x70696374  # apart from the pads' noise, whose generators have (seed, step)
+_OWN_STREAM = (
+    0x70696374  # apart from the pads' noise, whose generators have (seed, step)
+)
 
 
 class ScenePictures:
     """Changes pictures of N environments by the draws of their scenes."""
 
     def __init__(
-        self, changes: ImageRandomizationConfig, *, device: Any = "cpu", resolution: tuple[int, int] | None = None
+        self,
+        changes: ImageRandomizationConfig,
+        *,
+        device: Any = "cpu",
+        resolution: tuple[int, int] | None = None,
     ) -> None:
         """``device``: torch device on which pictures are changed. ``resolution``: rows and columns to which they are resized
         before; None: they keep their size."""
@@ -47,28 +53,52 @@ class ScenePictures:
         training; for policies other than tactile_pi05, which do not state a crop, with the paper's crop and at the pictures'
         own size. ``config``: the policy's configuration."""
         if not isinstance(config, TactilePI05Config):
-            return cls(ImageRandomizationConfig(noise_std=COTRAINING_NOISE_STD), device=config.device)
+            return cls(
+                ImageRandomizationConfig(noise_std=COTRAINING_NOISE_STD),
+                device=config.device,
+            )
         # The policy enlarges this crop in any case: another one would show objects at another size than in training.
-        changes = ImageRandomizationConfig(crop=config.crop_in_use, noise_std=COTRAINING_NOISE_STD)
+        changes = ImageRandomizationConfig(
+            crop=config.crop_in_use, noise_std=COTRAINING_NOISE_STD
+        )
         return cls(changes, device=config.device, resolution=config.image_resolution)
 
     @torch.no_grad()
     def __call__(
-        self, pictures: Mapping[str, np.ndarray], seeds_N: np.ndarray, steps_N: np.ndarray
+        self,
+        pictures: Mapping[str, np.ndarray],
+        seeds_N: np.ndarray,
+        steps_N: np.ndarray,
     ) -> dict[str, Tensor]:
         """Changed pictures, (N, 3, R, C) uint8 on the device, of each camera. Whole values, as a camera's: what is stored is what
         the policy saw. ``pictures``: key of the camera (``IMAGE_KEYS``) → (N, rows, columns, 3) uint8. ``seeds_N``, ``steps_N``:
         scene seed of each environment, and number of control steps since the scene's start."""
-        return {key: self._of_camera(key, clear, seeds_N, steps_N) for key, clear in pictures.items()}
+        return {
+            key: self._of_camera(key, clear, seeds_N, steps_N)
+            for key, clear in pictures.items()
+        }
 
-    def _of_camera(self, key: str, clear_NRC3: np.ndarray, seeds_N: np.ndarray, steps_N: np.ndarray) -> Tensor:
+    def _of_camera(
+        self, key: str, clear_NRC3: np.ndarray, seeds_N: np.ndarray, steps_N: np.ndarray
+    ) -> Tensor:
         draws_7N, noise_seeds_N = scene_draws(key, seeds_N)
         images_N3RC = (
-            torch.from_numpy(clear_NRC3).to(self._device).permute(0, 3, 1, 2).contiguous().to(torch.float32) / 255
+            torch.from_numpy(clear_NRC3)
+            .to(self._device)
+            .permute(0, 3, 1, 2)
+            .contiguous()
+            .to(torch.float32)
+            / 255
         )
         if self._resolution is not None:
-            images_N3RC = at_resolution(without_bars(images_N3RC, self._resolution, key), self._resolution)
-        noise = ScanNoise(noise_seeds_N, steps_N).draw(tuple(images_N3RC.shape)) if self.config.noise_std else None
+            images_N3RC = at_resolution(
+                without_bars(images_N3RC, self._resolution, key), self._resolution
+            )
+        noise = (
+            ScanNoise(noise_seeds_N, steps_N).draw(tuple(images_N3RC.shape))
+            if self.config.noise_std
+            else None
+        )
         changed_N3RC = self._changes.with_draws(
             images_N3RC,
             torch.from_numpy(draws_7N).to(images_N3RC),
@@ -81,7 +111,10 @@ def scene_draws(key: str, seeds_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Random numbers of scenes for one camera: (7, N) uniform numbers as ``ImageRandomization.with_draws`` takes them, and (N,)
     seeds of the noise. ``key``: key of the camera (``IMAGE_KEYS``)."""
     camera = [IMAGE_KEYS[name] for name in ROBOT.cameras].index(key)
-    draws_7N, noise_seeds_N = np.empty((NUM_DRAWS, len(seeds_N))), np.empty(len(seeds_N), np.int64)
+    draws_7N, noise_seeds_N = (
+        np.empty((NUM_DRAWS, len(seeds_N))),
+        np.empty(len(seeds_N), np.int64),
+    )
     for i, seed in enumerate(seeds_N):
         rng = np.random.default_rng((int(seed), _OWN_STREAM, camera))
         draws_7N[:, i], noise_seeds_N[i] = rng.random(NUM_DRAWS), rng.integers(2**63)

@@ -16,7 +16,10 @@ from taccorl.errors import TaccorlError
 
 BYTES, WORDS = "bytes", "words"
 _PAD, _BEGIN, _FIRST = 0, 1, 2
-_LOWEST, _HIGHEST = -1, 255  # numbers with a token of their own: π0.5's bins of the state
+_LOWEST, _HIGHEST = (
+    -1,
+    255,
+)  # numbers with a token of their own: π0.5's bins of the state
 _NUM_NUMBERS = _HIGHEST - _LOWEST + 1
 _NUM_WORDS = 256
 _PIECES = re.compile(r"-?\d+|[^\W\d]+|[^\w\s]")  # numbers, words, signs
@@ -38,7 +41,9 @@ class ByteTokenizer:
         rows = [self.tokens(text) for text in texts]
         longest = max(len(row) for row in rows)
         ids = torch.tensor([row + [_PAD] * (longest - len(row)) for row in rows])
-        mask = torch.tensor([[1] * len(row) + [0] * (longest - len(row)) for row in rows])
+        mask = torch.tensor(
+            [[1] * len(row) + [0] * (longest - len(row)) for row in rows]
+        )
         return {"input_ids": ids, "attention_mask": mask}
 
 
@@ -66,9 +71,15 @@ def write_number_embeddings(embedding_VD: torch.Tensor) -> None:
     """Initialise the embeddings (vocabulary, D) of ``WordTokenizer``'s numbers so that similar numbers have similar embeddings:
     sines and cosines of ½ … 128 half periods over the range, of the size of the others. With random embeddings each number would
     be learned separately."""
-    numbers = torch.arange(_NUM_NUMBERS, device=embedding_VD.device)[:, None] / _NUM_NUMBERS
-    half_turns = 2.0 ** torch.linspace(-1, 7, embedding_VD.shape[1] // 2, device=embedding_VD.device)
-    waves = torch.cat([trig(math.pi * numbers * half_turns) for trig in (torch.sin, torch.cos)], dim=1)
+    numbers = (
+        torch.arange(_NUM_NUMBERS, device=embedding_VD.device)[:, None] / _NUM_NUMBERS
+    )
+    half_turns = 2.0 ** torch.linspace(
+        -1, 7, embedding_VD.shape[1] // 2, device=embedding_VD.device
+    )
+    waves = torch.cat(
+        [trig(math.pi * numbers * half_turns) for trig in (torch.sin, torch.cos)], dim=1
+    )
     rest = embedding_VD[_FIRST + _NUM_NUMBERS :]
     with torch.no_grad():
         embedding_VD[_FIRST : _FIRST + _NUM_NUMBERS] = waves * math.sqrt(2) * rest.std()
@@ -99,9 +110,15 @@ class PromptTokenizerStep(TokenizerProcessorStep):
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, torch.Tensor]:
         texts = [text] if isinstance(text, str) else text
-        different = list(dict.fromkeys(texts))  # hundreds of rows of a batch share a handful of instructions
+        different = list(
+            dict.fromkeys(texts)
+        )  # hundreds of rows of a batch share a handful of instructions
         found = self.input_tokenizer(
-            different, truncation=False, padding="longest", padding_side="right", return_tensors="pt"
+            different,
+            truncation=False,
+            padding="longest",
+            padding_side="right",
+            return_tensors="pt",
         )
         length = found["input_ids"].shape[1]
         if length > self.max_length:
@@ -114,5 +131,7 @@ class PromptTokenizerStep(TokenizerProcessorStep):
         rows = torch.tensor([place[text] for text in texts])
         return {
             "input_ids": torch.nn.functional.pad(found["input_ids"], fill)[rows],
-            "attention_mask": torch.nn.functional.pad(found["attention_mask"], fill)[rows],
+            "attention_mask": torch.nn.functional.pad(found["attention_mask"], fill)[
+                rows
+            ],
         }

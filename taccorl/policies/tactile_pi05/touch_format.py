@@ -9,7 +9,13 @@ from typing import Any, NamedTuple
 from taccorl.errors import TaccorlError
 
 TACTILE = "observation.tactile"
-_STATED = {"sensor", "layout", "pads", "scheme", "gain_per_count"}  # keys of the format that taccorl ingest writes
+_STATED = {
+    "sensor",
+    "layout",
+    "pads",
+    "scheme",
+    "gain_per_count",
+}  # keys of the format that taccorl ingest writes
 
 
 class TouchInput(NamedTuple):
@@ -64,8 +70,17 @@ class TactileFormat:
             )
         names = tuple(told["pads"])
         if len(names) != pads:
-            raise TaccorlError(f"{where}: {TACTILE} names the pads {', '.join(names)}, but its layout states {pads}")
-        return cls(told["sensor"], names, rows, columns, told["scheme"], float(told["gain_per_count"]))
+            raise TaccorlError(
+                f"{where}: {TACTILE} names the pads {', '.join(names)}, but its layout states {pads}"
+            )
+        return cls(
+            told["sensor"],
+            names,
+            rows,
+            columns,
+            told["scheme"],
+            float(told["gain_per_count"]),
+        )
 
 
 def is_touch(key: str, feature: Mapping[str, Any]) -> bool:
@@ -76,7 +91,11 @@ def is_touch(key: str, feature: Mapping[str, Any]) -> bool:
 def touch_of(features: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """A dataset's features of touch; those that hold a window of several readings a row are left out."""
     touch = {k: f for k, f in features.items() if is_touch(k, f)}
-    return {k: f for k, f in touch.items() if k == TACTILE or metadata_of(f).get("layout", [1])[0] == 1}
+    return {
+        k: f
+        for k, f in touch.items()
+        if k == TACTILE or metadata_of(f).get("layout", [1])[0] == 1
+    }
 
 
 def metadata_of(feature: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,7 +104,9 @@ def metadata_of(feature: Mapping[str, Any]) -> dict[str, Any]:
     return told if isinstance(told, dict) and told.keys() >= _STATED else {}
 
 
-def layout_of(feature: Mapping[str, Any], known: Sequence[int] | None, where: str) -> list[int]:
+def layout_of(
+    feature: Mapping[str, Any], known: Sequence[int] | None, where: str
+) -> list[int]:
     """Shape of a reading that the dataset states, or ``known`` if it fits. Raises TaccorlError: no numbers, or another shape
     than that known."""
     if not re.fullmatch(r"bool|u?int\d+|float\d+", str(feature["dtype"])):
@@ -100,8 +121,14 @@ def layout_of(feature: Mapping[str, Any], known: Sequence[int] | None, where: st
         found = list(stated) if math.prod(stated) == math.prod(shape) else shape
     if known is None:
         return found
-    if not known or math.prod(known) != math.prod(shape) or (list(known) != found and len(found) > 1):
-        raise TaccorlError(f"{where} has readings of {by(found)}, but the policy (tactile_layouts) takes {by(known)}")
+    if (
+        not known
+        or math.prod(known) != math.prod(shape)
+        or (list(known) != found and len(found) > 1)
+    ):
+        raise TaccorlError(
+            f"{where} has readings of {by(found)}, but the policy (tactile_layouts) takes {by(known)}"
+        )
     return list(known)
 
 

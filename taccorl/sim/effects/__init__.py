@@ -17,5 +17,7 @@ def make_effect(name: str, **values) -> Effect:
     cls = effects.get(name)
     for key in values:
         if key not in (known := cls.settings()):
-            raise TaccorlError(f"effect {name}: no parameter {key!r}; {nearest(key, known)}")
+            raise TaccorlError(
+                f"effect {name}: no parameter {key!r}; {nearest(key, known)}"
+            )
     return cls(**values)

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 
-PAST_POSITIONS, PAST_TIME_S = "pictures/positions", "pictures/time_s"  # of ``PastScene``, in a snapshot
+PAST_POSITIONS, PAST_TIME_S = (
+    "pictures/positions",
+    "pictures/time_s",
+)  # of ``PastScene``, in a snapshot
 
 
 class AddedEffects:
@@ -43,15 +46,21 @@ class AddedEffects:
         pad_shape: tuple[int, int] = ROBOT.pad.shape,
     ) -> None:
         self.present = present(effects)
-        rewritten = sorted({name for effect in self.present for name in effect.rewrites})
+        rewritten = sorted(
+            {name for effect in self.present for name in effect.rewrites}
+        )
         self.rewrites = bool(rewritten)
         """True if an effect changes the model between physics steps."""
         self._live = LiveModel(batch, rewritten) if batch and self.present else None
         self._time_s = time_s
         self._scanned_s = np.array(time_s)
         self._start = [effect.memory(len(time_s), pad_shape) for effect in self.present]
-        self._memory: list[Memory] = [{k: v.copy() for k, v in rows.items()} for rows in self._start]
-        touch = [k for k, effect in enumerate(self.present) if effect.slot in TOUCH_SLOTS]
+        self._memory: list[Memory] = [
+            {k: v.copy() for k, v in rows.items()} for rows in self._start
+        ]
+        touch = [
+            k for k, effect in enumerate(self.present) if effect.slot in TOUCH_SLOTS
+        ]
         self.remember_touch = any(self._start[k] for k in touch)
         """True if a reading depends on earlier ones: then every step must scan the pads, even if nobody reads them."""
         oldest_s = sum(effect.picture_age_s() for effect in self.present)
@@ -92,7 +101,9 @@ class AddedEffects:
 
     def __call__(self, reading: np.ndarray) -> np.ndarray:
         """Reading of the pads (N, P, R, C) for the ideal ``reading`` (N, P, R, C). Does not change the memory."""
-        return self._read(reading, self._copied(np.arange(len(reading))), np.arange(len(reading)))
+        return self._read(
+            reading, self._copied(np.arange(len(reading))), np.arange(len(reading))
+        )
 
     def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
         """Advance the memory of touch effects. The reading counts as constant since the last scan.
@@ -109,9 +120,14 @@ class AddedEffects:
         self._scanned_s[ids] = self._time_s[ids]
 
     def _copied(self, ids: np.ndarray) -> list[Memory]:
-        return [{name: values[ids] for name, values in rows.items()} for rows in self._memory]
+        return [
+            {name: values[ids] for name, values in rows.items()}
+            for rows in self._memory
+        ]
 
-    def _read(self, reading: np.ndarray, memories: list[Memory], ids: np.ndarray) -> np.ndarray:
+    def _read(
+        self, reading: np.ndarray, memories: list[Memory], ids: np.ndarray
+    ) -> np.ndarray:
         now = self._time_s[ids]
         for effect, memory in zip(self.present, memories, strict=True):
             reading = effect.reading(reading, memory, now, now - self._scanned_s[ids])
@@ -119,25 +135,40 @@ class AddedEffects:
 
     def picture_age_s(self, camera: str) -> float:
         """Age [s] of the scene that the camera's pictures show."""
-        return sum(effect.picture_age_s() for effect in self.present if camera in effect.acts_on())
+        return sum(
+            effect.picture_age_s()
+            for effect in self.present
+            if camera in effect.acts_on()
+        )
 
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
         """Pictures of ``camera`` with effects, from rendered ``pictures`` (n, rows, columns, 3) uint8 RGB, letterboxed; same
         shape."""
-        acting = [e for e in self.present if camera.name in e.acts_on() and type(e).picture is not Effect.picture]
+        acting = [
+            e
+            for e in self.present
+            if camera.name in e.acts_on() and type(e).picture is not Effect.picture
+        ]
         if not acting:
             return pictures
         window = letterbox_window(camera.recording_size, pictures.shape[1:3])
-        inside = np.s_[window.top : window.top + window.rows, window.left : window.left + window.columns]
+        inside = np.s_[
+            window.top : window.top + window.rows,
+            window.left : window.left + window.columns,
+        ]
         pictures = pictures.copy()
         for picture in pictures:
             values = picture[inside].astype(np.float32)
             for effect in acting:
-                values = effect.picture(values, window.columns / camera.recording_size[1])
+                values = effect.picture(
+                    values, window.columns / camera.recording_size[1]
+                )
             picture[inside] = np.clip(np.round(values), 0, 255)
         return pictures
 
-    def reset(self, ids: np.ndarray, targets: np.ndarray, seeds: np.ndarray | None = None) -> None:
+    def reset(
+        self, ids: np.ndarray, targets: np.ndarray, seeds: np.ndarray | None = None
+    ) -> None:
         """Start new episodes: the memory of all effects returns to its initial state.
 
         Args:
@@ -146,7 +177,9 @@ class AddedEffects:
             seeds: (n,) seeds of the episodes, for effects that draw random numbers; 0 by default.
         """
         seeds = np.zeros(len(ids), dtype=np.int64) if seeds is None else seeds
-        for effect, memory, start in zip(self.present, self._memory, self._start, strict=True):
+        for effect, memory, start in zip(
+            self.present, self._memory, self._start, strict=True
+        ):
             for name, values in memory.items():
                 values[ids] = start[name][ids]
             effect.begin(memory, ids, seeds)
@@ -179,7 +212,11 @@ class AddedEffects:
         robot = SLOTS.index("robot")
         ordered = sorted(
             zip(self.present, self._memory, strict=True),
-            key=lambda pair: (max(SLOTS.index(pair[0].slot), robot), pair[0].name, pair[0].acts_on()),
+            key=lambda pair: (
+                max(SLOTS.index(pair[0].slot), robot),
+                pair[0].name,
+                pair[0].acts_on(),
+            ),
         )
         named = {
             f"{k}/{effect.name}/{name}": values
@@ -188,7 +225,10 @@ class AddedEffects:
         }
         named |= {"pads/scanned_s": self._scanned_s}
         if self.past:
-            named |= {PAST_POSITIONS: self.past.positions, PAST_TIME_S: self.past.time_s}
+            named |= {
+                PAST_POSITIONS: self.past.positions,
+                PAST_TIME_S: self.past.time_s,
+            }
         return named
 
 
@@ -199,14 +239,21 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
     for k, effect in enumerate(effects):
         for thing in effect.acts_on():
             if (first := taken.setdefault((effect.name, thing), k)) != k:
-                raise TaccorlError(f"{effect.name} acts on {thing} twice, entries {first + 1} and {k + 1}: combine")
+                raise TaccorlError(
+                    f"{effect.name} acts on {thing} twice, entries {first + 1} and {k + 1}: combine"
+                )
     here = [effect for effect in effects if not effect.is_absent]
-    return sorted(here, key=lambda effect: (SLOTS.index(effect.slot), effect.name, effect.acts_on()))
+    return sorted(
+        here,
+        key=lambda effect: (SLOTS.index(effect.slot), effect.name, effect.acts_on()),
+    )
 
 
 def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:
     """Edit a complete model specification so that it contains the effects of ``config``."""
     for effect in present(config.effects):
         if CELLS in effect.acts_on():
-            raise TaccorlError(f"effects: {effect.name}: a twin has no cells; select pads: {', '.join(ROBOT.pads)}")
+            raise TaccorlError(
+                f"effects: {effect.name}: a twin has no cells; select pads: {', '.join(ROBOT.pads)}"
+            )
         effect.edit(spec, config)

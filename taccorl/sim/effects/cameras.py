@@ -19,7 +19,10 @@ _TURN = {
     "bounds": (-0.35, 0.35),
     "source": "a choice: a bracket screwed on by hand; the paper aligns small pose offsets (App. B.3)",
 }
-_SHIFT = {"bounds": (-0.15, 0.15), "source": "a choice: hand-eye measurement with a ruler"}
+_SHIFT = {
+    "bounds": (-0.15, 0.15),
+    "source": "a choice: hand-eye measurement with a ruler",
+}
 
 
 @dataclass(kw_only=True)
@@ -34,7 +37,9 @@ class CameraEffect(Effect):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise TaccorlError(f"effect {self.name}: cameras are {self.cameras}; name at least one, each once")
+            raise TaccorlError(
+                f"effect {self.name}: cameras are {self.cameras}; name at least one, each once"
+            )
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
@@ -47,7 +52,9 @@ class CameraEffect(Effect):
         known = [camera.name for camera in config.cameras]
         for name in self.cameras:
             if name not in known:
-                raise TaccorlError(f"effect {self.name}: the twin has no camera {name!r}; {nearest(name, known)}")
+                raise TaccorlError(
+                    f"effect {self.name}: the twin has no camera {name!r}; {nearest(name, known)}"
+                )
 
 
 @effect("camera_exposure", slot="camera")
@@ -55,7 +62,9 @@ class CameraExposure(CameraEffect):
     """Exposure, gamma and blur of a camera: y = (g·x)^γ for values x in 0 … 1, clipped at 1, then blurred by a Gaussian of σ
     pixels of the recorded stream."""
 
-    gain: float = number("g", "1", 1, 1.3, (0.3, 3), "brightness of the paper's App. E: 0.7 … 1.3")
+    gain: float = number(
+        "g", "1", 1, 1.3, (0.3, 3), "brightness of the paper's App. E: 0.7 … 1.3"
+    )
     gamma: float = number("γ", "1", 1, 1.2, (0.4, 2.5))
     blur_px: float = number("σ", "px", 0, 1, (0, 8), "a choice: one pixel out of focus")
 
@@ -83,14 +92,23 @@ def blurred(picture: np.ndarray, sigma_px: float) -> np.ndarray:
     ends = np.arange(-reach - 0.5, reach + 1)
     weights = np.diff(ndtr(ends / sigma_px))
     weights /= weights.sum()
-    return cv2.sepFilter2D(picture, -1, weights, weights, borderType=cv2.BORDER_REPLICATE)
+    return cv2.sepFilter2D(
+        picture, -1, weights, weights, borderType=cv2.BORDER_REPLICATE
+    )
 
 
 @effect("camera_latency", slot="camera")
 class CameraLatency(CameraEffect):
     """Latency of a camera: the picture at time t shows the scene at t − d. Before the reset the scene counts as at rest."""
 
-    delay_s: float = number("d", "s", 0, 0.05, (0, 0.3), "a choice: one to two frames at 30 Hz, as USB cameras have")
+    delay_s: float = number(
+        "d",
+        "s",
+        0,
+        0.05,
+        (0, 0.3),
+        "a choice: one to two frames at 30 Hz, as USB cameras have",
+    )
 
     def picture_age_s(self) -> float:
         return self.delay_s

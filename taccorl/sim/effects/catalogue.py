@@ -12,7 +12,9 @@ def names_for(kind: str = "") -> list[str]:
     """Return the names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one. Raises
     TaccorlError: no such kind; the message names the nearest."""
     if kind and kind not in KINDS:
-        raise TaccorlError(f"--for={kind}: no effect acts on that; {nearest(kind, KINDS)}")
+        raise TaccorlError(
+            f"--for={kind}: no effect acts on that; {nearest(kind, KINDS)}"
+        )
     return [name for name in effects if not kind or kind in effects.get(name).kinds()]
 
 
@@ -31,10 +33,26 @@ def full(cls: type[Effect]) -> list[str]:
     separate the effect from each near-twin."""
     head, *rest = brief(cls)
     rest = [line for line in rest if not line.startswith("    near-twins: ")]
-    rest = [line if not line.startswith("    needs: ") else f"    needs: {needs_words(cls.needs)}" for line in rest]
-    lines = [head, f"    {cls.in_words}", *rest, f"    what it does to a policy: {cls.at_a_policy}"]
+    rest = [
+        line
+        if not line.startswith("    needs: ")
+        else f"    needs: {needs_words(cls.needs)}"
+        for line in rest
+    ]
+    lines = [
+        head,
+        f"    {cls.in_words}",
+        *rest,
+        f"    what it does to a policy: {cls.at_a_policy}",
+    ]
     lines += [f"    source of {p.name}: {p.source}" for p in cls.parameters()]
-    return [*lines, *(f"    near-twin {ALWAYS_FITTED.get(name, name)}: {why}" for name, why in cls.near_twins.items())]
+    return [
+        *lines,
+        *(
+            f"    near-twin {ALWAYS_FITTED.get(name, name)}: {why}"
+            for name, why in cls.near_twins.items()
+        ),
+    ]
 
 
 def needs_words(needs: Sequence[str]) -> str:

@@ -71,7 +71,9 @@ class CommandLag(_CommandEffect):
     possible: ClassVar = _WITH_GRIPPER
     time_constant_s: float = number("T", "s", 0, 0.05, (0, 0.5))
 
-    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+    def command(
+        self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray
+    ) -> np.ndarray:
         smooth = self.begun(targets, memory)
         smooth += (targets - smooth) * -np.expm1(-dt_s / self.time_constant_s)[:, None]
         return self.replaced(targets, smooth)
@@ -91,14 +93,22 @@ class DroppedCommands(_CommandEffect):
 
     fitted: ClassVar = False
     possible: ClassVar = _WITH_GRIPPER
-    probability: float = number("p", "1", 0, 0.1, (0, 0.95), "a choice; one in ten shows in a second of motion")
+    probability: float = number(
+        "p", "1", 0, 0.1, (0, 0.95), "a choice; one in ten shows in a second of motion"
+    )
     seed: int = 0
     """Seed of the bus: with another seed other commands are lost."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or not 0 <= self.seed <= _WORD:
-            raise TaccorlError(f"effect {self.name}: seed is {self.seed!r}; give a whole number in 0 … {_WORD}")
+        if (
+            isinstance(self.seed, bool)
+            or not isinstance(self.seed, int)
+            or not 0 <= self.seed <= _WORD
+        ):
+            raise TaccorlError(
+                f"effect {self.name}: seed is {self.seed!r}; give a whole number in 0 … {_WORD}"
+            )
 
     def drive(self) -> dict[str, float]:
         return {**(super().drive() or {}), "dropped_commands__seed": float(self.seed)}
@@ -111,7 +121,9 @@ class DroppedCommands(_CommandEffect):
         seeds = np.asarray(seeds, dtype=np.uint64)
         memory["episode"][ids] = (seeds ^ (seeds >> np.uint64(32))) & np.uint64(_WORD)
 
-    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+    def command(
+        self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray
+    ) -> np.ndarray:
         held, sent = memory["target"], dt_s > 0
         lost = uniform(self.seed, memory["episode"], memory["count"]) < self.probability
         keeps = np.where(sent, lost, True)[:, None] & ~np.isnan(held)
@@ -120,12 +132,19 @@ class DroppedCommands(_CommandEffect):
         return self.replaced(targets, held)
 
 
-def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
+def uniform(
+    seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray
+) -> np.ndarray:
     """Uniform random numbers in [0, 1), float64, shape (…), that depend only on ``seed``, ``episode`` and ``count`` (number of
     the command in its episode): whole numbers below 2³², arrays that broadcast to (…). The same on every machine."""
     # Arrays of at least one number: they wrap around, scalars warn.
-    key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)
-    bits = mixed(mixed(key) + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE))
+    key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(
+        episode, dtype=np.uint64
+    )
+    bits = mixed(
+        mixed(key)
+        + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE)
+    )
     return (bits >> np.uint64(11)) * 2.0**-53
 
 
@@ -151,9 +170,18 @@ class SlewLimit(_CommandEffect):
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: 35 to 98 % of the largest commanded speed."""
         shares = (0.35, 0.6, 0.8, 0.92, 0.98)
-        return [{"speed_rad_per_s": cls.clipped("speed_rad_per_s", s * seen["peak_speed_rad_per_s"])} for s in shares]
+        return [
+            {
+                "speed_rad_per_s": cls.clipped(
+                    "speed_rad_per_s", s * seen["peak_speed_rad_per_s"]
+                )
+            }
+            for s in shares
+        ]
 
-    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+    def command(
+        self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray
+    ) -> np.ndarray:
         limited = self.begun(targets, memory)
         reach = (self.speed_rad_per_s * dt_s)[:, None]
         limited += np.clip(targets - limited, -reach, reach)
@@ -168,18 +196,30 @@ class VelocityFeedforward(_CommandEffect):
     gets q* + α (K_d / K_p) q̇*. The effect acts after ``command_lag`` and ``slew_limit``, whose output r is differentiated, and
     before ``command_delay``."""
 
-    share: float = number("α", "1", 0, 0.5, (0, 1.5), "a choice; 1 in the MIT mode with speeds sent")
+    share: float = number(
+        "α", "1", 0, 0.5, (0, 1.5), "a choice; 1 in the MIT mode with speeds sent"
+    )
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         none = np.zeros((num_sims, len(ROBOT.action_names)))
-        return super().memory(num_sims, pad_shape) | {"speed": none, "lead_s": none.copy()}
+        return super().memory(num_sims, pad_shape) | {
+            "speed": none,
+            "lead_s": none.copy(),
+        }
 
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
+    def feel(
+        self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float
+    ) -> None:
         actuators = live.actuators(self.acts_on())
-        kd, kp = -live.model.actuator_biasprm[actuators, 2], -live.model.actuator_biasprm[actuators, 1]
+        kd, kp = (
+            -live.model.actuator_biasprm[actuators, 2],
+            -live.model.actuator_biasprm[actuators, 1],
+        )
         memory["lead_s"][ids[:, None], self.columns] = self.share * kd / kp
 
-    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+    def command(
+        self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray
+    ) -> np.ndarray:
         last, speed, sent = self.begun(targets, memory), memory["speed"], dt_s > 0
         speed[sent] = (targets - last)[sent] / dt_s[sent, None]
         last[sent] = targets[sent]

@@ -9,7 +9,14 @@ import mujoco
 import numpy as np
 
 from taccorl.robots import ROBOT
-from taccorl.sim.effects.effect import ArmEffect, JointEffect, Memory, Parameter, effect, number
+from taccorl.sim.effects.effect import (
+    ArmEffect,
+    JointEffect,
+    Memory,
+    Parameter,
+    effect,
+    number,
+)
 from taccorl.sim.effects.live_model import LiveModel
 
 if TYPE_CHECKING:
@@ -44,9 +51,13 @@ class ErrorDeadband(JointEffect):
         gain, bias = live.own("actuator_gainprm"), live.own("actuator_biasprm")
         inside = np.abs(error) <= self.width_rad
         stiffness = -bias[:, motors, 1]
-        bias[:, motors, 0] -= np.where(inside, 0.0, stiffness * self.width_rad * np.sign(error))
+        bias[:, motors, 0] -= np.where(
+            inside, 0.0, stiffness * self.width_rad * np.sign(error)
+        )
         bias[:, motors, 1] *= np.where(inside, _LEFT, 1.0)
-        gain[:, motors, 0] *= np.where(inside & ~live.integrates(self.acts_on()), _LEFT, 1.0)
+        gain[:, motors, 0] *= np.where(
+            inside & ~live.integrates(self.acts_on()), _LEFT, 1.0
+        )
 
 
 @effect("gravity_mismatch", slot="law", needs="weight")
@@ -78,7 +89,12 @@ class IntegralAction(JointEffect):
     integrated. Laws velocity and cascade: τ = K_d (u + r ∫ u dt), u = q̇* − q̇ or K_p / K_d (q* − q) − q̇; r is 1 / T_i."""
 
     rate_per_s: float = number(
-        "r", "1/s", 0, 0.5, (0, 500), "a choice: K_i / K_p; position loops have up to 5, loops of speed 10 to 200"
+        "r",
+        "1/s",
+        0,
+        0.5,
+        (0, 500),
+        "a choice: K_i / K_p; position loops have up to 5, loops of speed 10 to 200",
     )
 
     @classmethod
@@ -86,19 +102,32 @@ class IntegralAction(JointEffect):
         """Start values of a search, parameter → value each: rates of slow position loops, and those of velocity loops."""
         return [*super().starts(seen), {"rate_per_s": 6.0}, {"rate_per_s": 25.0}]
 
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        if dt_s == 0:  # at rest for ever: the integral has balanced what acts on the joint
+    def feel(
+        self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float
+    ) -> None:
+        if (
+            dt_s == 0
+        ):  # at rest for ever: the integral has balanced what acts on the joint
             motors, dofs = live.actuators(self.acts_on()), live.dofs(self.acts_on())
-            lever = live.model.actuator_gear[motors, 0] * live.model.actuator_gainprm[motors, 0]
+            lever = (
+                live.model.actuator_gear[motors, 0]
+                * live.model.actuator_gainprm[motors, 0]
+            )
             left_nm = live.seen("qfrc_smooth")[np.ix_(ids, dofs)]
-            live.seen("act")[np.ix_(ids, live.integrals(self.acts_on()))] -= left_nm / lever
+            live.seen("act")[np.ix_(ids, live.integrals(self.acts_on()))] -= (
+                left_nm / lever
+            )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():
             actuator = spec.actuator(name)
             kp, bias = actuator.gainprm[0], actuator.biasprm.copy()
-            actuator.set_to_pid(kp=kp, kv=-bias[2], ki=kp * self.rate_per_s, ctrlspec=_POSITION)
-            scale = -bias[1] / kp  # of an encoder: what this actuator sees and integrates is scale · q
+            actuator.set_to_pid(
+                kp=kp, kv=-bias[2], ki=kp * self.rate_per_s, ctrlspec=_POSITION
+            )
+            scale = (
+                -bias[1] / kp
+            )  # of an encoder: what this actuator sees and integrates is scale · q
             actuator.gear[0] *= scale
             actuator.gainprm[0] /= scale
             actuator.biasprm[:3] = [bias[0] / scale, -kp / scale, bias[2] / scale**2]
@@ -122,7 +151,10 @@ class SpeedDelay(JointEffect):
 
     @classmethod
     def accepted(cls, p: Parameter) -> tuple[float, float]:
-        return (-p.high, p.high)  # below 0: a speed that is newer than the difference of two samples of the file's loop
+        return (
+            -p.high,
+            p.high,
+        )  # below 0: a speed that is newer than the difference of two samples of the file's loop
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         joints = list(self.chosen(spec))
@@ -130,7 +162,10 @@ class SpeedDelay(JointEffect):
         for joint, inertia in zip(joints, least, strict=True):
             arm, name = joint.name.split("_", 1)
             control = config.controller_of(arm)
-            kd, most = control.kd_nms_per_rad[ROBOT.joints.index(name)], MOST_LOST * inertia
+            kd, most = (
+                control.kd_nms_per_rad[ROBOT.joints.index(name)],
+                MOST_LOST * inertia,
+            )
             lost = kd * self.delay_s
             joint.armature -= min(lost, most)
             if lost > most:
@@ -185,7 +220,14 @@ class DirectionGain(_ScaledTorque):
     Whether the torque is negative is determined at the end of each physics step, for the next step."""
 
     kept: ClassVar = ("carried_nm", "motor_nm")
-    factor: float = number("g", "1", 1, 0.7, (0.2, 5), "a choice: areas of one-rod cylinders differ by 1.2 to 2")
+    factor: float = number(
+        "g",
+        "1",
+        1,
+        0.7,
+        (0.2, 5),
+        "a choice: areas of one-rod cylinders differ by 1.2 to 2",
+    )
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         return (*super().look(live), live.motor_torque_nm(self.acts_on()))
@@ -217,19 +259,34 @@ class TorqueLag(JointEffect):
 
     rewrites: ClassVar = _GAINS
     kept: ClassVar = ("torque_nm", "new_share")
-    time_constant_s: float = number("T", "s", 0, 0.005, (0, 0.1), "a choice: a winding's L / R and the drive's filters")
+    time_constant_s: float = number(
+        "T",
+        "s",
+        0,
+        0.005,
+        (0, 0.1),
+        "a choice: a winding's L / R and the drive's filters",
+    )
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         memory = super().memory(num_sims, pad_shape)
         memory["new_share"] += 1.0  # without lag until it is known what it begins with
         return memory
 
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        torque, pid = live.seen("actuator_force")[:, live.actuators(self.acts_on())], live.integrates(self.acts_on())
+    def feel(
+        self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float
+    ) -> None:
+        torque, pid = (
+            live.seen("actuator_force")[:, live.actuators(self.acts_on())],
+            live.integrates(self.acts_on()),
+        )
         if dt_s == 0:  # an integral balances the joint at rest
             torque[:, pid] -= live.of_joints("qfrc_smooth", self.acts_on())[:, pid]
         step_s = live.model.opt.timestep
-        memory["torque_nm"][ids], memory["new_share"][ids] = torque[ids], step_s / (step_s + self.time_constant_s)
+        memory["torque_nm"][ids], memory["new_share"][ids] = (
+            torque[ids],
+            step_s / (step_s + self.time_constant_s),
+        )
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         motors, share = live.actuators(self.acts_on()), memory["new_share"]
@@ -254,8 +311,12 @@ class TorqueSaturation(JointEffect):
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Starts of fits, name → limit [N·m]: 55 to 97 % of the largest simulated motor torque; the largest measured one."""
         peak_nm = seen.get("peak_motor_nm", seen["peak_torque_nm"])
-        values = [s * peak_nm for s in (0.55, 0.75, 0.88, 0.97)] + [seen[n] for n in ("peak_measured_nm",) if n in seen]
-        return [{"torque_max_nm": cls.clipped("torque_max_nm", value)} for value in values]
+        values = [s * peak_nm for s in (0.55, 0.75, 0.88, 0.97)] + [
+            seen[n] for n in ("peak_measured_nm",) if n in seen
+        ]
+        return [
+            {"torque_max_nm": cls.clipped("torque_max_nm", value)} for value in values
+        ]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
@@ -270,7 +331,12 @@ class TorqueScale(_ScaledTorque):
 
     rewrites: ClassVar = ("qfrc_applied",)
     factor: float = number(
-        "g", "1", 1, 0.8, (0.2, 5), "a choice; one firmware of this arm gives 4 times the torque (piper_sdk issue 73)"
+        "g",
+        "1",
+        1,
+        0.8,
+        (0.2, 5),
+        "a choice; one firmware of this arm gives 4 times the torque (piper_sdk issue 73)",
     )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
@@ -298,23 +364,36 @@ class TorqueSpeedLimit(JointEffect):
     equals_when_wide: ClassVar = {"torque_saturation": "no_load_rad_per_s"}
     rewrites: ClassVar = ("jnt_actfrcrange",)
     kept: ClassVar = ("speed_rad_per_s",)
-    stall_nm: float = number("τ_s", "N·m", math.inf, 8, (0.05, 200), "as torque_saturation", over_kp=True)
-    no_load_rad_per_s: float = number("v₀", "rad/s", None, 4, (0.1, 50), "joints reach 180–225 °/s (PiPER manual)")
+    stall_nm: float = number(
+        "τ_s", "N·m", math.inf, 8, (0.05, 200), "as torque_saturation", over_kp=True
+    )
+    no_load_rad_per_s: float = number(
+        "v₀", "rad/s", None, 4, (0.1, 50), "joints reach 180–225 °/s (PiPER manual)"
+    )
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: stall torques near the largest commanded torque, no-load speeds near the largest speed."""
-        peak_nm, fastest = seen.get("peak_motor_nm", seen["peak_torque_nm"]), seen["peak_speed_rad_per_s"]
+        peak_nm, fastest = (
+            seen.get("peak_motor_nm", seen["peak_torque_nm"]),
+            seen["peak_speed_rad_per_s"],
+        )
         ends = (("stall_nm", peak_nm), ("no_load_rad_per_s", fastest))
         pairs = ((0.7, 2.0), (1.3, 1.3), (3.0, 1.1), (1.3, 0.85))
         return [
-            {name: cls.clipped(name, k * most) for (name, most), k in zip(ends, pair, strict=True)} for pair in pairs
+            {
+                name: cls.clipped(name, k * most)
+                for (name, most), k in zip(ends, pair, strict=True)
+            }
+            for pair in pairs
         ]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
             most_nm = self.stall_nm
-            if joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE:  # torque_saturation came first
+            if (
+                joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE
+            ):  # torque_saturation came first
                 most_nm = min(most_nm, joint.actfrcrange[1])
             joint.actgravcomp, joint.actfrclimited = True, True
             joint.actfrcrange = [-most_nm, most_nm]
@@ -325,7 +404,13 @@ class TorqueSpeedLimit(JointEffect):
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         speed, span = memory["speed_rad_per_s"], live.own("jnt_actfrcrange")
         joints = live.model.dof_jntid[live.dofs(self.acts_on())]
-        driving_nm = self.stall_nm * np.maximum(1.0 - np.abs(speed) / self.no_load_rad_per_s, 0.0)
+        driving_nm = self.stall_nm * np.maximum(
+            1.0 - np.abs(speed) / self.no_load_rad_per_s, 0.0
+        )
         least, most = span[:, joints, 0], span[:, joints, 1]
-        span[:, joints, 0] = np.maximum(least, -np.where(speed < 0, driving_nm, self.stall_nm))
-        span[:, joints, 1] = np.minimum(most, np.where(speed > 0, driving_nm, self.stall_nm))
+        span[:, joints, 0] = np.maximum(
+            least, -np.where(speed < 0, driving_nm, self.stall_nm)
+        )
+        span[:, joints, 1] = np.minimum(
+            most, np.where(speed > 0, driving_nm, self.stall_nm)
+        )

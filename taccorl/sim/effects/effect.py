@@ -22,7 +22,15 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, dataclass_transform, get_args
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Literal,
+    cast,
+    dataclass_transform,
+    get_args,
+)
 
 import mujoco
 import numpy as np
@@ -113,9 +121,22 @@ def number(
     """A dataclass field that holds a ``Parameter`` with these values; its default is the absent value, or else the typical
     one. ``over_kp`` is ``Parameter.over``."""
     low, high = map(float, bounds)
-    meta = {"unit": unit, "symbol": symbol, "absent": None if absent is None else float(absent)}
-    meta |= {"low": low, "high": high, "typical": float(typical), "source": source, "over": "kp" if over_kp else ""}
-    return field(default=float(typical if absent is None else absent), metadata={"parameter": meta})
+    meta = {
+        "unit": unit,
+        "symbol": symbol,
+        "absent": None if absent is None else float(absent),
+    }
+    meta |= {
+        "low": low,
+        "high": high,
+        "typical": float(typical),
+        "source": source,
+        "over": "kp" if over_kp else "",
+    }
+    return field(
+        default=float(typical if absent is None else absent),
+        metadata={"parameter": meta},
+    )
 
 
 class _Text:
@@ -177,25 +198,38 @@ class Effect:
 
     def __post_init__(self) -> None:
         if "__dataclass_fields__" not in type(self).__dict__:
-            raise TaccorlError(f"effect {self.name}: class {type(self).__name__} lacks its @dataclass(kw_only=True)")
+            raise TaccorlError(
+                f"effect {self.name}: class {type(self).__name__} lacks its @dataclass(kw_only=True)"
+            )
         known = {p.name: p for p in self.parameters()}
         for p in known.values():
             setattr(self, p.name, self._checked(p, getattr(self, p.name)))
         for name, ends in self.interval.items():
             if name not in known:
-                raise TaccorlError(f"effect {self.name}: interval of no parameter, {name!r}; {nearest(name, known)}")
+                raise TaccorlError(
+                    f"effect {self.name}: interval of no parameter, {name!r}; {nearest(name, known)}"
+                )
             if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] > ends[1]:
-                raise TaccorlError(f"effect {self.name}: interval of {name} is {ends}; give two numbers, low and high")
-        self.interval = {name: (float(low), float(high)) for name, (low, high) in self.interval.items()}
+                raise TaccorlError(
+                    f"effect {self.name}: interval of {name} is {ends}; give two numbers, low and high"
+                )
+        self.interval = {
+            name: (float(low), float(high))
+            for name, (low, high) in self.interval.items()
+        }
 
     def _checked(self, p: Parameter, value: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-            raise TaccorlError(f"effect {self.name}: {p.name} is {value!r}; give a number in {p.unit}")
+            raise TaccorlError(
+                f"effect {self.name}: {p.name} is {value!r}; give a number in {p.unit}"
+            )
         low, high = self.accepted(p)
         if value != p.absent and not low <= value <= high:
             unit = "" if p.unit == "1" else f" {p.unit}"
             range_ = f"{low:g} … {high:g}{unit}{self.range_by}"
-            raise TaccorlError(f"effect {self.name}: {p.name} is {value:g}{unit}, outside of {range_}")
+            raise TaccorlError(
+                f"effect {self.name}: {p.name} is {value:g}{unit}, outside of {range_}"
+            )
         return float(value)
 
     @classmethod
@@ -209,7 +243,9 @@ class Effect:
         """Parameters of the effect, in the order of the class's fields."""
         fields = [f for f in dataclasses.fields(cls) if "parameter" in f.metadata]
         if all(f.metadata["parameter"]["absent"] is None for f in fields):
-            raise TaccorlError(f"effect {cls.name}: one of its parameters must have an absent value ({cls.__module__})")
+            raise TaccorlError(
+                f"effect {cls.name}: one of its parameters must have an absent value ({cls.__module__})"
+            )
         return tuple(Parameter(name=f.name, **f.metadata["parameter"]) for f in fields)
 
     @classmethod
@@ -236,7 +272,11 @@ class Effect:
     @property
     def is_absent(self) -> bool:
         """Whether all parameters that have an absent value have it."""
-        return all(getattr(self, p.name) == p.absent for p in self.parameters() if p.absent is not None)
+        return all(
+            getattr(self, p.name) == p.absent
+            for p in self.parameters()
+            if p.absent is not None
+        )
 
     @property
     def reads_as(self) -> str:
@@ -252,16 +292,22 @@ class Effect:
         depend. Of joints: ``peak_torque_nm`` that the twin's controller commands, ``peak_motor_nm`` including gravity
         compensation, ``peak_measured_nm`` of efforts, ``peak_speed_rad_per_s`` and ``span_rad`` of the targets,
         ``lowest_rad`` and ``highest_rad`` that were measured, ``duration_s``."""
-        strength, absent = next((p, p.absent) for p in cls.parameters() if p.absent is not None)
+        strength, absent = next(
+            (p, p.absent) for p in cls.parameters() if p.absent is not None
+        )
         if not math.isfinite(absent):
             return [{}]
         shift = strength.typical - absent
-        two_sided = strength.low <= absent - abs(shift) and absent + abs(shift) <= strength.high
+        two_sided = (
+            strength.low <= absent - abs(shift) and absent + abs(shift) <= strength.high
+        )
         shares = (-1.0, 1.0) if two_sided else (1 / 3, 1.0, 3.0)
         if strength.unit == "N·m" and seen.get("peak_torque_nm", 0.0) > 0:
             shift, shares = min(seen["peak_torque_nm"], strength.high), (0.03, 0.1, 0.3)
         values = [absent + share * shift for share in shares]
-        return [{strength.name: v} for v in values if strength.low <= v <= strength.high]
+        return [
+            {strength.name: v} for v in values if strength.low <= v <= strength.high
+        ]
 
     def drive(self) -> dict[str, float] | None:
         """Field of ``Drive`` in ``alignment.controller.joint_kernel``, ``EFFECT__PARAMETER``, → value. An effect of one's own may
@@ -271,7 +317,9 @@ class Effect:
         and inertia and weight are read from the compiled model."""
         if self.slot == "body":
             return {}
-        own = {f"{self.name}__{p.name}": getattr(self, p.name) for p in self.parameters()}
+        own = {
+            f"{self.name}__{p.name}": getattr(self, p.name) for p in self.parameters()
+        }
         return own if self.slot in JOINT_SLOTS else None
 
     def acts_on(self) -> list[str]:
@@ -294,14 +342,18 @@ class Effect:
         """Prepare ``memory`` for new episodes of the simulations ``ids`` (n,), after a reset to its initial state. ``seeds`` (n,)
         are the seeds of the episodes, for effects that draw random numbers; 0 in simulations for a diagnosis."""
 
-    def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
+    def command(
+        self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray
+    ) -> np.ndarray:
         """Targets (N, A) [rad, m] that arrive at the controllers when ``targets`` (N, A) are sent, 150 times a second.
 
         ``dt_s`` (N,) is the time for which they will be held [s]: 0 for simulations that do not advance, whose memory must not
         change; and after a reset, when the targets are those at rest."""
         return targets
 
-    def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
+    def feel(
+        self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float
+    ) -> None:
         """Called after a physics step of ``dt_s`` [s]: store in ``memory`` what ``rewrite`` needs of the simulations ``ids``
         (n,). Forces are current. ``dt_s`` is 0 after a reset, when the state counts as constant in the past; if no effect of
         the twin has ``rewrites``, the hook is called after resets only."""
@@ -317,7 +369,9 @@ class Effect:
         """Reported values (N, A) [rad, m] for the true joint angles and openings ``values`` (N, A)."""
         return values
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+    def reading(
+        self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray
+    ) -> np.ndarray:
         """Readings of the pads with the effect. ``reading`` (N, P, R, C) are those of ideal pads: from the sensor's law, 0
         without contact, before gain, noise and rounding. Returns a new array of the same shape and float type.
 
@@ -350,7 +404,9 @@ class ArmEffect(Effect):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.arm not in (*ROBOT.arms, "both"):
-            raise TaccorlError(f"effect {self.name}: no arm {self.arm!r}; {nearest(self.arm, (*ROBOT.arms, 'both'))}")
+            raise TaccorlError(
+                f"effect {self.name}: no arm {self.arm!r}; {nearest(self.arm, (*ROBOT.arms, 'both'))}"
+            )
 
     def arms(self) -> list[str]:
         return [arm for arm in ROBOT.arms if self.arm in (arm, "both")]
@@ -391,7 +447,9 @@ class JointEffect(ArmEffect):
         """New values (N, number of chosen joints) of the arrays ``kept``."""
         return ()
 
-    def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
+    def feel(
+        self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float
+    ) -> None:
         for name, values in zip(self.kept, self.look(live), strict=True):
             memory[name][ids] = values[ids]
 
@@ -417,7 +475,9 @@ class TouchEffect(Effect):
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
         """``only``; else ``pads``, and ``cells`` if the class overrides ``reading``: a sensor of cells has nothing else."""
-        return cls.only or (("pads", "cells") if cls.reading is not Effect.reading else ("pads",))
+        return cls.only or (
+            ("pads", "cells") if cls.reading is not Effect.reading else ("pads",)
+        )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -430,7 +490,11 @@ class TouchEffect(Effect):
     @property
     def slots(self) -> list[int]:
         """Indices of the chosen pads in the P pads of a reading; a sensor of cells is the only entry of its reading."""
-        return [0] if self.pads == [CELLS] else [ROBOT.pads.index(pad) for pad in self.pads]
+        return (
+            [0]
+            if self.pads == [CELLS]
+            else [ROBOT.pads.index(pad) for pad in self.pads]
+        )
 
     def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":
         """The effect for readings of these rows and columns only; None if it requires whole pads (``windows``)."""
@@ -447,15 +511,23 @@ class BoardEffect(TouchEffect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise TaccorlError(f"effect {self.name}: seed is {self.seed!r}; give a whole number of 0 or more")
+        if (
+            isinstance(self.seed, bool)
+            or not isinstance(self.seed, int)
+            or self.seed < 0
+        ):
+            raise TaccorlError(
+                f"effect {self.name}: seed is {self.seed!r}; give a whole number of 0 or more"
+            )
 
 
 effects: Registry[type[Effect]] = Registry("effect", "taccorl.sim.effects")
 
 
 @dataclass_transform(kw_only_default=True, field_specifiers=(number, field))
-def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) -> Callable[[type[E]], type[E]]:
+def effect[E: Effect](
+    name: str, slot: Slot, needs: tuple[str, ...] | str = ()
+) -> Callable[[type[E]], type[E]]:
     """Class decorator of an effect: makes a keyword-only dataclass of it and registers it under ``name``. ``needs``:
     ``Effect.needs``, one word or several; those of the base class if not given."""
 
@@ -463,7 +535,10 @@ def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) 
         cls.name, cls.slot = name, slot
         if needs:
             cls.needs = (needs,) if isinstance(needs, str) else needs
-        for word, known in ((slot, SLOTS), *((word, tuple(NEEDS)) for word in getattr(cls, "needs", ()))):
+        for word, known in (
+            (slot, SLOTS),
+            *((word, tuple(NEEDS)) for word in getattr(cls, "needs", ())),
+        ):
             if word not in known:
                 raise TaccorlError(f"effect {name}: {word!r}: {nearest(word, known)}")
         return effects.register(name)(dataclass(kw_only=True)(cls))
@@ -471,9 +546,15 @@ def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) 
     return add
 
 
-def _check_chosen(effect: str, kind: str, chosen: list[str], possible: tuple[str, ...]) -> None:
+def _check_chosen(
+    effect: str, kind: str, chosen: list[str], possible: tuple[str, ...]
+) -> None:
     for name in chosen:
         if name not in possible:
-            raise TaccorlError(f"effect {effect}: {kind}s: no {kind} {name!r}; {nearest(name, possible)}")
+            raise TaccorlError(
+                f"effect {effect}: {kind}s: no {kind} {name!r}; {nearest(name, possible)}"
+            )
     if not chosen or len(set(chosen)) < len(chosen):
-        raise TaccorlError(f"effect {effect}: {kind}s are {chosen}; name at least one, each once")
+        raise TaccorlError(
+            f"effect {effect}: {kind}s are {chosen}; name at least one, each once"
+        )

@@ -22,12 +22,21 @@ class EncoderBias(JointEffect):
     """Constant error of an encoder: y = q + b, and τ = K_p (q* − y) − K_d q̇ + T_ref. The joint settles at q* − b and reports
     q*. So the reported angle alone does not show the effect at rest; cameras, touch and the arm's weight do."""
 
-    bias_rad: float = number("b", "rad", 0, 0.01, (-0.2, 0.2), "a choice: half a degree from zeroing an arm by hand")
+    bias_rad: float = number(
+        "b",
+        "rad",
+        0,
+        0.01,
+        (-0.2, 0.2),
+        "a choice: half a degree from zeroing an arm by hand",
+    )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():
             actuator = spec.actuator(name)
-            actuator.biasprm[0] -= actuator.gainprm[0] * self.bias_rad  # K_p (q* − q − b)
+            actuator.biasprm[0] -= (
+                actuator.gainprm[0] * self.bias_rad
+            )  # K_p (q* − q − b)
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
         values = values.copy()
@@ -45,17 +54,23 @@ class EncoderEccentricity(JointEffect):
 
     rewrites: ClassVar = ("actuator_biasprm",)
     kept: ClassVar = ("angle_rad",)
-    amplitude_rad: float = number("A", "rad", 0, 0.01, (0, 0.1), "a choice: 0.1 mm on a disc of 10 mm")
+    amplitude_rad: float = number(
+        "A", "rad", 0, 0.01, (0, 0.1), "a choice: 0.1 mm on a disc of 10 mm"
+    )
     phase_rad: float = number("φ", "rad", None, 0, (-math.tau, math.tau))
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: sine and cosine, of both signs."""
-        return [{"phase_rad": phase} for phase in (0.0, math.pi / 2, math.pi, -math.pi / 2)]
+        return [
+            {"phase_rad": phase} for phase in (0.0, math.pi / 2, math.pi, -math.pi / 2)
+        ]
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
         values = values.copy()
-        values[:, self.columns] += self.amplitude_rad * np.sin(values[:, self.columns] + self.phase_rad)
+        values[:, self.columns] += self.amplitude_rad * np.sin(
+            values[:, self.columns] + self.phase_rad
+        )
         return values
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
@@ -64,7 +79,9 @@ class EncoderEccentricity(JointEffect):
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         turned = memory["angle_rad"] + self.phase_rad
         bias, actuators = live.own("actuator_biasprm"), live.actuators(self.acts_on())
-        bias[:, actuators, 0] += bias[:, actuators, 1] * self.amplitude_rad * np.sin(turned)
+        bias[:, actuators, 0] += (
+            bias[:, actuators, 1] * self.amplitude_rad * np.sin(turned)
+        )
         bias[:, actuators, 2] *= 1.0 + self.amplitude_rad * np.cos(turned)
 
 
@@ -91,7 +108,9 @@ class SensorDelay(JointEffect):
     without delay."""
 
     possible: ClassVar = (*ROBOT.joints, "gripper")
-    delay_s: float = number("d", "s", 0, 0.02, (0, 0.2), "a choice: some cycles of the 200 Hz report")
+    delay_s: float = number(
+        "d", "s", 0, 0.02, (0, 0.2), "a choice: some cycles of the 200 Hz report"
+    )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():

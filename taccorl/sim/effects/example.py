@@ -92,5 +92,10 @@ _CURVE = """    effect = {cls}(curvature=0.1)
 def example(name: str, module: str, kind: Literal["joint", "cells"]) -> str:
     """Return the Python source of a module ``module`` with the effect ``name`` and two tests of it, of a joint or of cells."""
     law, arithmetic = {"joint": (_JOINT, _SPRING), "cells": (_CELLS, _CURVE)}[kind]
-    cls, title = "".join(word.capitalize() for word in name.split("_")), name.replace("_", " ").capitalize()
-    return (_HEAD + law + _TEST + arithmetic).format(name=name, module=module, cls=cls, title=title)
+    cls, title = (
+        "".join(word.capitalize() for word in name.split("_")),
+        name.replace("_", " ").capitalize(),
+    )
+    return (_HEAD + law + _TEST + arithmetic).format(
+        name=name, module=module, cls=cls, title=title
+    )

@@ -32,17 +32,30 @@ def add_dry_friction(joint: mujoco.MjsJoint, torque_nm: float) -> None:
     joint.solimp_friction = [DRY_SHARE, DRY_SHARE, 0.001, 0.5, 2.0]
 
 
-def add_bristles(spec: mujoco.MjSpec, joint: str, torque_nm: float, presliding_rad: float) -> None:
+def add_bristles(
+    spec: mujoco.MjSpec, joint: str, torque_nm: float, presliding_rad: float
+) -> None:
     """Add dry friction F [N·m] by Dahl's bristles, which bend by about x_p [rad] before the joint slides, as LuGre terms."""
     k = torque_nm / presliding_rad
-    add_passive_torque(spec, joint, "presliding", lugre=[k, BRISTLE_DAMPING_S * k, torque_nm, torque_nm, 1.0])
+    add_passive_torque(
+        spec,
+        joint,
+        "presliding",
+        lugre=[k, BRISTLE_DAMPING_S * k, torque_nm, torque_nm, 1.0],
+    )
 
 
-def add_passive_torque(spec: mujoco.MjSpec, joint: str, what: str, **terms: list[float]) -> None:
+def add_passive_torque(
+    spec: mujoco.MjSpec, joint: str, what: str, **terms: list[float]
+) -> None:
     """Add the actuator ``{joint}_{what}``: MuJoCo's DC motor without input and current, of which only the ``cogging`` or
     ``lugre`` terms act. ``torque_saturation`` of the same joint limits the sum of this actuator and the motor."""
-    actuator = spec.add_actuator(name=f"{joint}_{what}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
-    actuator.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=_NO_INPUT, **terms)
+    actuator = spec.add_actuator(
+        name=f"{joint}_{what}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint
+    )
+    actuator.set_to_dcmotor(
+        motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=_NO_INPUT, **terms
+    )
 
 
 class _LiveFriction(JointEffect):
@@ -56,7 +69,9 @@ class _LiveFriction(JointEffect):
             add_dry_friction(joint, 0.0)
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
-        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += memory["friction_nm"]
+        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += memory[
+            "friction_nm"
+        ]
 
 
 @effect("asymmetric_friction", slot="friction", needs="velocity")
@@ -68,7 +83,9 @@ class AsymmetricFriction(JointEffect):
     from the motor: efforts do not include it."""
 
     same_with_torque_ff: ClassVar = ("coulomb_friction",)
-    torque_nm: float = number("F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
+    torque_nm: float = number(
+        "F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True
+    )
     asymmetry: float = number("a", "1", None, 0.3, (-0.9, 0.9))
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
@@ -92,7 +109,9 @@ class CoulombFriction(JointEffect):
         "0.2–0.8 N·m fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification); 0.3 in Menagerie’s PiPER",
         over_kp=True,
     )  # fmt: skip
-    presliding_rad: float = number("x_p", "rad", 0, 1e-4, (0, 1e-2), "a choice; 0: the friction is rigid")
+    presliding_rad: float = number(
+        "x_p", "rad", 0, 1e-4, (0, 1e-2), "a choice; 0: the friction is rigid"
+    )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name, joint in zip(self.acts_on(), self.chosen(spec), strict=True):
@@ -117,10 +136,17 @@ class LoadFriction(_LiveFriction):
     )  # fmt: skip
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
-        return (np.abs(live.motor_torque_nm(self.acts_on()) + live.of_joints("qfrc_bias", self.acts_on())),)
+        return (
+            np.abs(
+                live.motor_torque_nm(self.acts_on())
+                + live.of_joints("qfrc_bias", self.acts_on())
+            ),
+        )
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
-        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += self.share * memory["passed_nm"]
+        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += (
+            self.share * memory["passed_nm"]
+        )
 
 
 @effect("position_dependent_friction", slot="friction", needs=("position", "velocity"))
@@ -135,8 +161,17 @@ class PositionDependentFriction(_LiveFriction):
     angle."""
 
     equals_when_wide: ClassVar = {"coulomb_friction": "width_rad"}
-    torque_nm: float = number("F₀", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
-    angle_rad: float = number("q₀", "rad", None, 0.55, (-4, 4), "a choice; a search takes it from the recordings")
+    torque_nm: float = number(
+        "F₀", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True
+    )
+    angle_rad: float = number(
+        "q₀",
+        "rad",
+        None,
+        0.55,
+        (-4, 4),
+        "a choice; a search takes it from the recordings",
+    )
     width_rad: float = number(
         "w", "rad", None, 0.1, (0.005, 2),
         "a choice: a tooth or a cable guide is narrow, a gear out of true is as wide as a radian",
@@ -148,9 +183,13 @@ class PositionDependentFriction(_LiveFriction):
         at its middle and its ends."""
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)
-        spots = [(place, 0.12) for place in np.arange(1, 12, 2) / 12] + [(place, 0.35) for place in (0.0, 0.5, 1.0)]
+        spots = [(place, 0.12) for place in np.arange(1, 12, 2) / 12] + [
+            (place, 0.35) for place in (0.0, 0.5, 1.0)
+        ]
         spots.sort()  # the middle one stands for all where one is enough
-        most_nm = min(max(0.1 * seen["peak_torque_nm"], 1e-3), cls.clipped("torque_nm", math.inf))
+        most_nm = min(
+            max(0.1 * seen["peak_torque_nm"], 1e-3), cls.clipped("torque_nm", math.inf)
+        )
         return [
             {
                 "torque_nm": most_nm,
@@ -162,7 +201,10 @@ class PositionDependentFriction(_LiveFriction):
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         angle = live.seen("qpos")[:, live.angles(self.acts_on())]
-        return (self.torque_nm * np.exp(-(((angle - self.angle_rad) / self.width_rad) ** 2)),)
+        return (
+            self.torque_nm
+            * np.exp(-(((angle - self.angle_rad) / self.width_rad) ** 2)),
+        )
 
 
 @effect("power_law_friction", slot="friction", needs="velocity")
@@ -174,19 +216,38 @@ class PowerLawFriction(_LiveFriction):
     reduces_to: ClassVar = {"coulomb_friction": "exponent"}
     equals_when_wide: ClassVar = {"viscous_friction": "exponent"}
     optional: ClassVar = {"yield_nm": "coulomb_friction"}
-    torque_nm: float = number("F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
-    exponent: float = number("n", "1", None, 0.4, (0, 1), "a choice; 0.7 fits a real drive (EMPS, docs/your_robot.md)")
+    torque_nm: float = number(
+        "F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True
+    )
+    exponent: float = number(
+        "n",
+        "1",
+        None,
+        0.4,
+        (0, 1),
+        "a choice; 0.7 fits a real drive (EMPS, docs/your_robot.md)",
+    )
     asymmetry: float = number("a", "1", None, 0, (-0.9, 0.9))
-    yield_nm: float = number("F_y", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
+    yield_nm: float = number(
+        "F_y", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True
+    )
 
     @property
     def reads_as(self) -> str:
         sides = f", asymmetric by {self.asymmetry:.2g}" if self.asymmetry else ""
-        return f"dry friction that the speed hardly changes{sides}" if self.exponent < 0.1 else ""
+        return (
+            f"dry friction that the speed hardly changes{sides}"
+            if self.exponent < 0.1
+            else ""
+        )
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         speed = live.of_joints("qvel", self.acts_on())
-        grown = self.torque_nm * (np.abs(speed) / AT_RAD_PER_S) ** self.exponent * (speed != 0.0)
+        grown = (
+            self.torque_nm
+            * (np.abs(speed) / AT_RAD_PER_S) ** self.exponent
+            * (speed != 0.0)
+        )
         return (self.yield_nm + grown * (1.0 + self.asymmetry * np.sign(speed)),)
 
 
@@ -202,12 +263,24 @@ class Presliding(JointEffect):
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name, joint in zip(self.acts_on(), self.chosen(spec), strict=True):
             for k, other in enumerate(config.effects):
-                if other.name not in ("coulomb_friction", "asymmetric_friction") or name not in other.acts_on():
+                if (
+                    other.name not in ("coulomb_friction", "asymmetric_friction")
+                    or name not in other.acts_on()
+                ):
                     continue
-                is_later, has_own = k > config.effects.index(self), getattr(other, "presliding_rad", 0.0) > 0.0
+                is_later, has_own = (
+                    k > config.effects.index(self),
+                    getattr(other, "presliding_rad", 0.0) > 0.0,
+                )
                 if is_later or has_own:
-                    why = "comes after it; list it before" if is_later else "has bristles of its own; remove one"
-                    raise TaccorlError(f"effect presliding of {name}: {other.name} {why}")
+                    why = (
+                        "comes after it; list it before"
+                        if is_later
+                        else "has bristles of its own; remove one"
+                    )
+                    raise TaccorlError(
+                        f"effect presliding of {name}: {other.name} {why}"
+                    )
             most_nm, joint.frictionloss = joint.frictionloss, 0.0
             if most_nm > 0.0:
                 add_bristles(spec, name, most_nm, self.presliding_rad)
@@ -218,7 +291,9 @@ class QuadraticDrag(JointEffect):
     """Drag in proportion to the squared speed: τ = −c q̇ |q̇|. At half the speed a quarter of it remains, so that a change of
     K_d can reproduce it at one speed only. Implemented as the second coefficient of MuJoCo's polynomial joint damping."""
 
-    drag_nms2_per_rad2: float = number("c", "N·m·s²/rad²", 0, 2, (0, 50), "0.3 N·m at 0.4 rad/s", over_kp=True)
+    drag_nms2_per_rad2: float = number(
+        "c", "N·m·s²/rad²", 0, 2, (0, 50), "0.3 N·m at 0.4 rad/s", over_kp=True
+    )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
@@ -234,16 +309,26 @@ class StribeckFriction(JointEffect):
     Implemented as MuJoCo's passive DC motor, with one additional activation in the state."""
 
     reduces_to: ClassVar = {"coulomb_friction": "stiction_share"}
-    torque_nm: float = number("F", "N·m", 0, 0.3, (0, 20), "as coulomb_friction", over_kp=True)
+    torque_nm: float = number(
+        "F", "N·m", 0, 0.3, (0, 20), "as coulomb_friction", over_kp=True
+    )
     stiction_share: float = number("s", "1", None, 1, (0, 3))
     stribeck_rad_per_s: float = number("v_s", "rad/s", None, 0.05, (0.005, 1))
-    presliding_rad: float = number("x_p", "rad", None, 5e-4, (1e-4, 1e-2), "stiffness of bristles: F (1 + s) / x_p")
+    presliding_rad: float = number(
+        "x_p", "rad", None, 5e-4, (1e-4, 1e-2), "stiffness of bristles: F (1 + s) / x_p"
+    )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         most_nm = self.torque_nm * (1.0 + self.stiction_share)
         stiffness = most_nm / self.presliding_rad
         for name in self.acts_on():
-            lugre = [stiffness, BRISTLE_DAMPING_S * stiffness, self.torque_nm, most_nm, self.stribeck_rad_per_s]
+            lugre = [
+                stiffness,
+                BRISTLE_DAMPING_S * stiffness,
+                self.torque_nm,
+                most_nm,
+                self.stribeck_rad_per_s,
+            ]
             add_passive_torque(spec, name, "stribeck", lugre=lugre)
 
 

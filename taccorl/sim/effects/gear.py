@@ -21,7 +21,9 @@ def _add_joint(motor: mujoco.MjsJoint, what: str) -> mujoco.MjsJoint:
 
     The motor supplies the gravity compensation. MuJoCo's gravity compensation acts on every joint; at this hinge it counts as an
     actuator force, which is limited to zero, so that the weight loads the gear."""
-    joint = motor.parent.add_joint(name=f"{motor.name}_{what}", axis=motor.axis, pos=motor.pos, armature=GEAR_KGM2)
+    joint = motor.parent.add_joint(
+        name=f"{motor.name}_{what}", axis=motor.axis, pos=motor.pos, armature=GEAR_KGM2
+    )
     joint.actgravcomp, joint.actfrclimited = True, True
     joint.actfrcrange = [-1e-12, 1e-12]
     return joint
@@ -53,13 +55,21 @@ class JointCompliance(JointEffect):
     The effect is a second hinge with a spring between the motor's joint and the link, so that the model has one more joint:
     ``left_joint5_compliance``. Its damping is κ / c."""
 
-    compliance_rad_per_nm: float = number("c", "rad/(N·m)", 0, 0.001, (0, 0.05), "a choice: 1e3 N·m/rad")
-    damping_s: float = number("κ", "s", None, 0.002, (0, 0.05), "a choice: lightly damped")
+    compliance_rad_per_nm: float = number(
+        "c", "rad/(N·m)", 0, 0.001, (0, 0.05), "a choice: 1e3 N·m/rad"
+    )
+    damping_s: float = number(
+        "κ", "s", None, 0.002, (0, 0.05), "a choice: lightly damped"
+    )
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: also gears as soft as the drive, and three times as soft."""
-        soft = [times * seen["drive_rad_per_nm"] for times in (1.0, 3.0) if "drive_rad_per_nm" in seen]
+        soft = [
+            times * seen["drive_rad_per_nm"]
+            for times in (1.0, 3.0)
+            if "drive_rad_per_nm" in seen
+        ]
         return [*super().starts(seen), *({"compliance_rad_per_nm": c} for c in soft)]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:

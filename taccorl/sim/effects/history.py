@@ -9,7 +9,9 @@ from mujoco.batch import Batch
 _LINEAR = 1  # MuJoCo's ``interp``: with the default, a hold, the trajectory would change with the delay in jumps
 
 
-def delay(entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep_s: float) -> None:
+def delay(
+    entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep_s: float
+) -> None:
     """Delay the control of an actuator, or the value of a sensor, by ``delay_s``, with linear interpolation.
 
     Values are stored once a physics step (``timestep_s``), and read before the newest is stored: a delay below one step acts as

@@ -9,7 +9,14 @@ import numpy as np
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.effects.effect import ArmEffect, JointEffect, Memory, Parameter, effect, number
+from taccorl.sim.effects.effect import (
+    ArmEffect,
+    JointEffect,
+    Memory,
+    Parameter,
+    effect,
+    number,
+)
 from taccorl.sim.effects.friction import add_passive_torque
 from taccorl.sim.effects.live_model import LiveModel
 
@@ -21,7 +28,10 @@ STOP_DAMPING_S = 0.005
 FARTHEST_M = 2.0
 """Largest distance of a ``payload`` that a file may state [m]: bounds of its place are those of a search on the PiPER."""
 _RADIUS_M = 0.02  # of the payload's ball, for its inertia
-_MOST_PERIODS, _MOST_STARTS = 60.0, 32  # where a search for cogging ends; enough for a span of π
+_MOST_PERIODS, _MOST_STARTS = (
+    60.0,
+    32,
+)  # where a search for cogging ends; enough for a span of π
 _QUARTERS = (0.0, math.pi / 2, math.pi, -math.pi / 2)  # sine and cosine of both signs
 
 
@@ -46,7 +56,14 @@ class CableSpring(JointEffect):
     K_p, which grows with the distance from q₀. Implemented as MuJoCo's joint spring."""
 
     stiffness_nm_per_rad: float = number("k", "N·m/rad", 0, 1, (0, 50), over_kp=True)
-    rest_rad: float = number("q₀", "rad", None, 0, (-3.2, 3.2), "a choice: cables are laid with the arm straight")
+    rest_rad: float = number(
+        "q₀",
+        "rad",
+        None,
+        0,
+        (-3.2, 3.2),
+        "a choice: cables are laid with the arm straight",
+    )
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
@@ -56,7 +73,10 @@ class CableSpring(JointEffect):
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
-            joint.stiffness[0], joint.springref = self.stiffness_nm_per_rad, self.rest_rad
+            joint.stiffness[0], joint.springref = (
+                self.stiffness_nm_per_rad,
+                self.rest_rad,
+            )
 
 
 @effect("cogging", slot="load", needs="position")
@@ -65,7 +85,9 @@ class Cogging(JointEffect):
 
     Implemented by the cogging term of a passive MuJoCo DC motor. Efforts do not include the torque."""
 
-    torque_nm: float = number("A", "N·m", 0, 0.3, (0, 5), "a choice: as much as friction", over_kp=True)
+    torque_nm: float = number(
+        "A", "N·m", 0, 0.3, (0, 5), "a choice: as much as friction", over_kp=True
+    )
     periods: float = number(
         "N", "1", None, 24, (6, 200),
         "a choice: fewer are weight or a cable; of the joint's turn, so a gear's ratio times the motor's periods",
@@ -77,18 +99,38 @@ class Cogging(JointEffect):
         """Start values of a search: sine and cosine of both signs; numbers of periods in steps of half the resolution of a
         recording over ``span_rad``, from half a period in it on; a twentieth of the torque that the controller commands. Of
         recordings of many turns periods ``wave_periods_1`` …, phases ``wave_phase_1`` … and π/4 to both sides."""
-        apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
-        periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
-        waves = [(seen[f"wave_periods_{k}"], seen[f"wave_phase_{k}"]) for k in (1, 2, 3) if f"wave_periods_{k}" in seen]
+        apart = max(
+            0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS
+        )
+        periods = np.arange(
+            min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart
+        )
+        waves = [
+            (seen[f"wave_periods_{k}"], seen[f"wave_phase_{k}"])
+            for k in (1, 2, 3)
+            if f"wave_periods_{k}" in seen
+        ]
         turns = (0.0, -0.25 * math.pi, 0.25 * math.pi)
-        pairs = [(n, math.remainder(phase + turn, math.tau)) for n, phase in waves for turn in turns]
+        pairs = [
+            (n, math.remainder(phase + turn, math.tau))
+            for n, phase in waves
+            for turn in turns
+        ]
         pairs = pairs or [(float(n), phase) for n in periods for phase in _QUARTERS]
         torque_nm = min(max(0.05 * seen["peak_torque_nm"], 1e-3), 5.0)
-        return [{"torque_nm": torque_nm, "periods": n, "phase_rad": phase} for n, phase in pairs]
+        return [
+            {"torque_nm": torque_nm, "periods": n, "phase_rad": phase}
+            for n, phase in pairs
+        ]
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():
-            add_passive_torque(spec, name, "cogging", cogging=[self.torque_nm, self.periods, self.phase_rad])
+            add_passive_torque(
+                spec,
+                name,
+                "cogging",
+                cogging=[self.torque_nm, self.periods, self.phase_rad],
+            )
 
 
 @effect("end_stop", slot="load", needs=("position", "velocity"))
@@ -106,7 +148,14 @@ class EndStop(JointEffect):
         "k", "N·m/rad", 0, 1e3, (0, 1e5),
         "a choice: a plastic cover; of steel it is as stiff as the arm, above 1e4", over_kp=True,
     )  # fmt: skip
-    angle_rad: float = number("q_e", "rad", None, 0.55, (-4, 4), "a choice; a search takes it from the recordings")
+    angle_rad: float = number(
+        "q_e",
+        "rad",
+        None,
+        0.55,
+        (-4, 4),
+        "a choice; a search takes it from the recordings",
+    )
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
@@ -117,7 +166,9 @@ class EndStop(JointEffect):
         reach, torque_nm = max(high - low, 1e-3), max(seen["peak_torque_nm"], 0.01)
         return [
             {
-                "stiffness_nm_per_rad": cls.clipped("stiffness_nm_per_rad", max(torque_nm / (gives * reach), 1.0)),
+                "stiffness_nm_per_rad": cls.clipped(
+                    "stiffness_nm_per_rad", max(torque_nm / (gives * reach), 1.0)
+                ),
                 "angle_rad": cls.clipped("angle_rad", place),
             }
             for inside, gives in ((0.02, 0.02), (0.1, 0.1), (0.3, 0.2))
@@ -129,7 +180,9 @@ class EndStop(JointEffect):
         memory["side"] += 1.0
         return memory
 
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
+    def feel(
+        self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float
+    ) -> None:
         angle = live.seen("qpos")[:, live.angles(self.acts_on())][ids]
         if dt_s == 0:
             memory["side"][ids] = np.where(angle <= self.angle_rad, 1.0, -1.0)
@@ -145,7 +198,12 @@ class EndStop(JointEffect):
         own, added = stiffness[:, joints], self.stiffness_nm_per_rad * memory["touches"]
         both = own + added
         # Two springs are one that rests in between: cable_spring may be there, too.
-        middle = np.divide(own * rest[:, angles] + added * self.angle_rad, both, out=rest[:, angles], where=added > 0)
+        middle = np.divide(
+            own * rest[:, angles] + added * self.angle_rad,
+            both,
+            out=rest[:, angles],
+            where=added > 0,
+        )
         stiffness[:, joints], rest[:, angles] = both, middle
         live.own("dof_damping")[:, dofs] += STOP_DAMPING_S * added
 
@@ -155,10 +213,29 @@ class Payload(ArmEffect):
     """Unknown payload: a ball of mass m fixed to the last body at c, along that body's axes. It adds the torque m g × lever arm
     to every joint, and its inertia. It has no contacts. In a robot file, m < 0: what the robot lacks of the model."""
 
-    mass_kg: float = number("m", "kg", 0, 0.2, (0, 1.5), "a choice; rated: 1.5 kg (PiPER manual)", over_kp=True)
-    x_m: float = number("c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
-    y_m: float = number("c_y", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
-    z_m: float = number("c_z", "m", None, 0.1, (-0.05, 0.25), "a choice: between flange and pads (TCP at 0.168)")
+    mass_kg: float = number(
+        "m",
+        "kg",
+        0,
+        0.2,
+        (0, 1.5),
+        "a choice; rated: 1.5 kg (PiPER manual)",
+        over_kp=True,
+    )
+    x_m: float = number(
+        "c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand"
+    )
+    y_m: float = number(
+        "c_y", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand"
+    )
+    z_m: float = number(
+        "c_z",
+        "m",
+        None,
+        0.1,
+        (-0.05, 0.25),
+        "a choice: between flange and pads (TCP at 0.168)",
+    )
     link: str = ""
     """Body of a robot file's model to which it is fixed; empty: the last one that the joint moves, of the PiPER the hand."""
     like_link: bool = False
@@ -171,21 +248,37 @@ class Payload(ArmEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search: the mass at its typical place, or a quarter of the range beside it along one axis."""
-        masses, places = super().starts(seen), [p for p in cls.parameters() if p.unit == "m"]
+        masses, places = (
+            super().starts(seen),
+            [p for p in cls.parameters() if p.unit == "m"],
+        )
         sides = [(p, side) for p in places for side in (-0.25, 0.25)]
-        return masses + [masses[-1] | {p.name: p.typical + side * (p.high - p.low)} for p, side in sides]
+        return masses + [
+            masses[-1] | {p.name: p.typical + side * (p.high - p.low)}
+            for p, side in sides
+        ]
 
     @property
     def reads_as(self) -> str:
-        so = "heavier throughout" if self.mass_kg > 0.0 else "lighter" + " throughout" * self.like_link
+        so = (
+            "heavier throughout"
+            if self.mass_kg > 0.0
+            else "lighter" + " throughout" * self.like_link
+        )
         text = f"{self.link or 'the last link that it moves'} is {so} than its model"
         return text * (self.mass_kg < 0.0 or self.like_link)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         below = f"mass_kg is {self.mass_kg:g} kg, below 0" * (self.mass_kg < 0.0)
-        stated = [below, f"link is {self.link!r}" * bool(self.link), "like_link is true" * self.like_link]
+        stated = [
+            below,
+            f"link is {self.link!r}" * bool(self.link),
+            "like_link is true" * self.like_link,
+        ]
         if what := " and ".join(filter(None, stated)):
-            raise TaccorlError(f"effect payload: {what}, which only robot files can state; remove it")
+            raise TaccorlError(
+                f"effect payload: {what}, which only robot files can state; remove it"
+            )
         for arm in self.arms():
             ball = spec.body(f"{arm}_{ROBOT.hand}").add_body(name=f"{arm}_payload")
             ball.mass, ball.explicitinertial = self.mass_kg, True
@@ -204,7 +297,9 @@ class Unbalance(JointEffect):
     it. Implemented by the cogging term of a passive MuJoCo DC motor, with one period a turn. Efforts do not include the torque.
     """
 
-    torque_nm: float = number("A", "N·m", 0, 0.5, (0, 10), "a choice: 0.5 kg at 0.1 m", over_kp=True)
+    torque_nm: float = number(
+        "A", "N·m", 0, 0.5, (0, 10), "a choice: 0.5 kg at 0.1 m", over_kp=True
+    )
     hangs_at_rad: float = number("q₀", "rad", None, 0, (-math.tau, math.tau))
 
     @classmethod
@@ -215,4 +310,9 @@ class Unbalance(JointEffect):
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():
-            add_passive_torque(spec, name, "unbalance", cogging=[self.torque_nm, 1.0, math.pi - self.hangs_at_rad])
+            add_passive_torque(
+                spec,
+                name,
+                "unbalance",
+                cogging=[self.torque_nm, 1.0, math.pi - self.hangs_at_rad],
+            )

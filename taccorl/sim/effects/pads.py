@@ -50,7 +50,12 @@ class DepthOffset(PadFrameEffect):
     command presses harder."""
 
     offset_m: float = number(
-        "d", "m", 0, 1e-4, (-1e-3, 1e-3), "a choice: pads are cut by hand, 3.6 mm thick (FlexiTac simulation settings)"
+        "d",
+        "m",
+        0,
+        1e-4,
+        (-1e-3, 1e-3),
+        "a choice: pads are cut by hand, 3.6 mm thick (FlexiTac simulation settings)",
     )
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
@@ -72,10 +77,15 @@ class PadShift(PadFrameEffect):
         """Start values of a search, parameter → value each: half a taxel in each direction. At larger shifts contact areas
         that do not overlap give no gradient."""
         half = 1e-3
-        return [{"across_m": s, "along_m": t} for s, t in ((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half))]
+        return [
+            {"across_m": s, "along_m": t}
+            for s, t in ((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half))
+        ]
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
-        return np.array([(1.0 if pad.endswith("_a") else -1.0) * self.across_m, self.along_m, 0.0])
+        return np.array(
+            [(1.0 if pad.endswith("_a") else -1.0) * self.across_m, self.along_m, 0.0]
+        )
 
 
 @effect("pad_compliance", slot="robot", needs="contact")
@@ -84,11 +94,15 @@ class PadCompliance(TouchEffect):
 
     A sensor's gain changes readings in the same way; only the opening of the fingers distinguishes the two."""
 
-    stiffness_factor: float = number("k", "1", 1, 0.5, (0.05, 20), "a choice, as the nominal stiffness is")
+    stiffness_factor: float = number(
+        "k", "1", 1, 0.5, (0.05, 20), "a choice, as the nominal stiffness is"
+    )
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         if config.robot.pads != "sprung":
-            raise TaccorlError(f"effect pad_compliance: pads are {config.robot.pads}; set robot.pads to sprung")
+            raise TaccorlError(
+                f"effect pad_compliance: pads are {config.robot.pads}; set robot.pads to sprung"
+            )
         for pad in self.pads:
             for joint in spec.joint(f"{pad}_spring").parent.joints:
                 joint.stiffness[0] *= self.stiffness_factor
@@ -103,7 +117,9 @@ class _ScanEffect(TouchEffect):
         """Readings (N, P, R, C) of the chosen pads for those of ideal ones, ``own``; ``time_s`` as in ``reading``."""
         raise NotImplementedError
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+    def reading(
+        self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray
+    ) -> np.ndarray:
         reading, own = reading.copy(), reading[:, self.slots]
         reading[:, self.slots] = self.law(own, time_s)
         return reading
@@ -115,7 +131,9 @@ class TaxelPowerLaw(_ScanEffect):
 
     p > 1 is steeper at high pressure, as for a ball on a soft half-space (Hertz); p < 1 is flatter, as for resistive foils."""
 
-    exponent: float = number("p", "1", 1, 1.5, (0.3, 3), "Hertz: 3/2 for a ball on a half-space")
+    exponent: float = number(
+        "p", "1", 1, 1.5, (0.3, 3), "Hertz: 3/2 for a ball on a half-space"
+    )
     reference: float = number(
         "f₀", "reading", None, 1, (0.1, 10),
         "a choice: where the linear law was calibrated; a reading of 1 is 75 counts",
@@ -128,8 +146,12 @@ class TaxelPowerLaw(_ScanEffect):
         return [{"exponent": 1.4}, {"exponent": 0.75}]
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):  # 0 and less to a power, where nothing touches
-            return own * np.where(own > 0, (own / self.reference) ** (self.exponent - 1.0), 1.0)
+        with np.errstate(
+            divide="ignore", invalid="ignore"
+        ):  # 0 and less to a power, where nothing touches
+            return own * np.where(
+                own > 0, (own / self.reference) ** (self.exponent - 1.0), 1.0
+            )
 
 
 @effect("taxel_saturation", slot="material")
@@ -146,7 +168,10 @@ class TaxelSaturation(_ScanEffect):
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: strong and weak saturation relative to the largest reading in the
         recordings (``peak_reading``)."""
-        return [{"limit": cls.clipped("limit", share * seen.get("peak_reading", 1.0))} for share in (1.0, 4.0)]
+        return [
+            {"limit": cls.clipped("limit", share * seen.get("peak_reading", 1.0))}
+            for share in (1.0, 4.0)
+        ]
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         return own / (1.0 + np.abs(own) / own.dtype.type(self.limit))
@@ -157,7 +182,14 @@ class TaxelThreshold(_ScanEffect):
     """Threshold of the readings: r = [f − t]₊, because foils touch each other only from t on, or because a driver cuts off small
     values."""
 
-    threshold: float = number("t", "reading", 0, 0.1, (0, 3), "a choice: 7.5 counts, half of the boards' threshold")
+    threshold: float = number(
+        "t",
+        "reading",
+        0,
+        0.1,
+        (0, 3),
+        "a choice: 7.5 counts, half of the boards' threshold",
+    )
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         return np.maximum(own - own.dtype.type(self.threshold), 0)
@@ -170,12 +202,21 @@ class TaxelCrosstalk(_ScanEffect):
 
     At the edge a taxel keeps the shares of missing neighbours, so that the sum over a pad does not change."""
 
-    share: float = number("c", "1", 0, 0.1, (0, 0.8), "a choice; covers carry load sideways, taxels share wires")
+    share: float = number(
+        "c",
+        "1",
+        0,
+        0.1,
+        (0, 0.8),
+        "a choice; covers carry load sideways, taxels share wires",
+    )
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         spread = own.copy()
         for axis in (2, 3):
-            flow = 0.25 * self.share * np.diff(own, axis=axis)  # from each taxel's next one into it
+            flow = (
+                0.25 * self.share * np.diff(own, axis=axis)
+            )  # from each taxel's next one into it
             first = (slice(None),) * axis
             spread[*first, :-1] += flow
             spread[*first, 1:] -= flow
@@ -187,10 +228,19 @@ class TaxelGhosting(_ScanEffect):
     """Ghosting along the wires of rows and columns: r_ij = f_ij + g (Σ_k f_ik + Σ_k f_kj − 2 f_ij). Every other taxel on a
     taxel's two wires adds the share g of its reading."""
 
-    share: float = number("g", "1", 0, 0.01, (0, 0.2), "a choice; some 5 to 20 taxels of a row are pressed at once")
+    share: float = number(
+        "g",
+        "1",
+        0,
+        0.01,
+        (0, 0.2),
+        "a choice; some 5 to 20 taxels of a row are pressed at once",
+    )
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        others = own.sum(axis=3, keepdims=True) + own.sum(axis=2, keepdims=True) - 2 * own
+        others = (
+            own.sum(axis=3, keepdims=True) + own.sum(axis=2, keepdims=True) - 2 * own
+        )
         return own + own.dtype.type(self.share) * others
 
 
@@ -206,7 +256,9 @@ class BaselineDrift(_ScanEffect):
     )  # fmt: skip
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        return own + (self.rate_per_min / 60.0 * time_s)[:, None, None, None].astype(own.dtype)
+        return own + (self.rate_per_min / 60.0 * time_s)[:, None, None, None].astype(
+            own.dtype
+        )
 
 
 @effect("taxel_temperature", slot="baseline", needs=("reading", "temperature"))
@@ -215,7 +267,9 @@ class TaxelTemperature(_ScanEffect):
     readings."""
 
     only: ClassVar = ("cells",)  # recordings of pads hold no temperature
-    gain_per_k: float = number("α", "1/K", 0, 0.005, (-0.1, 0.1), "a choice: half a per cent a kelvin")
+    gain_per_k: float = number(
+        "α", "1/K", 0, 0.005, (-0.1, 0.1), "a choice: half a per cent a kelvin"
+    )
     zero_per_k: float = number("β", "reading/K", 0, 0.02, (-1, 1))
 
     def __post_init__(self) -> None:
@@ -236,7 +290,9 @@ class TaxelTemperature(_ScanEffect):
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         warmer = self._above_nominal_k[:, None, None, None].astype(own.dtype)
-        return own + warmer * (own.dtype.type(self.gain_per_k) * own + own.dtype.type(self.zero_per_k))
+        return own + warmer * (
+            own.dtype.type(self.gain_per_k) * own + own.dtype.type(self.zero_per_k)
+        )
 
 
 @effect("dead_taxels", slot="taxel")
@@ -250,10 +306,14 @@ class DeadTaxels(BoardEffect):
         """(pads, rows, columns) bool, of the given ``shape``: round(s · taxels) dead taxels of each pad, also of pads that are
         not selected."""
         num_pads, num_taxels = shape[0], math.prod(shape[1:])
-        rank = np.random.default_rng(self.seed).permuted(np.tile(np.arange(num_taxels), (num_pads, 1)), axis=1)
+        rank = np.random.default_rng(self.seed).permuted(
+            np.tile(np.arange(num_taxels), (num_pads, 1)), axis=1
+        )
         return (rank < round(self.share * num_taxels)).reshape(shape)
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+    def reading(
+        self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray
+    ) -> np.ndarray:
         reading = reading.copy()
         reading[:, self.slots] *= ~self.dead(reading.shape[1:])[self.slots]
         return reading
@@ -266,8 +326,12 @@ class TaxelGainSpread(BoardEffect):
 
     log_std: float = number("s", "1", 0, 0.15, (0, 0.7))
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        log_gain = np.random.default_rng(self.seed).standard_normal(reading.shape[1:])[self.slots]
+    def reading(
+        self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray
+    ) -> np.ndarray:
+        log_gain = np.random.default_rng(self.seed).standard_normal(reading.shape[1:])[
+            self.slots
+        ]
         reading = reading.copy()
         reading[:, self.slots] *= np.exp(self.log_std * log_gain).astype(reading.dtype)
         return reading
@@ -280,7 +344,9 @@ class TaxelGainMap(_ScanEffect):
 
     only: ClassVar = ("pads",)  # gains of a sensor of cells are always fitted
     windows: ClassVar = False
-    share: float = number("s", "1", 0, 1, (0, 1), "1 is the map as it was measured; less fades it out")
+    share: float = number(
+        "s", "1", 0, 1, (0, 1), "1 is the map as it was measured; less fades it out"
+    )
     gains: list[float] = field(default_factory=lambda: [0.0])
     """g_i: one gain per taxel, row after row from palm to tip, pad after pad; or one gain for all. The default 0 is a pad that
     is not connected."""
@@ -289,18 +355,30 @@ class TaxelGainMap(_ScanEffect):
         super().__post_init__()
         expected = len(self.pads) * ROBOT.pad.num_taxels
         if len(self.gains) not in (1, expected):
-            raise TaccorlError(f"effect {self.name}: {len(self.gains)} gains for {expected} taxels: one each, or one")
-        bad = [g for g in self.gains if isinstance(g, bool) or not isinstance(g, int | float | np.number)]
+            raise TaccorlError(
+                f"effect {self.name}: {len(self.gains)} gains for {expected} taxels: one each, or one"
+            )
+        bad = [
+            g
+            for g in self.gains
+            if isinstance(g, bool) or not isinstance(g, int | float | np.number)
+        ]
         bad += [g for g in self.gains if not bad and not 0 <= g < math.inf]
         if bad:
-            raise TaccorlError(f"effect {self.name}: gains contain {bad[0]!r}; give numbers of 0 or more")
+            raise TaccorlError(
+                f"effect {self.name}: gains contain {bad[0]!r}; give numbers of 0 or more"
+            )
         self.gains = [float(g) for g in self.gains]
         self._window = (slice(None), slice(None))
 
     @classmethod
     def of(cls, gains: np.ndarray, pads: Sequence[str]) -> "TaxelGainMap":
         """The effect with the gains (P, R, C), rounded to six digits."""
-        return cls(share=1.0, pads=list(pads), gains=np.round(np.asarray(gains, float), 6).reshape(-1).tolist())
+        return cls(
+            share=1.0,
+            pads=list(pads),
+            gains=np.round(np.asarray(gains, float), 6).reshape(-1).tolist(),
+        )
 
     def within(self, window: tuple[slice, slice]) -> "TaxelGainMap":
         found = copy.copy(self)
@@ -308,5 +386,9 @@ class TaxelGainMap(_ScanEffect):
         return found
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        gains = np.broadcast_to(self.gains, len(self.pads) * ROBOT.pad.num_taxels).reshape(-1, *ROBOT.pad.shape)
-        return own * (1.0 + self.share * (gains[:, *self._window] - 1.0)).astype(own.dtype)
+        gains = np.broadcast_to(
+            self.gains, len(self.pads) * ROBOT.pad.num_taxels
+        ).reshape(-1, *ROBOT.pad.shape)
+        return own * (1.0 + self.share * (gains[:, *self._window] - 1.0)).astype(
+            own.dtype
+        )

@@ -84,19 +84,34 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     changed = {}
     for p in base.parameters():
         ends = {key: getattr(p, key) for key in ("absent", "low", "high", "typical")}
-        number = {k: v if v is None or not math.isfinite(v) else v * factors[p.name] for k, v in ends.items()}
+        number = {
+            k: v if v is None or not math.isfinite(v) else v * factors[p.name]
+            for k, v in ends.items()
+        }
         if p.unit == "rad/(N·m)":
             number["high"] = max(p.high * factors[p.name], SOFT * scale.drive)
         changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
-        units = {"rad_per_nm": scale.length / scale.force, "nm": scale.force, "rad": scale.length}
+        units = {
+            "rad_per_nm": scale.length / scale.force,
+            "nm": scale.force,
+            "rad": scale.length,
+        }
         units["rad_per_s"] = scale.length
-        own = {k: v / next((u for end, u in units.items() if k.endswith(f"_{end}")), 1.0) for k, v in seen.items()}
-        return [{key: value * factors[key] for key, value in start.items()} for start in base.starts(own)]
+        own = {
+            k: v / next((u for end, u in units.items() if k.endswith(f"_{end}")), 1.0)
+            for k, v in seen.items()
+        }
+        return [
+            {key: value * factors[key] for key, value in start.items()}
+            for start in base.starts(own)
+        ]
 
     by = "; in the file of an axis `force_unit_n` and `length_unit_m` set such bounds"
-    return _changed(base, changed, (scaled, name, scale), starts=classmethod(starts), range_by=by)
+    return _changed(
+        base, changed, (scaled, name, scale), starts=classmethod(starts), range_by=by
+    )
 
 
 @functools.cache
@@ -111,20 +126,42 @@ def bounded(name: str, bounds: tuple[tuple[str, float, float], ...]) -> type[Eff
     return _changed(base, changed, (bounded, name, bounds))
 
 
-def _changed(base: type[Effect], changed: Mapping[str, dict[str, Any]], made: tuple, **members: Any) -> type[Effect]:
+def _changed(
+    base: type[Effect],
+    changed: Mapping[str, dict[str, Any]],
+    made: tuple,
+    **members: Any,
+) -> type[Effect]:
     """Subclass of ``base`` with other values of ``number`` for some parameters; ``made`` is the call that returns it."""
-    fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": dict.fromkeys(changed, float)}
+    fields: dict[str, Any] = {
+        "__module__": base.__module__,
+        "__annotations__": dict.fromkeys(changed, float),
+    }
     for f in dataclasses.fields(base):
         if f.name in changed:
             meta = f.metadata["parameter"] | changed[f.name]
             default = meta["typical"] if meta["absent"] is None else meta["absent"]
-            fields[f.name] = dataclasses.field(default=default, metadata={"parameter": meta})
+            fields[f.name] = dataclasses.field(
+                default=default, metadata={"parameter": meta}
+            )
 
-    def again(self: Effect) -> tuple[Any, ...]:  # such a class has no name that pickle could import
-        return _remade, (*made, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+    def again(
+        self: Effect,
+    ) -> tuple[Any, ...]:  # such a class has no name that pickle could import
+        return _remade, (
+            *made,
+            {f.name: getattr(self, f.name) for f in dataclasses.fields(self)},
+        )
 
-    return dataclass(kw_only=True)(type(base.__name__, (base,), fields | members | {"__reduce__": again}))
+    return dataclass(kw_only=True)(
+        type(base.__name__, (base,), fields | members | {"__reduce__": again})
+    )
 
 
-def _remade(function: Callable[..., type[Effect]], name: str, argument: Any, values: dict[str, Any]) -> Effect:
+def _remade(
+    function: Callable[..., type[Effect]],
+    name: str,
+    argument: Any,
+    values: dict[str, Any],
+) -> Effect:
     return function(name, argument)(**values)

@@ -33,10 +33,16 @@ class RememberingEffect(TouchEffect):
     """M."""
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {self.kept: np.zeros((num_sims, self.elements, len(self.pads), *pad_shape), np.float32)}
+        return {
+            self.kept: np.zeros(
+                (num_sims, self.elements, len(self.pads), *pad_shape), np.float32
+            )
+        }
 
     @abstractmethod
-    def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
+    def fill(
+        self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray
+    ) -> None:
         """Fill ``seen`` (S, N, K) with the readings in consecutive scans, from those of ideal pads, ``own`` (S, N, K); change
         ``memory`` from its state before the first scan to that after the last. ``dt_s`` (S, N) is the time since the scan
         before."""
@@ -49,11 +55,16 @@ class RememberingEffect(TouchEffect):
             memory: arrays (N, …) with the state before the first scan; changed to the state after the last.
             dt_s: (S, N) time since the scan before.
         """
-        seen, flat = np.empty(own.shape, own.dtype), (*own.shape[:2], -1)  # in order, so that its flat form is a view
+        seen, flat = (
+            np.empty(own.shape, own.dtype),
+            (*own.shape[:2], -1),
+        )  # in order, so that its flat form is a view
         self.fill(own.reshape(flat), memory, dt_s, seen.reshape(flat))
         return seen
 
-    def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
+    def reading(
+        self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray
+    ) -> np.ndarray:
         reading, own = reading.copy(), reading[:, self.slots]
         reading[:, self.slots] = self.scans(own[None], memory, dt_s[None])[0]
         return reading
@@ -77,11 +88,19 @@ class CreepingEffect(RememberingEffect):
         """Time constants τᵢ [s]."""
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"crept": np.zeros((num_sims, len(self.times_s), len(self.pads), *pad_shape), np.float32)}
+        return {
+            "crept": np.zeros(
+                (num_sims, len(self.times_s), len(self.pads), *pad_shape), np.float32
+            )
+        }
 
-    def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
+    def fill(
+        self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray
+    ) -> None:
         lowest = -np.inf if self.below_rest or self.share > 0.0 else 0.0
-        _approach(own, (1.0, self.share, lowest), self.times_s, dt_s, memory["crept"], seen)
+        _approach(
+            own, (1.0, self.share, lowest), self.times_s, dt_s, memory["crept"], seen
+        )
 
 
 @effect("taxel_creep", slot="material")
@@ -90,8 +109,17 @@ class TaxelCreep(CreepingEffect):
     release a m remains and decays. Standard linear solid. a < 0 is relaxation: the reading decreases under a constant load."""
 
     below_rest: bool = False
-    share: float = number("a", "1", 0, 0.2, (-0.8, 2), "Velostat: 0.29 in 0.77 s (Lupasic/tactile-sensor-velostat)")
-    time_constant_s: float = number("τ", "s", None, 0.8, (0.05, 30), "the same Velostat taxel")
+    share: float = number(
+        "a",
+        "1",
+        0,
+        0.2,
+        (-0.8, 2),
+        "Velostat: 0.29 in 0.77 s (Lupasic/tactile-sensor-velostat)",
+    )
+    time_constant_s: float = number(
+        "τ", "s", None, 0.8, (0.05, 30), "the same Velostat taxel"
+    )
 
     @property
     def times_s(self) -> tuple[float, ...]:
@@ -100,7 +128,10 @@ class TaxelCreep(CreepingEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: a fast increase, a slow increase, a decrease."""
-        return [{"share": a, "time_constant_s": tau_s} for a, tau_s in ((0.3, 0.3), (0.3, 3.0), (-0.3, 1.0))]
+        return [
+            {"share": a, "time_constant_s": tau_s}
+            for a, tau_s in ((0.3, 0.3), (0.3, 3.0), (-0.3, 1.0))
+        ]
 
 
 @effect("taxel_log_creep", slot="material")
@@ -108,7 +139,9 @@ class TaxelLogCreep(CreepingEffect):
     """Creep over many time scales: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s. After t seconds of load, 0.2 s
     and more, r is (1 + a log₁₀(t / 0.018 s)) f within 0.03 a f. a < 0 is relaxation."""
 
-    only: ClassVar = ("cells",)  # presses of pads are too short to tell it from ``taxel_creep``
+    only: ClassVar = (
+        "cells",
+    )  # presses of pads are too short to tell it from ``taxel_creep``
     below_rest: bool = False
     share: float = number("a", "1", 0, 0.05, (-0.15, 0.3), "a choice: 5 % a decade")
 
@@ -132,9 +165,18 @@ class TaxelHysteresis(RememberingEffect):
     holds_scan: ClassVar = False
     half_width: float = number("h", "1", 0, 0.1, (0, 0.5))
 
-    def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
+    def fill(
+        self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray
+    ) -> None:
         low, high = np.float32(1.0 - self.half_width), np.float32(1.0 + self.half_width)
-        _carry_along(own, low, high, np.zeros(1, np.float32), memory["held"].reshape(own.shape[1], 1, -1), seen)
+        _carry_along(
+            own,
+            low,
+            high,
+            np.zeros(1, np.float32),
+            memory["held"].reshape(own.shape[1], 1, -1),
+            seen,
+        )
 
 
 @effect("taxel_play", slot="material")
@@ -153,14 +195,35 @@ class TaxelPlay(RememberingEffect):
     only: ClassVar = ("cells",)
     elements: ClassVar = 8
     optional: ClassVar = {"elastic": "", "spread": ""}
-    half_width: float = number("w", "reading", 0, 0.2, (0, 3), "a choice: 2 % of the rated load of a sensor of cells")
-    elastic: float = number("e", "1", 0, 0.5, (0, 0.95), "a choice; 0: the play carries all of the load")
+    half_width: float = number(
+        "w",
+        "reading",
+        0,
+        0.2,
+        (0, 3),
+        "a choice: 2 % of the rated load of a sensor of cells",
+    )
+    elastic: float = number(
+        "e", "1", 0, 0.5, (0, 0.95), "a choice; 0: the play carries all of the load"
+    )
     spread: float = number("u", "1", 0, 0.5, (0, 0.95), "a choice; 0: one play")
 
-    def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
-        one, wide = np.float32(1.0), 1.0 + self.spread * np.linspace(-1.0, 1.0, self.elements)
+    def fill(
+        self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray
+    ) -> None:
+        one, wide = (
+            np.float32(1.0),
+            1.0 + self.spread * np.linspace(-1.0, 1.0, self.elements),
+        )
         widths = (self.half_width / (1.0 - self.elastic) * wide).astype(np.float32)
-        _carry_along(own, one, one, widths, memory["held"].reshape(own.shape[1], self.elements, -1), seen)
+        _carry_along(
+            own,
+            one,
+            one,
+            widths,
+            memory["held"].reshape(own.shape[1], self.elements, -1),
+            seen,
+        )
         seen[:] = np.float32(self.elastic) * own + np.float32(1.0 - self.elastic) * seen
 
 
@@ -173,11 +236,23 @@ class TouchDelay(RememberingEffect):
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         shape = (num_sims, math.ceil(self.delay_s / _GAP_S) + 2)
-        return {"past": np.zeros((*shape, len(self.pads), *pad_shape), np.float32), "age_s": np.zeros(shape)}
+        return {
+            "past": np.zeros((*shape, len(self.pads), *pad_shape), np.float32),
+            "age_s": np.zeros(shape),
+        }
 
-    def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
+    def fill(
+        self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray
+    ) -> None:
         past = memory["past"].reshape(*memory["past"].shape[:2], -1)
-        _recall(own, np.asarray(dt_s, float), past, memory["age_s"], float(self.delay_s), seen)
+        _recall(
+            own,
+            np.asarray(dt_s, float),
+            past,
+            memory["age_s"],
+            float(self.delay_s),
+            seen,
+        )
 
 
 @effect("touch_lag", slot="taxel")
@@ -185,10 +260,21 @@ class TouchLag(RememberingEffect):
     """Low-pass of the readings: ṙ = (f − r) / T. Solved exactly for a reading that was constant since the last scan."""
 
     kept: ClassVar = "smooth"
-    time_constant_s: float = number("T", "s", 0, 0.03, (0, 0.5), "a choice: three scans")
+    time_constant_s: float = number(
+        "T", "s", 0, 0.03, (0, 0.5), "a choice: three scans"
+    )
 
-    def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
-        _approach(own, (0.0, 1.0, -np.inf), (self.time_constant_s,), dt_s, memory["smooth"], seen)
+    def fill(
+        self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray
+    ) -> None:
+        _approach(
+            own,
+            (0.0, 1.0, -np.inf),
+            (self.time_constant_s,),
+            dt_s,
+            memory["smooth"],
+            seen,
+        )
 
 
 def _approach(
@@ -203,7 +289,15 @@ def _approach(
     approaches f, ``own`` (S, N, K), with one of the M time constants ``times_s`` [s]."""
     reached = -np.expm1(-dt_s[..., None] / np.array(times_s)).astype(own.dtype)
     whole, share, lowest = np.array(law, np.float32)
-    _step(own, reached, whole, share, lowest, parts.reshape(own.shape[1], len(times_s), -1), seen)
+    _step(
+        own,
+        reached,
+        whole,
+        share,
+        lowest,
+        parts.reshape(own.shape[1], len(times_s), -1),
+        seen,
+    )
 
 
 @numba.njit(cache=True)
@@ -228,7 +322,12 @@ def _step(
 
 @numba.njit(cache=True)
 def _carry_along(
-    own: np.ndarray, low: np.float32, high: np.float32, widths: np.ndarray, held: np.ndarray, seen: np.ndarray
+    own: np.ndarray,
+    low: np.float32,
+    high: np.float32,
+    widths: np.ndarray,
+    held: np.ndarray,
+    seen: np.ndarray,
 ) -> None:
     """``held`` (N, M, K) is kept between ``low`` and ``high`` times ``own`` (S, N, K), ∓ ``widths`` (M,), in every scan. ``seen``
     is the mean of the M."""
@@ -245,7 +344,12 @@ def _carry_along(
 
 @numba.njit(cache=True)
 def _recall(
-    own: np.ndarray, dt_s: np.ndarray, past: np.ndarray, age_s: np.ndarray, delay_s: float, seen: np.ndarray
+    own: np.ndarray,
+    dt_s: np.ndarray,
+    past: np.ndarray,
+    age_s: np.ndarray,
+    delay_s: float,
+    seen: np.ndarray,
 ) -> None:
     """``past`` (N, H, K), the newest first, takes up ``own`` (S, N, K); ``seen`` is what there was ``delay_s`` ago.
 
@@ -267,4 +371,6 @@ def _recall(
             span = age_s[n, h + 1] - age_s[n, h]
             share = min((delay_s - age_s[n, h]) / span, 1.0) if span > 0.0 else 0.0
             for k in range(own.shape[2]):
-                seen[s, n, k] = past[n, h, k] + share * (past[n, h + 1, k] - past[n, h, k])
+                seen[s, n, k] = past[n, h, k] + share * (
+                    past[n, h + 1, k] - past[n, h, k]
+                )

@@ -51,14 +51,20 @@ class Sensor(abc.ABC):
     Letters in shapes: N simulations, P pads, R rows and C columns of taxels, K = R · C, S samples of a history."""
 
     def __init__(
-        self, spec: SensorSpec, pads: Sequence[str], baseline: np.ndarray, transforms: Sequence[Transform]
+        self,
+        spec: SensorSpec,
+        pads: Sequence[str],
+        baseline: np.ndarray,
+        transforms: Sequence[Transform],
     ) -> None:
         self.spec, self.pads, self.baseline = spec, tuple(pads), baseline
         self.transforms = list(transforms)
         """Transforms in the order in which they are applied; without any, a reading passes unchanged bit for bit."""
 
     @abc.abstractmethod
-    def reading(self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
+    def reading(
+        self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None
+    ) -> np.ndarray:
         """Law of the sensor: depth and rate of the taxels → normalised reading (N, P, R, C).
 
         Args:
@@ -90,7 +96,9 @@ class SensorConfig(abc.ABC):
     """Seed from which differences between boards (resting counts) are drawn."""
 
     @abc.abstractmethod
-    def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> Sensor:
+    def build(
+        self, pads: Sequence[str], transforms: Sequence[Transform] = ()
+    ) -> Sensor:
         """Build the sensor for these pads, in their order, with the effects ``transforms`` between law and gain, in their
         order."""
 
@@ -107,7 +115,9 @@ def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
         return noise.standard_normal(shape, dtype=np.float32)
     count = len(noise.seeds if isinstance(noise, ScanNoise) else noise)
     if count != shape[0]:
-        raise TaccorlError(f"noise: {count} generators for {shape[0]} simulations; give one each, or one for all")
+        raise TaccorlError(
+            f"noise: {count} generators for {shape[0]} simulations; give one each, or one for all"
+        )
     if isinstance(noise, ScanNoise):
         return noise.draw(shape)
     return np.stack([rng.standard_normal(shape[1:], dtype=np.float32) for rng in noise])

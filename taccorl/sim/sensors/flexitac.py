@@ -20,11 +20,22 @@ import numpy as np
 from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
 from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
-from taccorl.sim.sensors import Noise, Sensor, SensorConfig, Transform, as_wire, sensors, standard_normal
+from taccorl.sim.sensors import (
+    Noise,
+    Sensor,
+    SensorConfig,
+    Transform,
+    as_wire,
+    sensors,
+    standard_normal,
+)
 
 
 def normal_reading(
-    depth_m: np.ndarray, depth_rate_mps: np.ndarray, stiffness_per_m: float, damping_s_per_m: float
+    depth_m: np.ndarray,
+    depth_rate_mps: np.ndarray,
+    stiffness_per_m: float,
+    damping_s_per_m: float,
 ) -> np.ndarray:
     """Reading of a spring-damper taxel, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is 0. It is never negative.
 
@@ -40,7 +51,9 @@ def scan_instants_s(spec: SensorSpec) -> np.ndarray:
     return (share - 1) * spec.scan_time_s
 
 
-def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) -> np.ndarray:
+def at_scan_instants(
+    samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec
+) -> np.ndarray:
     """``samples`` (S, ..., R, C) at times ``time_s`` (S,) [s] → (..., R, C): each row of the wire at its own instant, by linear
     interpolation. Raises TaccorlError: times are not ascending, or do not cover the scan."""
     instants_s = scan_instants_s(spec)
@@ -56,7 +69,9 @@ def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) 
             f"{instants_s[0]:.4f} to {instants_s[-1]:.4f} s before the stamp"
         )
     after = np.clip(np.searchsorted(times, instants_s, side="right"), 1, len(times) - 1)
-    weight = ((instants_s - times[after - 1]) / (times[after] - times[after - 1])).astype(samples.dtype)
+    weight = (
+        (instants_s - times[after - 1]) / (times[after] - times[after - 1])
+    ).astype(samples.dtype)
     on_wire = as_wire(samples, spec)
     row = np.arange(spec.wire.rows)
     # Both picks stand first: (wire rows, ..., wire columns)
@@ -69,26 +84,49 @@ class FlexiTac(Sensor):
     """FlexiTac pads with the settings of ``FlexiTacConfig``. They have no state except for that of transforms with a memory."""
 
     def __init__(
-        self, config: "FlexiTacConfig", spec: SensorSpec, pads: Sequence[str], transforms: Sequence[Transform]
+        self,
+        config: "FlexiTacConfig",
+        spec: SensorSpec,
+        pads: Sequence[str],
+        transforms: Sequence[Transform],
     ) -> None:
         shape = (len(pads), spec.rows, spec.columns)
         low, high = config.resting_count
         # In the middle of a step of the converter, so that a reading of ± ½ count does not show.
-        self._resting = np.random.default_rng(config.seed).integers(low, high + 1, shape) + 0.5
-        super().__init__(spec, pads, np.floor(self._resting).astype(np.int64), transforms)
+        self._resting = (
+            np.random.default_rng(config.seed).integers(low, high + 1, shape) + 0.5
+        )
+        super().__init__(
+            spec, pads, np.floor(self._resting).astype(np.int64), transforms
+        )
         self._config = config
 
-    def reading(self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
+    def reading(
+        self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None
+    ) -> np.ndarray:
         shape = (*depth_m.shape[:-1], self.spec.rows, self.spec.columns)
         if time_s is None and depth_m.dtype == depth_rate_mps.dtype == np.float32:
             reading = np.empty(shape, np.float32)
-            stiffness, damping = self._config.normal_stiffness_per_m, self._config.normal_damping_s_per_m
-            _read(depth_m.ravel(), depth_rate_mps.ravel(), np.float32(stiffness), np.float32(damping), reading.ravel())
+            stiffness, damping = (
+                self._config.normal_stiffness_per_m,
+                self._config.normal_damping_s_per_m,
+            )
+            _read(
+                depth_m.ravel(),
+                depth_rate_mps.ravel(),
+                np.float32(stiffness),
+                np.float32(damping),
+                reading.ravel(),
+            )
             return reading
         grids = [a.reshape(shape) for a in (depth_m, depth_rate_mps)]
         if time_s is not None:
             grids = [at_scan_instants(grid, time_s, self.spec) for grid in grids]
-        return normal_reading(*grids, self._config.normal_stiffness_per_m, self._config.normal_damping_s_per_m)
+        return normal_reading(
+            *grids,
+            self._config.normal_stiffness_per_m,
+            self._config.normal_damping_s_per_m,
+        )
 
     def clean_counts(self, reading: np.ndarray) -> np.ndarray:
         return self._config.gain_count * reading
@@ -98,7 +136,10 @@ class FlexiTac(Sensor):
         if normal is None:
             normal = np.zeros(reading.shape, np.float32)
         counts = np.empty(reading.shape, self.spec.wire.dtype)
-        settings = np.float32(self._config.gain_count), np.float32(self._config.noise_std_count)
+        settings = (
+            np.float32(self._config.gain_count),
+            np.float32(self._config.noise_std_count),
+        )
         flat = (len(reading), self._resting.size)
         _convert(
             reading.reshape(flat),
@@ -113,7 +154,13 @@ class FlexiTac(Sensor):
 
 # Compiled for batches: without Python's lock, and each number is read once.
 @numba.njit(nogil=True, cache=True)
-def _read(depth: np.ndarray, rate: np.ndarray, stiffness: np.float32, damping: np.float32, reading: np.ndarray) -> None:
+def _read(
+    depth: np.ndarray,
+    rate: np.ndarray,
+    stiffness: np.float32,
+    damping: np.float32,
+    reading: np.ndarray,
+) -> None:
     """``normal_reading``, all flat float32."""
     for k in range(depth.size):
         force = stiffness * depth[k] + damping * rate[k]
@@ -157,14 +204,25 @@ class FlexiTacConfig(SensorConfig):
     """Standard deviation of a taxel's noise [counts], independent between scans. A choice, as in the stand-in recordings; the
     boards' own no-contact threshold is 15 counts."""
 
-    def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> FlexiTac:
+    def build(
+        self, pads: Sequence[str], transforms: Sequence[Transform] = ()
+    ) -> FlexiTac:
         """Build the sensor of these pads, in their order. ``transforms`` (effects) act on the reading: after the law, before
         gain and noise. Raises TaccorlError: a setting is not possible for a board."""
         spec = load_sensor_spec(find_spec(self.spec))
         low, high = self.resting_count
         if not 0 <= low <= high < spec.max_count:
-            raise TaccorlError(f"flexitac: resting_count {low} … {high}; needs 0 ≤ lowest ≤ highest < {spec.max_count}")
-        for name in ("normal_stiffness_per_m", "normal_damping_s_per_m", "gain_count", "noise_std_count"):
+            raise TaccorlError(
+                f"flexitac: resting_count {low} … {high}; needs 0 ≤ lowest ≤ highest < {spec.max_count}"
+            )
+        for name in (
+            "normal_stiffness_per_m",
+            "normal_damping_s_per_m",
+            "gain_count",
+            "noise_std_count",
+        ):
             if not 0 <= getattr(self, name) < np.inf:
-                raise TaccorlError(f"flexitac: {name} {getattr(self, name)}; needs 0 or more")
+                raise TaccorlError(
+                    f"flexitac: {name} {getattr(self, name)}; needs 0 or more"
+                )
         return FlexiTac(self, spec, pads, transforms)

@@ -12,10 +12,19 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numba.np.random._constants import fi_float, ki_float, wi_float, ziggurat_nor_inv_r_f, ziggurat_nor_r_f
+from numba.np.random._constants import (
+    fi_float,
+    ki_float,
+    wi_float,
+    ziggurat_nor_inv_r_f,
+    ziggurat_nor_r_f,
+)
 
 _TAIL, _TAIL_INVERSE = np.float32(ziggurat_nor_r_f), np.float32(ziggurat_nor_inv_r_f)
-_MULTIPLIER = np.uint64(0x2360ED051FC65DA4), np.uint64(0x4385DF649FCCF645)  # of PCG64: high and low half
+_MULTIPLIER = (
+    np.uint64(0x2360ED051FC65DA4),
+    np.uint64(0x4385DF649FCCF645),
+)  # of PCG64: high and low half
 _HALF, _LOW = np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
@@ -35,7 +44,11 @@ class ScanNoise(NamedTuple):
     def draw(self, shape: tuple[int, ...]) -> np.ndarray:
         """(N, …) float32 standard normal numbers; ``shape`` is the whole shape, with N first."""
         normal = np.empty(shape, np.float32)
-        _fill(self.seeds.astype(np.uint64), self.steps.astype(np.uint64), normal.reshape(shape[0], -1))
+        _fill(
+            self.seeds.astype(np.uint64),
+            self.steps.astype(np.uint64),
+            normal.reshape(shape[0], -1),
+        )
         return normal
 
 
@@ -63,7 +76,9 @@ def _seed_words(seed, step, words):
         for i in range(4):
             if i != source:
                 value, constant = _hashed(pool[source], constant, np.uint32(0x931E8875))
-                mixed = np.uint32(np.uint32(0xCA01F9DD) * pool[i]) - np.uint32(np.uint32(0x4973F715) * value)
+                mixed = np.uint32(np.uint32(0xCA01F9DD) * pool[i]) - np.uint32(
+                    np.uint32(0x4973F715) * value
+                )
                 mixed = np.uint32(mixed)
                 pool[i] = np.uint32(mixed ^ (mixed >> np.uint32(16)))
     constant = np.uint32(0x8B51F9DD)
@@ -108,12 +123,18 @@ def _next(state, buffer):
 @numba.njit(inline="always")
 def _next_share(state, buffer):
     """0 … 1, float32."""
-    return np.float32(_next(state, buffer) >> np.uint32(8)) * np.float32(1.0 / 16777216.0)
+    return np.float32(_next(state, buffer) >> np.uint32(8)) * np.float32(
+        1.0 / 16777216.0
+    )
 
 
 @numba.njit(nogil=True, cache=True)
 def _fill(seeds, steps, normal):
-    words, state, buffer = np.zeros(4, np.uint64), np.zeros(4, np.uint64), np.zeros(2, np.uint64)
+    words, state, buffer = (
+        np.zeros(4, np.uint64),
+        np.zeros(4, np.uint64),
+        np.zeros(2, np.uint64),
+    )
     for n in range(len(seeds)):
         _seed_words(seeds[n], steps[n], words)
         state[0], state[1], buffer[0] = np.uint64(0), np.uint64(0), np.uint64(0)
@@ -142,10 +163,18 @@ def _normal(state, buffer):
             return x
         if layer == 0:
             while True:
-                xx = -_TAIL_INVERSE * np.float32(math.log1p(-_next_share(state, buffer)))
+                xx = -_TAIL_INVERSE * np.float32(
+                    math.log1p(-_next_share(state, buffer))
+                )
                 yy = -np.float32(math.log1p(-_next_share(state, buffer)))
                 if yy + yy > xx * xx:
-                    return -(_TAIL + xx) if size >> np.uint32(8) & np.uint32(1) else _TAIL + xx
-        height = (fi_float[layer - np.uint32(1)] - fi_float[layer]) * _next_share(state, buffer) + fi_float[layer]
+                    return (
+                        -(_TAIL + xx)
+                        if size >> np.uint32(8) & np.uint32(1)
+                        else _TAIL + xx
+                    )
+        height = (fi_float[layer - np.uint32(1)] - fi_float[layer]) * _next_share(
+            state, buffer
+        ) + fi_float[layer]
         if height < math.exp(-0.5 * np.float64(x) * np.float64(x)):
             return x

@@ -12,7 +12,9 @@ from taccorl.tasks.experts.scripted import APART_M, Mating, Script, ScriptedExpe
 from taccorl.tasks.experts.se3 import inverse, rotvec, transform
 
 _TAIL, _HEAD = "tail", "head"  # grasps of the part with the hole and of the plug
-_LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras keep apart
+_LEAN_RAD = (
+    0.40  # hands lean away from each other, so that wrists and cameras keep apart
+)
 _GRIP_M = 0.028  # from the TCP to the part: it is gripped near the fingers' tips
 _LIFT_M, _LIFT_MPS = 0.10, 0.12
 _MEET_M = (0.32, 0.03, 0.16)  # the hole's mouth
@@ -21,7 +23,10 @@ _LOW_M = 0.05  # a part in the air below that goes up before it goes anywhere
 _CLEAR_M = 0.04  # between the plug and a hole that may still move
 _LEFT_STEADINESS = 0.4  # of a hand that holds still for the other
 _FIRMER = 1.2  # than the hand that inserts: what it holds is pushed
-_LEVEL_RAD, _FREE_M = 0.03, 0.0004  # it brings a part that was pushed askew back to level once nothing pushes any more
+_LEVEL_RAD, _FREE_M = (
+    0.03,
+    0.0004,
+)  # it brings a part that was pushed askew back to level once nothing pushes any more
 _LONGEST_REGAIN_S = 1.0
 
 
@@ -71,7 +76,11 @@ class AirAssemblyExpert(ScriptedExpert):
 
     def _go_on_holding(self) -> Script:
         """Continue with the part with the hole in the left hand."""
-        yield from self.firm("left", self.scene.holder.grasps[_TAIL].width_m, _FIRMER * self.config.grip_n)
+        yield from self.firm(
+            "left",
+            self.scene.holder.grasps[_TAIL].width_m,
+            _FIRMER * self.config.grip_n,
+        )
         if self.is_in(self._mating()):
             self.flags.add("holder waits")
             yield from self._hold(self._hole())
@@ -86,18 +95,30 @@ class AirAssemblyExpert(ScriptedExpert):
         yield from self.firm("right", plug.grasps[_HEAD].width_m)
         if not self.is_in(self._mating()):
             fit = self._mating().fit(self)
-            if fit.depth_m > -_CLEAR_M and fit.lateral_m < 2 * _CLEAR_M:  # out of the way of a left hand that may turn
+            if (
+                fit.depth_m > -_CLEAR_M and fit.lateral_m < 2 * _CLEAR_M
+            ):  # out of the way of a left hand that may turn
                 back = self.hands["right"].pose.copy()
-                back[:3, 3] -= (_CLEAR_M + max(float(fit.depth_m), 0.0)) * self._mating().axis(self)
+                back[:3, 3] -= (
+                    _CLEAR_M + max(float(fit.depth_m), 0.0)
+                ) * self._mating().axis(self)
                 yield from self.move("right", back, speed_mps=_LIFT_MPS)
             elif self.body(plug.name)[2, 3] < _LOW_M:
                 yield from self.rise("right", _LIFT_M, _LIFT_MPS)
         yield from self._meet()
 
     def _lift(self, arm: str, part: Part, grasp: str) -> Script:
-        meant = self.grasp(part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M)
-        yield from self.reach(arm, meant, lambda pose: pose @ transform((0, 0, -0.08)), speed_mps=0.1)
-        yield from self.close(arm, part.grasps[grasp].width_m, self.config.grip_n * (_FIRMER if arm == "left" else 1.0))
+        meant = self.grasp(
+            part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M
+        )
+        yield from self.reach(
+            arm, meant, lambda pose: pose @ transform((0, 0, -0.08)), speed_mps=0.1
+        )
+        yield from self.close(
+            arm,
+            part.grasps[grasp].width_m,
+            self.config.grip_n * (_FIRMER if arm == "left" else 1.0),
+        )
         yield from self.rise(arm, _LIFT_M, _LIFT_MPS)
 
     def _left(self) -> Script:
@@ -109,19 +130,32 @@ class AirAssemblyExpert(ScriptedExpert):
         hole = self._hole()
         hole_from_tcp = inverse(hole) @ self.tcp("left")
         is_near = np.linalg.norm(hole[:3, 3] - _MEET_M) < _NEAR_M
-        mouth = transform((hole if is_near else self.near(transform(_MEET_M)))[:3, 3], self.world_from_level())
-        yield from self.move("left", mouth @ hole_from_tcp, speed_mps=_LIFT_MPS, settle=True)
+        mouth = transform(
+            (hole if is_near else self.near(transform(_MEET_M)))[:3, 3],
+            self.world_from_level(),
+        )
+        yield from self.move(
+            "left", mouth @ hole_from_tcp, speed_mps=_LIFT_MPS, settle=True
+        )
         self.flags.add("holder waits")
         yield from self._hold(mouth)
 
     def _hold(self, mouth: np.ndarray) -> Script:
         """Hold the hole still at ``mouth`` (4, 4) until the plug is in."""
-        self.hands["left"].steadiness, self.hands["left"].learns = _LEFT_STEADINESS, False
+        self.hands["left"].steadiness, self.hands["left"].learns = (
+            _LEFT_STEADINESS,
+            False,
+        )
         self._held_like = mouth[:3, :3]
         while "plug is in" not in self.flags:
             self.hands["left"].learns = self._mating().fit(self).depth_m < -APART_M
-            if self._askew_rad() > _LEVEL_RAD and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M:
-                yield from self.move("left", mouth @ inverse(self._hole()) @ self.tcp("left"))
+            if (
+                self._askew_rad() > _LEVEL_RAD
+                and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M
+            ):
+                yield from self.move(
+                    "left", mouth @ inverse(self._hole()) @ self.tcp("left")
+                )
                 yield from self.settle("left")
             yield
 
@@ -135,7 +169,9 @@ class AirAssemblyExpert(ScriptedExpert):
 
     def _askew_rad(self) -> float:
         """How far the hole is turned from how it is to be held."""
-        held_like = self.world_from_level() if self._held_like is None else self._held_like
+        held_like = (
+            self.world_from_level() if self._held_like is None else self._held_like
+        )
         return float(np.linalg.norm(rotvec(held_like, self._hole())))
 
     def regain(self, arm: str) -> Script:

@@ -4,7 +4,9 @@ import numpy as np
 
 from taccorl.sim.part import TCP_ABOVE_M, Grasp, frame_pose
 
-TAIL_LENGTH_M = 0.030  # solid block behind each hole: there the hand is clear of the other hand
+TAIL_LENGTH_M = (
+    0.030  # solid block behind each hole: there the hand is clear of the other hand
+)
 
 
 def side_grasp(approach: tuple, height_m: float, z_m: float, width_m: float) -> Grasp:
@@ -13,4 +15,6 @@ def side_grasp(approach: tuple, height_m: float, z_m: float, width_m: float) -> 
     ``z_m`` the place along the part.
     """
     at = -np.asarray(approach) * (TCP_ABOVE_M - height_m) + (0, 0, z_m)
-    return Grasp(part_from_tcp=frame_pose((0, 0, -1), approach, tuple(at)), width_m=width_m)
+    return Grasp(
+        part_from_tcp=frame_pose((0, 0, -1), approach, tuple(at)), width_m=width_m
+    )

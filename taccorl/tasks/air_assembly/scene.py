@@ -52,10 +52,17 @@ class AirAssembly(Task):
         plug, holder = self.plug, self.holder
         return Reset(
             poses={
-                plug.name: on_table(plug, PLUG_AT_M + draw["plug_position"], -np.pi / 2),
-                holder.name: on_table(holder, HOLDER_AT_M + draw["socket_position"], np.pi / 2),
+                plug.name: on_table(
+                    plug, PLUG_AT_M + draw["plug_position"], -np.pi / 2
+                ),
+                holder.name: on_table(
+                    holder, HOLDER_AT_M + draw["socket_position"], np.pi / 2
+                ),
             },
-            mass_change_kg={plug.name: float(draw["plug_mass"][0]), holder.name: float(draw["socket_mass"][0])},
+            mass_change_kg={
+                plug.name: float(draw["plug_mass"][0]),
+                holder.name: float(draw["socket_mass"][0]),
+            },
             friction=float(draw["friction"][0]),
         )
 
@@ -63,15 +70,23 @@ class AirAssembly(Task):
         """Pose error of the plug in the hole, arrays (N,) for N simulations."""
         mate = self.plug.mate
         assert mate is not None
-        hole = scene.poses(self.holder.name) @ self.holder.holes[self.hole].part_from_hole
-        return measure_fit(hole, scene.poses(self.plug.name) @ mate.part_from_mate, mate.num_turns)
+        hole = (
+            scene.poses(self.holder.name) @ self.holder.holes[self.hole].part_from_hole
+        )
+        return measure_fit(
+            hole, scene.poses(self.plug.name) @ mate.part_from_mate, mate.num_turns
+        )
 
     def joined(self, scene: Scene) -> np.ndarray:
         """(N,) bool: the plug is in place, released and at rest."""
         done = np.asarray(~scene.pads_touching(self.plug.name).any(1))
         if done.any():
             done &= self.is_in_place(scene, self.fit(scene))
-        return done & at_rest(scene, self.plug.name, self.holder.name) if done.any() else done
+        return (
+            done & at_rest(scene, self.plug.name, self.holder.name)
+            if done.any()
+            else done
+        )
 
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
         def lifted(part: str) -> Callable[[Scene], np.ndarray]:

@@ -4,7 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from taccorl.sim.part import CLEARANCE_M, LEADING_END, Hole, Mate, Part, check_clearance, frame_pose
+from taccorl.sim.part import (
+    CLEARANCE_M,
+    LEADING_END,
+    Hole,
+    Mate,
+    Part,
+    check_clearance,
+    frame_pose,
+)
 from taccorl.sim.shapes import box_between, with_mass
 from taccorl.tasks.air_assembly.parts import TAIL_LENGTH_M, side_grasp
 
@@ -16,9 +24,13 @@ def tenon_plug(name: str = "plug") -> Part:
     return Part(
         name=name,
         solids=[replace(tenon, mass_kg=0.015), replace(head, mass_kg=0.065)],
-        table_from_part=frame_pose(x_axis=(0, 0, 1), z_axis=(1, 0, 0), at=(0, 0, 0.012)),
+        table_from_part=frame_pose(
+            x_axis=(0, 0, 1), z_axis=(1, 0, 0), at=(0, 0, 0.012)
+        ),
         mate=Mate(part_from_mate=LEADING_END, num_turns=2),
-        grasps={"head": side_grasp((-1, 0, 0), height_m=0.012, z_m=0.060, width_m=0.020)},
+        grasps={
+            "head": side_grasp((-1, 0, 0), height_m=0.012, z_m=0.060, width_m=0.020)
+        },
     )
 
 
@@ -33,12 +45,20 @@ def tenon_socket(name: str = "socket", clearance_m: float = CLEARANCE_M) -> Part
         box_between((-0.018, -0.015, 0), (-x, 0.015, end), "slate"),
         box_between((-x, y, 0), (x, 0.015, end), "slate"),
         box_between((-x, -0.015, 0), (x, -y, end), "slate"),
-        box_between((-0.018, -0.015, end), (0.018, 0.015, end + TAIL_LENGTH_M), "slate"),
+        box_between(
+            (-0.018, -0.015, end), (0.018, 0.015, end + TAIL_LENGTH_M), "slate"
+        ),
     ]
     return Part(
         name=name,
         solids=with_mass(solids, 0.150),
-        table_from_part=frame_pose(x_axis=(0, 0, 1), z_axis=(1, 0, 0), at=(0, 0, 0.018)),
+        table_from_part=frame_pose(
+            x_axis=(0, 0, 1), z_axis=(1, 0, 0), at=(0, 0, 0.018)
+        ),
         holes={"mortise": Hole(part_from_hole=np.eye(4), depth_m=end)},
-        grasps={"tail": side_grasp((-1, 0, 0), height_m=0.018, z_m=end + TAIL_LENGTH_M / 2, width_m=0.030)},
+        grasps={
+            "tail": side_grasp(
+                (-1, 0, 0), height_m=0.018, z_m=end + TAIL_LENGTH_M / 2, width_m=0.030
+            )
+        },
     )

@@ -14,7 +14,9 @@ from taccorl.tasks.assembly_1.parts import tenon_plug, tenon_socket
 
 _IN_DEPTH_M, _IN_TILT_RAD, _IN_LATERAL_M = 0.034, np.deg2rad(2.0), 0.003
 _WEDGED_M, _WEDGED_N = (0.004, 0.030), 15.0
-_AT_MOUTH_M = -0.002  # depth beyond which the plug's end is at the socket's face or has passed it
+_AT_MOUTH_M = (
+    -0.002
+)  # depth beyond which the plug's end is at the socket's face or has passed it
 
 
 @tasks.register("assembly_1")
@@ -51,11 +53,19 @@ class Assembly1(AirAssembly):
                 "sliding": beside & (fit.depth_m > _AT_MOUTH_M) & contact.touching,
             },
             partial=self._inside(fit).astype(int),
-            measures={"depth_m": fit.depth_m, "tilt_rad": fit.tilt_rad, "lateral_m": fit.lateral_m},
+            measures={
+                "depth_m": fit.depth_m,
+                "tilt_rad": fit.tilt_rad,
+                "lateral_m": fit.lateral_m,
+            },
         )
 
     def _inside(self, fit: Fit) -> np.ndarray:
-        return (fit.depth_m >= _IN_DEPTH_M) & (fit.tilt_rad < self.in_tilt_rad) & (fit.lateral_m < _IN_LATERAL_M)
+        return (
+            (fit.depth_m >= _IN_DEPTH_M)
+            & (fit.tilt_rad < self.in_tilt_rad)
+            & (fit.lateral_m < _IN_LATERAL_M)
+        )
 
     def is_in_place(self, scene: Scene, fit: Fit) -> np.ndarray:
         return self._inside(fit)

@@ -6,7 +6,10 @@ import numpy as np
 from taccorl.tasks.air_assembly.expert import AirAssemblyExpert
 from taccorl.tasks.experts.scripted import Mating, Script
 
-_LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, carries the plug before it is let go
+_LET_DOWN_M, _LET_DOWN_MPS = (
+    0.001,
+    0.01,
+)  # so that the cradle, not the hand, carries the plug before it is let go
 
 
 class Assembly2Expert(AirAssemblyExpert):
@@ -15,7 +18,9 @@ class Assembly2Expert(AirAssemblyExpert):
     enough_m = 0.032
 
     def world_from_level(self) -> np.ndarray:
-        return np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]).T  # y, the open side, up; z into the cradle
+        return np.array(
+            [[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]
+        ).T  # y, the open side, up; z into the cradle
 
     def push_in(self, mating: Mating) -> Script:
         yield from self.insert("right", mating, depth_m=0.036, enough_m=self.enough_m)

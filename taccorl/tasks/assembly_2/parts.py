@@ -17,14 +17,24 @@ def cradle_plug(name: str = "plug") -> Part:
     shaft = box_between((-0.010, -0.010, 0), (0.010, 0.010, 0.036), "violet")
     head = box_between((-0.012, -0.010, 0.036), (0.012, 0.010, 0.066), "violet")
     plastic = with_mass([shaft, head], 0.0288)
-    core = replace(box_between((-0.009, -0.009, 0.0007), (0.009, 0.009, 0.0157)), mass_kg=0.0412, touches=False)
+    core = replace(
+        box_between((-0.009, -0.009, 0.0007), (0.009, 0.009, 0.0157)),
+        mass_kg=0.0412,
+        touches=False,
+    )
     return Part(
         name=name,
         solids=[*plastic, core],
-        table_from_part=frame_pose(x_axis=(0, 1, 0), z_axis=(1, 0, 0), at=(0, 0, 0.010)),
+        table_from_part=frame_pose(
+            x_axis=(0, 1, 0), z_axis=(1, 0, 0), at=(0, 0, 0.010)
+        ),
         # Turned about y, not x, so that both have their open, upper side at +y.
-        mate=Mate(part_from_mate=frame_pose(x_axis=(-1, 0, 0), z_axis=(0, 0, -1)), num_turns=4),
-        grasps={"head": side_grasp((0, -1, 0), height_m=0.010, z_m=0.051, width_m=0.024)},
+        mate=Mate(
+            part_from_mate=frame_pose(x_axis=(-1, 0, 0), z_axis=(0, 0, -1)), num_turns=4
+        ),
+        grasps={
+            "head": side_grasp((0, -1, 0), height_m=0.010, z_m=0.051, width_m=0.024)
+        },
     )
 
 
@@ -45,7 +55,16 @@ def open_cradle(name: str = "cradle", clearance_m: float = CLEARANCE_M) -> Part:
     return Part(
         name=name,
         solids=with_mass(solids, 0.160),
-        table_from_part=frame_pose(x_axis=(0, 1, 0), z_axis=(1, 0, 0), at=(0, 0, 0.020)),
+        table_from_part=frame_pose(
+            x_axis=(0, 1, 0), z_axis=(1, 0, 0), at=(0, 0, 0.020)
+        ),
         holes={"cradle": Hole(part_from_hole=np.eye(4), depth_m=end)},
-        grasps={"tail": side_grasp((0, -1, 0), height_m=0.020, z_m=end + TAIL_LENGTH_M / 2, width_m=2 * outer)},
+        grasps={
+            "tail": side_grasp(
+                (0, -1, 0),
+                height_m=0.020,
+                z_m=end + TAIL_LENGTH_M / 2,
+                width_m=2 * outer,
+            )
+        },
     )

@@ -15,7 +15,10 @@ from taccorl.tasks.air_assembly.scene import LIFTED_M, AirAssembly
 from taccorl.tasks.assembly_2.parts import cradle_plug, open_cradle
 
 _COM_INSIDE_M = 0.002
-_IN_TILT_RAD, _IN_LATERAL_M = np.deg2rad(5.0), 0.004  # it lies on the cradle's floor, between its walls
+_IN_TILT_RAD, _IN_LATERAL_M = (
+    np.deg2rad(5.0),
+    0.004,
+)  # it lies on the cradle's floor, between its walls
 
 
 @tasks.register("assembly_2")
@@ -27,7 +30,9 @@ class Assembly2(AirAssembly):
     """
 
     name = "assembly_2"
-    instruction = "put the violet plug into the teal cradle in the air so that it stays there"
+    instruction = (
+        "put the violet plug into the teal cradle in the air so that it stays there"
+    )
     parts = ("plug", "cradle")
     mating = (("plug", "cradle"),)
     failures = {"dropped": 0.0, "fell_out": 0.1, "unsupported": 1.0}  # noqa: RUF012
@@ -53,7 +58,10 @@ class Assembly2(AirAssembly):
             failures={
                 "dropped": fell(plug) | fell(scene.poses("cradle")),
                 "fell_out": in_the_air,
-                "unsupported": released & touching & (fit.depth_m > 0) & (com_inside_m <= _COM_INSIDE_M),
+                "unsupported": released
+                & touching
+                & (fit.depth_m > 0)
+                & (com_inside_m <= _COM_INSIDE_M),
             },
             partial=(touching & self._inside(fit)).astype(int),
             measures={
@@ -66,7 +74,9 @@ class Assembly2(AirAssembly):
 
     def _inside(self, fit: Fit) -> np.ndarray:
         com_inside = fit.depth_m - self.com_from_tip_m > _COM_INSIDE_M
-        return com_inside & (fit.tilt_rad < _IN_TILT_RAD) & (fit.lateral_m < _IN_LATERAL_M)
+        return (
+            com_inside & (fit.tilt_rad < _IN_TILT_RAD) & (fit.lateral_m < _IN_LATERAL_M)
+        )
 
     def is_in_place(self, scene: Scene, fit: Fit) -> np.ndarray:
         return self._inside(fit) & scene.contact("plug", "cradle").touching

@@ -22,9 +22,13 @@ def expert_of(task: Task | type[Task]) -> type[ScriptedExpert]:
     try:
         expert = pkgutil.resolve_name(task.expert)
     except (ImportError, AttributeError, ValueError) as error:
-        raise TaccorlError(f"task {task.name}: its expert {task.expert!r} cannot be imported: {error}") from error
+        raise TaccorlError(
+            f"task {task.name}: its expert {task.expert!r} cannot be imported: {error}"
+        ) from error
     if not (isinstance(expert, type) and issubclass(expert, ScriptedExpert)):
-        raise TaccorlError(f"task {task.name}: its expert {task.expert!r} is no subclass of ScriptedExpert: {expert!r}")
+        raise TaccorlError(
+            f"task {task.name}: its expert {task.expert!r} is no subclass of ScriptedExpert: {expert!r}"
+        )
     return expert
 
 

@@ -15,8 +15,13 @@ DT_S = 1.0 / CONTROL_HZ
 """Duration of a control step [s]."""
 LEARNED = 1 - math.exp(-3.0 * DT_S)
 """Share of an offset at rest that is learnt in a control step: it is down to a third after 1 / 3 s."""
-_PULSE_S, _BETWEEN_PULSES_S = (0.27, 0.73), (0.5, 2.3)  # ranges of a pulse's duration, and of the time to the next one
-_AFTER_PULSE_STEPS = round(0.2 * CONTROL_HZ)  # two time constants of the arm: then it is back on its path
+_PULSE_S, _BETWEEN_PULSES_S = (
+    (0.27, 0.73),
+    (0.5, 2.3),
+)  # ranges of a pulse's duration, and of the time to the next one
+_AFTER_PULSE_STEPS = round(
+    0.2 * CONTROL_HZ
+)  # two time constants of the arm: then it is back on its path
 _MOST = {"m": 0.1, "rad": 0.5}
 """Unit → largest standard deviation of an error or a pulse, a choice far beyond what succeeds: 0.5 rad move a hand by 0.2 m."""
 
@@ -73,10 +78,14 @@ class ScriptedExpertConfig:
                 raise TaccorlError(f"hands.{name}={value:g}: a finite number, {least}")
             unit = name.rpartition("_")[2]
             if value > _MOST.get(unit, math.inf) and not name.startswith("feel"):
-                raise TaccorlError(f"hands.{name}={value:g}: at most {_MOST[unit]:g} {unit}")
+                raise TaccorlError(
+                    f"hands.{name}={value:g}: at most {_MOST[unit]:g} {unit}"
+                )
 
 
-EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
+EXACT = ScriptedExpertConfig(
+    tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0
+)
 """Hands without tremor and errors."""
 
 
@@ -91,10 +100,16 @@ class Hand:
     bias_rad: np.ndarray
     """(6,) offset of the joints at rest from their targets [rad], estimated in free motion, as a person corrects the hand by
     eye."""
-    predicted_rad: np.ndarray  # (6,) joint angles that are expected now if nothing touches the arm [rad]
+    predicted_rad: (
+        np.ndarray
+    )  # (6,) joint angles that are expected now if nothing touches the arm [rad]
     goal: np.ndarray  # World-from-TCP (4, 4) target, with tremor
-    learns: bool = True  # False in contact: an offset that contact causes is not learned
-    tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))  # (6,) present tremor [m, rad]
+    learns: bool = (
+        True  # False in contact: an offset that contact causes is not learned
+    )
+    tremor: np.ndarray = field(
+        default_factory=lambda: np.zeros(6)
+    )  # (6,) present tremor [m, rad]
     steadiness: float = 1.0  # Factor on the tremor, 0 … 1
     rests: bool = False  # True while what it holds stands on the table, which pulses would push away
     brought: bool = False  # True from the takeover of a policy until the hand begins to reach for a part
@@ -131,8 +146,14 @@ class Pulses:
         if not allowed:
             self._num = min(self._num, self._step - 1)
         elif self._step > self._num + self._wait and self._amplitude_rad > 0:
-            self._num, self._step, self._wait = self._drawn(_PULSE_S), 1, self._drawn(_BETWEEN_PULSES_S)
-            self._peak_rad = self._rng.normal(size=ROBOT.num_joints) * self._amplitude_rad
+            self._num, self._step, self._wait = (
+                self._drawn(_PULSE_S),
+                1,
+                self._drawn(_BETWEEN_PULSES_S),
+            )
+            self._peak_rad = (
+                self._rng.normal(size=ROBOT.num_joints) * self._amplitude_rad
+            )
         if self._step > self._num:
             return np.zeros(ROBOT.num_joints)
         return math.sin(math.pi * self._step / (self._num + 1)) ** 2 * self._peak_rad
@@ -143,7 +164,9 @@ class Pulses:
         return self._step < self._num + _AFTER_PULSE_STEPS
 
 
-def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
+def follow(
+    start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray
+) -> np.ndarray:
     """State (n,) of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after``,
     (n,) each.
 

@@ -31,10 +31,15 @@ class ArmKinematics:
         spec.compiler.degree = False
         add_arm(spec, arm, robot)
         self.arm, self.model = arm, spec.compile()
-        self._joints = np.array([self.model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints])
+        self._joints = np.array(
+            [self.model.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]
+        )
         self.model.jnt_range[self._joints] += [_MARGIN_RAD, -_MARGIN_RAD]
         self._low, self._high = self.model.jnt_range[self._joints].T
-        self._data, self._site = mujoco.MjData(self.model), self.model.site(f"{arm}_tcp").id
+        self._data, self._site = (
+            mujoco.MjData(self.model),
+            self.model.site(f"{arm}_tcp").id,
+        )
         # Views of the data: MuJoCo makes a new one whenever it is asked.
         self._qpos = self._data.qpos
         self._position, self._rotation = (
@@ -44,7 +49,11 @@ class ArmKinematics:
         self._jacobian = np.zeros((6, self.model.nv))
         self._configuration = mink.Configuration(self.model)
         self._frame = mink.FrameTask(
-            f"{arm}_tcp", "site", position_cost=1.0, orientation_cost=_METRES_PER_RAD, lm_damping=1e-6
+            f"{arm}_tcp",
+            "site",
+            position_cost=1.0,
+            orientation_cost=_METRES_PER_RAD,
+            lm_damping=1e-6,
         )
         self._limits = [mink.ConfigurationLimit(self.model)]
 
@@ -68,23 +77,37 @@ class ArmKinematics:
             if error_m < tolerance_m:
                 return joints, error_m
             mujoco.mj_comPos(self.model, self._data)
-            mujoco.mj_jacSite(self.model, self._data, self._jacobian[:3], self._jacobian[3:], self._site)
+            mujoco.mj_jacSite(
+                self.model,
+                self._data,
+                self._jacobian[:3],
+                self._jacobian[3:],
+                self._site,
+            )
             try:
-                joints = joints + np.linalg.solve(self._jacobian[:, self._joints], twist)
-            except np.linalg.LinAlgError:  # stretched out: two joints turn about the same line
+                joints = joints + np.linalg.solve(
+                    self._jacobian[:, self._joints], twist
+                )
+            except (
+                np.linalg.LinAlgError
+            ):  # stretched out: two joints turn about the same line
                 break
             if ((joints < self._low) | (joints > self._high)).any():
                 break
         return self._solve_within_limits(tcp_world, start_rad, tolerance_m)
 
-    def _error(self, tcp_world: np.ndarray, joints_rad: np.ndarray) -> tuple[np.ndarray, float]:
+    def _error(
+        self, tcp_world: np.ndarray, joints_rad: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """(6,) what is missing, in the world [m, rad], and its size [m]."""
         self._qpos[self._joints] = joints_rad
         mujoco.mj_kinematics(self.model, self._data)
         twist = np.empty(6)
         twist[:3] = tcp_world[:3, 3] - self._position
         twist[3:] = self._rotation @ rotvec(self._rotation, tcp_world)
-        return twist, math.sqrt(twist[:3] @ twist[:3]) + _METRES_PER_RAD * math.sqrt(twist[3:] @ twist[3:])
+        return twist, math.sqrt(twist[:3] @ twist[:3]) + _METRES_PER_RAD * math.sqrt(
+            twist[3:] @ twist[3:]
+        )
 
     def _solve_within_limits(
         self, tcp_world: np.ndarray, start_rad: np.ndarray, tolerance_m: float
@@ -94,15 +117,31 @@ class ArmKinematics:
         self._configuration.update(q)
         self._frame.set_target(mink.SE3.from_matrix(tcp_world))
         for _ in range(_ITERATIONS):
-            if self._error(tcp_world, self._configuration.q[self._joints])[1] < tolerance_m:
+            if (
+                self._error(tcp_world, self._configuration.q[self._joints])[1]
+                < tolerance_m
+            ):
                 break
-            step = mink.solve_ik(self._configuration, [self._frame], 1.0, "daqp", damping=1e-6, limits=self._limits)
-            self._configuration.integrate_inplace(np.clip(step, -_STEP_RAD, _STEP_RAD), 1.0)
+            step = mink.solve_ik(
+                self._configuration,
+                [self._frame],
+                1.0,
+                "daqp",
+                damping=1e-6,
+                limits=self._limits,
+            )
+            self._configuration.integrate_inplace(
+                np.clip(step, -_STEP_RAD, _STEP_RAD), 1.0
+            )
         joints = np.clip(self._configuration.q[self._joints], self._low, self._high)
         return joints, self._error(tcp_world, joints)[1]
 
     def search(
-        self, tcp_world: np.ndarray, rng: np.random.Generator, tries: int = 20, tolerance_m: float = 5e-4
+        self,
+        tcp_world: np.ndarray,
+        rng: np.random.Generator,
+        tries: int = 20,
+        tolerance_m: float = 5e-4,
     ) -> np.ndarray:
         """Joint angles (6,) [rad] that bring the TCP to ``tcp_world`` (4, 4) within ``tolerance_m``: of the solutions from
         ``tries`` random starts, the one farthest from the joint limits.
@@ -113,7 +152,10 @@ class ArmKinematics:
         low, high = self._low, self._high
         best, best_margin, best_error = None, -np.inf, np.inf
         for _ in range(tries):
-            joints, error_m = self.solve(tcp_world, rng.uniform(low + 0.15 * (high - low), high - 0.15 * (high - low)))
+            joints, error_m = self.solve(
+                tcp_world,
+                rng.uniform(low + 0.15 * (high - low), high - 0.15 * (high - low)),
+            )
             best_error = min(best_error, error_m)
             margin = np.minimum(joints - low, high - joints).min()
             if error_m < tolerance_m and margin > best_margin:

@@ -23,7 +23,9 @@ class Mating:
 
     held: str  # Name of the held part
     held_from_mate: np.ndarray  # (4, 4) pose of its leading end (``Mate``) in its frame
-    num_turns: int | None  # Number of rotations about the hole's axis at which it looks the same; None: any angle
+    num_turns: (
+        int | None
+    )  # Number of rotations about the hole's axis at which it looks the same; None: any angle
     holder: str  # Name of the part with the hole
     holder_from_hole: np.ndarray  # (4, 4) pose of the hole in that part's frame
 
@@ -32,11 +34,17 @@ class Mating:
         """The mating of ``held``, whose leading end (``Part.mate``) is required, with the hole called ``hole`` of ``holder``."""
         assert held.mate is not None
         return cls(
-            held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole
+            held.name,
+            held.mate.part_from_mate,
+            held.mate.num_turns,
+            holder.name,
+            holder.holes[hole].part_from_hole,
         )
 
     def _relative(self, scene: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
-        return scene.body(self.holder) @ self.holder_from_hole, scene.body(self.held) @ self.held_from_mate
+        return scene.body(self.holder) @ self.holder_from_hole, scene.body(
+            self.held
+        ) @ self.held_from_mate
 
     def fit(self, scene: BodyPoses) -> Fit:
         """Present pose error of the held part in the hole."""
@@ -80,7 +88,9 @@ class Aim:
         hole = scene.body(mating.holder) @ mating.holder_from_hole
         mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
         pose = hole @ mate @ inverse(mating.held_from_mate) @ self.part_from_tcp
-        pose[:3, :3] = hole[:3, :3] @ turn(self.given[3:])[:3, :3] @ hole[:3, :3].T @ pose[:3, :3]
+        pose[:3, :3] = (
+            hole[:3, :3] @ turn(self.given[3:])[:3, :3] @ hole[:3, :3].T @ pose[:3, :3]
+        )
         pose[:3, 3] += hole[:3, :3] @ self.given[:3]
         return pose
 
@@ -89,17 +99,25 @@ class Aim:
         """Copy of this aim with zero position error (``off_m``) and zero direction error (``off_rad``)."""
         return replace(self, off_m=np.zeros(2), off_rad=np.zeros(3))
 
-    def poses(self, scene: BodyPoses, mating: Mating, depth_m: float) -> tuple[np.ndarray, np.ndarray]:
+    def poses(
+        self, scene: BodyPoses, mating: Mating, depth_m: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return two target poses (4, 4) of the TCP in the world: with the errors of this aim, and without them. The arguments
         are those of ``pose``."""
-        return self.pose(scene, mating, depth_m), self.exact.pose(scene, mating, depth_m)
+        return self.pose(scene, mating, depth_m), self.exact.pose(
+            scene, mating, depth_m
+        )
 
-    def giving_way(self, scene: BodyPoses, mating: Mating, push_world: np.ndarray) -> "Aim":
+    def giving_way(
+        self, scene: BodyPoses, mating: Mating, push_world: np.ndarray
+    ) -> "Aim":
         """The aim after contact forces have displaced the compliant wrist by ``push_world`` (6,) [m, rad], except along the
         hole's axis."""
         world_from_hole = (scene.body(mating.holder) @ mating.holder_from_hole)[:3, :3]
         sideways = world_from_hole.T @ push_world[:3] * (1, 1, 0)
-        return replace(self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]])
+        return replace(
+            self, given=self.given + np.r_[sideways, world_from_hole.T @ push_world[3:]]
+        )
 
 
 def deflection(wanted: np.ndarray, actual: np.ndarray) -> np.ndarray:

@@ -21,7 +21,9 @@ def minimum_jerk(x: float) -> float:
     return 10 * x**3 - 15 * x**4 + 6 * x**5
 
 
-def transform(pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None) -> np.ndarray:
+def transform(
+    pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None
+) -> np.ndarray:
     """Transform (4, 4) from a position ``pos_m`` (3,) and a rotation matrix (3, 3) (identity by default)."""
     pose = _IDENTITY.copy()  # in a third of the time of np.eye
     pose[:3, 3] = pos_m
@@ -79,9 +81,13 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     return pose
 
 
-def is_on_way(here: np.ndarray, start: np.ndarray, end: np.ndarray, near_m: float, near_rad: float) -> bool:
+def is_on_way(
+    here: np.ndarray, start: np.ndarray, end: np.ndarray, near_m: float, near_rad: float
+) -> bool:
     """Whether the pose ``here`` is no farther than ``near_m`` from the straight way between two poses (4, 4), and turned by no
     more than ``near_rad`` from its end."""
     way, gone = end[:3, 3] - start[:3, 3], here[:3, 3] - start[:3, 3]
     left = gone - float(np.clip(gone @ way / (way @ way), 0.0, 1.0)) * way
-    return bool(np.linalg.norm(left) < near_m and np.linalg.norm(rotvec(here, end)) < near_rad)
+    return bool(
+        np.linalg.norm(left) < near_m and np.linalg.norm(rotvec(here, end)) < near_rad
+    )

@@ -16,13 +16,23 @@ from taccorl.tasks.puzzle.scene import Puzzle
 
 # Heights of a piece's underside over the tray's top: when carried (clear of the other knobs), and before it is pressed.
 _CARRY_M, _HOVER_M = 0.045, 0.003
-_REACH_MPS, _CARRY_MPS, _NEAR_MPS = 0.35, 0.30, 0.15  # peak speeds: empty, with a piece, up and down
+_REACH_MPS, _CARRY_MPS, _NEAR_MPS = (
+    0.35,
+    0.30,
+    0.15,
+)  # peak speeds: empty, with a piece, up and down
 # The arm has 7 N/mm over the tray. Pressed on a corner by more than some 10 N, a piece would turn in the fingers.
 _FEEL = 0.4  # of the configuration's: blocked at 4 N more than the hand's own damping
 _LIGHTLY_M = 0.0005  # the command below the piece while it slides on the tray
 _EASE_M = 0.002  # the hand lifts by that much before it presses again
-_IN_MOUTH_M, _AT_FLOOR_M, _FLOOR_M = 0.001, 0.0092, 0.010  # depth from which it has dropped in, lies, and of the hole
-_FASTER_IN_HOLE = 3.0  # than down to the tray, where a quick hand would hit hard: 0.6 N for each mm/s
+_IN_MOUTH_M, _AT_FLOOR_M, _FLOOR_M = (
+    0.001,
+    0.0092,
+    0.010,
+)  # depth from which it has dropped in, lies, and of the hole
+_FASTER_IN_HOLE = (
+    3.0  # than down to the tray, where a quick hand would hit hard: 0.6 N for each mm/s
+)
 _LET_GO_M = 0.045  # between the pads: wider, the fingers would reach the knobs beside
 _LEVEL_RAD = 0.3  # a piece that leans by more cannot be gripped by its knob
 _NEAR_TRAY_M = 0.13  # from the tray's middle: in the other hand's way
@@ -67,9 +77,13 @@ class PuzzleExpert(ScriptedExpert):
                 yield from self.firm(arm, part.grasps["knob"].width_m)
                 low_m = float(mating.fit(self).depth_m) + _CARRY_M
                 if low_m > 0 and not self.is_in(mating):
-                    yield from self.move(arm, raised(self.hands[arm].pose, low_m), speed_mps=_NEAR_MPS)
+                    yield from self.move(
+                        arm, raised(self.hands[arm].pose, low_m), speed_mps=_NEAR_MPS
+                    )
             before = order[: order.index(shape)]
-            if not {_is_in(other) for other in before} <= self.flags and self._is_over_tray(arm):
+            if not {
+                _is_in(other) for other in before
+            } <= self.flags and self._is_over_tray(arm):
                 home = self.kinematics[arm].pose(np.array(self._task.home_rad[arm]))
                 yield from self.move(arm, self.near(home), speed_mps=_CARRY_MPS)
             for other in before:
@@ -79,7 +93,9 @@ class PuzzleExpert(ScriptedExpert):
         yield from self._retreat(arm)
 
     def _is_over_tray(self, arm: str) -> bool:
-        return bool(np.linalg.norm((self.tcp(arm) - self.body("tray"))[:2, 3]) < _NEAR_TRAY_M)
+        return bool(
+            np.linalg.norm((self.tcp(arm) - self.body("tray"))[:2, 3]) < _NEAR_TRAY_M
+        )
 
     def _is_in(self, shape: str) -> bool:
         """In its hole and let go."""
@@ -123,9 +139,13 @@ class PuzzleExpert(ScriptedExpert):
     def _lift(self, arm: str, shape: str, height_m: float = 0.06) -> Script:
         """Grip a piece by its knob where it lies and lift it."""
         ahead = partial(raised, height_m=0.04)
-        yield from self.reach(arm, self._knob(shape), ahead, speed_mps=_NEAR_MPS, far_mps=_REACH_MPS)
+        yield from self.reach(
+            arm, self._knob(shape), ahead, speed_mps=_NEAR_MPS, far_mps=_REACH_MPS
+        )
         yield from self.close(arm, self._part(shape).grasps["knob"].width_m)
-        yield from self.move(arm, raised(self.hands[arm].pose, height_m), speed_mps=_NEAR_MPS)
+        yield from self.move(
+            arm, raised(self.hands[arm].pose, height_m), speed_mps=_NEAR_MPS
+        )
 
     def _place(self, arm: str, shape: str, *, is_near: bool = False) -> Script:
         """Carry a held piece to its hole, where it may be already, feel it in, let go, look; grip it again where it rests on
@@ -137,7 +157,9 @@ class PuzzleExpert(ScriptedExpert):
                 yield from self._lift(arm, shape, height_m=0.02)
             yield from self._press(arm, mating, carry=bool(attempt) or not is_near)
             yield from self.open(arm, _LET_GO_M)
-            yield from self.move(arm, raised(self.hands[arm].pose, 0.035), speed_mps=_NEAR_MPS)
+            yield from self.move(
+                arm, raised(self.hands[arm].pose, 0.035), speed_mps=_NEAR_MPS
+            )
             self.hands[arm].learns, self.hands[arm].steadiness = True, 1.0
             if self._task.placed(self.sim, shape)[0]:
                 return
@@ -154,10 +176,14 @@ class PuzzleExpert(ScriptedExpert):
         aim = self._first_aim(arm, mating)
         if carry:
             yield from self.aim(arm, mating, aim, -_CARRY_M, speed_mps=_CARRY_MPS)
-        yield from self.aim(arm, mating, aim, -_HOVER_M, speed_mps=_NEAR_MPS, settle=True)
+        yield from self.aim(
+            arm, mating, aim, -_HOVER_M, speed_mps=_NEAR_MPS, settle=True
+        )
         hand.learns, hand.steadiness = False, 0.3
         aim, depth = (yield from self._align(arm, mating, aim, -_HOVER_M)), -_HOVER_M
-        speed_mps = (self.rng.uniform(0.006, 0.010) if config.aim_m > 0 else 0.008) * config.speed
+        speed_mps = (
+            self.rng.uniform(0.006, 0.010) if config.aim_m > 0 else 0.008
+        ) * config.speed
         began, free = self.step_count, self.pushed(arm)
         while self.step_count - began < _LONGEST_S * CONTROL_HZ:
             at, pushed = float(mating.fit(self).depth_m), self.pushed(arm) - free
@@ -176,12 +202,17 @@ class PuzzleExpert(ScriptedExpert):
                     aim = yield from self._align(arm, mating, aim, depth)
             elif at > _IN_MOUTH_M:
                 aim = aim.giving_way(self, mating, config.give_way * pushed)
-            depth = min(depth + speed_mps * DT_S * (_FASTER_IN_HOLE if at > _IN_MOUTH_M else 1), _FLOOR_M)
+            depth = min(
+                depth + speed_mps * DT_S * (_FASTER_IN_HOLE if at > _IN_MOUTH_M else 1),
+                _FLOOR_M,
+            )
             hand.place(*aim.poses(self, mating, depth))
             yield
         yield from self.pause(arm, 0.1, 0.25)
 
-    def _align(self, arm: str, mating: Mating, aim: Aim, depth_m: float) -> Generator[None, None, Aim]:
+    def _align(
+        self, arm: str, mating: Mating, aim: Aim, depth_m: float
+    ) -> Generator[None, None, Aim]:
         """Look at the piece in the fingers, and bring it to where the aim says that it should be."""
         aim = self._look(arm, mating, aim)
         yield from self.aim(arm, mating, aim, depth_m, speed_mps=0.04)
@@ -210,7 +241,9 @@ class PuzzleExpert(ScriptedExpert):
         """TCP pose for a piece's knob, from above, among the four ways to grip it that with the hand's x nearest the base."""
         grip = self.body(shape) @ self._part(shape).grasps["knob"].part_from_tcp
         turned = [grip @ turn((0, 0, k * np.pi / 2)) for k in range(4)]
-        return raised(min(turned, key=lambda pose: pose[0, 0]), 0.001 + self.config.grasp_m)
+        return raised(
+            min(turned, key=lambda pose: pose[0, 0]), 0.001 + self.config.grasp_m
+        )
 
     @property
     def _task(self) -> Puzzle:

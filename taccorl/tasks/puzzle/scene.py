@@ -16,20 +16,41 @@ from scipy.spatial.transform import Rotation
 from taccorl.robots import ROBOT
 from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
 from taccorl.sim.randomize import OBJECT_FRICTION, symmetric
-from taccorl.sim.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell, tasks
+from taccorl.sim.task import (
+    AT_REST_MPS,
+    Reset,
+    Scene,
+    Subtask,
+    Task,
+    Verdict,
+    fell,
+    tasks,
+)
 from taccorl.tasks.puzzle.parts import PIECES, puzzle_piece, puzzle_tray
 
 # Nominal places [m]: outlines stay ≥ 4 mm apart whatever is drawn, and all are reached ≥ 0.2 rad from the joint limits.
-TRAY_AT_M, YAW_RAD = (0.27, -0.02), -np.pi / 2  # the tray's x runs to the right; pieces lie as their holes do
-PIECES_AT_M = {"circle": (0.285, 0.155), "heart": (0.285, -0.195), "triangle": (0.285, -0.324)}
+TRAY_AT_M, YAW_RAD = (
+    (0.27, -0.02),
+    -np.pi / 2,
+)  # the tray's x runs to the right; pieces lie as their holes do
+PIECES_AT_M = {
+    "circle": (0.285, 0.155),
+    "heart": (0.285, -0.195),
+    "triangle": (0.285, -0.324),
+}
 """Piece → nominal place (x, y) on the table, in the world [m]."""
 
 _ABOVE_FLOOR_M, _TILT_RAD = 0.0025, np.deg2rad(3.0)
-_LATERAL_M, _TURN_RAD = 0.003, np.deg2rad(10.0)  # wider than any clearance: only what lies in its own hole is within
+_LATERAL_M, _TURN_RAD = (
+    0.003,
+    np.deg2rad(10.0),
+)  # wider than any clearance: only what lies in its own hole is within
 _TIPPED_RAD = np.deg2rad(30.0)
 _LIFTED_M = 0.03
 _ENTERED_M = 0.002  # below the mouth: the piece is in a hole, perhaps jammed
-_SEARCHING_MPS = 0.005  # faster than this, a piece that is pressed on the tray searches its hole
+_SEARCHING_MPS = (
+    0.005  # faster than this, a piece that is pressed on the tray searches its hole
+)
 _KNOB_ABOVE_M = 0.0325  # middle of the knob over the piece's underside
 _LEFT_ALONE_M = 0.10  # knob from both hands: nobody is about to pick it up again
 
@@ -39,7 +60,9 @@ class Puzzle(Task):
     """Task: put three pieces into a tray."""
 
     name = "puzzle"
-    instruction = "put the circle, the heart and the triangle into their holes in the tray"
+    instruction = (
+        "put the circle, the heart and the triangle into their holes in the tray"
+    )
     parts = PIECES
     clamped = ("tray",)
     mating = tuple((shape, "tray") for shape in PIECES)
@@ -76,7 +99,9 @@ class Puzzle(Task):
         mates = [piece.mate for piece in self.pieces.values() if piece.mate]
         self._piece_from_mate = np.stack([mate.part_from_mate for mate in mates])
         self._is_round = np.array([mate.num_turns is None for mate in mates])
-        self._turn_period_rad = np.array([2 * np.pi / (mate.num_turns or 1) for mate in mates])
+        self._turn_period_rad = np.array(
+            [2 * np.pi / (mate.num_turns or 1) for mate in mates]
+        )
 
     def add_parts(self, spec: mujoco.MjSpec) -> None:
         for part in (self.tray, *self.pieces.values()):
@@ -88,7 +113,11 @@ class Puzzle(Task):
         poses = {"tray": np.r_[TRAY_AT_M + draw["tray_position"], 0.0, quat]}
         for shape, piece in self.pieces.items():
             # The table's "reset support" moves what the piece lies on, "position" the piece on it: both add up.
-            xy = PIECES_AT_M[shape] + draw[f"{shape}_support"] + draw[f"{shape}_position"]
+            xy = (
+                PIECES_AT_M[shape]
+                + draw[f"{shape}_support"]
+                + draw[f"{shape}_position"]
+            )
             poses[shape] = on_table(piece, xy, YAW_RAD + float(draw[f"{shape}_yaw"][0]))
         return Reset(poses=poses, friction=float(draw["friction"][0]))
 
@@ -96,7 +125,11 @@ class Puzzle(Task):
         """Pose errors of pieces (all by default) in their own holes; arrays (N, len(which)) in the order of ``PIECES``."""
         k = list(which)
         pieces = np.stack([scene.poses(PIECES[i]) for i in k], axis=1)
-        fit = measure_fit(scene.poses("tray")[:, None] @ self._tray_from_hole[k], pieces @ self._piece_from_mate[k], 1)
+        fit = measure_fit(
+            scene.poses("tray")[:, None] @ self._tray_from_hole[k],
+            pieces @ self._piece_from_mate[k],
+            1,
+        )
         period_rad = self._turn_period_rad[k]
         turn_rad = fit.turn_rad - period_rad * np.round(fit.turn_rad / period_rad)
         return fit._replace(turn_rad=np.where(self._is_round[k], 0.0, turn_rad))
@@ -107,7 +140,12 @@ class Puzzle(Task):
         """
         # The other two are wider than any clearance: only what is in its own hole is within.
         turned = np.abs(fit.turn_rad) < _TURN_RAD
-        return (fit.depth_m > self.in_depth_m) & (fit.tilt_rad < _TILT_RAD) & (fit.lateral_m < _LATERAL_M) & turned
+        return (
+            (fit.depth_m > self.in_depth_m)
+            & (fit.tilt_rad < _TILT_RAD)
+            & (fit.lateral_m < _LATERAL_M)
+            & turned
+        )
 
     def look(self, scene: Scene) -> Verdict:
         fit = self.fits(scene)
@@ -121,13 +159,29 @@ class Puzzle(Task):
         fallen = fell(pieces.reshape(-1, 4, 4)).reshape(-1, len(PIECES))
         tipped = released & (pieces[..., 2, 2] < np.cos(_TIPPED_RAD))
         rim = on_rim & _left_alone(scene, pieces, on_rim)
-        failures = {"dropped": fallen, "tipped": tipped, "rim": rim, "wrong place": pressed}
-        measures = {"depth_m": fit.depth_m, "tilt_rad": fit.tilt_rad, "lateral_m": fit.lateral_m}
+        failures = {
+            "dropped": fallen,
+            "tipped": tipped,
+            "rim": rim,
+            "wrong place": pressed,
+        }
+        measures = {
+            "depth_m": fit.depth_m,
+            "tilt_rad": fit.tilt_rad,
+            "lateral_m": fit.lateral_m,
+        }
         return Verdict(
             goal=placed.sum(axis=1) == len(PIECES),
-            failures={name: np.logical_or.reduce(seen, axis=1) for name, seen in failures.items()},
+            failures={
+                name: np.logical_or.reduce(seen, axis=1)
+                for name, seen in failures.items()
+            },
             partial=placed.sum(axis=1),
-            measures={f"{shape}_{what}": of[:, k] for what, of in measures.items() for k, shape in enumerate(PIECES)},
+            measures={
+                f"{shape}_{what}": of[:, k]
+                for what, of in measures.items()
+                for k, shape in enumerate(PIECES)
+            },
         )
 
     def placed(self, scene: Scene, shape: str) -> np.ndarray:
@@ -147,7 +201,10 @@ class Puzzle(Task):
             def placed(scene: Scene) -> np.ndarray:
                 return self.placed(scene, shape)
 
-            return (Subtask(name=f"grasp {shape}", done=lifted), Subtask(name=f"place {shape}", done=placed))
+            return (
+                Subtask(name=f"grasp {shape}", done=lifted),
+                Subtask(name=f"place {shape}", done=placed),
+            )
 
         return {"left": pair("circle"), "right": (*pair("triangle"), *pair("heart"))}
 
@@ -172,4 +229,7 @@ def _left_alone(scene: Scene, pieces: np.ndarray, asked: np.ndarray) -> np.ndarr
     knobs = pieces[..., :3, 3] + _KNOB_ABOVE_M * pieces[..., :3, 2]
     hands = np.stack([scene.poses(f"{arm}_{ROBOT.hand}") for arm in ROBOT.arms], axis=1)
     tcps = hands[..., :3, 3] + ROBOT.tcp_from_hand_m * hands[..., :3, 2]
-    return np.linalg.norm(knobs[:, :, None] - tcps[:, None], axis=3).min(axis=2) > _LEFT_ALONE_M
+    return (
+        np.linalg.norm(knobs[:, :, None] - tcps[:, None], axis=3).min(axis=2)
+        > _LEFT_ALONE_M
+    )

@@ -6,8 +6,26 @@ from dataclasses import replace
 import numpy as np
 from shapely.geometry import Polygon, box
 
-from taccorl.sim.part import CLEARANCE_M, LEADING_END, TCP_ABOVE_M, Grasp, Hole, Mate, Part, check_clearance, frame_pose
-from taccorl.sim.shapes import Capsule, Cylinder, box_between, circle_outline, extrude, moved, with_mass
+from taccorl.sim.part import (
+    CLEARANCE_M,
+    LEADING_END,
+    TCP_ABOVE_M,
+    Grasp,
+    Hole,
+    Mate,
+    Part,
+    check_clearance,
+    frame_pose,
+)
+from taccorl.sim.shapes import (
+    Capsule,
+    Cylinder,
+    box_between,
+    circle_outline,
+    extrude,
+    moved,
+    with_mass,
+)
 
 TUBE_RADIUS_M, _TUBE_LENGTH_M = 0.008, 0.100
 _RACK_HOLES_M = {"left": -0.026, "middle": 0.0, "right": 0.026}
@@ -19,10 +37,16 @@ def glass_tube(name: str = "tube") -> Part:
     r, length, cap = TUBE_RADIUS_M, _TUBE_LENGTH_M, 0.012
     # The capsule's upper end is hidden in the cap.
     glass = Capsule(
-        radius_m=r, half_height_m=length / 2 - r, part_from_solid=frame_pose(at=(0, 0, length / 2)), color="glass"
+        radius_m=r,
+        half_height_m=length / 2 - r,
+        part_from_solid=frame_pose(at=(0, 0, length / 2)),
+        color="glass",
     )
     lid = Cylinder(
-        radius_m=0.010, half_height_m=cap / 2, part_from_solid=frame_pose(at=(0, 0, length - cap / 2)), color="red"
+        radius_m=0.010,
+        half_height_m=cap / 2,
+        part_from_solid=frame_pose(at=(0, 0, length - cap / 2)),
+        color="red",
     )
     return Part(
         name=name,
@@ -33,7 +57,12 @@ def glass_tube(name: str = "tube") -> Part:
         mate=Mate(part_from_mate=LEADING_END, num_turns=None),
         # 60 mm up: clear of the stand's prisms, and of the rack when the tube is in. TCP x points to the bottom, so that
         # the wrist camera is above the hand when the tube stands. Any turn about the tube's axis is as good.
-        grasps={"middle": Grasp(part_from_tcp=frame_pose((0, 0, -1), (-1, 0, 0), (0, 0, 0.060)), width_m=2 * r)},
+        grasps={
+            "middle": Grasp(
+                part_from_tcp=frame_pose((0, 0, -1), (-1, 0, 0), (0, 0, 0.060)),
+                width_m=2 * r,
+            )
+        },
     )
 
 
@@ -46,13 +75,22 @@ def tube_stand(name: str = "stand") -> Part:
     ]  # fmt: skip
     profile = Polygon(outline)
     along_x = frame_pose(x_axis=(0, 1, 0), z_axis=(1, 0, 0))
-    blocks = [extrude(profile, *span, "walnut") for span in ((0.010, 0.022), (0.079, 0.086))]
+    blocks = [
+        extrude(profile, *span, "walnut") for span in ((0.010, 0.022), (0.079, 0.086))
+    ]
     base = box_between((0, -0.022, 0), (0.096, 0.022, 0.004), "walnut")
     return Part(
         name=name,
-        solids=with_mass([base, *(moved(solid, along_x) for block in blocks for solid in block)], 0.120),
+        solids=with_mass(
+            [base, *(moved(solid, along_x) for block in blocks for solid in block)],
+            0.120,
+        ),
         clamped=True,
-        seats={"tube": frame_pose(x_axis=(0, 0, 1), z_axis=(1, 0, 0), at=(0, 0, _STAND_HEIGHT_M))},
+        seats={
+            "tube": frame_pose(
+                x_axis=(0, 0, 1), z_axis=(1, 0, 0), at=(0, 0, _STAND_HEIGHT_M)
+            )
+        },
     )
 
 
@@ -69,7 +107,12 @@ def tube_rack(name: str = "rack", clearance_m: float = CLEARANCE_M) -> Part:
         solid
         for low, high in ((0.018, 0.022), (0.046, 0.050))
         for (x0, x1), x in zip(cells, _RACK_HOLES_M.values(), strict=True)
-        for solid in extrude(Polygon(box(x0, -0.019, x1, 0.019).exterior, [hole + np.array((x, 0))]), low, high, "blue")
+        for solid in extrude(
+            Polygon(box(x0, -0.019, x1, 0.019).exterior, [hole + np.array((x, 0))]),
+            low,
+            high,
+            "blue",
+        )
     ]
     frame = [
         box_between((-0.045, -0.022, 0), (0.045, 0.022, 0.004), "blue"),
@@ -81,10 +124,18 @@ def tube_rack(name: str = "rack", clearance_m: float = CLEARANCE_M) -> Part:
         name=name,
         solids=with_mass([*plates, *frame], 0.250),
         holes={
-            which: Hole(part_from_hole=frame_pose(z_axis=(0, 0, -1), at=(x, 0, 0.050)), depth_m=0.046)
+            which: Hole(
+                part_from_hole=frame_pose(z_axis=(0, 0, -1), at=(x, 0, 0.050)),
+                depth_m=0.046,
+            )
             for which, x in _RACK_HOLES_M.items()
         },
         grasps={
-            "handle": Grasp(part_from_tcp=frame_pose((1, 0, 0), (0, 0, -1), (-0.061, 0, TCP_ABOVE_M)), width_m=0.020)
+            "handle": Grasp(
+                part_from_tcp=frame_pose(
+                    (1, 0, 0), (0, 0, -1), (-0.061, 0, TCP_ABOVE_M)
+                ),
+                width_m=0.020,
+            )
         },
     )

@@ -13,15 +13,29 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.sim.part import Fit, Part, add_part, measure_fit, on_table
 from taccorl.sim.randomize import OBJECT_FRICTION, symmetric
-from taccorl.sim.task import AT_REST_MPS, Reset, Scene, Subtask, Task, Verdict, fell, tasks
+from taccorl.sim.task import (
+    AT_REST_MPS,
+    Reset,
+    Scene,
+    Subtask,
+    Task,
+    Verdict,
+    fell,
+    tasks,
+)
 from taccorl.tasks.test_tube.parts import glass_tube, tube_rack, tube_stand
 
-TUBE_AT_M, TUBE_YAW_RAD = (0.175, -0.315), np.pi / 2  # of the tube's middle; heading from its bottom to its cap
+TUBE_AT_M, TUBE_YAW_RAD = (
+    (0.175, -0.315),
+    np.pi / 2,
+)  # of the tube's middle; heading from its bottom to its cap
 RACK_AT_M, RACK_YAW_RAD = (0.400, 0.035), -np.pi / 2  # nominal; the handle looks to +y
 TUBE_MIDDLE_M = 0.050  # along the tube, from its bottom
 _HOLE = "middle"
 _IN_DEPTH_M, _IN_LATERAL_M, _IN_TILT_RAD = 0.040, 0.003, np.deg2rad(5.0)
-_RIM_M = 0.006  # less deep is not in the hole: of the tube's round bottom 8 mm are its own
+_RIM_M = (
+    0.006  # less deep is not in the hole: of the tube's round bottom 8 mm are its own
+)
 _CELL_M = 0.013  # half the distance of two holes: farther off is another hole's
 _LIFTED_M = 0.070  # of the tube's middle: 30 mm above where it lies
 _LYING_M = 0.030  # lower than the stand holds the tube's middle, and half as high as the rack does
@@ -40,7 +54,13 @@ class TestTube(Task):
     parts = ("tube", "rack")
     clamped = ("stand",)
     mating = (("tube", "rack"),)
-    failures = {"dropped": 0.5, "rack moved": 0.0, "rim": 0.5, "jam": 0.5, "missed": 0.5}  # noqa: RUF012
+    failures = {  # noqa: RUF012
+        "dropped": 0.5,
+        "rack moved": 0.0,
+        "rim": 0.5,
+        "jam": 0.5,
+        "missed": 0.5,
+    }
     home_rad = {  # noqa: RUF012
         "left": (-0.085, 2.021, -1.094, -0.582, 0.784, -1.228),
         "right": (0.636, 1.815, -0.673, -0.497, 0.873, -0.544),
@@ -68,12 +88,16 @@ class TestTube(Task):
         yaw = TUBE_YAW_RAD + float(draw["tube_yaw"][0])
         along = np.array([np.cos(yaw), np.sin(yaw)])
         # The stand's origin is below the tube's bottom; both turn about the tube's middle.
-        stand = on_table(self.stand, TUBE_AT_M + draw["tube_position"] - TUBE_MIDDLE_M * along, yaw)
+        stand = on_table(
+            self.stand, TUBE_AT_M + draw["tube_position"] - TUBE_MIDDLE_M * along, yaw
+        )
         return Reset(
             poses={
                 "stand": stand,
                 "tube": in_seat(stand, self.stand.seats["tube"]),
-                "rack": on_table(self.rack, RACK_AT_M + draw["holder_position"], RACK_YAW_RAD),
+                "rack": on_table(
+                    self.rack, RACK_AT_M + draw["holder_position"], RACK_YAW_RAD
+                ),
             },
             friction=float(draw["friction"][0]),
         )
@@ -83,7 +107,9 @@ class TestTube(Task):
         mate = self.tube.mate
         assert mate is not None
         hole = scene.poses("rack") @ self.rack.holes[_HOLE].part_from_hole
-        return measure_fit(hole, scene.poses("tube") @ mate.part_from_mate, mate.num_turns)
+        return measure_fit(
+            hole, scene.poses("tube") @ mate.part_from_mate, mate.num_turns
+        )
 
     def inside(self, fit: Fit) -> np.ndarray:
         """(N,) bool: tubes with these pose errors are deep enough in the hole."""
@@ -92,7 +118,11 @@ class TestTube(Task):
 
     def look(self, scene: Scene) -> Verdict:
         tube, rack, fit = scene.poses("tube"), scene.poses("rack"), self.fit(scene)
-        inside, speed, released = self.inside(fit), _speed(scene), ~scene.pads_touching("tube").any(1)
+        inside, speed, released = (
+            self.inside(fit),
+            _speed(scene),
+            ~scene.pads_touching("tube").any(1),
+        )
         at_rack = released & scene.contact("tube", "rack").touching
         entered, here = fit.depth_m >= _RIM_M, fit.lateral_m < _CELL_M
         stuck = (fit.depth_m < _IN_DEPTH_M) | (fit.tilt_rad >= _IN_TILT_RAD)
@@ -100,11 +130,15 @@ class TestTube(Task):
         return Verdict(
             goal=inside & released & (speed < AT_REST_MPS),
             failures={
-                "dropped": fell(tube) | fell(rack) | (released & (_middle(tube)[:, 2] < _LYING_M)),
+                "dropped": fell(tube)
+                | fell(rack)
+                | (released & (_middle(tube)[:, 2] < _LYING_M)),
                 "rack moved": moved > _MOVED_M,
                 "rim": at_rack & ~entered,
                 "jam": at_rack & entered & here & stuck,
-                "missed": at_rack & entered & ~here,  # in another hole, or leaning on the rack
+                "missed": at_rack
+                & entered
+                & ~here,  # in another hole, or leaning on the rack
             },
             partial=inside.astype(int),
             measures={
@@ -129,10 +163,15 @@ class TestTube(Task):
 
         def inserted(scene: Scene) -> np.ndarray:
             released = ~scene.pads_touching("tube").any(1)
-            return self.inside(self.fit(scene)) & released & (_speed(scene) < AT_REST_MPS)
+            return (
+                self.inside(self.fit(scene)) & released & (_speed(scene) < AT_REST_MPS)
+            )
 
         return {
-            "left": (Subtask(name="grasp rack", done=gripped), Subtask(name="hold rack", done=inserted)),
+            "left": (
+                Subtask(name="grasp rack", done=gripped),
+                Subtask(name="hold rack", done=inserted),
+            ),
             "right": (
                 Subtask(name="lift tube", done=lifted),
                 Subtask(name="turn tube upright", done=upright),
@@ -147,7 +186,12 @@ def in_seat(stand_pose: np.ndarray, stand_from_part: np.ndarray) -> np.ndarray:
     """
     turned = Rotation.from_quat(stand_pose[3:], scalar_first=True)
     pos = stand_pose[:3] + turned.apply(stand_from_part[:3, 3]) + (0, 0, 0.0002)
-    return np.r_[pos, (turned * Rotation.from_matrix(stand_from_part[:3, :3])).as_quat(scalar_first=True)]
+    return np.r_[
+        pos,
+        (turned * Rotation.from_matrix(stand_from_part[:3, :3])).as_quat(
+            scalar_first=True
+        ),
+    ]
 
 
 def _speed(scene: Scene) -> np.ndarray:

@@ -42,13 +42,24 @@ def test_functions_of_lanes_are_those_of_math() -> None:
     rng, far = np.random.default_rng(0), np.zeros(5)
     for scale in (1e-9, 1e-3, 0.1, 1.0, 10.0):
         for _ in range(200):
-            x, exponent = scale * rng.uniform(-1, 1, (1, lanes.LANES)), rng.uniform(0.1, 3.0, (1, lanes.LANES))
+            x, exponent = (
+                scale * rng.uniform(-1, 1, (1, lanes.LANES)),
+                rng.uniform(0.1, 3.0, (1, lanes.LANES)),
+            )
             found = np.empty((5, lanes.LANES))
             _of_lanes(x, exponent, found)
             for k, (v, e) in enumerate(zip(x[0], exponent[0], strict=True)):
-                share = -math.expm1(-v) / v if v > 0 else math.nan  # not stated for x < 0
+                share = (
+                    -math.expm1(-v) / v if v > 0 else math.nan
+                )  # not stated for x < 0
                 grown = abs(v) ** e * (1 + abs(e * math.log(abs(v))))
-                errors = found[:, k] - (math.sin(v), math.cos(v), math.exp(-v), share, abs(v) ** e)
+                errors = found[:, k] - (
+                    math.sin(v),
+                    math.cos(v),
+                    math.exp(-v),
+                    share,
+                    abs(v) ** e,
+                )
                 far = np.fmax(far, abs(errors) / (1.0, 1.0, math.exp(-v), share, grown))
     assert (far[:3] < 1e-15).all() and far[3] < 1e-12 and far[4] < 1e-15, far
 
@@ -71,36 +82,67 @@ def test_a_lane_does_not_depend_on_the_others() -> None:
     drives = [Drive(**(JOINT | effect)) for effect in effects]
     couplings = [np.full(ROWS, 0.01 * k) for k in range(len(drives))]
     together = simulate_all(drives, SENT, couplings, *MORE, 0)
-    for drive, coupling, (reported, effort) in zip(drives, couplings, together, strict=True):
+    for drive, coupling, (reported, effort) in zip(
+        drives, couplings, together, strict=True
+    ):
         alone = simulate(drive, SENT, coupling, *MORE)
-        assert np.allclose(alone[0], reported, rtol=0, atol=1e-12) and np.allclose(alone[1], effort, rtol=0, atol=1e-9)
+        assert np.allclose(alone[0], reported, rtol=0, atol=1e-12) and np.allclose(
+            alone[1], effort, rtol=0, atol=1e-9
+        )
     apart = [np.ptp(reported) for reported, _ in together]
-    assert len({round(float(one), 9) for one in apart}) == len(apart)  # each effect does something
+    assert len({round(float(one), 9) for one in apart}) == len(
+        apart
+    )  # each effect does something
 
 
 COGS = {"cogging__torque_nm": 5.0, "cogging__periods": 30.0}
 
 
-@pytest.mark.parametrize("effect", [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}, COGS])
-def test_steps_of_half_a_millisecond_are_nearly_as_good_as_those_of_a_twentieth(effect: dict[str, float]) -> None:
-    sent, none, ones = 0.3 * np.sin(0.02 * np.arange(1000)), np.zeros(1000), np.ones(1000)
-    drive, more = Drive(400.0, 10.0, 0.0, 0.1, gravity_cos=3.0, midpoint=1.0, **effect), (none, none, ones, ones, none)
-    half, fine = (simulate(drive, sent, *more, 0.0, n, 1, 1e-3 / n, 0.0)[0] for n in (2, 20))
+@pytest.mark.parametrize(
+    "effect",
+    [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}, COGS],
+)
+def test_steps_of_half_a_millisecond_are_nearly_as_good_as_those_of_a_twentieth(
+    effect: dict[str, float],
+) -> None:
+    sent, none, ones = (
+        0.3 * np.sin(0.02 * np.arange(1000)),
+        np.zeros(1000),
+        np.ones(1000),
+    )
+    drive, more = (
+        Drive(400.0, 10.0, 0.0, 0.1, gravity_cos=3.0, midpoint=1.0, **effect),
+        (none, none, ones, ones, none),
+    )
+    half, fine = (
+        simulate(drive, sent, *more, 0.0, n, 1, 1e-3 / n, 0.0)[0] for n in (2, 20)
+    )
     assert np.std(half - fine) < 1.1e-4, "of 0.3 rad at 3.2 Hz"
 
 
 @pytest.mark.slow
-def test_a_change_of_an_imported_source_reaches_the_compiled_kernel(tmp_path: Path) -> None:
+def test_a_change_of_an_imported_source_reaches_the_compiled_kernel(
+    tmp_path: Path,
+) -> None:
     """The speed at which a power-law friction is stated, a tenth of it in a copy whose compiled kernel is kept."""
     for folder in ("taccorl", "tests/alignment/controller"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / folder,
+            tmp_path / folder,
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
     for name in ("tests/__init__.py", "tests/fresh_python.py"):
         shutil.copy2(ROOT / name, tmp_path / name)
 
     def swing() -> float:
-        where = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+        where = {
+            "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+            "PYTHONPATH": str(tmp_path),
+        }
         return float(printed(sys.executable, "-c", SWING, cwd=tmp_path, **where))
 
     before, source = swing(), tmp_path / "taccorl/sim/effects/friction.py"
-    source.write_text(source.read_text().replace("\nAT_RAD_PER_S = 0.1\n", "\nAT_RAD_PER_S = 0.01\n"))
+    source.write_text(
+        source.read_text().replace("\nAT_RAD_PER_S = 0.1\n", "\nAT_RAD_PER_S = 0.01\n")
+    )
     assert swing() < 0.8 * before  # thirty times the friction

@@ -15,11 +15,20 @@ from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 
 RATE_HZ, DT_S = 200, 1e-5
-WINDING: dict[str, Any] = {"supply_v": 12.0, "resistance_ohm": 4.0, "torque_nm_per_a": 1.0, "emf_v_s_per_rad": 1.1}
-SERVO = AxisConfig(name="servo", unit="rad", inertia=0.02, law="pwm", kp=6.0, lever_m=0.15, **WINDING)
+WINDING: dict[str, Any] = {
+    "supply_v": 12.0,
+    "resistance_ohm": 4.0,
+    "torque_nm_per_a": 1.0,
+    "emf_v_s_per_rad": 1.1,
+}
+SERVO = AxisConfig(
+    name="servo", unit="rad", inertia=0.02, law="pwm", kp=6.0, lever_m=0.15, **WINDING
+)
 
 
-def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0) -> Measurement:
+def recording(
+    target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0
+) -> Measurement:
     more = {"target_kinds": (kind,), "payload_kg": {"servo": payload_kg}}
     return of_signal("made", RATE_HZ, target, np.zeros(len(target)), "servo", **more)
 
@@ -29,7 +38,9 @@ def answer(axis: AxisConfig, m: Measurement) -> JointResponse:
     return model.simulate(motion_of(m, "servo", DrivenAxis(axis)), model.gains)
 
 
-def integrated(target: np.ndarray, torque, inertia: float, weight_nm: float = 0.0) -> np.ndarray:
+def integrated(
+    target: np.ndarray, torque, inertia: float, weight_nm: float = 0.0
+) -> np.ndarray:
     """(T,) position of inertia · q̈ = torque(target, q, v) − weight sin q from rest at 0, targets held."""
     q = v = 0.0
     found = []
@@ -54,14 +65,24 @@ def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
     found = answer(SERVO, m)
     assert np.abs(found.reported - truth).max() < 2e-4  # the model's steps are 1 ms
     # At the end it stands: 12 V · kp · e / R holds the weight.
-    assert 3.0 * 6.0 * (0.8 - found.reported[-1]) == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
-    assert found.effort[-1] == pytest.approx(weight * math.sin(found.reported[-1]), rel=0.03)
+    assert 3.0 * 6.0 * (0.8 - found.reported[-1]) == pytest.approx(
+        weight * math.sin(found.reported[-1]), rel=0.03
+    )
+    assert found.effort[-1] == pytest.approx(
+        weight * math.sin(found.reported[-1]), rel=0.03
+    )
     stiff = dataclasses.replace(SERVO, emf_v_s_per_rad=1e-6)
-    assert np.abs(answer(stiff, m).reported - truth).max() > 0.05, "without back-EMF it is much faster"
+    assert np.abs(answer(stiff, m).reported - truth).max() > 0.05, (
+        "without back-EMF it is much faster"
+    )
 
 
 def sampled(
-    target: np.ndarray, axis: AxisConfig, filter_s: float = 0.0, dead: float = 0.0, gain: float = 1.0
+    target: np.ndarray,
+    axis: AxisConfig,
+    filter_s: float = 0.0,
+    dead: float = 0.0,
+    gain: float = 1.0,
 ) -> np.ndarray:
     """(T,) position of an axis of law impedance or pwm whose loop of ``loop_hz`` computes its speed from two readings, smooths it
     over ``filter_s`` and holds its output; ``dead``: half the dead band [rad], ``gain``: factor on negative torques."""
@@ -85,35 +106,67 @@ def sampled(
 
 
 QUICK = dataclasses.replace(SERVO, kd=0.1, loop_hz=1000.0, lever_m=0.0)
-ARM = AxisConfig(name="servo", unit="rad", inertia=0.002, kp=3.0, kd=0.08, loop_hz=1000.0)
+ARM = AxisConfig(
+    name="servo", unit="rad", inertia=0.002, kp=3.0, kd=0.08, loop_hz=1000.0
+)
 
 
 @pytest.mark.parametrize(
     ("axis", "filter_s", "late_s", "effect", "most"),
     [
         (QUICK, 0.0, 0.0, {}, 3e-4),
-        (QUICK, 3e-3, 2.53e-3, {}, 8e-4),  # the mean age of the filter's readings is 1 ms · e⁻⅓ / (1 − e⁻⅓)
+        (
+            QUICK,
+            3e-3,
+            2.53e-3,
+            {},
+            8e-4,
+        ),  # the mean age of the filter's readings is 1 ms · e⁻⅓ / (1 − e⁻⅓)
         (QUICK, 0.0, 0.0, {"dead": 0.02}, 8e-4),
         (ARM, 0.0, 0.0, {"gain": 0.7}, 6e-4),
     ],
 )
-def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(axis, filter_s, late_s, effect, most):
+def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(
+    axis, filter_s, late_s, effect, most
+):
     """Steps. At the end of the duty only the back-EMF damps, at once; a gain of one direction is that of the damping, too; a
     target that leaves a dead band acts at once."""
-    target = np.select([np.arange(400) < k for k in (20, 100, 180, 300)], [0.0, 0.8, -0.3, -0.25], 0.5)
+    target = np.select(
+        [np.arange(400) < k for k in (20, 100, 180, 300)], [0.0, 0.8, -0.3, -0.25], 0.5
+    )
     truth = sampled(target, axis, filter_s, **effect)
-    own = [("error_deadband", "width_rad", "dead"), ("direction_gain", "factor", "gain")]
-    entries = tuple(EffectEntry(name, {p: effect[k]}) for name, p, k in own if k in effect)
-    found = answer(dataclasses.replace(axis, speed_late_s=late_s, effects=entries), recording(target))
-    assert np.abs(found.reported - truth).max() < most, np.abs(found.reported - truth).max()
+    own = [
+        ("error_deadband", "width_rad", "dead"),
+        ("direction_gain", "factor", "gain"),
+    ]
+    entries = tuple(
+        EffectEntry(name, {p: effect[k]}) for name, p, k in own if k in effect
+    )
+    found = answer(
+        dataclasses.replace(axis, speed_late_s=late_s, effects=entries),
+        recording(target),
+    )
+    assert np.abs(found.reported - truth).max() < most, np.abs(
+        found.reported - truth
+    ).max()
 
 
 def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of_the_loop():
     """The drive's loop runs at 2 kHz, a row is logged every 1 ms, and its target acts 1.5 ms later. Its effort is that of the
     loop period before it. The model's effort is off by 0.006 N·m with steps of one loop period (0.5 ms), and by 0.29 N·m with
     steps of 1 ms, in which old and new target are averaged. A fitted loop rate must not change the step."""
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.04, kp=40.0, kd=2.0, loop_hz=2000.0, target_late_s=1.5e-3)
-    target = 0.3 * np.sin(2 * np.pi * (2.0 + 8.0 * np.arange(800) / 800) * np.arange(800) / 1000)
+    axis = AxisConfig(
+        name="servo",
+        unit="rad",
+        inertia=0.04,
+        kp=40.0,
+        kd=2.0,
+        loop_hz=2000.0,
+        target_late_s=1.5e-3,
+    )
+    target = 0.3 * np.sin(
+        2 * np.pi * (2.0 + 8.0 * np.arange(800) / 800) * np.arange(800) / 1000
+    )
     q = v = seen = asked = 0.0
     efforts = []
     for n in range(1600):
@@ -124,10 +177,18 @@ def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of
             v += DT_S * asked / 0.04
             q += DT_S * v
     m = of_signal("made", 1000, target, np.zeros(800), "servo")
-    joint, fitted = DrivenAxis(axis), DrivenAxis(axis, dataclasses.replace(axis, loop_hz=None))
+    joint, fitted = (
+        DrivenAxis(axis),
+        DrivenAxis(axis, dataclasses.replace(axis, loop_hz=None)),
+    )
     motion = motion_of(m, "servo", joint)
-    assert joint.timestep_s(motion) == pytest.approx(5e-4) and fitted.timestep_s(motion) == pytest.approx(1e-3)
-    off = [np.std(JointModel(j).simulate(motion, j.gains).effort - efforts) for j in (joint, fitted)]
+    assert joint.timestep_s(motion) == pytest.approx(5e-4) and fitted.timestep_s(
+        motion
+    ) == pytest.approx(1e-3)
+    off = [
+        np.std(JointModel(j).simulate(motion, j.gains).effort - efforts)
+        for j in (joint, fitted)
+    ]
     assert off[0] < 0.02 and off[1] > 0.1
 
 
@@ -136,13 +197,20 @@ def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():
     axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
     time_s = np.arange(200) / RATE_HZ
     found = answer(axis, recording(np.full(200, 1.5), "velocity"))
-    np.testing.assert_allclose(found.reported, 1.5 * (time_s - 0.1 * (1 - np.exp(-time_s / 0.1))), atol=3e-3)
+    np.testing.assert_allclose(
+        found.reported, 1.5 * (time_s - 0.1 * (1 - np.exp(-time_s / 0.1))), atol=3e-3
+    )
 
 
 def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
     """τ = kd (u + r ∫ u dt), u = kp (q* − q) − q̇. At rest it balances a spring of 2 N·m/rad at the target."""
-    numbers = {"integral_action": {"rate_per_s": 15.0}, "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0}}
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0)
+    numbers = {
+        "integral_action": {"rate_per_s": 15.0},
+        "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0},
+    }
+    axis = AxisConfig(
+        name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0
+    )
     axis.effects = tuple(EffectEntry(*one) for one in numbers.items())
     target, total = np.where(np.arange(400) < 10, 0.0, 0.3), np.zeros(1)
 
@@ -152,15 +220,24 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
 
     found = answer(axis, recording(target))
     assert np.abs(found.reported - integrated(target, torque, 0.08)).max() < 1e-4
-    assert found.reported[-1] == pytest.approx(0.3, abs=1e-3) and found.effort[-1] == pytest.approx(0.6, rel=0.01)
-    axis.effects += (EffectEntry("coulomb_friction", {"torque_nm": 0.5}),)  # within which it begins with any effort
+    assert found.reported[-1] == pytest.approx(0.3, abs=1e-3) and found.effort[
+        -1
+    ] == pytest.approx(0.6, rel=0.01)
+    axis.effects += (
+        EffectEntry("coulomb_friction", {"torque_nm": 0.5}),
+    )  # within which it begins with any effort
     for seen, given in ((0.3, 0.3), (0.9, 0.5), (np.nan, 0.0)):
-        held = answer(axis, dataclasses.replace(recording(np.zeros(50)), effort=np.full((50, 1), seen)))
+        held = answer(
+            axis,
+            dataclasses.replace(recording(np.zeros(50)), effort=np.full((50, 1), seen)),
+        )
         assert held.effort == pytest.approx(np.full(50, given), abs=2e-3)
 
 
 @pytest.mark.parametrize("law", ["cascade", "velocity"])
-def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_the_rest(law):
+def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_the_rest(
+    law,
+):
     """A loop of 1 kHz smooths the speed of two readings by a quarter in each period: 1 ms · (1 − ¼) / ¼ = 3 ms late. The sum of
     that speed lacks 20 · 4 N·m/rad · 3 ms = 0.24 N·m·s/rad of damping, 8 … 20 mrad; half a period of the newest error 1 … 2 mrad,
     and 0.04 … 0.07 N·m of a row's effort."""
@@ -171,20 +248,40 @@ def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_th
     truth, effort = np.empty((2, len(target)))
     for step in range(len(target) * round(1 / (RATE_HZ * DT_S))):
         row, within = divmod(step, round(1 / (RATE_HZ * DT_S)))
-        truth[row], effort[row] = (q, torque) if within == 0 else (truth[row], effort[row])
+        truth[row], effort[row] = (
+            (q, torque) if within == 0 else (truth[row], effort[row])
+        )
         if step % round(1 / (hz * DT_S)) == 0:
             late, before = late + 0.25 * ((q - before) * hz - late), q
-            error = (8.0 * (target[row] - q) if law == "cascade" else target[row]) - late
+            error = (
+                8.0 * (target[row] - q) if law == "cascade" else target[row]
+            ) - late
             total += error / hz
             torque = 4.0 * (error + rate * total)
         v += DT_S * torque / 0.08
         q += DT_S * v
-    gains, kind = ({"kp": 8.0, "kd": 4.0}, "position") if law == "cascade" else ({"kd": 4.0}, law)
+    gains, kind = (
+        ({"kp": 8.0, "kd": 4.0}, "position") if law == "cascade" else ({"kd": 4.0}, law)
+    )
     effect = EffectEntry("integral_action", {"rate_per_s": rate})
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.08, law=law, **gains, loop_hz=hz, speed_late_s=3e-3)
-    found = answer(dataclasses.replace(axis, effects=(effect,)), recording(target, kind))
-    assert np.abs(found.reported - truth).max() < 2e-4, np.abs(found.reported - truth).max()
-    assert np.median(np.abs(found.effort - effort)) < 5e-3, np.median(np.abs(found.effort - effort))
+    axis = AxisConfig(
+        name="servo",
+        unit="rad",
+        inertia=0.08,
+        law=law,
+        **gains,
+        loop_hz=hz,
+        speed_late_s=3e-3,
+    )
+    found = answer(
+        dataclasses.replace(axis, effects=(effect,)), recording(target, kind)
+    )
+    assert np.abs(found.reported - truth).max() < 2e-4, np.abs(
+        found.reported - truth
+    ).max()
+    assert np.median(np.abs(found.effort - effort)) < 5e-3, np.median(
+        np.abs(found.effort - effort)
+    )
 
 
 def test_a_torque_accelerates_and_none_lets_the_axis_coast():
@@ -199,7 +296,10 @@ def test_a_torque_accelerates_and_none_lets_the_axis_coast():
 def test_torques_of_an_outer_loop_are_replayed_near_the_measured_position_and_friction_shows():
     """Commands of kp 2, kd 0.2 beside 0.005 N·m that the model lacks: alone they are 0.06 mrad with K = (20 π)² · 0.02, and drift
     else. Friction of 0.05 N·m is ten times as much. The spring is no effort of the motor."""
-    axis, goals = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque"), 0.4 * np.sin(np.arange(800) / 60)
+    axis, goals = (
+        AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque"),
+        0.4 * np.sin(np.arange(800) / 60),
+    )
     for friction_nm, least, most in ((0.0, 0.0, 2e-4), (0.05, 4e-4, 1.5e-3)):
         q = v = 0.0
         rows = list[tuple[float, float]]()
@@ -210,7 +310,10 @@ def test_torques_of_an_outer_loop_are_replayed_near_the_measured_position_and_fr
                 q += DT_S * v
         measured, torques = np.array(rows).T
         made = {"target_kinds": ("torque",), "effort": torques}
-        free, held = (of_signal("m", RATE_HZ, torques, measured, "servo", held=x, **made) for x in (False, True))
+        free, held = (
+            of_signal("m", RATE_HZ, torques, measured, "servo", held=x, **made)
+            for x in (False, True)
+        )
         assert np.abs(answer(axis, free).reported - measured).max() > 0.1
         found = answer(axis, held)
         assert least < np.sqrt(np.mean((found.reported - measured) ** 2)) < most
@@ -237,15 +340,21 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
     )
     assert np.abs(answer(SERVO, m).reported - truth).max() < 5e-4
     assert answer(SERVO, m).effort[off] == pytest.approx(np.zeros(80))
-    with pytest.raises(TaccorlError, match=r"made:.*supply voltage.*servo.*stated,.*law torque.*use"):
+    with pytest.raises(
+        TaccorlError, match=r"made:.*supply voltage.*servo.*stated,.*law torque.*use"
+    ):
         torque_axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
-        answer(torque_axis, dataclasses.replace(m, target_kinds=("torque",), payload_kg={}))
+        answer(
+            torque_axis, dataclasses.replace(m, target_kinds=("torque",), payload_kg={})
+        )
 
 
 def test_targets_act_at_their_own_times_and_late_by_what_the_file_states():
     """J q̈ = τ from rest: 0.01 N·m from 0.1037 s on give τ t² / 2 J. The row is at 0.1 s; its target came
     2.2 ms later, and the file states 1.5 ms."""
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque", target_late_s=1.5e-3)
+    axis = AxisConfig(
+        name="servo", unit="rad", inertia=0.02, law="torque", target_late_s=1.5e-3
+    )
     time_s = np.arange(200) / RATE_HZ
     target = np.where(time_s < 0.0999, 0.0, 0.01)
     m = dataclasses.replace(recording(target, "torque"), command_s=time_s + 2.2e-3)
@@ -260,44 +369,71 @@ def test_a_torque_that_the_controller_adds_moves_the_axis_and_is_in_its_effort()
     added = np.where(np.arange(200) < 100, 0.0, 0.01)[:, None]
     found = answer(axis, dataclasses.replace(m, torque_ff=added))
     assert np.diff(found.reported)[-1] * RATE_HZ == pytest.approx(0.05, rel=0.02)
-    assert found.effort[101] == pytest.approx(0.01, rel=0.06) and abs(found.effort[-1]) < 2e-4
+    assert (
+        found.effort[101] == pytest.approx(0.01, rel=0.06)
+        and abs(found.effort[-1]) < 2e-4
+    )
 
 
 def test_the_effort_of_a_row_is_before_its_target_or_after_it_as_the_file_says():
     """At rest 18 N·m/rad times a step of 0.01 rad: 0.18 N·m in the step's row, or in the next."""
     m = recording(np.where(np.arange(50) < 20, 0.0, 0.01))
     before, after = (
-        answer(dataclasses.replace(SERVO, effort_after_target=own), m).effort[19:21] for own in (False, True)
+        answer(dataclasses.replace(SERVO, effort_after_target=own), m).effort[19:21]
+        for own in (False, True)
     )
     assert before == pytest.approx([0.0, 0.0]) and after == pytest.approx([0.0, 0.18])
 
 
 def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():
     """0.3 kg at 0.2 m on a rod of 0.06 kg: J + 0.3 · 0.04 + 0.06 · 0.04 / 3 kg·m², and 9.81 (0.06 + 0.006) N·m at 90°."""
-    m = dataclasses.replace(recording(np.zeros(50), payload_kg=0.3), lever_m={"servo": 0.2}, arm_kg={"servo": 0.06})
+    m = dataclasses.replace(
+        recording(np.zeros(50), payload_kg=0.3),
+        lever_m={"servo": 0.2},
+        arm_kg={"servo": 0.06},
+    )
     axis = DrivenAxis(SERVO)
     rigid = axis.rigid(motion_of(m, "servo", axis), [])
     assert rigid.inertia == pytest.approx(0.02 + 0.012 + 0.0008)
     assert (rigid.gravity_sin, rigid.gravity_cos) == pytest.approx((9.81 * 0.066, 0.0))
-    stated = DrivenAxis(dataclasses.replace(SERVO, payload_kg=0.3, lever_m=0.2, arm_kg=0.06))
+    stated = DrivenAxis(
+        dataclasses.replace(SERVO, payload_kg=0.3, lever_m=0.2, arm_kg=0.06)
+    )
     always = dataclasses.replace(recording(np.zeros(50)), payload_kg={})
     assert stated.rigid(motion_of(always, "servo", stated), []) == rigid
     nowhere = DrivenAxis(dataclasses.replace(SERVO, lever_m=0.0))
-    with pytest.raises(TaccorlError, match=r"made: payload_kg or arm_kg of servo is stated.*write `lever_m"):
+    with pytest.raises(
+        TaccorlError,
+        match=r"made: payload_kg or arm_kg of servo is stated.*write `lever_m",
+    ):
         motion_of(recording(np.zeros(50), payload_kg=0.3), "servo", nowhere)
 
 
 def test_a_gain_s_register_is_worth_its_factor():
     """800 steps of 0.0075 / rad are 6 / rad: 18 N·m/rad at 12 V, 4 Ω and 1 N·m/A."""
-    assert dataclasses.replace(SERVO, kp=800.0, kp_factor=0.0075).loop_gains == pytest.approx(SERVO.loop_gains)
+    assert dataclasses.replace(
+        SERVO, kp=800.0, kp_factor=0.0075
+    ).loop_gains == pytest.approx(SERVO.loop_gains)
     assert SERVO.loop_gains.kp == pytest.approx(18.0)
-    fitted = AxisConfig(name="servo", unit="rad", inertia=0.02, kp=400.0, kp_factor=0.02, kd=10.0, kd_factor=0.1)
+    fitted = AxisConfig(
+        name="servo",
+        unit="rad",
+        inertia=0.02,
+        kp=400.0,
+        kp_factor=0.02,
+        kd=10.0,
+        kd_factor=0.1,
+    )
     again = fitted.with_numbers({"kp": 9.0, "kd": 1.1})
-    assert (again.kp, again.kd) == pytest.approx((450.0, 11.0)), "the file keeps its register's steps"
+    assert (again.kp, again.kd) == pytest.approx((450.0, 11.0)), (
+        "the file keeps its register's steps"
+    )
 
 
 def test_a_target_that_the_law_does_not_take_is_refused():
-    with pytest.raises(TaccorlError, match=r"servo.*commanded by velocity,.*law.*position;.*q_target"):
+    with pytest.raises(
+        TaccorlError, match=r"servo.*commanded by velocity,.*law.*position;.*q_target"
+    ):
         answer(SERVO, recording(np.zeros(50), "velocity"))
 
 
@@ -306,6 +442,9 @@ def test_targets_of_the_rate_of_the_rows_are_held_although_stamps_are_rounded():
     target = 0.2 * np.sin(2 * np.pi * np.arange(240) / 60)
     m = dataclasses.replace(recording(target), time_s=np.linspace(0.0, 3.9834, 240))
     assert 59.9 < m.rate_hz < 60.0
-    held, stated, faster = (answer(dataclasses.replace(SERVO, command_hz=hz), m).reported for hz in (None, 60.0, 120.0))
+    held, stated, faster = (
+        answer(dataclasses.replace(SERVO, command_hz=hz), m).reported
+        for hz in (None, 60.0, 120.0)
+    )
     np.testing.assert_array_equal(held, stated)
     assert np.abs(faster - held).max() > 1e-3

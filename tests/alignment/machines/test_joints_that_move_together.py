@@ -27,7 +27,9 @@ def steps(late_rows: int = 0) -> Measurement:
     ``upper`` so many rows later than it is logged."""
     rng, target = np.random.default_rng(5), np.tile([-0.3, 0.5], (600, 1))
     for k in range(12):
-        target[50 * k + 30 + 20 * (k % 2) :, k % 2] = [-0.3, 0.5][k % 2] + rng.uniform(-0.25, 0.25)
+        target[50 * k + 30 + 20 * (k % 2) :, k % 2] = [-0.3, 0.5][k % 2] + rng.uniform(
+            -0.25, 0.25
+        )
     model = mujoco.MjModel.from_xml_string(ARM)
     data, seen = mujoco.MjData(model), np.empty((600, 2))
     data.qpos[:] = target[0]
@@ -39,7 +41,14 @@ def steps(late_rows: int = 0) -> Measurement:
         mujoco.mj_step(model, data, 100)
     noisy = seen + rng.normal(0.0, NOISE_RAD, seen.shape)
     time_s = np.arange(600) / 100
-    return Measurement(name="steps", time_s=time_s, target=target, measured=noisy, signals=NAMES, units=("rad", "rad"))
+    return Measurement(
+        name="steps",
+        time_s=time_s,
+        target=target,
+        measured=noisy,
+        signals=NAMES,
+        units=("rad", "rad"),
+    )
 
 
 def left(folder: Path, m: Measurement, name: str) -> np.ndarray:
@@ -50,13 +59,17 @@ def left(folder: Path, m: Measurement, name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_right_model_leaves_the_noise_while_all_joints_make_steps(tmp_path: Path, name: str) -> None:
+def test_a_right_model_leaves_the_noise_while_all_joints_make_steps(
+    tmp_path: Path, name: str
+) -> None:
     """With loads by the positions of rows 1.13 and 1.42, and up to 9 and 12."""
     off = left(tmp_path, steps(), name)
     assert np.sqrt(np.mean(off**2)) < 1.06 and np.abs(off).max() < 4.5
 
 
-def test_a_joint_that_is_later_than_its_file_says_is_a_better_known_load_than_by_its_rows(tmp_path: Path) -> None:
+def test_a_joint_that_is_later_than_its_file_says_is_a_better_known_load_than_by_its_rows(
+    tmp_path: Path,
+) -> None:
     """1.45 with loads by the positions of rows."""
     off = left(tmp_path, steps(late_rows=4), "fore")
     assert np.sqrt(np.mean(off**2)) < 1.25

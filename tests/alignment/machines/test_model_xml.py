@@ -22,7 +22,12 @@ def link(name: str, inertia: str = INERTIA) -> str:
 
 
 def joint(
-    name: str, parent: str, child: str, limit: str = 'lower="-1" upper="1"', at: str = "0 0 0", kind: str = "revolute"
+    name: str,
+    parent: str,
+    child: str,
+    limit: str = 'lower="-1" upper="1"',
+    at: str = "0 0 0",
+    kind: str = "revolute",
 ):
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>'
@@ -41,53 +46,96 @@ def urdf(folder: Path, *parts: str) -> Path:
 
 
 def line_of(path: Path, words: str, which: int = 0) -> int:
-    return [k for k, line in enumerate(path.read_text().splitlines(), 1) if words in line][which]
+    return [
+        k for k, line in enumerate(path.read_text().splitlines(), 1) if words in line
+    ][which]
 
 
 def test_two_joints_of_one_name_are_named_with_their_links_and_lines(tmp_path: Path):
-    path = urdf(tmp_path, link("a"), link("b"), joint("j", "base", "a"), joint("j", "a", "b"))
+    path = urdf(
+        tmp_path, link("a"), link("b"), joint("j", "base", "a"), joint("j", "a", "b")
+    )
     first, second = line_of(path, 'name="j"'), line_of(path, 'name="j"', 1)
-    with pytest.raises(TaccorlError, match=rf"arm\.urdf:{second}: .*'j'.*base → a \(line {first}\).*a → b"):
+    with pytest.raises(
+        TaccorlError,
+        match=rf"arm\.urdf:{second}: .*'j'.*base → a \(line {first}\).*a → b",
+    ):
         load_robot_model(path)
 
 
 def test_two_links_or_mjcf_joints_of_one_name_are_refused(tmp_path: Path):
-    with pytest.raises(TaccorlError, match=r"arm\.urdf:\d+: two <link> have the name 'a'"):
+    with pytest.raises(
+        TaccorlError, match=r"arm\.urdf:\d+: two <link> have the name 'a'"
+    ):
         load_robot_model(urdf(tmp_path, link("a"), link("a"), joint("j", "base", "a")))
     path = tmp_path / "arm.xml"
     body = '<body name="{}"><joint name="j"/><geom size="0.1"/>{}</body>'
-    path.write_text(f"<mujoco><worldbody>\n{body.format('a', chr(10) + body.format('b', ''))}</worldbody></mujoco>")
-    with pytest.raises(TaccorlError, match=r"arm\.xml:3: two <joint> .*'j'.*world → a \(line 2\).*a → b"):
+    path.write_text(
+        f"<mujoco><worldbody>\n{body.format('a', chr(10) + body.format('b', ''))}</worldbody></mujoco>"
+    )
+    with pytest.raises(
+        TaccorlError,
+        match=r"arm\.xml:3: two <joint> .*'j'.*world → a \(line 2\).*a → b",
+    ):
         load_robot_model(path)
 
 
-@pytest.mark.parametrize(("degrees", "remarks"), [(170.0, 1), (math.degrees(6.28) / 1e3, 0), (20.0, 1), (18.0, 0)])
+@pytest.mark.parametrize(
+    ("degrees", "remarks"),
+    [(170.0, 1), (math.degrees(6.28) / 1e3, 0), (20.0, 1), (18.0, 0)],
+)
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_limits_of_many_turns_are_probably_degrees(tmp_path: Path, degrees: float, remarks: int, kind: str):
+def test_limits_of_many_turns_are_probably_degrees(
+    tmp_path: Path, degrees: float, remarks: int, kind: str
+):
     """3 turns are 18.85 rad; a slide has no turns."""
-    path = urdf(tmp_path, link("a"), joint("j", "base", "a", f'lower="{-degrees}" upper="{degrees}"', kind=kind))
+    path = urdf(
+        tmp_path,
+        link("a"),
+        joint("j", "base", "a", f'lower="{-degrees}" upper="{degrees}"', kind=kind),
+    )
     found = [r for r in load_robot_model(path).remarks if "degrees" in r]
     assert len(found) == (remarks if kind == "revolute" else 0)
     if found:
-        assert f"line {line_of(path, '<limit')}" in found[0] and f"{math.radians(degrees):.4g}" in found[0]
+        assert (
+            f"line {line_of(path, '<limit')}" in found[0]
+            and f"{math.radians(degrees):.4g}" in found[0]
+        )
 
 
-@pytest.mark.parametrize("moments", [("1.5e-6", "2e-7", "8e-7"), ("1e-9", "1", "2"), ("0.1", "-0.1", "0.1")])
+@pytest.mark.parametrize(
+    "moments", [("1.5e-6", "2e-7", "8e-7"), ("1e-9", "1", "2"), ("0.1", "-0.1", "0.1")]
+)
 def test_an_inertia_that_no_body_has_is_named_with_its_link_line_and_numbers(
     tmp_path: Path, moments: tuple[str, str, str]
 ):
     inertia = 'ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"'.format(*moments)
-    path = urdf(tmp_path, link("a"), link("b", inertia), joint("j", "base", "a"), joint("k", "a", "b"))
-    with pytest.raises(TaccorlError, match=rf"arm\.urdf:{line_of(path, '<inertia ixx', 1)}: link b") as found:
+    path = urdf(
+        tmp_path,
+        link("a"),
+        link("b", inertia),
+        joint("j", "base", "a"),
+        joint("k", "a", "b"),
+    )
+    with pytest.raises(
+        TaccorlError, match=rf"arm\.urdf:{line_of(path, '<inertia ixx', 1)}: link b"
+    ) as found:
         load_robot_model(path)
     text = str(found.value)
-    assert all(f"{float(x):.4g}" in text for x in moments) and 'balanceinertia="true"' in text
+    assert (
+        all(f"{float(x):.4g}" in text for x in moments)
+        and 'balanceinertia="true"' in text
+    )
 
 
 @pytest.mark.parametrize("at", ["0,1 0 0", "0 0", "a b c"])
-def test_lines_are_those_of_the_file_with_its_shapes_and_comments(tmp_path: Path, at: str):
+def test_lines_are_those_of_the_file_with_its_shapes_and_comments(
+    tmp_path: Path, at: str
+):
     path = urdf(tmp_path, link("a"), joint("j", "base", "a", at=at))
-    with pytest.raises(TaccorlError, match=rf"arm\.urdf:{line_of(path, f'xyz="{at}"')}: "):
+    with pytest.raises(
+        TaccorlError, match=rf"arm\.urdf:{line_of(path, f'xyz="{at}"')}: "
+    ):
         load_robot_model(path)
 
 
@@ -126,18 +174,27 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_models_that_would_never_end_or_steer_are_refused_at_once_in_one_line(name: str, tmp_path: Path):
+def test_models_that_would_never_end_or_steer_are_refused_at_once_in_one_line(
+    name: str, tmp_path: Path
+):
     (tmp_path / name).write_text(HOSTILE[name])
     began = time.process_time()
     with pytest.raises(TaccorlError) as found:
         load_robot_model(tmp_path / name)
     text = str(found.value)
-    assert "\n" not in text and text.isprintable() and text.startswith(str(tmp_path / name)) and len(text) < 600
+    assert (
+        "\n" not in text
+        and text.isprintable()
+        and text.startswith(str(tmp_path / name))
+        and len(text) < 600
+    )
     assert time.process_time() - began < 5.0
 
 
 def test_the_memory_that_a_model_asks_for_is_not_taken(tmp_path: Path):
-    (tmp_path / "arm.xml").write_text(f'<mujoco><size memory="900G"/><worldbody>{BODY.format("")}</worldbody></mujoco>')
+    (tmp_path / "arm.xml").write_text(
+        f'<mujoco><size memory="900G"/><worldbody>{BODY.format("")}</worldbody></mujoco>'
+    )
     assert list(load_robot_model(tmp_path / "arm.xml").joints) == ["j"]
 
 

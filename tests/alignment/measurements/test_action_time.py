@@ -54,13 +54,21 @@ def both(tmp_path_factory) -> BothWays:
     num_rows = round(SECONDS * FPS)
     for k in range(num_rows):
         fade = min(1.0, max(0.0, min(k - 8, num_rows - 8 - k) / 20))
-        wave = 0.08 * fade * np.sin(2 * np.pi * frequency_hz * k / FPS + phase).sum(axis=0)
+        wave = (
+            0.08 * fade * np.sin(2 * np.pi * frequency_hz * k / FPS + phase).sum(axis=0)
+        )
         recorder.step(home + np.where(JOINTS, wave, -0.02 * fade))
     trajectory = recorder.trajectory()
     path = tmp_path_factory.mktemp("both") / "bench.mcap"
-    config = StandInConfig(duration_s=float(trajectory.time_s[-1]) + 2 * LEAD_S, camera_size=(96, 128))
+    config = StandInConfig(
+        duration_s=float(trajectory.time_s[-1]) + 2 * LEAD_S, camera_size=(96, 128)
+    )
     story = TwinStory(sim, trajectory, "success")
-    publish(path, StandInStreams(config, story, Dark()), {"origin": "surrogate recording", "instruction": "move"})
+    publish(
+        path,
+        StandInStreams(config, story, Dark()),
+        {"origin": "surrogate recording", "instruction": "move"},
+    )
     with open_episodes(path, "piper_flexitac_mcap") as (ingested,):
         pass
     return BothWays(sim, recorder.episode("bench", {"task": "bench"}), ingested)
@@ -71,17 +79,29 @@ def lag_rows(action: np.ndarray, state: np.ndarray) -> float:
 
     Both are smooth on the scale of a row, so that action between two rows is the straight line.
     """
-    shifts, rows = np.arange(-3.0, 6.0, 0.02), np.arange(10, len(state) - 10, dtype=float)
+    shifts, rows = (
+        np.arange(-3.0, 6.0, 0.02),
+        np.arange(10, len(state) - 10, dtype=float),
+    )
     errors = []
     for shift in shifts:
-        at = np.stack([np.interp(rows - shift, np.arange(len(action)), column) for column in action.T], axis=1)
+        at = np.stack(
+            [
+                np.interp(rows - shift, np.arange(len(action)), column)
+                for column in action.T
+            ],
+            axis=1,
+        )
         difference = state[10:-10] - at
         errors.append(float(np.square(difference - difference.mean(axis=0)).sum()))
     return float(shifts[int(np.argmin(errors))])
 
 
 def episode_lag_rows(episode: Episode) -> float:
-    return lag_rows(episode.arrays[ACTION][:, JOINTS].astype(float), episode.arrays[STATE][:, JOINTS].astype(float))
+    return lag_rows(
+        episode.arrays[ACTION][:, JOINTS].astype(float),
+        episode.arrays[STATE][:, JOINTS].astype(float),
+    )
 
 
 def test_lag_of_a_known_shift_is_found():
@@ -93,20 +113,28 @@ def test_lag_of_a_known_shift_is_found():
 
 def test_the_arms_lag_as_the_checks_report_it_is_behind_the_command_in_force(both):
     # Without the row by which an action is ahead: the lag of the controller alone.
-    for one, other in zip(arm_lags(both.collected).values(), arm_lags(both.ingested).values(), strict=True):
-        assert 0.05 < one.lag_s < 0.12 and other.lag_s == pytest.approx(one.lag_s, abs=PART_OF_ROW / FPS)
+    for one, other in zip(
+        arm_lags(both.collected).values(), arm_lags(both.ingested).values(), strict=True
+    ):
+        assert 0.05 < one.lag_s < 0.12 and other.lag_s == pytest.approx(
+            one.lag_s, abs=PART_OF_ROW / FPS
+        )
 
 
 def test_measurements_of_both_have_equal_lag_behind_the_command_in_force(both):
     lags = []
     for episode in (both.collected, both.ingested):
-        m = from_episode(episode, signal_names(episode.spec), ("rad",) * 14, Path("d"), 0)
+        m = from_episode(
+            episode, signal_names(episode.spec), ("rad",) * 14, Path("d"), 0
+        )
         assert m.num_rows == episode.num_rows - 1
         np.testing.assert_array_equal(m.target, episode.arrays[ACTION][:-1])
         np.testing.assert_array_equal(m.measured, episode.arrays[STATE][1:])
         lags.append(lag_rows(m.target[:, JOINTS], m.measured[:, JOINTS]))
     collected = episode_lag_rows(both.collected)
-    assert collected > 1  # one row until the target is reached, and what the arm lags behind its command
+    assert (
+        collected > 1
+    )  # one row until the target is reached, and what the arm lags behind its command
     assert lags[0] == pytest.approx(collected - 1, abs=0.05)
     assert lags[1] == pytest.approx(lags[0], abs=PART_OF_ROW)
 
@@ -114,9 +142,13 @@ def test_measurements_of_both_have_equal_lag_behind_the_command_in_force(both):
 def test_a_twins_own_episode_is_replayed_to_its_own_states(both):
     both.sim.reset([0])
     twin = replay_episode(both.sim, both.collected)
-    np.testing.assert_allclose(twin.arrays[STATE], both.collected.arrays[STATE], atol=5e-5)
+    np.testing.assert_allclose(
+        twin.arrays[STATE], both.collected.arrays[STATE], atol=5e-5
+    )
     arrays = both.collected.arrays
-    early = dataclasses.replace(both.collected, arrays=arrays | {ACTION: np.roll(arrays[ACTION], -1, axis=0)})
+    early = dataclasses.replace(
+        both.collected, arrays=arrays | {ACTION: np.roll(arrays[ACTION], -1, axis=0)}
+    )
     both.sim.reset([0])
     wrong = replay_episode(both.sim, early)
     assert np.abs(wrong.arrays[STATE] - arrays[STATE]).max() > 5e-3
@@ -131,7 +163,9 @@ def test_the_ingested_recording_is_replayed_within_its_clock(both):
 
 
 def test_who_does_not_state_the_convention_is_refused(both):
-    silent = dataclasses.replace(both.ingested, spec=dataclasses.replace(both.ingested.spec, action_time=None))
+    silent = dataclasses.replace(
+        both.ingested, spec=dataclasses.replace(both.ingested.spec, action_time=None)
+    )
     with pytest.raises(DatasetError, match=r"action_time.*Ingest its recordings again"):
         from_episode(silent, signal_names(silent.spec), ("rad",) * 14, Path("d"), 0)
     with pytest.raises(DatasetError, match="action_time"):

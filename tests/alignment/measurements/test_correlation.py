@@ -4,10 +4,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from taccorl.alignment.measurements.correlation import Rows, block_of_rows, block_sums, independent_rows, unstacked
+from taccorl.alignment.measurements.correlation import (
+    Rows,
+    block_of_rows,
+    block_sums,
+    independent_rows,
+    unstacked,
+)
 
 
-def coloured(num_rows: int, num_channels: int, keep: float, seed: int = 0) -> np.ndarray:
+def coloured(
+    num_rows: int, num_channels: int, keep: float, seed: int = 0
+) -> np.ndarray:
     """(T, C) independent AR(1) channels."""
     white = np.random.default_rng(seed).standard_normal((num_rows + 1000, num_channels))
     return lfilter([1.0], [1.0, -keep], white, axis=0)[1000:]
@@ -22,12 +30,16 @@ def test_channels_are_no_neighbours_in_time(channels: int):
 
 def test_white_noise_is_independent_and_coloured_noise_is_not():
     assert independent_rows([coloured(20000, 1, 0.0)]) == pytest.approx(20000, rel=0.1)
-    assert independent_rows([coloured(20000, 1, 0.9)]) == pytest.approx(20000 / 19, rel=0.2)
+    assert independent_rows([coloured(20000, 1, 0.9)]) == pytest.approx(
+        20000 / 19, rel=0.2
+    )
 
 
 def test_recordings_add_up_and_their_ends_are_no_neighbours():
     parts = [coloured(5000, 2, 0.9, seed) for seed in range(4)]
-    assert independent_rows(parts) == pytest.approx(sum(independent_rows([p]) for p in parts))
+    assert independent_rows(parts) == pytest.approx(
+        sum(independent_rows([p]) for p in parts)
+    )
 
 
 def test_unmeasured_rows_do_not_count():
@@ -38,7 +50,10 @@ def test_unmeasured_rows_do_not_count():
 
 
 def test_few_rows_and_a_channel_that_is_exactly_zero():
-    assert independent_rows([np.zeros((5, 1))]) == 5 and independent_rows([np.zeros((100, 3))]) == 300
+    assert (
+        independent_rows([np.zeros((5, 1))]) == 5
+        and independent_rows([np.zeros((100, 3))]) == 300
+    )
     assert independent_rows([np.full((50, 1), np.nan)]) == 1
 
 
@@ -54,7 +69,11 @@ def test_blocks_of_time_hold_all_channels_and_end_with_a_recording():
     layout = [Rows(np.ones((100, 2), bool), 100.0), Rows(np.ones((60, 1), bool), 100.0)]
     layout[0].measured[:10, 1] = False
     sums = block_sums(np.ones(190 + 60), layout)
-    assert sums.tolist() == [90, 100, 60]  # 50 rows of two channels less ten, 50 of two, and 60 of the second recording
+    assert sums.tolist() == [
+        90,
+        100,
+        60,
+    ]  # 50 rows of two channels less ten, 50 of two, and 60 of the second recording
 
 
 def test_unstacked_is_what_was_stacked():

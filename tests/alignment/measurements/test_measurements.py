@@ -17,7 +17,16 @@ from taccorl.robots import ROBOT
 def made(*names: str, **repeats: str) -> list[Measurement]:
     time_s, zeros = np.arange(4) / 200, np.zeros((4, 14))
     own = {n: zeros + 0.001 * k for k, n in enumerate(names)}
-    return [Measurement(name=n, time_s=time_s, target=zeros, measured=own[n], repeat_of=repeats.get(n)) for n in names]
+    return [
+        Measurement(
+            name=n,
+            time_s=time_s,
+            target=zeros,
+            measured=own[n],
+            repeat_of=repeats.get(n),
+        )
+        for n in names
+    ]
 
 
 def names(measurements) -> list[str]:
@@ -36,20 +45,29 @@ def pressed(words: str) -> str:
 BALL = "shape: sphere, radius_m: 0.012, arm: left"
 
 
-TABLE = "t,left_joint5.q,left_joint5.q_target,left_joint5.tau\n" + "".join(f"{k / 200},0.1,0.2,4\n" for k in range(5))
+TABLE = "t,left_joint5.q,left_joint5.q_target,left_joint5.tau\n" + "".join(
+    f"{k / 200},0.1,0.2,4\n" for k in range(5)
+)
 
 
 @pytest.fixture
 def folder(tmp_path):
     for k in (1, 2, 10, 3):
-        (tmp_path / f"sweep_{k}.csv").write_text(TABLE.replace(",0.1,", f",{0.1 + 0.001 * k},"))
+        (tmp_path / f"sweep_{k}.csv").write_text(
+            TABLE.replace(",0.1,", f",{0.1 + 0.001 * k},")
+        )
     (tmp_path / "notes.txt").write_text("hello")
     return tmp_path
 
 
 def test_a_folder_is_read_in_natural_order_and_says_what_it_left(folder):
     found = read_measurements(folder)
-    assert names(found.fit) == ["sweep_1.csv", "sweep_2.csv", "sweep_3.csv", "sweep_10.csv"]
+    assert names(found.fit) == [
+        "sweep_1.csv",
+        "sweep_2.csv",
+        "sweep_3.csv",
+        "sweep_10.csv",
+    ]
     assert found.validation == found.test == ()
     assert found.rule == "all for fitting"
 
@@ -67,10 +85,13 @@ def test_a_copy_of_a_fit_recording_checks_nothing(folder):
     index = folder / "measurements.yaml"
     index.write_text("recordings: {last.csv: {use: test}}")
     with pytest.raises(
-        TaccorlError, match=r"sweep_2\.csv \(fit\) is last\.csv \(test\), number for number.*remove one"
+        TaccorlError,
+        match=r"sweep_2\.csv \(fit\) is last\.csv \(test\), number for number.*remove one",
     ):
         read_measurements(folder)
-    index.write_text("recordings: {last.csv: {repeat_of: sweep_2.csv}}")  # one use: a warning of the checks
+    index.write_text(
+        "recordings: {last.csv: {repeat_of: sweep_2.csv}}"
+    )  # one use: a warning of the checks
     assert names(read_measurements(folder).fit)[0] == "last.csv"
 
 
@@ -84,7 +105,10 @@ def test_an_index_says_what_files_cannot(folder):
     )
     found = read_measurements(folder)
     assert names(found.fit) == ["sweep_1.csv", "sweep_2.csv"]
-    assert (names(found.validation), names(found.test)) == (["sweep_3.csv"], ["sweep_10.csv"])
+    assert (names(found.validation), names(found.test)) == (
+        ["sweep_3.csv"],
+        ["sweep_10.csv"],
+    )
     assert found.fit[1].repeat_of == "sweep_1.csv" and not found.fit[0].held
     assert found.unlisted == ("sweep_1.csv",)
     (held,) = found.validation
@@ -93,7 +117,9 @@ def test_an_index_says_what_files_cannot(folder):
     np.testing.assert_array_equal(held.effort[:, 0], 1.0)
     (alone,) = read_measurements(folder / "sweep_3.csv").fit  # asked for by itself
     assert alone.kp == {"left_joint5": 40.0}
-    (folder / "measurements.yaml").write_text("recordings: {sweep_1.csv: {effort_scale: {left_joint5: 0}}}")
+    (folder / "measurements.yaml").write_text(
+        "recordings: {sweep_1.csv: {effort_scale: {left_joint5: 0}}}"
+    )
     (first,) = (m for m in read_measurements(folder).all if m.name == "sweep_1.csv")
     assert np.isnan(first.effort).all()  # not measured
 
@@ -142,7 +168,9 @@ def test_the_index_names_the_columns_file(tmp_path):
 def test_nothing_to_read_is_an_error_with_a_way_out(tmp_path):
     with pytest.raises(RecordingError, match="no such file or folder"):
         read_measurements(tmp_path / "sweps")
-    with pytest.raises(RecordingError, match=r"no recording here.*tables \(.csv, .parquet, .mat\)"):
+    with pytest.raises(
+        RecordingError, match=r"no recording here.*tables \(.csv, .parquet, .mat\)"
+    ):
         read_measurements(tmp_path)
 
 
@@ -169,7 +197,10 @@ def test_a_motion_and_its_repeats_stay_together():
     [
         ({"validation": ["z"]}, "validation: no measurement 'z'"),
         ({"validation": ["a"], "test": ["a"]}, "both.*validation.*test"),
-        ({"validation": ["a", "b"]}, r"left.*fit:.*b.*2.*validation.*measurements\.yaml"),
+        (
+            {"validation": ["a", "b"]},
+            r"left.*fit:.*b.*2.*validation.*measurements\.yaml",
+        ),
         ({"validation_every": 1}, "leaves nothing.*fit"),
     ],
 )
@@ -187,7 +218,9 @@ def test_repeats_in_a_circle():
 
 def test_shapes_and_units_are_checked():
     (m,) = made("a")
-    with pytest.raises(TaccorlError, match=r"measured.*\(3, 14\),.*times.*signals.*\(4, 14\)"):
+    with pytest.raises(
+        TaccorlError, match=r"measured.*\(3, 14\),.*times.*signals.*\(4, 14\)"
+    ):
         dataclasses.replace(m, measured=np.zeros((3, 14)))
     with pytest.raises(TaccorlError, match="rad or m, not 'deg'"):
         dataclasses.replace(m, units=("deg",) * 14)
@@ -215,10 +248,14 @@ def test_a_recording_of_one_joint_becomes_one_of_the_robot():
     rest = np.arange(14.0)
     whole = m.on_robot(rest)
     assert whole.signals == ROBOT.action_names
-    np.testing.assert_array_equal(whole.target[0], np.where(np.arange(14) == 4, 0.2, rest))
+    np.testing.assert_array_equal(
+        whole.target[0], np.where(np.arange(14) == 4, 0.2, rest)
+    )
     assert np.isfinite(whole.measured).sum() == 3
     wrong = dataclasses.replace(m, units=("m",))
-    with pytest.raises(TaccorlError, match="left_joint5 is in m, the robot's is in rad"):
+    with pytest.raises(
+        TaccorlError, match="left_joint5 is in m, the robot's is in rad"
+    ):
         wrong.on_robot(rest)
     assert [other_arm(n) for n in ("left_joint5", "right_gripper", "drive")] == [
         "right_joint5",
@@ -227,10 +264,21 @@ def test_a_recording_of_one_joint_becomes_one_of_the_robot():
     ]
 
 
-@pytest.mark.parametrize(("last", "note", "held"), [(0.31, "", True), (0.31, "a.csv", False), (0.3, "a.csv", True)])
-def test_torques_are_held_where_nothing_repeats(tmp_path: Path, last: float, note: str, held: bool) -> None:
+@pytest.mark.parametrize(
+    ("last", "note", "held"),
+    [(0.31, "", True), (0.31, "a.csv", False), (0.3, "a.csv", True)],
+)
+def test_torques_are_held_where_nothing_repeats(
+    tmp_path: Path, last: float, note: str, held: bool
+) -> None:
     """A copy repeats nothing."""
     for name, q in (("a.csv", 0.3), ("b.csv", last)):
-        (tmp_path / name).write_text(f"t,servo.q,servo.tau_target\n0.0,0.1,0.0\n0.1,0.2,0.5\n0.2,{q},0.0\n")
-    (tmp_path / "measurements.yaml").write_text(f"recordings: {{b.csv: {{repeat_of: {note or 'null'}}}}}")
-    assert [m.held for m in read_measurements(tmp_path, units={"servo": "rad"}).all] == [held] * 2
+        (tmp_path / name).write_text(
+            f"t,servo.q,servo.tau_target\n0.0,0.1,0.0\n0.1,0.2,0.5\n0.2,{q},0.0\n"
+        )
+    (tmp_path / "measurements.yaml").write_text(
+        f"recordings: {{b.csv: {{repeat_of: {note or 'null'}}}}}"
+    )
+    assert [
+        m.held for m in read_measurements(tmp_path, units={"servo": "rad"}).all
+    ] == [held] * 2

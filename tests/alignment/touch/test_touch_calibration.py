@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from made_press import K_D, K_N, ball_at, plain, press
 
-from taccorl.alignment.touch.calibration import TouchCalibration, calibrate_touch, noise_level, touch_match
+from taccorl.alignment.touch.calibration import (
+    TouchCalibration,
+    calibrate_touch,
+    noise_level,
+    touch_match,
+)
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
@@ -34,13 +39,19 @@ def found(presses: list[TouchMotion]) -> TouchCalibration:
 def test_the_noise_is_found_where_nothing_touches(presses: list[TouchMotion]) -> None:
     noise = noise_level(presses)
     # 1.3 counts and the converter's 1/√12 together
-    assert noise.pooled_std_count == pytest.approx(math.hypot(1.3, 1 / math.sqrt(12)), rel=0.01)
+    assert noise.pooled_std_count == pytest.approx(
+        math.hypot(1.3, 1 / math.sqrt(12)), rel=0.01
+    )
     # 0.999 of a normal distribution: 3.09 σ = 4.1, in whole counts
     assert noise.threshold_count in (4.0, 5.0)
 
 
-def test_stiffness_and_damping_are_recovered_within_their_intervals(found: TouchCalibration) -> None:
-    assert found.trouble == "" and found.stiffness.value == pytest.approx(K_N, rel=0.003)
+def test_stiffness_and_damping_are_recovered_within_their_intervals(
+    found: TouchCalibration,
+) -> None:
+    assert found.trouble == "" and found.stiffness.value == pytest.approx(
+        K_N, rel=0.003
+    )
     assert found.damping.value == pytest.approx(K_D, rel=0.03)
     # A smoothed opening cuts a press's corners by some µm, which noise alone knows nothing of: 4 standard errors
     for number, truth in ((found.stiffness, K_N), (found.damping, K_D)):
@@ -49,7 +60,9 @@ def test_stiffness_and_damping_are_recovered_within_their_intervals(found: Touch
         assert abs(number.value - truth) < 2 * half
 
 
-def test_the_validation_recording_is_matched_up_to_the_noise(found: TouchCalibration) -> None:
+def test_the_validation_recording_is_matched_up_to_the_noise(
+    found: TouchCalibration,
+) -> None:
     before, after = found.before, found.after
     assert found.fitted_to == ("press_0", "press_1")
     assert found.validation == ("press_2",)
@@ -62,10 +75,14 @@ def test_the_validation_recording_is_matched_up_to_the_noise(found: TouchCalibra
 def test_the_twins_own_effects_act_in_the_fit(presses: list[TouchMotion]) -> None:
     """With pads that the twin takes for 0.2 mm too thick the same readings need a smaller k_n."""
     thick = TwinConfig(effects=[make_effect("depth_offset", offset_m=2e-4)])
-    assert calibrate_touch(presses[:1], presses[1:2], thick).stiffness.value < 0.85 * K_N
+    assert (
+        calibrate_touch(presses[:1], presses[1:2], thick).stiffness.value < 0.85 * K_N
+    )
 
 
-def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(presses: list[TouchMotion]) -> None:
+def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(
+    presses: list[TouchMotion],
+) -> None:
     """A patch of counts moved by one column."""
     motion = presses[0]
     clean = np.zeros(motion.measured.shape, np.int16)
@@ -80,12 +97,19 @@ def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(presse
 def test_what_cannot_be_calibrated_is_said(presses: list[TouchMotion]) -> None:
     with pytest.raises(TaccorlError, match=r"1 recordings.*fit.*0.*validation"):
         calibrate_touch(presses[:1], [], CONFIG)
-    late = motions(0, law=lambda depth, rate, time_s: np.roll(plain(depth, rate, time_s), 3, axis=0))
+    late = motions(
+        0,
+        law=lambda depth, rate, time_s: np.roll(plain(depth, rate, time_s), 3, axis=0),
+    )
     found = calibrate_touch(late, late, CONFIG)
     assert "k_d is no more than its error" in found.trouble
     assert found.damping.low == 0.0
     assert found.damping.high > 0.1
     in_time = ("measured", "time_s", "object_from_pad", "velocity", "clearance_m")
-    touched = dataclasses.replace(presses[0], **{name: getattr(presses[0], name)[210:240] for name in in_time})
-    with pytest.raises(TaccorlError, match=r"pad left_a has 0 frames without contact in press_0"):
+    touched = dataclasses.replace(
+        presses[0], **{name: getattr(presses[0], name)[210:240] for name in in_time}
+    )
+    with pytest.raises(
+        TaccorlError, match=r"pad left_a has 0 frames without contact in press_0"
+    ):
         noise_level([touched])

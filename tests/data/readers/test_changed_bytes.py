@@ -34,7 +34,9 @@ def angle(k: int, j: int) -> float:
 
 @pytest.fixture
 def bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(test_bags, "angles", lambda k: np.array([angle(k, j) for j in range(6)]))
+    monkeypatch.setattr(
+        test_bags, "angles", lambda k: np.array([angle(k, j) for j in range(6)])
+    )
     return write_bag(tmp_path / "bag", num=NUM)
 
 
@@ -66,19 +68,25 @@ def entry_of(path: Path, spec: RecordingSpec) -> dict[str, Any]:
     return ingest_one(job)
 
 
-def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_its_place(bag, spec):
+def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_its_place(
+    bag, spec
+):
     clean = entry_of(bag, spec)
     assert not [f for f in clean["episodes"][0]["findings"] if f["severity"] != "note"]
     # Sample 302 lies between row 45 (sample 300) and row 46 (sample 306.7): no row shows it.
     old = struct.pack("<d", angle(302, 2))
     wrong = bytearray(old)
-    wrong[6] ^= 0x20  # the exponent's second bit: 0.3 sin(3.512) = -0.1086 becomes a quarter of that
+    wrong[6] ^= (
+        0x20  # the exponent's second bit: 0.3 sin(3.512) = -0.1086 becomes a quarter of that
+    )
     value = struct.unpack("<d", wrong)[0]
     assert value == angle(302, 2) / 4
     change(db3_of(bag), old, bytes(wrong))
     entry = entry_of(bag, spec)
     assert entry["outcome"] == "written"
-    (finding,) = [f for f in entry["episodes"][0]["findings"] if f["severity"] != "note"]
+    (finding,) = [
+        f for f in entry["episodes"][0]["findings"] if f["severity"] != "note"
+    ]
     assert (finding["check"], finding["feature"]) == ("sample_jump", "j")
     # The joint went on meanwhile, so the way back is the longer one: to sample 303, 303 / 200 Hz = 1.515 s.
     # 2 × 3.93 rad/s × 5 ms = 0.0393 rad; between rows the step of 0.081 rad would be no news (2 × 3.93 / 30 = 0.26 rad).
@@ -92,12 +100,18 @@ def test_a_position_that_a_joint_cannot_reach_between_two_samples_is_named_with_
         assert fact in finding["text"]
 
 
-def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(bag, spec):
+def test_sqlites_integrity_check_names_the_message_whose_log_time_was_changed(
+    bag, spec
+):
     path = db3_of(bag)
     with sqlite3.connect(path) as connection:
-        ((number, log_ns),) = connection.execute("SELECT id, timestamp FROM messages WHERE id = 21")
+        ((number, log_ns),) = connection.execute(
+            "SELECT id, timestamp FROM messages WHERE id = 21"
+        )
     changed = log_ns ^ 1
-    change(path, log_ns.to_bytes(8, "big"), changed.to_bytes(8, "big"))  # the table's or the index's, as it lies
+    change(
+        path, log_ns.to_bytes(8, "big"), changed.to_bytes(8, "big")
+    )  # the table's or the index's, as it lies
     entry = entry_of(bag, spec)
     assert entry["outcome"] == "split"
     assert f"row {number} missing from index timestamp_idx" in entry["reason"]
@@ -113,16 +127,23 @@ def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag, sp
     assert entry_of(bag, spec)["outcome"] == "quarantined"
 
 
-def test_the_report_and_the_screen_say_that_a_bag_has_no_checksums(bag, spec, tmp_path, capsys):
+def test_the_report_and_the_screen_say_that_a_bag_has_no_checksums(
+    bag, spec, tmp_path, capsys
+):
     entry = entry_of(bag, spec)
     assert "SQLite" in entry["unprotected"] and "no checksums" in entry["unprotected"]
-    assert main(["ingest", str(bag), f"--spec={tmp_path / 'spec.yaml'}", "--dry_run=true"]) == 0
+    assert (
+        main(["ingest", str(bag), f"--spec={tmp_path / 'spec.yaml'}", "--dry_run=true"])
+        == 0
+    )
     assert f"1 of 1 recordings: {entry['unprotected']}" in capsys.readouterr().out
 
 
 def unprotected(path: Path, name: str, spec: str) -> str:
     reader = readers.get(name)(Source(path, (path,)), load_recording_spec(spec))
-    for _ in reader.messages({c.topic for c in load_recording_spec(spec).channels.values()}):
+    for _ in reader.messages(
+        {c.topic for c in load_recording_spec(spec).channels.values()}
+    ):
         pass
     return reader.unprotected
 
@@ -130,7 +151,10 @@ def unprotected(path: Path, name: str, spec: str) -> str:
 def test_of_hdf5_only_datasets_without_a_checksum_are_named(tmp_path):
     path = write_hdf5(tmp_path / "e.hdf5")
     with h5py.File(path, "a") as file:
-        for name, options in (("action", {"fletcher32": True}), ("observations/qpos", {"compression": "gzip"})):
+        for name, options in (
+            ("action", {"fletcher32": True}),
+            ("observations/qpos", {"compression": "gzip"}),
+        ):
             values = file[name][:]
             del file[name]
             file.create_dataset(name, data=values, chunks=(31, 14), **options)
@@ -174,7 +198,9 @@ SHAPE = (ROWS, 14)
 def external(file: h5py.File, name: str) -> None:
     path = Path(file.filename).with_name(SECRET)
     np.full(SHAPE, 0.01, np.float32).tofile(path)
-    file.create_dataset(name, SHAPE, "f4", external=[(str(path), 0, h5py.h5f.UNLIMITED)])
+    file.create_dataset(
+        name, SHAPE, "f4", external=[(str(path), 0, h5py.h5f.UNLIMITED)]
+    )
 
 
 def virtual(file: h5py.File, name: str) -> None:
@@ -189,30 +215,54 @@ def virtual(file: h5py.File, name: str) -> None:
 @pytest.mark.parametrize(
     ("make", "facts"),
     [
-        (lambda f, n: f.create_dataset(n, (ROWS, 10**10), "f4"), ("[10000000000]", "37.3 GiB", "1 GiB")),
         (
-            lambda f, n: f.create_dataset(n, (ROWS, 14 * 10**6), "f4", chunks=(ROWS, 10**6), compression="gzip"),
+            lambda f, n: f.create_dataset(n, (ROWS, 10**10), "f4"),
+            ("[10000000000]", "37.3 GiB", "1 GiB"),
+        ),
+        (
+            lambda f, n: f.create_dataset(
+                n, (ROWS, 14 * 10**6), "f4", chunks=(ROWS, 10**6), compression="gzip"
+            ),
             ("62 rows", "[14000000]", "3.2 GiB", "smaller chunks"),
         ),
         (
             lambda f, n: f.create_dataset(
-                n, SHAPE, "f8", maxshape=(None, None), chunks=(1, 250 * 10**6), compression="gzip"
+                n,
+                SHAPE,
+                "f8",
+                maxshape=(None, None),
+                chunks=(1, 250 * 10**6),
+                compression="gzip",
             ),
-            ("1.9 GiB", "1 GiB"),  # HDF5 unpacks whole chunks, and these are wider than the rows
+            (
+                "1.9 GiB",
+                "1 GiB",
+            ),  # HDF5 unpacks whole chunks, and these are wider than the rows
         ),
-        (lambda f, n: f.create_dataset(n, SHAPE, "f4"), ("none of its 62 rows was ever written",)),
+        (
+            lambda f, n: f.create_dataset(n, SHAPE, "f4"),
+            ("none of its 62 rows was ever written",),
+        ),
         (external, (SECRET, "external storage", "not opened")),
         (virtual, (OTHER, "virtual dataset", "not opened")),
     ],
 )
-def test_a_dataset_that_must_not_be_read_costs_its_own_recording_only(make, facts, tmp_path):
+def test_a_dataset_that_must_not_be_read_costs_its_own_recording_only(
+    make, facts, tmp_path
+):
     folder = tmp_path / "in"
     write(folder / "episode_0.hdf5")
     with h5py.File(write(folder / "episode_1.hdf5"), "a") as file:
         del file["action"]
         make(file, "action")
     spec = load_recording_spec("cobot_magic_hdf5")
-    jobs = find_jobs([folder / f"episode_{k}.hdf5" for k in (1, 0)], spec, "s", tmp_path / "store", dry_run=True)
+    jobs = find_jobs(
+        [folder / f"episode_{k}.hdf5" for k in (1, 0)],
+        spec,
+        "s",
+        tmp_path / "store",
+        dry_run=True,
+    )
     refused, written = ingest(jobs, tmp_path / "out", None)["recordings"]
     assert (refused["outcome"], written["outcome"]) == ("refused", "written")
     assert "episode_1.hdf5: /action: " in refused["reason"]
@@ -223,10 +273,15 @@ def test_rows_that_were_never_written_are_no_zeros(tmp_path):
     path = write(tmp_path / "e.hdf5")
     with h5py.File(path, "a") as file:
         del file["action"]
-        file.create_dataset("action", SHAPE, "f4", chunks=(10, 14))[:30] = np.stack([state(k + 1) for k in range(30)])
+        file.create_dataset("action", SHAPE, "f4", chunks=(10, 14))[:30] = np.stack(
+            [state(k + 1) for k in range(30)]
+        )
     reader = readers.get("hdf5")(Source(path, (path,)))
     assert len(list(reader.messages({"/action"}))) == 30
-    assert reader.damage[0].reason == "/action, rows 30 to 39 cannot be read (never written)"
+    assert (
+        reader.damage[0].reason
+        == "/action, rows 30 to 39 cannot be read (never written)"
+    )
 
 
 def test_a_thousand_million_rows_are_refused_at_once(tmp_path):
@@ -235,21 +290,32 @@ def test_a_thousand_million_rows_are_refused_at_once(tmp_path):
         file.create_dataset("action", (10**9, 14), "f4", chunks=(1000, 14))[:1000] = 1.0
     begin_s = time.monotonic()
     reader = readers.get("hdf5")(Source(path, (path,)))
-    with pytest.raises(RecordingError, match=r"e.hdf5: /action: it claims 1,000,000,000 rows; at most 1,000,000"):
+    with pytest.raises(
+        RecordingError,
+        match=r"e.hdf5: /action: it claims 1,000,000,000 rows; at most 1,000,000",
+    ):
         list(reader.messages({"/action"}, stamps_only={"/action"}))
     (topic,) = inspect_source("hdf5", Source(path, (path,))).topics
     assert topic.num_messages == 0 and "1,000,000,000 rows" in topic.problem
     assert time.monotonic() - begin_s < 5
 
 
-def test_a_recording_that_needs_too_much_memory_does_not_end_the_batch(tmp_path, monkeypatch):
+def test_a_recording_that_needs_too_much_memory_does_not_end_the_batch(
+    tmp_path, monkeypatch
+):
     path = write(tmp_path / "e.hdf5")
 
     def too_much(*_: Any) -> None:
         np.empty(10**15)  # 8 PB
 
     monkeypatch.setattr(ingest_module, "opened", too_much)
-    (job,) = find_jobs([path], load_recording_spec("cobot_magic_hdf5"), "s", tmp_path / "store", dry_run=True)
+    (job,) = find_jobs(
+        [path],
+        load_recording_spec("cobot_magic_hdf5"),
+        "s",
+        tmp_path / "store",
+        dry_run=True,
+    )
     entry = ingest_one(job)
     assert entry["outcome"] == "refused"
     assert "more memory than there is" in entry["reason"]

@@ -22,7 +22,12 @@ import numpy as np
 import pytest
 import yaml
 import zstandard
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf import (
+    descriptor_pb2,
+    descriptor_pool,
+    message_factory,
+    timestamp_pb2,
+)
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk
 from mcap.stream_reader import breakup_chunk
@@ -40,8 +45,12 @@ T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 1_000_000
 NUM_MESSAGES = 48
 TEXT = "=" * 80
-HEADER_TEXT = f"{TEXT}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-JOINT_STATE = f"std_msgs/Header header\nstring[] name\nfloat64[] position\n{HEADER_TEXT}"
+HEADER_TEXT = (
+    f"{TEXT}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+)
+JOINT_STATE = (
+    f"std_msgs/Header header\nstring[] name\nfloat64[] position\n{HEADER_TEXT}"
+)
 IMAGE = f"std_msgs/Header header\nstring format\nuint8[] data\n{HEADER_TEXT}"
 SERVICE = "bool enable\n---\nbool done\n"  # what rosbag2 stores for a service; no .msg parser accepts it
 TOPICS = ("/joints", "/camera", "/pad", "/proto")
@@ -55,37 +64,56 @@ def _protobuf() -> tuple[bytes, Any]:
     """(descriptor set, message class) of ``t.Values``: timestamp, repeated double v."""
     stamp = descriptor_pb2.FileDescriptorProto()
     timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
-    file = descriptor_pb2.FileDescriptorProto(name="t.proto", package="t", syntax="proto3", dependency=[stamp.name])
+    file = descriptor_pb2.FileDescriptorProto(
+        name="t.proto", package="t", syntax="proto3", dependency=[stamp.name]
+    )
     message = file.message_type.add(name="Values")
     kinds = descriptor_pb2.FieldDescriptorProto
     stamped = {"type": kinds.TYPE_MESSAGE, "type_name": ".google.protobuf.Timestamp"}
     message.field.add(name="timestamp", number=1, label=kinds.LABEL_OPTIONAL, **stamped)
-    message.field.add(name="v", number=2, label=kinds.LABEL_REPEATED, type=kinds.TYPE_DOUBLE)
+    message.field.add(
+        name="v", number=2, label=kinds.LABEL_REPEATED, type=kinds.TYPE_DOUBLE
+    )
     pool = descriptor_pool.DescriptorPool()
     pool.Add(stamp)
     pool.Add(file)
     made = message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Values"))
-    return descriptor_pb2.FileDescriptorSet(file=[stamp, file]).SerializeToString(), made
+    return descriptor_pb2.FileDescriptorSet(
+        file=[stamp, file]
+    ).SerializeToString(), made
 
 
 DESCRIPTORS, VALUES = _protobuf()
 ENCODERS = {
-    "/joints": serialize_dynamic("sensor_msgs/msg/JointState", JOINT_STATE)["sensor_msgs/msg/JointState"],
-    "/camera": serialize_dynamic("sensor_msgs/msg/CompressedImage", IMAGE)["sensor_msgs/msg/CompressedImage"],
+    "/joints": serialize_dynamic("sensor_msgs/msg/JointState", JOINT_STATE)[
+        "sensor_msgs/msg/JointState"
+    ],
+    "/camera": serialize_dynamic("sensor_msgs/msg/CompressedImage", IMAGE)[
+        "sensor_msgs/msg/CompressedImage"
+    ],
 }
 
 
 def header(stamp_ns: int) -> dict[str, Any]:
-    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": "f"}
+    return {
+        "stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9},
+        "frame_id": "f",
+    }
 
 
 def values(topic: str, k: int) -> Any:
     """What message k of the recording says."""
     rng = np.random.default_rng(k)
     if topic == "/joints":
-        return {"name": list("abcd"), "position": [float(k), *rng.normal(size=3).tolist()]}
+        return {
+            "name": list("abcd"),
+            "position": [float(k), *rng.normal(size=3).tolist()],
+        }
     if topic == "/camera":
-        return {"format": "jpeg", "data": rng.integers(0, 256, 150, dtype=np.uint8).tobytes()}
+        return {
+            "format": "jpeg",
+            "data": rng.integers(0, 256, 150, dtype=np.uint8).tobytes(),
+        }
     return [k, k + 0.5] if topic == "/proto" else rng.integers(0, 256, 12).tolist()
 
 
@@ -104,7 +132,12 @@ def payload(topic: str, k: int) -> bytes:
 def known(topic: str, k: int) -> tuple[Any, ...]:
     """What the reader must say about message k."""
     log_ns = T0_NS + k * STEP_NS
-    return (topic, log_ns, None if topic == "/pad" else log_ns - 5_000_000, values(topic, k))
+    return (
+        topic,
+        log_ns,
+        None if topic == "/pad" else log_ns - 5_000_000,
+        values(topic, k),
+    )
 
 
 def content(topic: str, value: Any) -> Any:
@@ -113,7 +146,9 @@ def content(topic: str, value: Any) -> Any:
         return {"name": list(value.name), "position": list(value.position)}
     if topic == "/camera":
         return {"format": value.format, "data": bytes(value.data)}
-    return list(value.v) if topic == "/proto" else value.get("data")  # absent where its key was hit
+    return (
+        list(value.v) if topic == "/proto" else value.get("data")
+    )  # absent where its key was hit
 
 
 def topic_of(k: int) -> str:
@@ -121,8 +156,12 @@ def topic_of(k: int) -> str:
 
 
 def register(writer: Writer) -> dict[str, int]:
-    joints = writer.register_schema("sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE.encode())
-    camera = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", IMAGE.encode())
+    joints = writer.register_schema(
+        "sensor_msgs/msg/JointState", "ros2msg", JOINT_STATE.encode()
+    )
+    camera = writer.register_schema(
+        "sensor_msgs/msg/CompressedImage", "ros2msg", IMAGE.encode()
+    )
     pad = writer.register_schema("Pad", "jsonschema", b'{"type": "object"}')
     proto = writer.register_schema("t.Values", "protobuf", DESCRIPTORS)
     return {
@@ -135,9 +174,16 @@ def register(writer: Writer) -> dict[str, int]:
 
 def build(layout: str, number: int = NUM_MESSAGES, **options: Any) -> bytes:
     """The recording as a file; a chunk holds about eight messages."""
-    compression = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}.get(layout, CompressionType.NONE)
+    compression = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}.get(
+        layout, CompressionType.NONE
+    )
     chunked = layout != "unchunked"
-    usual = {"chunk_size": 1500, "compression": compression, "use_chunking": chunked, "enable_data_crcs": not chunked}
+    usual = {
+        "chunk_size": 1500,
+        "compression": compression,
+        "use_chunking": chunked,
+        "enable_data_crcs": not chunked,
+    }
     out = io.BytesIO()
     writer = Writer(out, **{**usual, **options})
     writer.start("ros2", "test")
@@ -147,7 +193,9 @@ def build(layout: str, number: int = NUM_MESSAGES, **options: Any) -> bytes:
         topic, log_ns = topic_of(k), T0_NS + k * STEP_NS
         writer.add_message(ids[topic], log_ns, payload(topic, k), log_ns, k)
         if k == number // 2:
-            writer.add_attachment(log_ns, log_ns, "notes.txt", "text/plain", bytes(range(200)))
+            writer.add_attachment(
+                log_ns, log_ns, "notes.txt", "text/plain", bytes(range(200))
+            )
     writer.add_metadata("episode_1", {"instruction": "insert"})
     writer.finish()
     return out.getvalue()
@@ -178,7 +226,11 @@ def places_of(data: bytes) -> dict[int, Place]:
         body = data[offset + 9 : end]
         if opcode == 0x06:
             stream = mcap_records.ReadDataStream(io.BytesIO(body))
-            logs = [r.log_time for r in breakup_chunk(Chunk.read(stream), True) if hasattr(r, "log_time")]
+            logs = [
+                r.log_time
+                for r in breakup_chunk(Chunk.read(stream), True)
+                if hasattr(r, "log_time")
+            ]
         else:
             logs = [struct.unpack_from("<Q", body, 6)[0]] if opcode == 0x05 else []
         places.update({log: Place(offset, end, next_end) for log in logs})
@@ -200,8 +252,13 @@ def reader_of(path: Path) -> McapReader:
     return McapReader(Source(path, (path,)))
 
 
-def delivered(reader: McapReader, topics: Any = TOPICS, **options: Any) -> list[tuple[Any, ...]]:
-    return [(m.topic, m.log_ns, m.stamp_ns, content(m.topic, m.value)) for m in reader.messages(topics, **options)]
+def delivered(
+    reader: McapReader, topics: Any = TOPICS, **options: Any
+) -> list[tuple[Any, ...]]:
+    return [
+        (m.topic, m.log_ns, m.stamp_ns, content(m.topic, m.value))
+        for m in reader.messages(topics, **options)
+    ]
 
 
 EXPECTED = [known(topic_of(k), k) for k in range(NUM_MESSAGES)]
@@ -223,8 +280,14 @@ def test_every_encoding_and_layout_comes_back_message_by_message(tmp_path, layou
     reader = reader_of(write(tmp_path, FILES[layout]))
     assert delivered(reader) == EXPECTED
     assert reader.damage == []
-    assert reader.metadata == {"session": {"operator": "nobody"}, "episode_1": {"instruction": "insert"}}
-    assert {t: (kind.name, kind.encoding, kind.undecodable) for t, kind in reader.topics().items()} == {
+    assert reader.metadata == {
+        "session": {"operator": "nobody"},
+        "episode_1": {"instruction": "insert"},
+    }
+    assert {
+        t: (kind.name, kind.encoding, kind.undecodable)
+        for t, kind in reader.topics().items()
+    } == {
         "/joints": ("sensor_msgs/msg/JointState", "cdr", None),
         "/camera": ("sensor_msgs/msg/CompressedImage", "cdr", None),
         "/pad": ("Pad", "json", None),
@@ -300,19 +363,32 @@ def test_topics_that_cannot_be_decoded_do_not_touch_the_others(tmp_path, capfd):
             delivered(reader, (topic,))
     assert len(list(reader.messages(None))) == 8 * 6  # their times can still be seen
     assert [t for t, p in problems.items() if not p] == [*TOPICS, "/lone"]
-    assert [m.value for m in reader.messages(("/lone",))] == [{"x": 1}] * 8  # JSON needs no schema
+    assert [m.value for m in reader.messages(("/lone",))] == [
+        {"x": 1}
+    ] * 8  # JSON needs no schema
     assert capfd.readouterr() == ("", "")  # mcap_ros2 prints what it raises
 
 
 def test_a_topic_of_two_types_is_refused(tmp_path):
     writer = Writer(out := io.BytesIO())
     writer.start()
-    kinds = [writer.register_schema(name, "jsonschema", b"{}") for name in ("t.Empty", "t.Other")]
-    ids = [writer.register_channel("/t", "json", kind) for kind in (kinds[0], kinds[0], kinds[1])]
-    writer.add_message(ids[1], T0_NS, b'{"x": 1}', T0_NS)  # a recorder that began anew: one type
+    kinds = [
+        writer.register_schema(name, "jsonschema", b"{}")
+        for name in ("t.Empty", "t.Other")
+    ]
+    ids = [
+        writer.register_channel("/t", "json", kind)
+        for kind in (kinds[0], kinds[0], kinds[1])
+    ]
+    writer.add_message(
+        ids[1], T0_NS, b'{"x": 1}', T0_NS
+    )  # a recorder that began anew: one type
     writer.add_message(ids[2], T0_NS + 1, b'{"x": 2}', T0_NS + 1)
     writer.finish()
-    with pytest.raises(RecordingError, match=r"/t: messages of t\.Other, but its first channel is of t\.Empty"):
+    with pytest.raises(
+        RecordingError,
+        match=r"/t: messages of t\.Other, but its first channel is of t\.Empty",
+    ):
         list(reader_of(write(tmp_path, out.getvalue())).messages(("/t",)))
 
 
@@ -335,7 +411,11 @@ def test_the_stamp_is_found_wherever_the_header_stands(tmp_path, case):
     with (tmp_path / "a.mcap").open("wb") as file, Ros2Writer(file) as writer:
         schema = writer.register_msgdef("pkg/msg/M", definition)
         writer.write_message("/m", schema, message, log_time=T0_NS + 9)
-    for options in ({"topics": None}, {"topics": ("/m",)}, {"topics": ("/m",), "stamps_only": ("/m",)}):
+    for options in (
+        {"topics": None},
+        {"topics": ("/m",)},
+        {"topics": ("/m",), "stamps_only": ("/m",)},
+    ):
         (found,) = reader_of(tmp_path / "a.mcap").messages(**options)
         assert found.stamp_ns == expected
 
@@ -349,16 +429,24 @@ def test_big_endian_messages_are_read():
 # --- salvage
 
 
-def check_salvage(path: Path, layout: str, first: int, last: int, *, shifted: bool = False) -> McapReader:
+def check_salvage(
+    path: Path, layout: str, first: int, last: int, *, shifted: bool = False
+) -> McapReader:
     """Read a file whose bytes [first, last) were touched and hold the result against the intact one.
 
     ``shifted``: bytes were taken away or added, so the places behind differ and the index at the end points astray.
     """
     reader, places, size = reader_of(path), PLACES[layout], path.stat().st_size
-    definitions = layout == "unchunked" and shifted and first < min(p.start for p in places.values())
+    definitions = (
+        layout == "unchunked"
+        and shifted
+        and first < min(p.start for p in places.values())
+    )
     try:
         found = delivered(reader)
-    except RecordingError as error:  # a schema without CRC and without a copy at the end
+    except (
+        RecordingError
+    ) as error:  # a schema without CRC and without a copy at the end
         assert definitions and "does not parse" in str(error)
         return reader
     counts = Counter(log for _, log, _, _ in found)
@@ -366,14 +454,31 @@ def check_salvage(path: Path, layout: str, first: int, last: int, *, shifted: bo
     touched = {log for log, p in places.items() if p.start < last and p.end > first}
     # A message outside chunks counts only if a record begins where it ends: it may go with the one behind it.
     # Where bytes are missing, a record may also have eaten the beginning of the one behind it.
-    eaten = max([end for _, start, end in records_of(FILES[layout]) if shifted and start < last], default=0)
+    eaten = max(
+        [
+            end
+            for _, start, end in records_of(FILES[layout])
+            if shifted and start < last
+        ],
+        default=0,
+    )
     reach = max(last, eaten + 1)
-    neighbours = {log for log, p in places.items() if layout == "unchunked" and p.start < reach and p.next_end > first}
-    first_chunk = layout != "unchunked" and shifted and first < min(p.end for p in places.values())
+    neighbours = {
+        log
+        for log, p in places.items()
+        if layout == "unchunked" and p.start < reach and p.next_end > first
+    }
+    first_chunk = (
+        layout != "unchunked"
+        and shifted
+        and first < min(p.end for p in places.values())
+    )
     lost = {log for log in by_log if log not in counts}
 
     altered = [m for m in found if m != by_log.get(m[1])]
-    if layout == "unchunked":  # only the data section's CRC guards these: it may pass on one message, but says so
+    if (
+        layout == "unchunked"
+    ):  # only the data section's CRC guards these: it may pass on one message, but says so
         assert len(altered) <= len(touched)
         assert not altered or reader.damage
         lost -= {log for log in lost if altered and log in touched}
@@ -383,7 +488,10 @@ def check_salvage(path: Path, layout: str, first: int, last: int, *, shifted: bo
     intact = [m for m in found if m not in altered]
     assert intact == [m for m in EXPECTED if m in intact]  # in the file's order
     if not (definitions or first_chunk):
-        assert lost <= touched | neighbours, (lost - touched - neighbours, reader.damage)
+        assert lost <= touched | neighbours, (
+            lost - touched - neighbours,
+            reader.damage,
+        )
     for d in reader.damage:
         assert 0 <= d.byte_start <= d.byte_end <= size
         assert d.file == str(path)
@@ -391,10 +499,13 @@ def check_salvage(path: Path, layout: str, first: int, last: int, *, shifted: bo
         for log in lost:
             p = places[log]
             assert any(
-                d.byte_start <= min(p.end, size) and d.byte_end > min(p.start, size - 1) for d in reader.damage
+                d.byte_start <= min(p.end, size) and d.byte_end > min(p.start, size - 1)
+                for d in reader.damage
             ), (p, reader.damage)
     assert not lost or any(d.lost for d in reader.damage)
-    assert len(list(reader.messages(None))) >= len(found) - len(altered)  # looking at times only survives it too
+    assert len(list(reader.messages(None))) >= len(found) - len(
+        altered
+    )  # looking at times only survives it too
     return reader
 
 
@@ -403,7 +514,15 @@ def test_a_file_cut_anywhere_keeps_what_was_written_before(tmp_path, layout):
     data, rng = FILES[layout], np.random.default_rng(1)
     data_end = next(offset for opcode, offset, _ in records_of(data) if opcode == 0x0F)
     for cut in sorted(
-        {9, 20, data_end, data_end + 5, len(data) - 1, len(data) - 9, *rng.integers(9, len(data), 25).tolist()}
+        {
+            9,
+            20,
+            data_end,
+            data_end + 5,
+            len(data) - 1,
+            len(data) - 9,
+            *rng.integers(9, len(data), 25).tolist(),
+        }
     ):
         reader = check_salvage(write(tmp_path, data[:cut]), layout, cut, len(data))
         assert reader.damage
@@ -413,8 +532,13 @@ def test_a_file_cut_anywhere_keeps_what_was_written_before(tmp_path, layout):
             assert reader.damage[-1].byte_end == cut
 
 
-@pytest.mark.parametrize("layout", ["zstd", *(pytest.param(x, marks=pytest.mark.slow) for x in ("none", "unchunked"))])
-def test_any_flipped_bit_in_any_kind_of_record_header_costs_only_that_record(tmp_path, layout):
+@pytest.mark.parametrize(
+    "layout",
+    ["zstd", *(pytest.param(x, marks=pytest.mark.slow) for x in ("none", "unchunked"))],
+)
+def test_any_flipped_bit_in_any_kind_of_record_header_costs_only_that_record(
+    tmp_path, layout
+):
     """Opcode and length of two records of each kind, bit by bit: a wrong length must not step over sound records unseen."""
     data, seen = FILES[layout], Counter()
     for opcode, offset, _ in records_of(data):
@@ -425,15 +549,26 @@ def test_any_flipped_bit_in_any_kind_of_record_header_costs_only_that_record(tmp
             for bit in range(8) if byte == 0 else (0, 3, 7):
                 broken = bytearray(data)
                 broken[offset + byte] ^= 1 << bit
-                reader = check_salvage(write(tmp_path, bytes(broken)), layout, offset + byte, offset + byte + 1)
+                reader = check_salvage(
+                    write(tmp_path, bytes(broken)),
+                    layout,
+                    offset + byte,
+                    offset + byte + 1,
+                )
                 if (opcode, byte, bit) == (0x07, 0, 7):
                     continue  # an application's own record, for all that anybody can tell; nothing was in it
                 assert reader.damage, (opcode, byte, bit)
-                assert any(d.byte_start <= offset + byte < d.byte_end for d in reader.damage), (opcode, byte, bit)
+                assert any(
+                    d.byte_start <= offset + byte < d.byte_end for d in reader.damage
+                ), (opcode, byte, bit)
 
 
 def place_of(layout: str, opcode: int, which: int = 0) -> tuple[int, int]:
-    return [(offset, end) for kind, offset, end in records_of(FILES[layout]) if kind == opcode][which]
+    return [
+        (offset, end)
+        for kind, offset, end in records_of(FILES[layout])
+        if kind == opcode
+    ][which]
 
 
 def flip(layout: str, at: int) -> bytes:
@@ -442,55 +577,86 @@ def flip(layout: str, at: int) -> bytes:
     return bytes(data)
 
 
-def test_a_flipped_byte_in_a_chunk_costs_that_chunk_and_names_it_with_its_times(tmp_path):
+def test_a_flipped_byte_in_a_chunk_costs_that_chunk_and_names_it_with_its_times(
+    tmp_path,
+):
     start, end = place_of("zstd", 0x06, 2)
-    reader = check_salvage(write(tmp_path, flip("zstd", end - 30)), "zstd", end - 30, end - 29)
+    reader = check_salvage(
+        write(tmp_path, flip("zstd", end - 30)), "zstd", end - 30, end - 29
+    )
     (damage,) = reader.damage
     logs = sorted(log for log, p in PLACES["zstd"].items() if p.start == start)
-    assert (damage.byte_start, damage.byte_end, damage.start_ns, damage.end_ns) == (start, end, logs[0], logs[-1])
+    assert (damage.byte_start, damage.byte_end, damage.start_ns, damage.end_ns) == (
+        start,
+        end,
+        logs[0],
+        logs[-1],
+    )
     assert damage.reason.startswith("chunk lost")
     assert str(damage) == f"a.mcap bytes {start:,} to {end:,}: {damage.reason}"
     assert len(delivered(reader)) == NUM_MESSAGES - len(logs)
 
 
 @pytest.mark.parametrize("layout", ["none", "lz4", "zstd"])
-def test_the_index_at_the_end_gives_meaning_to_messages_whose_definitions_were_lost(tmp_path, layout):
+def test_the_index_at_the_end_gives_meaning_to_messages_whose_definitions_were_lost(
+    tmp_path, layout
+):
     """The first chunk holds all schemas and channels."""
     start, end = place_of(layout, 0x06, 0)
     lost = sum(p.start == start for p in PLACES[layout].values())
-    reader = check_salvage(write(tmp_path, flip(layout, end - 20)), layout, end - 20, end - 19)
+    reader = check_salvage(
+        write(tmp_path, flip(layout, end - 20)), layout, end - 20, end - 19
+    )
     assert len(delivered(reader)) == NUM_MESSAGES - lost
     assert reader.topics()["/joints"].name == "sensor_msgs/msg/JointState"
 
 
-def test_without_index_the_messages_of_lost_definitions_are_counted_and_nothing_is_invented(tmp_path):
+def test_without_index_the_messages_of_lost_definitions_are_counted_and_nothing_is_invented(
+    tmp_path,
+):
     _, end = place_of("zstd", 0x06, 0)
     footer = place_of("zstd", 0x02)[0]
     data = flip("zstd", end - 20)[:footer]  # neither footer nor, therefore, index
     reader = reader_of(write(tmp_path, data))
     assert delivered(reader) == []
-    first = sum(p.start == place_of("zstd", 0x06, 0)[0] for p in PLACES["zstd"].values())
-    assert f"{NUM_MESSAGES - first} messages of channels whose definition was lost" in [d.reason for d in reader.damage]
+    first = sum(
+        p.start == place_of("zstd", 0x06, 0)[0] for p in PLACES["zstd"].values()
+    )
+    assert f"{NUM_MESSAGES - first} messages of channels whose definition was lost" in [
+        d.reason for d in reader.damage
+    ]
 
 
 def test_a_damaged_definition_outside_chunks_is_replaced_by_the_index_copy(tmp_path):
     offset, _ = place_of("unchunked", 0x04, 1)
     at = FILES["unchunked"].index(b"/camera", offset) + 3
-    reader = check_salvage(write(tmp_path, flip("unchunked", at)), "unchunked", at, at + 1)
+    reader = check_salvage(
+        write(tmp_path, flip("unchunked", at)), "unchunked", at, at + 1
+    )
     assert delivered(reader) == EXPECTED
-    assert "a damaged channel; the index's copy is used" in [d.reason for d in reader.damage]
+    assert "a damaged channel; the index's copy is used" in [
+        d.reason for d in reader.damage
+    ]
     assert set(reader.topics()) == set(TOPICS)
 
 
-def test_unprotected_messages_that_do_not_decode_are_damage_but_a_wrong_schema_is_an_error(tmp_path):
+def test_unprotected_messages_that_do_not_decode_are_damage_but_a_wrong_schema_is_an_error(
+    tmp_path,
+):
     data = bytearray(FILES["unchunked"])
-    pads = [p for log, p in PLACES["unchunked"].items() if (log - T0_NS) // STEP_NS % 4 == 2]
+    pads = [
+        p for log, p in PLACES["unchunked"].items() if (log - T0_NS) // STEP_NS % 4 == 2
+    ]
     assert len(pads) == 12
     for p in pads[:10]:
         data[p.end - 1] = ord("!")
     reader = reader_of(write(tmp_path, bytes(data)))
-    assert delivered(reader) == [m for m in EXPECTED if PLACES["unchunked"][m[1]] not in pads[:10]]
-    assert [(d.byte_start, d.byte_end) for d in reader.damage] == [(p.start, p.end) for p in pads[:10]]
+    assert delivered(reader) == [
+        m for m in EXPECTED if PLACES["unchunked"][m[1]] not in pads[:10]
+    ]
+    assert [(d.byte_start, d.byte_end) for d in reader.damage] == [
+        (p.start, p.end) for p in pads[:10]
+    ]
     data[pads[10].end - 1] = ord("!")  # the eleventh
     with pytest.raises(RecordingError, match=r"/pad: .* does not fit its schema Pad"):
         delivered(reader_of(write(tmp_path, bytes(data))))
@@ -505,17 +671,28 @@ OUTSIDE = {
         len(FILES[layout]) + 700,
         False,
     ),
-    "a second recording behind it": lambda layout, end: (FILES[layout] * 2, end[1], 2 * len(FILES[layout]), True),
+    "a second recording behind it": lambda layout, end: (
+        FILES[layout] * 2,
+        end[1],
+        2 * len(FILES[layout]),
+        True,
+    ),
 }
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("case", OUTSIDE)
-def test_damage_outside_of_the_messages_costs_none_of_them_and_is_told(tmp_path, layout, case):
+def test_damage_outside_of_the_messages_costs_none_of_them_and_is_told(
+    tmp_path, layout, case
+):
     data, first, last, lost = OUTSIDE[case](layout, place_of(layout, 0x0F))
     reader = reader_of(write(tmp_path, data))
     assert delivered(reader) == EXPECTED
-    assert (reader.damage[0].byte_start, reader.damage[0].byte_end, reader.damage[0].lost) == (first, last, lost)
+    assert (
+        reader.damage[0].byte_start,
+        reader.damage[0].byte_end,
+        reader.damage[0].lost,
+    ) == (first, last, lost)
 
 
 @pytest.mark.parametrize(
@@ -524,7 +701,12 @@ def test_damage_outside_of_the_messages_costs_none_of_them_and_is_told(tmp_path,
         (b"", r"is empty \(0 bytes\)"),
         (b"\x89MC", "is not an MCAP file: begins with"),
         (b"PK\x03\x04" + bytes(5000), "a ZIP archive, no recording"),
-        (np.random.default_rng(0).integers(0, 256, 300_000, dtype=np.uint8).tobytes(), "is not an MCAP file"),
+        (
+            np.random.default_rng(0)
+            .integers(0, 256, 300_000, dtype=np.uint8)
+            .tobytes(),
+            "is not an MCAP file",
+        ),
         (b"\x06" * 100_000, "is not an MCAP file"),
     ],
     ids=["empty", "three bytes", "zip", "noise", "sixes"],
@@ -554,15 +736,30 @@ def test_a_chunk_is_found_again_beside_what_only_looks_like_one(tmp_path):
 
 def with_bytes_before(at: int, more: bytes) -> bytes:
     """The zstd file with ``more`` put in at ``at``, behind all that its index points to, and the index made right again."""
-    data, (_, summary), (footer, _) = FILES["zstd"], place_of("zstd", 0x0F), place_of("zstd", 0x02)
-    moved = data[summary:footer] + struct.pack("<BQQQ", 0x02, 20, summary + len(more), 0)
-    return data[:at] + more + data[at:summary] + moved + struct.pack("<I", zlib.crc32(moved)) + mcap_records.MAGIC
+    data, (_, summary), (footer, _) = (
+        FILES["zstd"],
+        place_of("zstd", 0x0F),
+        place_of("zstd", 0x02),
+    )
+    moved = data[summary:footer] + struct.pack(
+        "<BQQQ", 0x02, 20, summary + len(more), 0
+    )
+    return (
+        data[:at]
+        + more
+        + data[at:summary]
+        + moved
+        + struct.pack("<I", zlib.crc32(moved))
+        + mcap_records.MAGIC
+    )
 
 
 def test_an_applications_own_record_is_passed_over(tmp_path):
     """The MCAP specification leaves kinds 0x80 and above to applications."""
     private = struct.pack("<BQ", 0x90, 50) + bytes(50)
-    reader = reader_of(write(tmp_path, with_bytes_before(place_of("zstd", 0x0F)[0], private)))
+    reader = reader_of(
+        write(tmp_path, with_bytes_before(place_of("zstd", 0x0F)[0], private))
+    )
     assert delivered(reader) == EXPECTED
     assert reader.damage == []
 
@@ -584,7 +781,9 @@ def mcap_with_chunk(chunk: Chunk) -> bytes:
 
     def good(k: int) -> bytes:
         inner = RecordBuilder()
-        Channel(id=1, topic="/lone", message_encoding="json", metadata={}, schema_id=0).write(inner)
+        Channel(
+            id=1, topic="/lone", message_encoding="json", metadata={}, schema_id=0
+        ).write(inner)
         mcap_records.Message(1, T0_NS + k, b"1", T0_NS, k).write(inner)
         data = inner.end()
         out = RecordBuilder()
@@ -600,9 +799,20 @@ def zeros(compression: str, megabytes: int) -> bytes:
     block = bytes(1 << 20)
     if compression == "zstd":
         compressor = zstandard.ZstdCompressor(level=1).compressobj()
-        return b"".join([*(compressor.compress(block) for _ in range(megabytes)), compressor.flush()])
+        return b"".join(
+            [
+                *(compressor.compress(block) for _ in range(megabytes)),
+                compressor.flush(),
+            ]
+        )
     with lz4.frame.LZ4FrameCompressor() as frame:
-        return b"".join([frame.begin(), *(frame.compress(block) for _ in range(megabytes)), frame.flush()])
+        return b"".join(
+            [
+                frame.begin(),
+                *(frame.compress(block) for _ in range(megabytes)),
+                frame.flush(),
+            ]
+        )
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
@@ -610,7 +820,9 @@ def zeros(compression: str, megabytes: int) -> bytes:
 def test_a_decompression_bomb_takes_no_memory(tmp_path, compression, claim):
     """600 MiB of zeros in a chunk that claims 4 EiB, 1 TiB, the truth, or 1 MiB."""
     data = zeros(compression, 600) if compression else bytes(1000)
-    path = write(tmp_path, mcap_with_chunk(Chunk(compression, data, T0_NS, T0_NS, 1, claim)))
+    path = write(
+        tmp_path, mcap_with_chunk(Chunk(compression, data, T0_NS, T0_NS, 1, claim))
+    )
     reader = reader_of(path)
     with bounded_memory(megabytes=12 + len(data) / 2**20 * 4):
         assert [m.log_ns for m in reader.messages(("/lone",))] == [T0_NS, T0_NS + 1]
@@ -642,11 +854,22 @@ def bounded_memory(megabytes: float) -> Iterator[None]:
         ("", 0, 0, None),
     ],
 )
-def test_a_chunk_without_crc_must_at_least_hold_together(tmp_path, compression, beyond, claim, reason):
+def test_a_chunk_without_crc_must_at_least_hold_together(
+    tmp_path, compression, beyond, claim, reason
+):
     """One message in it, whose length reaches ``beyond`` the chunk; the chunk claims ``claim`` bytes too many."""
     data = struct.pack("<BQHIQQ", 0x05, 22 + 4 + beyond, 1, 0, T0_NS + 5, 0) + b"1234"
-    reader = reader_of(write(tmp_path, mcap_with_chunk(Chunk(compression, data, T0_NS, T0_NS, 0, len(data) + claim))))
-    assert [m.value for m in reader.messages(("/lone",))] == ([1, 1] if reason else [1, 1234, 1])
+    reader = reader_of(
+        write(
+            tmp_path,
+            mcap_with_chunk(
+                Chunk(compression, data, T0_NS, T0_NS, 0, len(data) + claim)
+            ),
+        )
+    )
+    assert [m.value for m in reader.messages(("/lone",))] == (
+        [1, 1] if reason else [1, 1234, 1]
+    )
     assert not reason or reason in reader.damage[0].reason
 
 
@@ -655,26 +878,44 @@ def test_a_chunk_larger_than_memory_is_not_read(tmp_path):
     size = 300 << 20
     data = mcap_with_chunk(Chunk("", b"", T0_NS, T0_NS, 1, size))
     at = data.index(struct.pack("<Q", size))
-    start, body = at - 25, at + 8 + 4 + 4 + 8  # CRC, empty compression name, length of the data
+    start, body = (
+        at - 25,
+        at + 8 + 4 + 4 + 8,
+    )  # CRC, empty compression name, length of the data
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         file.write(
-            data[:start] + struct.pack("<BQ", 0x06, 40 + size) + data[start + 9 : body - 8] + struct.pack("<Q", size)
+            data[:start]
+            + struct.pack("<BQ", 0x06, 40 + size)
+            + data[start + 9 : body - 8]
+            + struct.pack("<Q", size)
         )
         file.seek(size, 1)
         file.write(data[body:])
     reader = reader_of(path)
     with bounded_memory(megabytes=20):
         assert [m.log_ns for m in reader.messages(("/lone",))] == [T0_NS, T0_NS + 1]
-    assert (reader.damage[0].byte_start, reader.damage[0].byte_end) == (start, body + size)
-    assert "314,572,840 bytes; at most 268,435,456 are accepted" in reader.damage[0].reason
+    assert (reader.damage[0].byte_start, reader.damage[0].byte_end) == (
+        start,
+        body + size,
+    )
+    assert (
+        "314,572,840 bytes; at most 268,435,456 are accepted" in reader.damage[0].reason
+    )
 
 
 def test_a_log_time_beyond_int64_is_damage_and_not_an_overflow(tmp_path):
-    data = file_of(*(("/pad", log_ns, payload("/pad", 2)) for log_ns in (2**64 - 1, T0_NS + 2 * STEP_NS)))
+    data = file_of(
+        *(
+            ("/pad", log_ns, payload("/pad", 2))
+            for log_ns in (2**64 - 1, T0_NS + 2 * STEP_NS)
+        )
+    )
     reader = reader_of(write(tmp_path, data))
     assert delivered(reader) == [EXPECTED[2]]
-    assert [d.reason for d in reader.damage] == ["1 messages with a log time after the year 2262"]
+    assert [d.reason for d in reader.damage] == [
+        "1 messages with a log time after the year 2262"
+    ]
 
 
 # --- partial reads
@@ -692,7 +933,9 @@ def test_a_partial_read_gives_every_message_inside_its_bounds(tmp_path, layout, 
         first, last = sorted(rng.integers(0, NUM_MESSAGES, 2).tolist())
         start_ns, end_ns = T0_NS + first * STEP_NS, T0_NS + last * STEP_NS
         found = delivered(reader, start_ns=start_ns, end_ns=end_ns)
-        assert [m for m in found if start_ns <= m[1] <= end_ns] == EXPECTED[first : last + 1]
+        assert [m for m in found if start_ns <= m[1] <= end_ns] == EXPECTED[
+            first : last + 1
+        ]
         assert len({m[1] for m in found}) == len(found)
         if warm and layout != "unchunked" and last - first < 8:
             assert len(found) < NUM_MESSAGES  # it does skip
@@ -701,7 +944,10 @@ def test_a_partial_read_gives_every_message_inside_its_bounds(tmp_path, layout, 
 def test_messages_out_of_time_order_are_found_by_a_partial_read(tmp_path):
     """A late message in an early chunk: bounds go by what a chunk holds, not by its neighbours."""
     order = [0, 1, 47, 2, 3, 4, 5, 6, 7, 8, 9, 10]
-    data = file_of(*(("/pad", T0_NS + k * STEP_NS, payload("/pad", k)) for k in order), chunk_size=200)
+    data = file_of(
+        *(("/pad", T0_NS + k * STEP_NS, payload("/pad", k)) for k in order),
+        chunk_size=200,
+    )
     reader = reader_of(write(tmp_path, data))
     delivered(reader)
     found = [m[1] for m in delivered(reader, start_ns=T0_NS + 20 * STEP_NS)]
@@ -738,13 +984,19 @@ def bag(folder: Path, *numbers: int) -> Path:
     """x_<n>.mcap for each number, holding message n only."""
     folder.mkdir()
     for n in numbers:
-        write(folder, file_of((topic_of(n), T0_NS + n * STEP_NS, payload(topic_of(n), n))), f"x_{n}.mcap")
+        write(
+            folder,
+            file_of((topic_of(n), T0_NS + n * STEP_NS, payload(topic_of(n), n))),
+            f"x_{n}.mcap",
+        )
     return folder
 
 
 def index(folder: Path, names: Any) -> None:
     """metadata.yaml with these file names, or with any bytes."""
-    about = yaml.safe_dump({"rosbag2_bagfile_information": {"relative_file_paths": names}}).encode()
+    about = yaml.safe_dump(
+        {"rosbag2_bagfile_information": {"relative_file_paths": names}}
+    ).encode()
     (folder / "metadata.yaml").write_bytes(names if isinstance(names, bytes) else about)
 
 
@@ -752,14 +1004,32 @@ def read_bag(source: Source) -> list[int]:
     return [(m[1] - T0_NS) // STEP_NS for m in delivered(McapReader(source))]
 
 
-def test_a_split_bag_is_one_recording_in_the_order_of_metadata_yaml_or_of_its_numbers(tmp_path):
+def test_a_split_bag_is_one_recording_in_the_order_of_metadata_yaml_or_of_its_numbers(
+    tmp_path,
+):
     folder = bag(tmp_path / "b", 0, 1, 2, 9, 10, 11)
     ((name, source),) = find_sources(folder, reader="mcap", split_bag=True)
     assert (name, source.path) == ("mcap", folder)
-    assert read_bag(source) == [0, 1, 2, 9, 10, 11]  # by name, x_10 would come before x_2
-    assert [read_bag(source) for _, source in find_sources(folder, reader="mcap")] == [[0], [1], [2], [9], [10], [11]]
+    assert read_bag(source) == [
+        0,
+        1,
+        2,
+        9,
+        10,
+        11,
+    ]  # by name, x_10 would come before x_2
+    assert [read_bag(source) for _, source in find_sources(folder, reader="mcap")] == [
+        [0],
+        [1],
+        [2],
+        [9],
+        [10],
+        [11],
+    ]
     folder = bag(tmp_path / "c", 0, 1, 2)
-    index(folder, ["x_2.mcap", "c/x_0.mcap", "x_1.mcap"])  # old rosbag2 wrote the folder's name before it
+    index(
+        folder, ["x_2.mcap", "c/x_0.mcap", "x_1.mcap"]
+    )  # old rosbag2 wrote the folder's name before it
     ((_, source),) = find_sources(folder, reader="mcap", split_bag=False)
     assert read_bag(source) == [2, 0, 1]
 
@@ -767,11 +1037,17 @@ def test_a_split_bag_is_one_recording_in_the_order_of_metadata_yaml_or_of_its_nu
 @pytest.mark.parametrize(
     ("names", "reason"),
     [
-        (["x_0.mcap", "x_1.mcap", "x_7.mcap"], "names x_7.mcap, which is not in .*: copy the whole bag"),
+        (
+            ["x_0.mcap", "x_1.mcap", "x_7.mcap"],
+            "names x_7.mcap, which is not in .*: copy the whole bag",
+        ),
         (["x_0.mcap"], "does not name x_1.mcap: run `ros2 bag reindex`"),
         (None, "metadata"),
         ([3], "metadata"),
-        *((other, "metadata") for other in (b"", b"[", b"a: 1", b"\xff\xfe\x00", b"- 1\n")),
+        *(
+            (other, "metadata")
+            for other in (b"", b"[", b"a: 1", b"\xff\xfe\x00", b"- 1\n")
+        ),
     ],
 )
 def test_a_bag_that_is_not_what_its_metadata_says_is_refused(tmp_path, names, reason):
@@ -784,7 +1060,10 @@ def test_a_bag_that_is_not_what_its_metadata_says_is_refused(tmp_path, names, re
 def test_a_bag_compressed_file_by_file_says_what_to_do(tmp_path):
     folder = bag(tmp_path / "b", 0)
     (folder / "x_0.mcap").rename(folder / "x_0.mcap.zstd")
-    with pytest.raises(RecordingError, match=r"a compressed bag file: unpack it with `unzstd x_0\.mcap\.zstd`"):
+    with pytest.raises(
+        RecordingError,
+        match=r"a compressed bag file: unpack it with `unzstd x_0\.mcap\.zstd`",
+    ):
         find_sources(folder, reader="mcap")
 
 

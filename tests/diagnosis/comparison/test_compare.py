@@ -26,12 +26,19 @@ def measured() -> Measurements:
     return sweeps(friction(FRICTION_NM))
 
 
-def test_twin_with_the_hidden_effect_is_at_the_floor_and_without_it_off_by_friction_over_stiffness(measured):
-    nominal, true = compare(TwinConfig(), measured), compare(friction(FRICTION_NM), measured)
+def test_twin_with_the_hidden_effect_is_at_the_floor_and_without_it_off_by_friction_over_stiffness(
+    measured,
+):
+    nominal, true = (
+        compare(TwinConfig(), measured),
+        compare(friction(FRICTION_NM), measured),
+    )
     for use in ("fit", "validation"):
         score = true.score(SIGNAL, "position", use)
         assert score is not None and 0.9 < score.ratio < 1.1
-        assert score.floor == pytest.approx(NOISE_RAD, rel=0.1), "from the repeated recording"
+        assert score.floor == pytest.approx(NOISE_RAD, rel=0.1), (
+            "from the repeated recording"
+        )
     # Dry friction holds the joint F / K_p behind where the nominal twin is, on the side that it comes from.
     residual = np.concatenate([t.residual for t in nominal.of(SIGNAL)])
     behind = FRICTION_NM / ROBOT.kp_nm_per_rad[4]
@@ -44,8 +51,12 @@ def test_both_ways_of_replaying_agree_where_both_may_be_used():
     m = recorded(friction(), chirp(3, seconds=3.0), 3)
     alone, whole = replay_joints(friction(), m, [SIGNAL]), replay_whole(friction(), m)
     j = m.column(SIGNAL)
-    assert np.abs(alone.reported[:, j] - whole.reported[:, j]).max() < 5e-5  # rad, the contract of the one-joint model
-    assert np.nanmax(np.abs(alone.effort[1:, j] - whole.effort[1:, j])) < 0.05  # N·m of 1
+    assert (
+        np.abs(alone.reported[:, j] - whole.reported[:, j]).max() < 5e-5
+    )  # rad, the contract of the one-joint model
+    assert (
+        np.nanmax(np.abs(alone.effort[1:, j] - whole.effort[1:, j])) < 0.05
+    )  # N·m of 1
 
 
 def test_one_joint_s_error_stays_with_it_while_another_moves():
@@ -62,10 +73,15 @@ def test_gripper_or_contact_takes_the_whole_twin():
     free, target = recorded(TwinConfig(), target, 5), target.copy()
     target[300:, 6] -= 0.02
     gripping = recorded(TwinConfig(), target, 6)
-    assert [r.way for r in replay_all(TwinConfig(), [free, gripping], lambda *_: None)] == ["joint", "twin"]
+    assert [
+        r.way for r in replay_all(TwinConfig(), [free, gripping], lambda *_: None)
+    ] == ["joint", "twin"]
     assert moving(gripping) == [SIGNAL, "left_gripper"]
     found = compare(TwinConfig(), Measurements((gripping,)))
-    assert [s for s, kind in found.signals if kind == "position"] == [SIGNAL, "left_gripper"]
+    assert [s for s, kind in found.signals if kind == "position"] == [
+        SIGNAL,
+        "left_gripper",
+    ]
     assert all(s.ratio < 2.0 for s in found.scores() if s.kind == "position")
 
 
@@ -73,21 +89,32 @@ def test_gripper_or_contact_takes_the_whole_twin():
 def test_known_payload_and_commanded_gains_are_those_of_the_recording(gripping):
     k = 4
     gains = {
-        "kp_nm_per_rad": [v * (2 if j == k else 1) for j, v in enumerate(ROBOT.kp_nm_per_rad)],
-        "kd_nms_per_rad": [v * (2 if j == k else 1) for j, v in enumerate(ROBOT.kd_nms_per_rad)],
+        "kp_nm_per_rad": [
+            v * (2 if j == k else 1) for j, v in enumerate(ROBOT.kp_nm_per_rad)
+        ],
+        "kd_nms_per_rad": [
+            v * (2 if j == k else 1) for j, v in enumerate(ROBOT.kd_nms_per_rad)
+        ],
     }
     robot = TwinConfig(effects=[make_effect("payload", arm="left", mass_kg=0.4)])
-    robot = dataclasses.replace(robot, controller=dataclasses.replace(robot.controller, **gains))
+    robot = dataclasses.replace(
+        robot, controller=dataclasses.replace(robot.controller, **gains)
+    )
     target = chirp(6, seconds=2.0)
     if gripping:
         target[300:, 6] -= 0.02
     m = recorded(robot, target, 8)
     known = dataclasses.replace(
-        m, kp={SIGNAL: 2 * ROBOT.kp_nm_per_rad[k]}, kd={SIGNAL: 2 * ROBOT.kd_nms_per_rad[k]}, payload_kg={"left": 0.4}
+        m,
+        kp={SIGNAL: 2 * ROBOT.kp_nm_per_rad[k]},
+        kd={SIGNAL: 2 * ROBOT.kd_nms_per_rad[k]},
+        payload_kg={"left": 0.4},
     )
     ratios = []
     for one in (m, known):
-        score = compare(TwinConfig(), Measurements((one,))).score(SIGNAL, "position", "fit")
+        score = compare(TwinConfig(), Measurements((one,))).score(
+            SIGNAL, "position", "fit"
+        )
         ratios.append(score.ratio)
     assert ratios[0] > 5
     assert ratios[1] < 1.5
@@ -134,7 +161,9 @@ def test_score_is_the_arithmetic_written_out():
 def test_uses_are_kept_apart():
     _, position = swing()
     good, bad = np.full(len(position), 1e-3), np.full(len(position), 5e-3)
-    found = comparison(trace(good, position, use="fit"), trace(bad, position, use="test"))
+    found = comparison(
+        trace(good, position, use="fit"), trace(bad, position, use="test")
+    )
     assert found.uses == ("fit", "test")
     assert [s.rmse for s in found.scores()] == pytest.approx([1e-3, 5e-3])
     assert found.score("left_joint5", "position", "validation") is None
@@ -147,14 +176,21 @@ def test_interval_holds_the_truth_although_neighbours_are_alike():
     _, position = swing(seconds=20.0)
     held = 0
     for _ in range(60):
-        score = comparison(trace(1e-3 * alike(rng, len(position)), position)).scores()[0]
+        score = comparison(trace(1e-3 * alike(rng, len(position)), position)).scores()[
+            0
+        ]
         held += score.interval[0] <= 1e-3 <= score.interval[1]
     assert held >= 50
 
 
 def test_only_some_joints_and_a_wrong_name():
     _, position = swing(2.0)
-    found = comparison(*[trace(0 * position, position, signal=s) for s in ("left_joint4", "left_joint5")])
+    found = comparison(
+        *[
+            trace(0 * position, position, signal=s)
+            for s in ("left_joint4", "left_joint5")
+        ]
+    )
     assert [s for s, _ in only(found, ["left_joint5"]).signals] == ["left_joint5"]
     with pytest.raises(TaccorlError, match=r"left_joint6.*left_joint5"):
         only(found, ["left_joint6"])
@@ -166,8 +202,12 @@ def presses() -> Measurements:
     return Measurements((made_press.press(0),), (made_press.press(1),))
 
 
-def test_pads_of_the_right_law_are_at_their_noise_and_of_another_stiffness_are_not(presses):
-    right = FlexiTacConfig(normal_stiffness_per_m=made_press.K_N, normal_damping_s_per_m=made_press.K_D)
+def test_pads_of_the_right_law_are_at_their_noise_and_of_another_stiffness_are_not(
+    presses,
+):
+    right = FlexiTacConfig(
+        normal_stiffness_per_m=made_press.K_N, normal_damping_s_per_m=made_press.K_D
+    )
     ball = made_press.ball_at(0.001, 0.003)
     scores = {}
     for name, sensor in (("right", right), ("nominal", FlexiTacConfig())):
@@ -181,12 +221,17 @@ def test_pads_of_the_right_law_are_at_their_noise_and_of_another_stiffness_are_n
     # Held readings are 900 δ measured and 1200 δ in the nominal twin: off by a third of what was measured.
     held = found.touches[0]
     felt = held.replayed > 20
-    assert np.median((held.replayed / np.maximum(held.measured, 1))[felt]) == pytest.approx(1200 / 900, rel=0.05)
+    assert np.median(
+        (held.replayed / np.maximum(held.measured, 1))[felt]
+    ) == pytest.approx(1200 / 900, rel=0.05)
 
 
 @pytest.mark.slow
 def test_touch_of_an_unknown_object_is_not_compared_and_says_so(presses):
-    with pytest.raises(TaccorlError, match=r"nothing to compare: left_gripper.*what was pressed is not known"):
+    with pytest.raises(
+        TaccorlError,
+        match=r"nothing to compare: left_gripper.*what was pressed is not known",
+    ):
         compare(TwinConfig(), presses)  # nothing but touch in it
     m = presses.fit[0]
     target = m.target.copy()

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.diagnosis.experiment_design.loads import LIBRARY, REST_S, CellsPart, LoadProfile, LoadRange, load_range
+from taccorl.diagnosis.experiment_design.loads import (
+    LIBRARY,
+    REST_S,
+    CellsPart,
+    LoadProfile,
+    LoadRange,
+    load_range,
+)
 from taccorl.diagnosis.experiment_design.plan import TELLS, Plan, plan
 from taccorl.errors import TaccorlError
 from taccorl.surrogate.cells import CellsCase, draw_cells, simulated
@@ -21,7 +28,11 @@ def pressed() -> tuple[CellsCase, Measurements]:
 
 
 def planned(
-    case: CellsCase, known: Measurements, *rivals: str, of: tuple[str, ...], allowed: LoadRange | None = None
+    case: CellsCase,
+    known: Measurements,
+    *rivals: str,
+    of: tuple[str, ...],
+    allowed: LoadRange | None = None,
 ) -> Plan:
     part = CellsPart(case.config(), known, allowed or load_range(case.config(), known))
     part.library = [p for p in part.library if p.name in of]
@@ -30,11 +41,17 @@ def planned(
 
 def test_a_ramp_takes_as_long_as_its_speed_needs():
     """0 … 12 N at 4 N/s is 3 s, where the corner's 0.5 s would be 24 N/s; the hold and the rests stay."""
-    profile = LoadProfile(name="x", knots=((0.0, 0.0), (1.0, 0.0), (1.5, 1.0), (3.5, 1.0), (9.5, 0.0)))
+    profile = LoadProfile(
+        name="x", knots=((0.0, 0.0), (1.0, 0.0), (1.5, 1.0), (3.5, 1.0), (9.5, 0.0))
+    )
     load = profile.load(12.0, 4.0, 100.0)
     assert len(load) == 100 * (1 + 3 + 2 + 6) + 1
     assert np.abs(np.diff(load)).max() * 100.0 == pytest.approx(4.0)
-    assert (load[:101] == 0).all() and load[400:601] == pytest.approx(12.0) and load[-1] == 0
+    assert (
+        (load[:101] == 0).all()
+        and load[400:601] == pytest.approx(12.0)
+        and load[-1] == 0
+    )
 
 
 @pytest.mark.parametrize("profile", LIBRARY, ids=[p.name for p in LIBRARY])
@@ -51,7 +68,9 @@ def test_load_and_speed_are_those_of_the_recordings_unless_given(pressed):
     found = load_range(case.config(), known)
     assert found.highest == pytest.approx(19.0, rel=0.02)
     assert found.speed == pytest.approx(127.0, rel=0.1)
-    assert load_range(case.config(), known, span=[0, 5], speed=2.0) == LoadRange(highest=5.0, speed=2.0)
+    assert load_range(case.config(), known, span=[0, 5], speed=2.0) == LoadRange(
+        highest=5.0, speed=2.0
+    )
     for options, said in (
         ({"span": [1, 5]}, r"--span=\[1, 5\].*--span=\[0, 20\]"),
         ({"span": [0, 21]}, "rated 20 N"),
@@ -76,11 +95,15 @@ def test_the_score_is_of_the_load_that_may_be_applied(pressed):
     case, known = pressed
     whole, tenth = (
         planned(
-            *(case, known, "taxel_creep", "touch_lag"), of=("three_loads",), allowed=LoadRange(highest=n, speed=100.0)
+            *(case, known, "taxel_creep", "touch_lag"),
+            of=("three_loads",),
+            allowed=LoadRange(highest=n, speed=100.0),
         ).planned[0]
         for n in (15.0, 1.5)
     )
-    assert tenth.made.target.max() == pytest.approx(1.5) and whole.made.target.max() == pytest.approx(15.0)
+    assert tenth.made.target.max() == pytest.approx(
+        1.5
+    ) and whole.made.target.max() == pytest.approx(15.0)
     assert tenth.worst < 0.2 * whole.worst
 
 
@@ -90,20 +113,36 @@ def test_a_press_lasts_as_long_at_any_rate_of_the_recordings(pressed):
 
     def at_1_khz(m):
         fast = m.resampled(1000.0)
-        return dataclasses.replace(fast, temperature_c=np.interp(fast.time_s, m.time_s, m.temperature_c))
+        return dataclasses.replace(
+            fast, temperature_c=np.interp(fast.time_s, m.time_s, m.temperature_c)
+        )
 
-    fast = Measurements(tuple(map(at_1_khz, known.fit)), tuple(map(at_1_khz, known.validation)))
-    (slow_press,), (fast_press,) = (
-        planned(case, m, "touch_lag", "touch_delay", of=("taps",)).planned for m in (known, fast)
+    fast = Measurements(
+        tuple(map(at_1_khz, known.fit)), tuple(map(at_1_khz, known.validation))
     )
-    assert (slow_press.made.rate_hz, fast_press.made.rate_hz) == (pytest.approx(100.0), pytest.approx(200.0))
-    slow_s, fast_s = ((len(p.made.target) - 1) / p.made.rate_hz for p in (slow_press, fast_press))
+    (slow_press,), (fast_press,) = (
+        planned(case, m, "touch_lag", "touch_delay", of=("taps",)).planned
+        for m in (known, fast)
+    )
+    assert (slow_press.made.rate_hz, fast_press.made.rate_hz) == (
+        pytest.approx(100.0),
+        pytest.approx(200.0),
+    )
+    slow_s, fast_s = (
+        (len(p.made.target) - 1) / p.made.rate_hz for p in (slow_press, fast_press)
+    )
     assert fast_s == pytest.approx(slow_s, abs=0.1) == pytest.approx(9.5, abs=0.1)
 
 
 def test_one_cell_alone_is_for_cells_with_loads_of_their_own():
     case = draw_cells("taxel_crosstalk", 4)
-    found = planned(case, simulated(case), "taxel_crosstalk", "taxel_saturation", of=("three_loads", "one_cell"))
+    found = planned(
+        case,
+        simulated(case),
+        "taxel_crosstalk",
+        "taxel_saturation",
+        of=("three_loads", "one_cell"),
+    )
     alone = next(p for p in found.planned if p.name == "one_cell")
     assert (alone.made.target.max(axis=0) > 0).sum() == 1
     both = next(p for p in found.planned if p.name == "three_loads")
@@ -111,7 +150,9 @@ def test_one_cell_alone_is_for_cells_with_loads_of_their_own():
     assert alone.worst > TELLS
 
     shared = draw_cells("taxel_creep", 3)
-    found = planned(shared, simulated(shared), "taxel_creep", "touch_lag", of=("one_cell", "taps"))
+    found = planned(
+        shared, simulated(shared), "taxel_creep", "touch_lag", of=("one_cell", "taps")
+    )
     assert [p.name for p in found.planned] == ["taps"]
 
 
@@ -128,15 +169,28 @@ def test_the_planned_press_settles_a_tie_of_independent_data():
 
     case = CellsCase(seed=5, hidden="touch_delay", values={"delay_s": 0.06})
     slow, taps = cells._presses((0.4, 3.0, 2.0), (0.9, 4.0, 2.0)), OF_NAME["taps"].knots
-    names = {"slow": ("fit", slow), "slow_again": ("fit", slow), "other": ("validation", slow), "taps": ("fit", taps)}
+    names = {
+        "slow": ("fit", slow),
+        "slow_again": ("fit", slow),
+        "other": ("validation", slow),
+        "taps": ("fit", taps),
+    }
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cells, "RECORDINGS", names | {"taps_too": ("validation", taps)})
         recorded = {name: cells.record(case, name) for name in cells.RECORDINGS}
-    recorded["slow_again"] = dataclasses.replace(recorded["slow_again"], repeat_of="slow")
+    recorded["slow_again"] = dataclasses.replace(
+        recorded["slow_again"], repeat_of="slow"
+    )
     machine = CellsMachine(case.config())
-    before = Measurements((recorded["slow"], recorded["slow_again"]), (recorded["other"],))
-    after = Measurements((*before.fit, recorded["taps"]), (*before.validation, recorded["taps_too"]))
-    tied, settled = (machine.diagnose(machine.config.name, m).diagnosis for m in (before, after))
+    before = Measurements(
+        (recorded["slow"], recorded["slow_again"]), (recorded["other"],)
+    )
+    after = Measurements(
+        (*before.fit, recorded["taps"]), (*before.validation, recorded["taps_too"])
+    )
+    tied, settled = (
+        machine.diagnose(machine.config.name, m).diagnosis for m in (before, after)
+    )
     assert settled.names == ("touch_delay",) and not settled.rivals.get("touch_delay")
     ((first, others),) = tied.rivals.items()
     assert {"touch_lag", "touch_delay"} <= {first, *others}

@@ -39,7 +39,10 @@ def targets(rng: np.random.Generator) -> np.ndarray:
         count = int(rng.uniform(0.7, 2.2) * ROW_HZ)
         goal = np.clip(rng.uniform(-1, 1), q - count / ROW_HZ, q + count / ROW_HZ)
         s = np.arange(1, count + 1) / count
-        rows += [*(q + (goal - q) * s**3 * (10 - 15 * s + 6 * s * s)), *[goal] * int(rng.uniform(0, 1.5) * ROW_HZ)]
+        rows += [
+            *(q + (goal - q) * s**3 * (10 - 15 * s + 6 * s * s)),
+            *[goal] * int(rng.uniform(0, 1.5) * ROW_HZ),
+        ]
         q = goal
     return np.round(np.array(rows[:ROWS]) / COUNT) * COUNT
 
@@ -54,7 +57,9 @@ def simulated(sent: np.ndarray, late: np.ndarray, row_steps: int) -> np.ndarray:
             seen[:, step // row_steps] = q
         goal = sent[every, np.maximum(step - late, 0) // row_steps]
         free = v + STEP_S * (KP * (goal - q) - DAMPING * v) / INERTIA
-        after = np.sign(free) * np.maximum(np.abs(free) - STEP_S * FRICTION / INERTIA, 0.0)
+        after = np.sign(free) * np.maximum(
+            np.abs(free) - STEP_S * FRICTION / INERTIA, 0.0
+        )
         q += 0.5 * STEP_S * (v + after)
         v = after
     return seen
@@ -74,14 +79,26 @@ def fitted_delays(folder: Path, row_steps: int) -> tuple[np.ndarray, np.ndarray]
             of_signal(f"row {n}", ROW_HZ, sent[n], seen[n], "swing")
             for n in range(k * RECORDINGS, (k + 1) * RECORDINGS)
         ]
-        problem = JointProblem(robot, "swing", Measurements(tuple(every[:3]), tuple(every[3:])))
+        problem = JointProblem(
+            robot, "swing", Measurements(tuple(every[:3]), tuple(every[3:]))
+        )
         names = (*problem.present, "command_delay")
         starts = {f.name: f.start for f in problem.candidates["command_delay"].frees}
         found, steps = over_own_scale(
-            problem, fit(problem, problem.fit, names, problem.start | starts, 60), problem.fit
+            problem,
+            fit(problem, problem.fit, names, problem.start | starts, 60),
+            problem.fit,
         )
-        found = dataclasses.replace(found, moved=moved_by(problem, found, problem.fit, problem.validation, steps))
-        stated = {n.name: n for n in absolute_numbers(found, inertia_kgm2=problem.inertia_kgm2, pinned=True, kd=0.0)}
+        found = dataclasses.replace(
+            found,
+            moved=moved_by(problem, found, problem.fit, problem.validation, steps),
+        )
+        stated = {
+            n.name: n
+            for n in absolute_numbers(
+                found, inertia_kgm2=problem.inertia_kgm2, pinned=True, kd=0.0
+            )
+        }
         delay = stated["command_delay.delay_s"]
         delays.append((delay.value, delay.low, delay.high))
     return late * STEP_S * STEPS / row_steps, np.array(delays)
@@ -94,11 +111,15 @@ def test_the_interval_of_a_delay_at_30_hz_holds_the_truth(tmp_path: Path) -> Non
     truth_s, delays = fitted_delays(tmp_path, STEPS)
     value, low, high = delays.T
     print(summary(truth_s, delays))
-    assert sum((low <= truth_s) & (truth_s <= high)) >= 9 and np.mean(high - value) < 1e-3
+    assert (
+        sum((low <= truth_s) & (truth_s <= high)) >= 9 and np.mean(high - value) < 1e-3
+    )
 
 
 @pytest.mark.slow
-def test_rows_that_last_longer_than_their_stamps_say_make_a_delay_too_short(tmp_path: Path) -> None:
+def test_rows_that_last_longer_than_their_stamps_say_make_a_delay_too_short(
+    tmp_path: Path,
+) -> None:
     """A limit, not a promise (docs/limits.md): rows of 33.5 ms that are stamped 33.33 ms. The motion then looks faster than the
     known inertia allows, and a shorter delay takes up a part of that."""
     truth_s, delays = fitted_delays(tmp_path, STEPS + 1)

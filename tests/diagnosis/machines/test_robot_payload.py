@@ -36,7 +36,11 @@ MODEL = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integrato
 <joint name="elbow" axis="0 1 0" range="-2 2" armature="0.02"/>{tip}</body></body></worldbody></mujoco>"""
 HEAD = "kind: robot\nmodel: arm.xml\ngravity_compensation: 1.0\njoints:\n"
 DRIVE = "  {}: {{kp: {}, kd: {}, rotor_inertia: {}, loop_hz: 1000.0, effort_after_target: true}}\n"
-FILE = HEAD + DRIVE.format("yaw", 150.0, 6.0, 0.05) + DRIVE.format("elbow", 80.0, 3.0, 0.02)
+FILE = (
+    HEAD
+    + DRIVE.format("yaw", 150.0, 6.0, 0.05)
+    + DRIVE.format("elbow", 80.0, 3.0, 0.02)
+)
 SCARA_KG, SCARA_AT_M = 0.6, (0.05, 0.0, -0.06)
 SCARA_JOINTS = ("shoulder", "elbow", "lift")
 SCARA_MODEL = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/><worldbody>
@@ -47,7 +51,11 @@ SCARA_MODEL = """<mujoco><compiler angle="radian"/><option timestep="0.0005" int
 <body name="quill" pos="0.2 0 0"><inertial pos="0 0 -0.05" mass="1.5" diaginertia="0.004 0.004 0.0006"/>
 <joint name="lift" type="slide" axis="0 0 1" range="-0.2 0.2" armature="2"/>{tip}</body></body></body></worldbody></mujoco>"""
 SCARA_TIP = '<body pos="0.05 0 -0.11"><inertial pos="0 0 0" mass="0.6" diaginertia="1e-6 1e-6 1e-6"/></body>'
-SCARA_FILE = HEAD + DRIVE.format("shoulder", 500.0, 30.0, 0.12) + DRIVE.format("elbow", 250.0, 12.0, 0.06)
+SCARA_FILE = (
+    HEAD
+    + DRIVE.format("shoulder", 500.0, 30.0, 0.12)
+    + DRIVE.format("elbow", 250.0, 12.0, 0.06)
+)
 SCARA_FILE += DRIVE.format("lift", 6000.0, 300.0, 2.0)
 CONSIDERED = ("payload", "command_delay", "command_lag", "coulomb_friction", "armature")
 WITHOUT = [name for name in effects if name not in CONSIDERED]
@@ -86,24 +94,54 @@ def machine(folder: Path, model: str = TWO.known, file: str = FILE) -> RobotMach
 
 
 def recorded(
-    name: str, joint: int, amplitude: float, fastest_hz: float, seed: int, again: str | None = None, arm: Arm = TWO
+    name: str,
+    joint: int,
+    amplitude: float,
+    fastest_hz: float,
+    seed: int,
+    again: str | None = None,
+    arm: Arm = TWO,
 ) -> Measurement:
     """A chirp of one joint for 5 s, from rest; rows at 200 Hz. Control at 1 kHz with differences of positions as speeds, and with
     the weight of the arm without the mass."""
-    model, known = (mujoco.MjModel.from_xml_string(xml) for xml in (arm.true, arm.known))
-    data, believed, rng = mujoco.MjData(model), mujoco.MjData(known), np.random.default_rng(seed)
+    model, known = (
+        mujoco.MjModel.from_xml_string(xml) for xml in (arm.true, arm.known)
+    )
+    data, believed, rng = (
+        mujoco.MjData(model),
+        mujoco.MjData(known),
+        np.random.default_rng(seed),
+    )
     time_s = np.arange(1100) * 0.005
-    moving, target = np.clip(time_s - 0.5, 0.0, None), np.tile(arm.rest, (len(time_s), 1))
-    wave = amplitude * np.sin(2 * np.pi * (0.1 + 0.5 * (fastest_hz - 0.1) * moving / 5.0) * moving)[:, None]
-    target[:, (0 if arm.steps else joint) : joint + 1] += amplitude * np.sign(wave) if arm.steps else wave
-    for _ in range(20):  # where it rests: the controller carries the weight of the known bodies only
+    moving, target = (
+        np.clip(time_s - 0.5, 0.0, None),
+        np.tile(arm.rest, (len(time_s), 1)),
+    )
+    wave = (
+        amplitude
+        * np.sin(2 * np.pi * (0.1 + 0.5 * (fastest_hz - 0.1) * moving / 5.0) * moving)[
+            :, None
+        ]
+    )
+    target[:, (0 if arm.steps else joint) : joint + 1] += (
+        amplitude * np.sign(wave) if arm.steps else wave
+    )
+    for _ in range(
+        20
+    ):  # where it rests: the controller carries the weight of the known bodies only
         data.qpos[:] = (
-            target[0] if not data.qfrc_bias.any() else target[0] + (believed.qfrc_bias - data.qfrc_bias) / arm.kp
+            target[0]
+            if not data.qfrc_bias.any()
+            else target[0] + (believed.qfrc_bias - data.qfrc_bias) / arm.kp
         )
         believed.qpos[:] = data.qpos
         mujoco.mj_forward(model, data)
         mujoco.mj_forward(known, believed)
-    measured, effort, last = np.empty_like(target), np.empty_like(target), data.qpos.copy()
+    measured, effort, last = (
+        np.empty_like(target),
+        np.empty_like(target),
+        data.qpos.copy(),
+    )
     for step in range(10 * len(time_s)):
         row = step // 10
         if step % 2 == 0:
@@ -120,46 +158,77 @@ def recorded(
         mujoco.mj_step(model, data)
     measured += arm.noise * rng.normal(size=target.shape)
     effort += arm.noise_effort * rng.normal(size=target.shape)
-    return logged(name, arm.joints, arm.units, again, time_s=time_s, target=target, measured=measured, effort=effort)
+    return logged(
+        name,
+        arm.joints,
+        arm.units,
+        again,
+        time_s=time_s,
+        target=target,
+        measured=measured,
+        effort=effort,
+    )
 
 
-def test_a_wrong_torque_constant_of_a_joint_that_weight_loads_is_no_mass(tmp_path: Path) -> None:
+def test_a_wrong_torque_constant_of_a_joint_that_weight_loads_is_no_mass(
+    tmp_path: Path,
+) -> None:
     """Efforts times 1.3. With gains that nobody knows a payload makes up for it, by more numbers."""
     arm = TWO._replace(true=TWO.known, delay_s=0.0)
-    one, again = (recorded(n, 1, 0.3, 2.5, k, of, arm) for k, n, of in ((1, "a", None), (11, "b", "a")))
+    one, again = (
+        recorded(n, 1, 0.3, 2.5, k, of, arm)
+        for k, n, of in ((1, "a", None), (11, "b", "a"))
+    )
     other = recorded("c", 1, 0.25, 2.2, 21, None, arm)
-    fit, validation = ([dataclasses.replace(m, effort=1.3 * m.effort) for m in of] for of in ((one, again), (other,)))
+    fit, validation = (
+        [dataclasses.replace(m, effort=1.3 * m.effort) for m in of]
+        for of in ((one, again), (other,))
+    )
     made = Measurements(tuple(fit), tuple(validation))
     found = machine(tmp_path).diagnose("elbow", made, **WAY, gains="fitted").diagnosis
-    assert found.names == () and found.base["effort_scale"] == pytest.approx(1.3, rel=0.01)
+    assert found.names == () and found.base["effort_scale"] == pytest.approx(
+        1.3, rel=0.01
+    )
     assert [c.name for c in found.changed] == ["effort_scale"]
 
 
 @pytest.mark.slow
-def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(tmp_path: Path) -> None:
+def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(
+    tmp_path: Path,
+) -> None:
     """0.35 kg at 0.4 m from the yaw axis is half of its inertia: without it the delay is wrong, and efforts need a factor."""
     fit, validation = [], []
     for j, name in enumerate(JOINTS):
-        fit += [recorded(name, j, 0.3, 2.5, j), recorded(f"{name}_again", j, 0.3, 2.5, 10 + j, name)]
+        fit += [
+            recorded(name, j, 0.3, 2.5, j),
+            recorded(f"{name}_again", j, 0.3, 2.5, 10 + j, name),
+        ]
         validation.append(recorded(f"{name}_other", j, 0.25, 2.2, 20 + j))
     made, arm = Measurements(tuple(fit), tuple(validation)), machine(tmp_path)
     alone = arm.diagnose("yaw", made, **WAY).diagnosis
     low, high = alone.intervals["command_delay.delay_s"]
     assert not low < DELAY_S < high
-    assert alone.base["effort_scale"] > 1.15 and "effort_scale" in [c.name for c in alone.changed]
+    assert alone.base["effort_scale"] > 1.15 and "effort_scale" in [
+        c.name for c in alone.changed
+    ]
 
     yaw, elbow = diagnose_parts(arm, JOINTS, made, **WAY)
     (payload,) = elbow.diagnosis.effects
     assert payload.name == "payload"
     values = {p.name: getattr(payload, p.name) for p in payload.parameters()}
     assert values["mass_kg"] == pytest.approx(MASS_KG, rel=0.02)
-    assert values["x_m"] == pytest.approx(0.15, abs=0.02)  # from the forearm's centre of mass
+    assert values["x_m"] == pytest.approx(
+        0.15, abs=0.02
+    )  # from the forearm's centre of mass
     assert abs(values["y_m"]) < 2e-3, "the elbow turns about y"
     assert "forearm" in elbow.remark
     assert [e.name for e in yaw.diagnosis.effects] == ["command_delay"]
     low, high = yaw.diagnosis.intervals["command_delay.delay_s"]
     assert low < DELAY_S < high and high - low < 5e-3
-    assert yaw.diagnosis.errors["after"]["validation"] < 0.2 * alone.errors["after"]["validation"]
+    assert (
+        yaw.diagnosis.errors["after"]["validation"]
+        < 0.2 * alone.errors["after"]["validation"]
+    )
     assert any("elbow" in r for r in yaw.diagnosis.remarks)
     assert "effort_scale" not in [c.name for c in yaw.diagnosis.changed]
 
@@ -167,26 +236,42 @@ def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(
     added = {*mended.effects} - {"speed_delay"}  # its speed is not delayed
     assert left == "" and added == {"command_delay", "payload"}
     traces = [m.compare(made).traces for m in (arm, mended)]
-    own = [[t for t in of if (t.kind, t.use) == ("position", "validation")] for of in traces]
-    before, after = ({t.signal: np.sqrt(np.mean(t.residual**2)) for t in of} for of in own)
+    own = [
+        [t for t in of if (t.kind, t.use) == ("position", "validation")]
+        for of in traces
+    ]
+    before, after = (
+        {t.signal: np.sqrt(np.mean(t.residual**2)) for t in of} for of in own
+    )
     assert all(after[name] < 0.1 * before[name] for name in JOINTS)
 
 
 def test_one_body_has_one_payload(tmp_path: Path) -> None:
-    model = MODEL.format(tip="").replace('name="yaw" axis="0 0 1"', 'name="yaw" axis="0 1 0"')
+    model = MODEL.format(tip="").replace(
+        'name="yaw" axis="0 0 1"', 'name="yaw" axis="0 1 0"'
+    )
     arm = machine(tmp_path)
     (tmp_path / "arm.xml").write_text(model)
     arm = dataclasses.replace(arm, robot=load_machine(tmp_path / "robot.yaml").robot)  # type: ignore[attr-defined]
-    held = [Addition(name, [make_effect("payload", mass_kg=0.2)], {}, {}) for name in JOINTS]
+    held = [
+        Addition(name, [make_effect("payload", mass_kg=0.2)], {}, {}) for name in JOINTS
+    ]
     with pytest.raises(TaccorlError, match=r"payload.*elbow.*yaw.*forearm"):
         arm.with_additions(held)
     held_at_elbow = arm.with_additions(held[1:])
-    assert held_at_elbow.effect("payload", "yaw", {"mass_kg": 0.1}) is None, "yaw feels the elbow's"
+    assert held_at_elbow.effect("payload", "yaw", {"mass_kg": 0.1}) is None, (
+        "yaw feels the elbow's"
+    )
     # Bounds of a search follow the robot: half of 0.15 + 0.1 m of links, or twice 0.1 m from the elbow to the centre of mass.
     payload = arm.effect("payload", "elbow", {"mass_kg": 0.1, "x_m": 0.18})
     ends = {p.name: (p.low, p.high) for p in payload.parameters()}
-    assert ends["x_m"] == (-0.2, 0.2) and ends["mass_kg"] == (pytest.approx(-0.95 * 0.8), 1.5)
-    assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(Payload) == {"y_m": 0.0}
+    assert ends["x_m"] == (-0.2, 0.2) and ends["mass_kg"] == (
+        pytest.approx(-0.95 * 0.8),
+        1.5,
+    )
+    assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(
+        Payload
+    ) == {"y_m": 0.0}
 
 
 TEACH_KG, TEACH_AT_M = 0.15, (0.02, -0.01, 0.03)
@@ -205,16 +290,28 @@ TEACH_FILE = "kind: robot\nmodel: arm.xml\njoints:\n" + "".join(
 
 
 def taught(
-    name: str, seed: int, model: str, factors: Sequence[float] = (1.0, 1.0, 1.0), rows: int = 600
+    name: str,
+    seed: int,
+    model: str,
+    factors: Sequence[float] = (1.0, 1.0, 1.0),
+    rows: int = 600,
 ) -> Measurement:
     """All joints move at once for 12 s between random targets, from rest; rows at 50 Hz, positions only. Nothing compensates
     weight, and each drive gives ``factors`` times its torque."""
     rng, model_ = np.random.default_rng(seed), mujoco.MjModel.from_xml_string(model)
     data, time_s = mujoco.MjData(model_), np.arange(rows) * 0.02
-    waves = rng.uniform(0.1, 0.4, (3, 4)), rng.uniform(0.0, 6.3, (3, 4)), rng.uniform(0.1, 0.3, (3, 4))
+    waves = (
+        rng.uniform(0.1, 0.4, (3, 4)),
+        rng.uniform(0.0, 6.3, (3, 4)),
+        rng.uniform(0.1, 0.3, (3, 4)),
+    )
     ease = np.clip((time_s - 0.2) / 2.0, 0.0, 1.0) ** 2
     target = ease[:, None] * np.stack(
-        [(a * np.sin(6.28 * f * time_s[:, None] + p)).sum(1) for f, p, a in zip(*waves, strict=True)], axis=1
+        [
+            (a * np.sin(6.28 * f * time_s[:, None] + p)).sum(1)
+            for f, p, a in zip(*waves, strict=True)
+        ],
+        axis=1,
     )
     measured = np.empty_like(target)
     for step in range(-6000, 40 * len(time_s)):
@@ -224,7 +321,14 @@ def taught(
         data.qfrc_applied[:] = 18.0 * np.array(factors) * (target[row] - data.qpos)
         mujoco.mj_step(model_, data)
     measured += 3e-4 * rng.normal(size=target.shape)
-    return logged(name, TEACH_JOINTS, ("rad",) * 3, time_s=time_s, target=target, measured=measured)
+    return logged(
+        name,
+        TEACH_JOINTS,
+        ("rad",) * 3,
+        time_s=time_s,
+        target=target,
+        measured=measured,
+    )
 
 
 def teaching(model: str, factors: Sequence[float] = (1.0, 1.0, 1.0)) -> Measurements:
@@ -236,24 +340,42 @@ def teaching(model: str, factors: Sequence[float] = (1.0, 1.0, 1.0)) -> Measurem
 def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
     """Most of the mass's torque at the lift joint changes because elbow and wrist move. Each joint alone could have 0.7 times its
     torque instead; a drive that has leaves no mass."""
-    without = [name for name in effects if name not in ("payload", "torque_scale", "direction_gain", "unbalance")]
+    without = [
+        name
+        for name in effects
+        if name not in ("payload", "torque_scale", "direction_gain", "unbalance")
+    ]
     robot = machine(tmp_path, TEACH_MODEL.format(tip=""), TEACH_FILE)
     one, made = SearchConfig(max_effects=1), teaching(TEACH_MODEL.format(tip=TEACH_TIP))
     found = diagnose_parts(robot, TEACH_JOINTS, made, search=one, without=without)
     added = {f.part: f.diagnosis.names for f in found if f.diagnosis.effects}
-    added = {part: [n for n in names if n != "viscous_friction"] for part, names in added.items()}
+    added = {
+        part: [n for n in names if n != "viscous_friction"]
+        for part, names in added.items()
+    }
     (owner,) = [part for part, names in added.items() if names]
     assert added[owner] == ["payload"]
     assert all(f.diagnosis.errors["after"]["validation"] < 1.2 for f in found)
-    (payload,) = [e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)]
+    (payload,) = [
+        e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)
+    ]
     true = {"mass_kg": TEACH_KG, "x_m": TEACH_AT_M[0], "z_m": TEACH_AT_M[2]}
     for name, value in true.items():
         low, high = payload.interval[name]
         assert low <= value <= high and low <= getattr(payload, name) <= high, name
     low, high = payload.interval["mass_kg"]
     assert high - low < 0.03
-    (stated,) = [n for f in found if f.part == owner for n in f.known.identifiable if n.name == "payload.mass_kg"]
-    assert (stated.low, stated.high) == (low, high) and stated.words() in payload.evidence, "one interval everywhere"
+    (stated,) = [
+        n
+        for f in found
+        if f.part == owner
+        for n in f.known.identifiable
+        if n.name == "payload.mass_kg"
+    ]
+    assert (stated.low, stated.high) == (
+        low,
+        high,
+    ) and stated.words() in payload.evidence, "one interval everywhere"
 
     made = teaching(TEACH_MODEL.format(tip=""), (0.7, 1.0, 1.0))
     weak = diagnose_parts(robot, TEACH_JOINTS, made, search=one, without=without)
@@ -264,15 +386,22 @@ def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_place_of_a_mass_is_what_all_joints_say_that_feel_it(tmp_path: Path) -> None:
+def test_the_place_of_a_mass_is_what_all_joints_say_that_feel_it(
+    tmp_path: Path,
+) -> None:
     """The forearm is 2.5 times as heavy as its model, in 5 s of motion. A mass in the hand explains the lift joint, but leaves a
     constant torque missing at elbow and wrist, which nothing has."""
     plain = TEACH_MODEL.format(tip="")
-    heavy = plain.replace('mass="0.1" diaginertia="5e-5 2e-4 2e-4"', 'mass="0.25" diaginertia="12.5e-5 5e-4 5e-4"')
+    heavy = plain.replace(
+        'mass="0.1" diaginertia="5e-5 2e-4 2e-4"',
+        'mass="0.25" diaginertia="12.5e-5 5e-4 5e-4"',
+    )
     made = [taught(f"episode_{seed}", seed, heavy, rows=250) for seed in range(3)]
     way = WAY | {"without": [name for name in effects if name != "payload"]}
     robot = machine(tmp_path, plain, TEACH_FILE)
-    lift, elbow, wrist = diagnose_parts(robot, TEACH_JOINTS, Measurements(tuple(made[:2]), tuple(made[2:])), **way)
+    lift, elbow, wrist = diagnose_parts(
+        robot, TEACH_JOINTS, Measurements(tuple(made[:2]), tuple(made[2:])), **way
+    )
     (payload,) = [e for e in lift.diagnosis.effects if isinstance(e, Payload)]
     low, high = payload.interval["mass_kg"]
     assert payload.link == "fore" and low <= 0.15 <= high and high - low < 0.015
@@ -289,23 +418,53 @@ def test_a_link_that_is_too_light_or_too_heavy_is_named_where_efforts_are_the_in
     contradicts it. Of too much, efforts that are off by a factor, with other friction, would explain nearly as much."""
     plain = TEACH_MODEL.format(tip="")
     heavy = plain.replace('0.08 0 0.01"\nmass="0.1"', '0.08 0 0.01"\nmass="0.25"')
-    true, model = {0.15: (heavy, plain), -0.15: (plain, heavy), 0.0: (heavy, heavy)}[missing_kg]
-    robot = machine(tmp_path, model, TEACH_FILE.replace("kp: 18.0, kd: 0.0", "law: effort"))
+    true, model = {0.15: (heavy, plain), -0.15: (plain, heavy), 0.0: (heavy, heavy)}[
+        missing_kg
+    ]
+    robot = machine(
+        tmp_path, model, TEACH_FILE.replace("kp: 18.0, kd: 0.0", "law: effort")
+    )
 
-    def driven(m: Measurement) -> Measurement:  # the drive's torque jumps with its target at a row: its mean there
-        mean = 9.0 * (m.target + np.vstack([m.target[:1], m.target[:-1]])) - 18.0 * m.measured
-        return dataclasses.replace(m, target=m.measured.copy(), effort=mean, target_kinds=("effort",) * 3)
+    def driven(
+        m: Measurement,
+    ) -> (
+        Measurement
+    ):  # the drive's torque jumps with its target at a row: its mean there
+        mean = (
+            9.0 * (m.target + np.vstack([m.target[:1], m.target[:-1]]))
+            - 18.0 * m.measured
+        )
+        return dataclasses.replace(
+            m, target=m.measured.copy(), effort=mean, target_kinds=("effort",) * 3
+        )
 
     made = [driven(taught(f"episode_{seed}", seed, true)) for seed in range(5)]
-    kept = ("payload", "unbalance", "armature", *["viscous_friction"] * (missing_kg <= 0.0))  # else it stays as it is
-    way = {"search": SearchConfig(max_effects=1), "without": [name for name in effects if name not in kept]}
-    found = diagnose_parts(robot, TEACH_JOINTS, Measurements(tuple(made[:3]), tuple(made[3:])), **way)
-    for payload in [e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)]:
+    kept = (
+        "payload",
+        "unbalance",
+        "armature",
+        *["viscous_friction"] * (missing_kg <= 0.0),
+    )  # else it stays as it is
+    way = {
+        "search": SearchConfig(max_effects=1),
+        "without": [name for name in effects if name not in kept],
+    }
+    found = diagnose_parts(
+        robot, TEACH_JOINTS, Measurements(tuple(made[:3]), tuple(made[3:])), **way
+    )
+    for payload in [
+        e for f in found for e in f.diagnosis.effects if isinstance(e, Payload)
+    ]:
         low, high = payload.interval["mass_kg"]
-        assert payload.link == "fore" and low <= missing_kg <= high and high - low < 0.03
+        assert (
+            payload.link == "fore" and low <= missing_kg <= high and high - low < 0.03
+        )
         assert ("fore is lighter" in payload.evidence) == (missing_kg < 0.0)
     assert len(payloads(found)) == (missing_kg != 0.0)
-    assert all(f.diagnosis.errors["after"]["validation"] < 1.2 and not f.diagnosis.changed for f in found)
+    assert all(
+        f.diagnosis.errors["after"]["validation"] < 1.2 and not f.diagnosis.changed
+        for f in found
+    )
 
 
 def test_of_masses_at_the_floor_the_one_that_surely_leaves_less_is_better() -> None:
@@ -313,23 +472,47 @@ def test_of_masses_at_the_floor_the_one_that_surely_leaves_less_is_better() -> N
     rng, share = np.random.default_rng(0), np.full(40, 1 / 40)
 
     def mass(holds: bool = True, **left: float) -> OneMass:
-        own = {j: Blocks(level + 0.2 * rng.random(40), share) for j, level in left.items()}
-        return OneMass(cast(Fit, None), holds, True, {j: (Blocks(0.3 + 0.0 * share, share), b) for j, b in own.items()})
+        own = {
+            j: Blocks(level + 0.2 * rng.random(40), share) for j, level in left.items()
+        }
+        return OneMass(
+            cast(Fit, None),
+            holds,
+            True,
+            {j: (Blocks(0.3 + 0.0 * share, share), b) for j, b in own.items()},
+        )
 
     more = dict.fromkeys("abcde", 0.5)
-    hand, same, fore = mass(**more, lift=0.5, wrist=0.5), mass(**more, lift=0.5, wrist=0.5), mass(**more, lift=0.3)
-    assert {*hand.errors.values()} == {1.0} and is_better(fore, hand, hand) and not is_better(hand, fore, hand)
+    hand, same, fore = (
+        mass(**more, lift=0.5, wrist=0.5),
+        mass(**more, lift=0.5, wrist=0.5),
+        mass(**more, lift=0.3),
+    )
+    assert (
+        {*hand.errors.values()} == {1.0}
+        and is_better(fore, hand, hand)
+        and not is_better(hand, fore, hand)
+    )
     assert not is_better(same, hand, hand) and not is_better(hand, same, hand), "a tie"
-    assert is_better(hand, mass(False, lift=0.1), hand) and not is_better(mass(False, lift=0.1), hand, hand)
+    assert is_better(hand, mass(False, lift=0.1), hand) and not is_better(
+        mass(False, lift=0.1), hand, hand
+    )
 
 
 def scara_recordings(arm: Arm, joints: Sequence[str] = SCARA_JOINTS) -> Measurements:
     fit, validation = [], []
-    for j, (name, amplitude) in enumerate(zip(SCARA_JOINTS, (0.3, 0.3, 0.05), strict=True)):
+    for j, (name, amplitude) in enumerate(
+        zip(SCARA_JOINTS, (0.3, 0.3, 0.05), strict=True)
+    ):
         if name in joints:
             runs = ((name, j, None), (f"{name}_again", 10 + j, name))
-            fit += [recorded(one, j, amplitude, 2.5, seed, of, arm) for one, seed, of in runs]
-            validation.append(recorded(f"{name}_other", j, 0.8 * amplitude, 2.2, 20 + j, arm=arm))
+            fit += [
+                recorded(one, j, amplitude, 2.5, seed, of, arm)
+                for one, seed, of in runs
+            ]
+            validation.append(
+                recorded(f"{name}_other", j, 0.8 * amplitude, 2.2, 20 + j, arm=arm)
+            )
     return Measurements(tuple(fit), tuple(validation))
 
 
@@ -337,15 +520,25 @@ def test_a_joint_is_judged_beside_what_its_neighbour_lacks(tmp_path: Path) -> No
     """The shoulder of a SCARA follows its targets 12 ms late. A model without this delay accelerates the shoulder too early, and
     that acceleration loads the elbow in the model at the wrong time."""
     arm = SCARA._replace(true=SCARA.known, delay_s=DELAY_S, steps=True)
-    runs = [recorded(f"m{k}", 1, 0.12, hz, k, None, arm) for k, hz in enumerate((1.5, 1.1))]
-    made, robot = Measurements((runs[0],), (runs[1],)), machine(tmp_path, SCARA.known, SCARA_FILE)
+    runs = [
+        recorded(f"m{k}", 1, 0.12, hz, k, None, arm) for k, hz in enumerate((1.5, 1.1))
+    ]
+    made, robot = (
+        Measurements((runs[0],), (runs[1],)),
+        machine(tmp_path, SCARA.known, SCARA_FILE),
+    )
     way = WAY | {"without": [*WITHOUT, "payload", "command_lag", "armature"]}
     alone = robot.diagnose("elbow", made, **way).diagnosis
-    assert alone.status == "something_else" and alone.errors["after"]["validation"] > 3.0
+    assert (
+        alone.status == "something_else" and alone.errors["after"]["validation"] > 3.0
+    )
     shoulder, elbow = diagnose_parts(robot, SCARA_JOINTS[:2], made, **way)
     low, high = shoulder.diagnosis.intervals["command_delay.delay_s"]
     assert low < DELAY_S < high and shoulder.diagnosis.names == ("command_delay",)
-    assert not elbow.diagnosis.names and elbow.diagnosis.errors["after"]["validation"] < 1.4
+    assert (
+        not elbow.diagnosis.names
+        and elbow.diagnosis.errors["after"]["validation"] < 1.4
+    )
     assert any("mend shoulder first" in text for text in elbow.diagnosis.remarks)
 
 
@@ -354,16 +547,28 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
     """0.6 kg: 5.886 N of weight at the slide, and m r² at the vertical hinges, which alone look like inertias of three rotors."""
     made, robot = scara_recordings(SCARA), machine(tmp_path, SCARA.known, SCARA_FILE)
     shoulder, elbow, lift = diagnose_parts(robot, SCARA_JOINTS, made, **WAY)
-    assert not {"armature", "payload"} & {*shoulder.diagnosis.names, *elbow.diagnosis.names}
+    assert not {"armature", "payload"} & {
+        *shoulder.diagnosis.names,
+        *elbow.diagnosis.names,
+    }
     (payload,) = lift.diagnosis.effects
     assert isinstance(payload, Payload)
     low, high = payload.interval["mass_kg"]
-    assert low <= SCARA_KG <= high and high - low < 0.03 and payload.mass_kg == pytest.approx(SCARA_KG, abs=0.01)
+    assert (
+        low <= SCARA_KG <= high
+        and high - low < 0.03
+        and payload.mass_kg == pytest.approx(SCARA_KG, abs=0.01)
+    )
     low, high = payload.interval["y_m"]
     assert low <= SCARA_AT_M[1] <= high
-    assert payload.z_m == 0.0 and "z_m" not in payload.interval, "no vertical axis feels its height"
+    assert payload.z_m == 0.0 and "z_m" not in payload.interval, (
+        "no vertical axis feels its height"
+    )
     assert not lift.diagnosis.rivals.get("payload")
-    assert elbow.diagnosis.errors["after"]["validation"] < 1.2 and not elbow.diagnosis.names
+    assert (
+        elbow.diagnosis.errors["after"]["validation"] < 1.2
+        and not elbow.diagnosis.names
+    )
     assert any("torque_ff of lift" in text for text in lift.diagnosis.remarks)
     mended, left = robot.mended([shoulder, elbow, lift])
     assert left == "" and list(mended.robot.masses()) == ["lift"]
@@ -387,8 +592,12 @@ def test_the_inertia_of_one_rotor_is_no_payload(tmp_path: Path) -> None:
     shoulder, elbow, lift = diagnose_parts(robot, SCARA_JOINTS, made, **WAY)
     assert "payload" not in (*shoulder.diagnosis.names, *lift.diagnosis.names)
     (armature,) = elbow.diagnosis.effects
-    assert armature.name == "armature" and "payload" not in elbow.diagnosis.rivals.get("armature", ())
+    assert armature.name == "armature" and "payload" not in elbow.diagnosis.rivals.get(
+        "armature", ()
+    )
     low, high = armature.interval["added_kgm2"]
     assert low <= 0.05 <= high and high - low < 0.04
     (alone,) = diagnose_parts(robot, ["elbow"], made, **WAY)
-    assert "payload" in alone.diagnosis.rivals["armature"], "the elbow alone cannot tell"
+    assert "payload" in alone.diagnosis.rivals["armature"], (
+        "the elbow alone cannot tell"
+    )

@@ -36,7 +36,15 @@ joints:
   pan: {kp: 300.0, kd: 12.0, rotor_inertia: 0.1, loop_hz: 1000.0, effort_after_target: true}
   lift: {kp: 300.0, kd: 12.0, rotor_inertia: 0.1, loop_hz: 1000.0, effort_after_target: true}
 """
-CONSIDERED = ("unbalance", "cable_spring", "cogging", "gravity_mismatch", "payload", "coulomb_friction", "armature")
+CONSIDERED = (
+    "unbalance",
+    "cable_spring",
+    "cogging",
+    "gravity_mismatch",
+    "payload",
+    "coulomb_friction",
+    "armature",
+)
 WITHOUT = [name for name in effects if name not in CONSIDERED]
 
 
@@ -56,14 +64,29 @@ def turned(
     swing: float = 0.0,
 ) -> Measurement:
     """The pan joint swings for 5 s, from rest, and lift is held or swings. At 1 kHz drives add an upright arm's weight."""
-    model, upright = mujoco.MjModel.from_xml_string(MODEL), mujoco.MjModel.from_xml_string(MODEL)
-    model.opt.gravity[:] = 9.81 * np.array([math.sin(tilt_rad), 0.0, -math.cos(tilt_rad)])
-    data, believed, rng = mujoco.MjData(model), mujoco.MjData(upright), np.random.default_rng(seed)
+    model, upright = (
+        mujoco.MjModel.from_xml_string(MODEL),
+        mujoco.MjModel.from_xml_string(MODEL),
+    )
+    model.opt.gravity[:] = 9.81 * np.array(
+        [math.sin(tilt_rad), 0.0, -math.cos(tilt_rad)]
+    )
+    data, believed, rng = (
+        mujoco.MjData(model),
+        mujoco.MjData(upright),
+        np.random.default_rng(seed),
+    )
     time_s = np.arange(1200) * 0.005
     moving = np.clip(time_s - 1.0, 0.0, None)
     pan = amplitude * np.sin(2 * np.pi * hz * moving) * np.clip(moving, 0, 1)
-    target = np.column_stack([pan, lift + swing * np.sin(2 * np.pi * 0.2 * moving) * np.clip(moving, 0, 1)])
-    measured, effort, last = np.empty_like(target), np.empty_like(target), target[0].copy()
+    target = np.column_stack(
+        [pan, lift + swing * np.sin(2 * np.pi * 0.2 * moving) * np.clip(moving, 0, 1)]
+    )
+    measured, effort, last = (
+        np.empty_like(target),
+        np.empty_like(target),
+        target[0].copy(),
+    )
     data.qpos[:] = target[0]
     for step in range(-4000, 10 * len(time_s)):  # 2 s of rest before
         row = max(step, 0) // 10
@@ -78,58 +101,112 @@ def turned(
         mujoco.mj_step(model, data)
     measured += rng.normal(0.0, 1e-4, target.shape)
     effort += rng.normal(0.0, 0.05, target.shape)
-    return logged(name, JOINTS, ("rad", "rad"), time_s=time_s, target=target, measured=measured, effort=effort)
+    return logged(
+        name,
+        JOINTS,
+        ("rad", "rad"),
+        time_s=time_s,
+        target=target,
+        measured=measured,
+        effort=effort,
+    )
 
 
-def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(tmp_path: Path) -> None:
+def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(
+    tmp_path: Path,
+) -> None:
     """3 kg at 0.3 m and a base that leans by 4°: A = 3 · 9.81 · 0.3 · sin 4° = 0.6159 N·m, lowest at 0 rad."""
     torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
     made = Measurements(
-        (turned("a", 1.3, 0.25, 1), turned("b", 0.6, 0.8, 2)), (turned("c", 1.1, 0.4, 3),), (turned("d", 1.2, 0.3, 4),)
+        (turned("a", 1.3, 0.25, 1), turned("b", 0.6, 0.8, 2)),
+        (turned("c", 1.1, 0.4, 3),),
+        (turned("d", 1.2, 0.3, 4),),
     )
-    found = machine(tmp_path).diagnose("pan", made, search=SearchConfig(max_effects=2), without=WITHOUT)
+    found = machine(tmp_path).diagnose(
+        "pan", made, search=SearchConfig(max_effects=2), without=WITHOUT
+    )
     d = found.diagnosis
     assert d.names == ("unbalance",) and not d.rivals and d.status == "at_floor"
     assert d.after.values["unbalance.torque_nm"] == pytest.approx(torque_nm, rel=0.01)
     assert d.after.values["unbalance.hangs_at_rad"] == pytest.approx(0.0, abs=0.01)
     assert d.one_pose == {"unbalance": ("lift",)}
-    assert any("gravity: [0.0" in remark and "robot.yaml" in remark for remark in d.remarks)
+    assert any(
+        "gravity: [0.0" in remark and "robot.yaml" in remark for remark in d.remarks
+    )
     said = verdict("pan", d, can_tell=found.can_tell)
     assert said.command == "taccorl excite pan --effects=unbalance,cable_spring"
-    assert said.level == "moderate" and "unbalance" in said.confidence and "lift" in said.record_next
-    tied = verdict("pan", dataclasses.replace(d, rivals={"unbalance": ("cable_spring",)}))
-    assert tied.level == "moderate" and "lift" in tied.record_next and "unbalance,cable_spring" in tied.command
+    assert (
+        said.level == "moderate"
+        and "unbalance" in said.confidence
+        and "lift" in said.record_next
+    )
+    tied = verdict(
+        "pan", dataclasses.replace(d, rivals={"unbalance": ("cable_spring",)})
+    )
+    assert (
+        tied.level == "moderate"
+        and "lift" in tied.record_next
+        and "unbalance,cable_spring" in tied.command
+    )
     elsewhere = verdict("pan", dataclasses.replace(d, one_pose={}, remarks=()))
     assert elsewhere.level == "high" and "lift" not in elsewhere.record_next
 
 
 @pytest.mark.slow
-def test_a_spring_that_holds_in_two_poses_of_the_other_joint_is_named_without_that_doubt(tmp_path: Path) -> None:
+def test_a_spring_that_holds_in_two_poses_of_the_other_joint_is_named_without_that_doubt(
+    tmp_path: Path,
+) -> None:
     poses = [
-        turned(f"{lift}_{seed}", 1.2 - 0.1 * seed, 0.3 + 0.1 * seed, seed, tilt_rad=0.0, spring=0.7, lift=lift)
+        turned(
+            f"{lift}_{seed}",
+            1.2 - 0.1 * seed,
+            0.3 + 0.1 * seed,
+            seed,
+            tilt_rad=0.0,
+            spring=0.7,
+            lift=lift,
+        )
         for lift in (0.0, 0.9)
         for seed in (1, 2)
     ]
     d = (
         machine(tmp_path)
-        .diagnose("pan", Measurements(tuple(poses[::2]), tuple(poses[1::2])), without=WITHOUT)
+        .diagnose(
+            "pan", Measurements(tuple(poses[::2]), tuple(poses[1::2])), without=WITHOUT
+        )
         .diagnosis
     )
     assert d.names == ("cable_spring",) and not d.rivals and d.one_pose == {}
-    assert d.after.values["cable_spring.stiffness_nm_per_rad"] == pytest.approx(0.7, rel=0.03)
+    assert d.after.values["cable_spring.stiffness_nm_per_rad"] == pytest.approx(
+        0.7, rel=0.03
+    )
 
 
 def test_an_upright_robot_lacks_nothing(tmp_path: Path) -> None:
-    made = Measurements((turned("a", 1.3, 0.25, 1, tilt_rad=0.0),), (turned("c", 1.1, 0.4, 3, tilt_rad=0.0),))
-    assert machine(tmp_path).diagnose("pan", made, without=WITHOUT).diagnosis.status == "nothing_missing"
+    made = Measurements(
+        (turned("a", 1.3, 0.25, 1, tilt_rad=0.0),),
+        (turned("c", 1.1, 0.4, 3, tilt_rad=0.0),),
+    )
+    assert (
+        machine(tmp_path).diagnose("pan", made, without=WITHOUT).diagnosis.status
+        == "nothing_missing"
+    )
 
 
 def test_an_unbalance_is_of_hinges_only(tmp_path: Path) -> None:
     machine(tmp_path)
-    (tmp_path / "arm.xml").write_text(MODEL.replace('name="lift" axis', 'name="lift" type="slide" axis'))
+    (tmp_path / "arm.xml").write_text(
+        MODEL.replace('name="lift" axis', 'name="lift" type="slide" axis')
+    )
     robot = load_machine(tmp_path / "robot.yaml")
-    assert robot.effect("unbalance", "lift", {"torque_nm": 1.0, "hangs_at_rad": 0.0}) is None
-    assert robot.effect("unbalance", "pan", {"torque_nm": 1.0, "hangs_at_rad": 0.0}) is not None
+    assert (
+        robot.effect("unbalance", "lift", {"torque_nm": 1.0, "hangs_at_rad": 0.0})
+        is None
+    )
+    assert (
+        robot.effect("unbalance", "pan", {"torque_nm": 1.0, "hangs_at_rad": 0.0})
+        is not None
+    )
     entry = "effort_after_target: true, effects: [{effect: unbalance, torque_nm: 1.0, hangs_at_rad: 0.0}]}"
     head = FILE.rpartition("effort_after_target: true}")[0]
     (tmp_path / "robot.yaml").write_text(f"{head}{entry}\n")
@@ -139,7 +216,11 @@ def test_an_unbalance_is_of_hinges_only(tmp_path: Path) -> None:
 
 def replay_error(robot: RobotMachine, m: Measurement) -> float:
     """Root mean square of simulated minus measured position of joint ``pan`` [rad], over all rows of ``m``."""
-    (trace,) = [t for t in robot.compare(Measurements((m,))).traces if (t.signal, t.kind) == ("pan", "position")]
+    (trace,) = [
+        t
+        for t in robot.compare(Measurements((m,))).traces
+        if (t.signal, t.kind) == ("pan", "position")
+    ]
     return float(np.sqrt(np.mean(trace.residual**2)))
 
 
@@ -156,13 +237,21 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
     arms = [1.0, math.cos(0.9)]  # whose mean is 0.811: each is 0.189 from it
     change = change_between_poses(robot.robot, "pan", [level, raised], down)
     assert change == pytest.approx((arms[0] - arms[1]) / (arms[0] + arms[1]), abs=0.01)
-    np.testing.assert_allclose(down, (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), atol=2e-4)
-    assert tilt_like(robot.robot, "pan", [raised], 10.0 * torque_nm, 0.0) is None, "a tilt of 64°"
-    leaning = dataclasses.replace(robot.robot.config, gravity=[2.0 * float(x) for x in down])  # of any length
+    np.testing.assert_allclose(
+        down, (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), atol=2e-4
+    )
+    assert tilt_like(robot.robot, "pan", [raised], 10.0 * torque_nm, 0.0) is None, (
+        "a tilt of 64°"
+    )
+    leaning = dataclasses.replace(
+        robot.robot.config, gravity=[2.0 * float(x) for x in down]
+    )  # of any length
     leaning = RobotMachine(dataclasses.replace(robot.robot, config=leaning), "leaning")
     leaning.save(tmp_path / "leaning.yaml")
     loaded = load_machine(tmp_path / "leaning.yaml")
-    effect = robot.effect("unbalance", "pan", {"torque_nm": torque_nm, "hangs_at_rad": 0.0})
+    effect = robot.effect(
+        "unbalance", "pan", {"torque_nm": torque_nm, "hangs_at_rad": 0.0}
+    )
     loads = robot.with_additions([Addition("pan", [effect], {}, {})])
     errors = [replay_error(r, raised) for r in (loaded, loads, robot)]
     assert errors[0] < 1.5e-4 < 4e-4 < errors[1] and errors[2] > 4e-4
@@ -171,12 +260,16 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
 def test_gravity_also_turns_with_other_joints_that_move(tmp_path: Path) -> None:
     """Both joints swing: what the tilt adds about the pan axis changes with lift."""
     both, robot = turned("both", 0.5, 0.3, 7, swing=0.8), machine(tmp_path)
-    config = dataclasses.replace(robot.robot.config, gravity=[math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)])
+    config = dataclasses.replace(
+        robot.robot.config, gravity=[math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)]
+    )
     leaning = RobotMachine(dataclasses.replace(robot.robot, config=config), "leaning")
     assert replay_error(leaning, both) < 0.3 * replay_error(robot, both)
 
 
-@pytest.mark.parametrize("tilt_of_lift_rad", [pytest.param(TILT_RAD, marks=pytest.mark.slow), 0.0])
+@pytest.mark.parametrize(
+    "tilt_of_lift_rad", [pytest.param(TILT_RAD, marks=pytest.mark.slow), 0.0]
+)
 def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one_stands_upright(
     tmp_path: Path, tilt_of_lift_rad: float
 ) -> None:
@@ -192,23 +285,45 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
         ),
         (turned("c", 1.1, 0.4, 5), turned("n", 0.0, 0.3, 6, swing=0.75, **still)),
     )
-    found = diagnose_parts(machine(tmp_path), JOINTS, made, search=SearchConfig(max_effects=1), without=WITHOUT)
-    remarks = [text for text in found[0].diagnosis.remarks if "tilt of the base" in text]
+    found = diagnose_parts(
+        machine(tmp_path),
+        JOINTS,
+        made,
+        search=SearchConfig(max_effects=1),
+        without=WITHOUT,
+    )
+    remarks = [
+        text for text in found[0].diagnosis.remarks if "tilt of the base" in text
+    ]
     mended, _ = machine(tmp_path).mended(found)
     mended.save(tmp_path / "mended.yaml")
     written = load_machine(tmp_path / "mended.yaml")
     assert found[0].diagnosis.names == ("unbalance",) and len(remarks) == 1
     if tilt_of_lift_rad:
-        x, y, z = map(float, re.findall(r"gravity: \[(.*?)\]", remarks[0])[0].split(", "))
+        x, y, z = map(
+            float, re.findall(r"gravity: \[(.*?)\]", remarks[0])[0].split(", ")
+        )
         low, high = map(float, re.findall(r"x (\S+) … (\S+?)[,)]", remarks[0])[0])
         assert low <= math.sin(TILT_RAD) <= high and high - low < 0.002
-        assert (x, y, z) == pytest.approx((math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), abs=1e-3)
+        assert (x, y, z) == pytest.approx(
+            (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), abs=1e-3
+        )
         assert "pan and lift" in remarks[0] and "robot.yaml" in remarks[0]
-        assert found[1].diagnosis.names == ("unbalance",) and remarks[0] in found[1].diagnosis.remarks
-        assert written.robot.config.gravity == pytest.approx([x, y, z], abs=1e-3) and written.effects == ()
+        assert (
+            found[1].diagnosis.names == ("unbalance",)
+            and remarks[0] in found[1].diagnosis.remarks
+        )
+        assert (
+            written.robot.config.gravity == pytest.approx([x, y, z], abs=1e-3)
+            and written.effects == ()
+        )
         assert len(machine(tmp_path).changes_as_a_whole(found)) == 1
         raised = turned("raised", 1.2, 0.3, 8, lift=-0.9)
-        assert replay_error(written, raised) < 1.5e-4 < replay_error(machine(tmp_path), raised)
+        assert (
+            replay_error(written, raised)
+            < 1.5e-4
+            < replay_error(machine(tmp_path), raised)
+        )
     else:
         assert "gravity:" not in " ".join(found[0].diagnosis.remarks)
         assert "at pan" in remarks[0] and "at lift" in remarks[0]

@@ -21,11 +21,22 @@ RATE_HZ, PARTS = 200, 50
 MASS_KG, KP, KD = 30.0, 12_000.0, 900.0
 OIL_KG, PER_S, STIFF = 50.0, 12.0, 4000.0
 LIMITS = (-0.15, 0.15)
-AIR = AxisConfig(name="rod", unit="m", inertia=25.0, kp=KP, kd=KD, limits=LIMITS, effort_limit=1500.0)
-OIL = AxisConfig(
-    name="rod", unit="m", law="cascade", inertia=OIL_KG, kp=PER_S, kd=STIFF, limits=LIMITS, effort_limit=5000.0
+AIR = AxisConfig(
+    name="rod", unit="m", inertia=25.0, kp=KP, kd=KD, limits=LIMITS, effort_limit=1500.0
 )
-Force = Callable[[float, float], float]  # (error of the position [m], speed [m/s]) → force [N]
+OIL = AxisConfig(
+    name="rod",
+    unit="m",
+    law="cascade",
+    inertia=OIL_KG,
+    kp=PER_S,
+    kd=STIFF,
+    limits=LIMITS,
+    effort_limit=5000.0,
+)
+Force = Callable[
+    [float, float], float
+]  # (error of the position [m], speed [m/s]) → force [N]
 
 
 def air(factor: float) -> Force:
@@ -72,18 +83,43 @@ def moved(
             after = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             at += dt_s * 0.5 * (speed + after)
             speed = after
-    measured, effort = (np.array(rows) + np.random.default_rng(seed).standard_normal((len(rows), 2)) * (2e-5, 2.0)).T
-    return logged(name, ("rod",), ("m",), repeat_of, time_s=time_s, target=target, measured=measured, effort=effort)
+    measured, effort = (
+        np.array(rows)
+        + np.random.default_rng(seed).standard_normal((len(rows), 2)) * (2e-5, 2.0)
+    ).T
+    return logged(
+        name,
+        ("rod",),
+        ("m",),
+        repeat_of,
+        time_s=time_s,
+        target=target,
+        measured=measured,
+        effort=effort,
+    )
 
 
-def found_in(axis: AxisConfig, force: Force, mass_kg: float, friction_n=(0.0, 0.0), considered=effects) -> Diagnosis:
+def found_in(
+    axis: AxisConfig,
+    force: Force,
+    mass_kg: float,
+    friction_n=(0.0, 0.0),
+    considered=effects,
+) -> Diagnosis:
     first = moved("first", force, mass_kg, (0.3, 1.1), 1, friction_n)
     again = moved("again", force, mass_kg, (0.3, 1.1), 2, friction_n, repeat_of="first")
     held = moved("held", force, mass_kg, (0.4, 0.9), 3, friction_n)
     return one_round(axis, Measurements((first, again), (held,)), considered)
 
 
-NEAR = "direction_gain", "asymmetric_friction", "coulomb_friction", "torque_scale", "viscous_friction", "backlash"
+NEAR = (
+    "direction_gain",
+    "asymmetric_friction",
+    "coulomb_friction",
+    "torque_scale",
+    "viscous_friction",
+    "backlash",
+)
 
 
 @pytest.mark.parametrize(
@@ -96,19 +132,34 @@ NEAR = "direction_gain", "asymmetric_friction", "coulomb_friction", "torque_scal
         pytest.param(OIL, oil, OIL_KG, 0.6, effects, marks=pytest.mark.slow),
     ],
 )
-def test_the_gain_of_a_cylinder_that_differs_by_direction_is_found(axis, force, mass_kg, factor, considered):
+def test_the_gain_of_a_cylinder_that_differs_by_direction_is_found(
+    axis, force, mass_kg, factor, considered
+):
     found = found_in(axis, force(factor), mass_kg, considered=considered)
-    assert found.names == ("direction_gain",) and not found.rivals and found.status == "at_floor"
+    assert (
+        found.names == ("direction_gain",)
+        and not found.rivals
+        and found.status == "at_floor"
+    )
     assert found.errors["fitted"]["validation"] > 5.0
-    assert found.after.values["direction_gain.factor"] == pytest.approx(factor, rel=0.005)
+    assert found.after.values["direction_gain.factor"] == pytest.approx(
+        factor, rel=0.005
+    )
 
 
 @pytest.mark.slow
 def test_seals_that_rub_more_one_way_are_no_gain() -> None:
     """40 N forwards and 20 N backwards: a constant force differs by direction, too, at one amplitude."""
     found = found_in(AIR, air(1.0), MASS_KG, friction_n=(40.0, 20.0))
-    assert found.names[0] in ("coulomb_friction", "asymmetric_friction") and found.status == "at_floor"
-    assert "direction_gain" not in {*found.names, *found.rivals.get(found.names[0], ()), *found.rounds[0].ties}
+    assert (
+        found.names[0] in ("coulomb_friction", "asymmetric_friction")
+        and found.status == "at_floor"
+    )
+    assert "direction_gain" not in {
+        *found.names,
+        *found.rivals.get(found.names[0], ()),
+        *found.rounds[0].ties,
+    }
 
 
 @pytest.mark.parametrize("target", [0.1, -0.1])
@@ -117,7 +168,11 @@ def test_a_velocity_loop_has_another_speed_backwards(target: float) -> None:
     axis = AxisConfig(name="rod", unit="m", law="velocity", inertia=OIL_KG, kd=STIFF)
     cls = axis.effect_class("direction_gain")
     rest = moved("first", air(1.0), MASS_KG, (0.3, 1.1), 1)
-    m = dataclasses.replace(rest, target=np.full_like(rest.target, target), target_kinds=("velocity",))
+    m = dataclasses.replace(
+        rest, target=np.full_like(rest.target, target), target_kinds=("velocity",)
+    )
     numbers: dict[str, Any] = {"factor": 0.6}
     at = simulated(axis, axis_motion(axis, m), [cls(**numbers)]).reported
-    assert (at[400] - at[200]) * RATE_HZ / 200 == pytest.approx(target * (0.6 if target < 0 else 1.0), rel=1e-6)
+    assert (at[400] - at[200]) * RATE_HZ / 200 == pytest.approx(
+        target * (0.6 if target < 0 else 1.0), rel=1e-6
+    )

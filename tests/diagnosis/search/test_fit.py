@@ -6,8 +6,22 @@ import numpy as np
 import pytest
 from made_problem import MadeProblem, Ripple, Square, drive, record
 
-from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
-from taccorl.diagnosis.search.fit import FAR, FINE, fit, moved_by, out_of_dents, over_own_scale, residuals, rms
+from taccorl.diagnosis.search.evidence import (
+    Blocks,
+    bic_gain,
+    block_squares,
+    standard_score,
+)
+from taccorl.diagnosis.search.fit import (
+    FAR,
+    FINE,
+    fit,
+    moved_by,
+    out_of_dents,
+    over_own_scale,
+    residuals,
+    rms,
+)
 from taccorl.diagnosis.search.problem import Free, free
 from taccorl.diagnosis.search.screen import alike, probe
 
@@ -37,7 +51,10 @@ def test_what_a_model_leaves_above_the_floor_widens_its_intervals_however_many_r
     square = 0.8 * np.sign(np.sin(40.0 * t))
     model = fit(problem, [record(0, gain=0.0, seconds=60.0, extra=square)], (), {})
     assert model.error == pytest.approx(np.sqrt(1.0 + 64.0), rel=0.01)
-    (wide,), (narrow,) = np.sqrt(model.covariance()), np.sqrt(model.covariance(left_over=False))
+    (wide,), (narrow,) = (
+        np.sqrt(model.covariance()),
+        np.sqrt(model.covariance(left_over=False)),
+    )
     assert wide[0] == pytest.approx(0.1 * np.sqrt((65.0 - 2.25) / 4), rel=0.02)
     assert narrow[0] < 0.1 * wide[0]
     clean = fit(problem, [record(0, gain=0.0, seconds=60.0)], (), {})
@@ -47,10 +64,16 @@ def test_what_a_model_leaves_above_the_floor_widens_its_intervals_however_many_r
 def test_of_what_is_left_within_the_noise_only_what_lasts_widens_intervals():
     """A square wave of 0.3 floors that lasts 6 s a side: of its 0.09 a share 1 − 2 · 0.75 s / 6 s is left 0.5 to 1 s later."""
     for period_s, expected in ((12.0, 0.09 * 0.75 * 0.1**2), (0.04, 0.0)):
-        square = 0.03 * np.sign(np.sin(2.0 * np.pi / period_s * np.arange(0.0, 60.0, 0.005)))
+        square = 0.03 * np.sign(
+            np.sin(2.0 * np.pi / period_s * np.arange(0.0, 60.0, 0.005))
+        )
         recording = record(0, gain=0.0, seconds=60.0, extra=square)
-        model = fit(Offset(), [dataclasses.replace(recording, short_noise=True)], (), {})
-        assert model.covariance()[0, 0] == pytest.approx(expected, rel=0.2, abs=0.1**2 / 400)
+        model = fit(
+            Offset(), [dataclasses.replace(recording, short_noise=True)], (), {}
+        )
+        assert model.covariance()[0, 0] == pytest.approx(
+            expected, rel=0.2, abs=0.1**2 / 400
+        )
         assert fit(Offset(), [recording], (), {}).covariance()[0, 0] < 0.1**2 / 400
 
 
@@ -72,14 +95,19 @@ def test_where_a_response_jumps_an_interval_is_as_wide_as_over_its_own_range():
     assert np.sqrt(found.covariance()[0, 0]) == pytest.approx(0.005, rel=0.4)
     assert steps[0] == pytest.approx(0.005, rel=0.4)
     smooth = fit(Offset(), recording, (), {}, step=FINE)
-    assert over_own_scale(Offset(), smooth, recording)[0].covariance() == pytest.approx(smooth.covariance(), rel=1e-6)
+    assert over_own_scale(Offset(), smooth, recording)[0].covariance() == pytest.approx(
+        smooth.covariance(), rel=1e-6
+    )
 
 
 class Dented(MadeProblem):
     """A strength s acts as s + 0.02 sin(s / 0.004): its slope is negative in places."""
 
     def simulate(self, base, effects, recording):
-        acts = [Ripple(strength=one.strength + 0.02 * np.sin(one.strength / 0.004)) for one in effects]
+        acts = [
+            Ripple(strength=one.strength + 0.02 * np.sin(one.strength / 0.004))
+            for one in effects
+        ]
         return super().simulate(base, acts, recording)
 
 
@@ -99,17 +127,27 @@ class Furrowed(MadeProblem):
 
     def simulate(self, base, effects, recording):
         strength = vars(effects[0])["strength"]
-        dents = 0.06 * (1.0 - np.cos(40.0 * (strength - 2.0))) + 0.6 * abs(strength - 2.0)
+        dents = 0.06 * (1.0 - np.cos(40.0 * (strength - 2.0))) + 0.6 * abs(
+            strength - 2.0
+        )
         wave = Ripple.signal(recording.time_s, recording.data)
         return (
-            3.0 * drive(recording.time_s, recording.data) + 30.0 * (strength + base["offset"] - 2.4) + dents * wave
+            3.0 * drive(recording.time_s, recording.data)
+            + 30.0 * (strength + base["offset"] - 2.4)
+            + dents * wave
         )[:, None]
 
 
 def test_a_fit_leaves_a_dent_along_a_furrow_of_two_numbers():
     """The dents are 2π / 40 = 0.157 apart; a strength that moves alone by 0.02 leaves 6 noise floors."""
     recording = [record(0, offset=0.0)]
-    stopped = fit(Furrowed(Square), recording, ("square",), {"square.strength": 2.3, "offset": 0.1}, step=FINE)
+    stopped = fit(
+        Furrowed(Square),
+        recording,
+        ("square",),
+        {"square.strength": 2.3, "offset": 0.1},
+        step=FINE,
+    )
     found = out_of_dents(Furrowed(Square), stopped, recording, 30, FINE)
     assert abs(stopped.values["square.strength"] - 2.0) > 0.1
     assert found.values["square.strength"] == pytest.approx(2.0, abs=0.05)
@@ -133,7 +171,11 @@ def test_an_interval_holds_a_gain_that_the_peaks_of_an_input_s_noise_make_seem_s
     """Inputs of 1 … 5, whose peaks are about 3 × 0.02 higher: 2 % of 3, and noise of 0.1 in 2000 rows has 0.02 %."""
     inputs = np.repeat(np.arange(1.0, 6.0), 400)
     seen = inputs + np.random.default_rng(8).normal(0.0, 0.02, 2000)
-    recording = [dataclasses.replace(record(0, gain=0.0, offset=0.0, extra=3.0 * inputs), data=seen)]
+    recording = [
+        dataclasses.replace(
+            record(0, gain=0.0, offset=0.0, extra=3.0 * inputs), data=seen
+        )
+    ]
     model = fit(Peaks(), recording, (), {}, step=FINE)
     moved = moved_by(Peaks(), model, recording, recording, np.full(1, FINE))
     low, high = dataclasses.replace(model, moved=moved).intervals()["gain"]
@@ -142,19 +184,31 @@ def test_an_interval_holds_a_gain_that_the_peaks_of_an_input_s_noise_make_seem_s
 
 def test_a_number_at_its_bound_is_said_to_be_there():
     problem = MadeProblem()
-    problem.base = (Free(name="gain", unit="1", start=1.0, low=0.1, high=2.0, log=True), problem.base[1])
+    problem.base = (
+        Free(name="gain", unit="1", start=1.0, low=0.1, high=2.0, log=True),
+        problem.base[1],
+    )
     assert fit(problem, [record(0)], (), {}).at_bound == ("gain",)
     assert fit(MadeProblem(), [record(0)], (), {}).at_bound == ()
     alone, recordings = Offset(), [record(0, gain=0.0)]
     alone.base = (dataclasses.replace(Offset.base[0], low=0.6, high=0.7),)
     model = fit(alone, recordings, (), {})
-    assert model.at_bound == ("offset",) and moved_by(alone, model, recordings, recordings, np.full(1, FINE)) == [0.0]
+    assert model.at_bound == ("offset",) and moved_by(
+        alone, model, recordings, recordings, np.full(1, FINE)
+    ) == [0.0]
 
 
 def test_a_fit_that_runs_out_of_steps_says_so():
-    short = fit(MadeProblem(Square), [record(0, Square(strength=3.0))], ("square",), {}, most=1)
+    short = fit(
+        MadeProblem(Square), [record(0, Square(strength=3.0))], ("square",), {}, most=1
+    )
     assert "not converged" in short.trouble
-    assert fit(MadeProblem(Square), [record(0, Square(strength=3.0))], ("square",), {}).trouble == ""
+    assert (
+        fit(
+            MadeProblem(Square), [record(0, Square(strength=3.0))], ("square",), {}
+        ).trouble
+        == ""
+    )
 
 
 def test_a_simulation_that_ends_in_nan_counts_as_far_off_and_unmeasured_rows_count_nothing():
@@ -183,7 +237,9 @@ def test_blocks_are_means_of_half_a_second():
 
 def test_standard_score_is_mean_over_its_error():
     # mean 2, deviation √(((1−2)² + 0 + (3−2)²) / 2) = 1, error 1/√3
-    assert standard_score(Blocks(np.array([1.0, 2.0, 3.0]), np.full(3, 1 / 3))) == pytest.approx(2 * np.sqrt(3))
+    assert standard_score(
+        Blocks(np.array([1.0, 2.0, 3.0]), np.full(3, 1 / 3))
+    ) == pytest.approx(2 * np.sqrt(3))
     assert standard_score(Blocks(np.array([5.0]), np.ones(1))) == 0.0
     assert standard_score(Blocks(np.zeros(4), np.full(4, 0.25))) == 0.0
 
@@ -201,7 +257,10 @@ def test_a_block_with_little_weight_decides_little():
 
 def test_bic_of_a_needless_parameter_falls_below_zero():
     recordings, problem = [record(0)], MadeProblem(Ripple)
-    parent, child = fit(problem, recordings, (), {}), fit(problem, recordings, ("ripple",), {})
+    parent, child = (
+        fit(problem, recordings, (), {}),
+        fit(problem, recordings, ("ripple",), {}),
+    )
     # one number of ln n less a trifle: on its logarithmic scale it cannot quite reach 0
     assert -np.log(3000) - 2 < bic_gain(parent, child, 1) < -np.log(1000)
     there = [record(0, Ripple(strength=0.5))]
@@ -238,9 +297,14 @@ def test_strengths_that_cannot_change_sign_are_searched_on_a_logarithmic_scale()
 
 
 @pytest.mark.parametrize(("start", "told"), [(0.0, ()), (1.0, ("size",))])
-def test_a_number_that_ends_where_its_range_begins_is_no_warning_if_it_began_there(start, told):
+def test_a_number_that_ends_where_its_range_begins_is_no_warning_if_it_began_there(
+    start, told
+):
     size = Free(name="size", unit="m", start=start, low=0.0, high=1.0, scale=1e-5)
     ended = dataclasses.replace(
-        fit(Offset(), [record(0, gain=0.0)], (), {}), frees=(size,), values={"size": 1e-6}, at_bound=("size",)
+        fit(Offset(), [record(0, gain=0.0)], (), {}),
+        frees=(size,),
+        values={"size": 1e-6},
+        at_bound=("size",),
     )
     assert tuple(f.name for f in ended.at_an_end) == told

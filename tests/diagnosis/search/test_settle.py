@@ -21,7 +21,9 @@ class Sum(MadeProblem):
     )
 
     def simulate(self, base, effects, recording):
-        return super().simulate({"gain": base["a"] + base["b"], **base}, effects, recording)
+        return super().simulate(
+            {"gain": base["a"] + base["b"], **base}, effects, recording
+        )
 
 
 def seven(seed: int):
@@ -49,23 +51,47 @@ def test_numbers_that_the_recordings_determine_hardly_move():
     """Each moves by less than σ² / D² of its way to the start, D = 0.25 of its range: less than its standard error here."""
     problem, fitted = MadeProblem(Ripple), [record(0, Ripple(strength=1.7))]
     model = fit(problem, fitted, ("ripple",), {}, step=FINE)
-    found = settled(problem, model, {"gain": 50.0, "offset": 9.0}, (), fitted, [record(1, Ripple(strength=1.7))])
+    found = settled(
+        problem,
+        model,
+        {"gain": 50.0, "offset": 9.0},
+        (),
+        fitted,
+        [record(1, Ripple(strength=1.7))],
+    )
     spread = np.sqrt(np.diag(model.covariance()))
     for f, sigma in zip(model.frees, spread, strict=True):
-        moved = abs(f.coordinate(found.values[f.name]) - f.coordinate(model.values[f.name]))
+        moved = abs(
+            f.coordinate(found.values[f.name]) - f.coordinate(model.values[f.name])
+        )
         assert moved < 0.1 * sigma
 
 
 def test_the_strength_of_an_added_effect_takes_up_what_an_open_number_gives_back():
     """Gain and ``hidden`` act alike, and together they are 3. The twin states a gain of 1; the strength is then 2."""
     problem, fitted, validation = MadeProblem(Hidden), [record(0)], [record(1)]
-    model = fit(problem, fitted, ("hidden",), {"gain": 2.9, "offset": 0.0, "hidden.strength": 0.1}, step=FINE)
+    model = fit(
+        problem,
+        fitted,
+        ("hidden",),
+        {"gain": 2.9, "offset": 0.0, "hidden.strength": 0.1},
+        step=FINE,
+    )
     assert model.values["gain"] > 2.5
-    found = settled(problem, model, {"gain": 1.0, "offset": 0.0}, (), fitted, validation)
-    assert found.values["gain"] + found.values["hidden.strength"] == pytest.approx(3.0, abs=0.02)
+    found = settled(
+        problem, model, {"gain": 1.0, "offset": 0.0}, (), fitted, validation
+    )
+    assert found.values["gain"] + found.values["hidden.strength"] == pytest.approx(
+        3.0, abs=0.02
+    )
     there = dataclasses.asdict(found.effects[0])["strength"]
     assert there == found.values["hidden.strength"] > model.values["hidden.strength"]
     known = settled(
-        problem, model, {"gain": 1.0, "offset": 0.0, "hidden.strength": 0.1}, ("hidden",), fitted, validation
+        problem,
+        model,
+        {"gain": 1.0, "offset": 0.0, "hidden.strength": 0.1},
+        ("hidden",),
+        fitted,
+        validation,
     )
     assert known.values["hidden.strength"] < found.values["hidden.strength"]

@@ -26,7 +26,12 @@ PARQUET = "data/chunk-000/file-000.parquet"
 @pytest.fixture(scope="module")
 def plan(collected, tmp_path_factory):
     sources = Store(tmp_path_factory.mktemp("sources")).dataset(collected)
-    usual = {"spec": load_mimic_spec("assembly_2"), "sources": sources, "episodes": 2, "images": False}
+    usual = {
+        "spec": load_mimic_spec("assembly_2"),
+        "sources": sources,
+        "episodes": 2,
+        "images": False,
+    }
     return lambda kind=AugmentPlan, **changes: kind(**(usual | changes))
 
 
@@ -37,15 +42,21 @@ def quiet(_: str) -> None:
 @pytest.fixture(scope="module")
 def augmented(plan, tmp_path_factory):
     folder = tmp_path_factory.mktemp("augment")
-    return folder, produce(plan(), folder / "new", Store(folder / "store"), quiet).report
+    return folder, produce(
+        plan(), folder / "new", Store(folder / "store"), quiet
+    ).report
 
 
 @pytest.mark.slow
-def test_the_dataset_holds_successes_that_say_what_they_are_made_of(augmented, collected):
+def test_the_dataset_holds_successes_that_say_what_they_are_made_of(
+    augmented, collected
+):
     folder, report = augmented
     dataset = Dataset(folder / "new")
     assert dataset.num_episodes == report["episodes"] == 2
-    names = {source.name for source in read_sources(collected, load_mimic_spec("assembly_2"))}
+    names = {
+        source.name for source in read_sources(collected, load_mimic_spec("assembly_2"))
+    }
     for i in range(2):
         episode = dataset.episode(i)
         assert episode.success
@@ -65,16 +76,22 @@ def test_the_dataset_holds_successes_that_say_what_they_are_made_of(augmented, c
 def test_another_spec_never_mixes_with_what_the_store_holds(augmented, plan):
     folder, _ = augmented
     before = sorted((folder / "store" / "mimicgen").iterdir())
-    other = plan(spec=with_options(load_mimic_spec("assembly_2"), retarget="eef"), episodes=1)
+    other = plan(
+        spec=with_options(load_mimic_spec("assembly_2"), retarget="eef"), episodes=1
+    )
     assert other.config(0) != plan().config(0)
     with pytest.raises(InTheWayError):
         produce(other, folder / "new", Store(folder / "store"), quiet)
-    assert sorted((folder / "store" / "mimicgen").iterdir()) == before  # refused before the first attempt
+    assert (
+        sorted((folder / "store" / "mimicgen").iterdir()) == before
+    )  # refused before the first attempt
     assert Dataset(folder / "new").num_episodes == 2
 
 
 @pytest.mark.slow
-def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(plan, tmp_path, monkeypatch):
+def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(
+    plan, tmp_path, monkeypatch
+):
     from taccorl.episodes.sources.mimicgen.attempt import Attempts
 
     run = Attempts.run
@@ -85,14 +102,21 @@ def test_an_attempt_that_breaks_is_counted_and_the_others_go_on(plan, tmp_path, 
         return run(self, k)
 
     monkeypatch.setattr(Attempts, "run", broken)
-    report = produce(plan(episodes=1), tmp_path / "new", Store(tmp_path / "store"), quiet).report
+    report = produce(
+        plan(episodes=1), tmp_path / "new", Store(tmp_path / "store"), quiet
+    ).report
     assert report["outcomes"]["error"] == 1
-    assert "ZeroDivisionError: nobody knows (test_mimicgen_augment.py:" in report["entries"][0]["reason"]
+    assert (
+        "ZeroDivisionError: nobody knows (test_mimicgen_augment.py:"
+        in report["entries"][0]["reason"]
+    )
     assert report["episodes"] == 1
 
 
 @pytest.mark.slow
-def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next(augmented, plan, tmp_path, monkeypatch):
+def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next(
+    augmented, plan, tmp_path, monkeypatch
+):
     folder, _ = augmented
     step, steps = Simulation.step, []
 
@@ -103,7 +127,9 @@ def test_physics_that_ends_in_nan_is_counted_and_leaves_no_trace_in_the_next(aug
         step(self, action, **words)
 
     monkeypatch.setattr(Simulation, "step", poisoned)
-    report = produce(plan(episodes=1), tmp_path / "new", Store(tmp_path / "store"), quiet).report
+    report = produce(
+        plan(episodes=1), tmp_path / "new", Store(tmp_path / "store"), quiet
+    ).report
     assert report["outcomes"] == {"diverged": 1, "success": 1}
     assert report["entries"][0]["rows"] == 40
     of = [
@@ -128,20 +154,33 @@ class Deadly(AugmentPlan):
 
 
 @pytest.mark.slow
-def test_an_attempt_that_kills_its_process_twice_is_counted_and_not_made_again(augmented, plan, tmp_path, monkeypatch):
-    shutil.copytree(augmented[0] / "store", tmp_path / "store")  # it holds attempt 1, which succeeds
-    store, some, engine = Store(tmp_path / "store"), plan(Deadly, episodes=1), LocalEngine(workers=2)
+def test_an_attempt_that_kills_its_process_twice_is_counted_and_not_made_again(
+    augmented, plan, tmp_path, monkeypatch
+):
+    shutil.copytree(
+        augmented[0] / "store", tmp_path / "store"
+    )  # it holds attempt 1, which succeeds
+    store, some, engine = (
+        Store(tmp_path / "store"),
+        plan(Deadly, episodes=1),
+        LocalEngine(workers=2),
+    )
     shutil.rmtree(store.find(some.steps[0].stage, some.config(0), some.inputs(0)).path)
     shutil.rmtree(store.root / "mimicgen_rows")
     done = produce(some, tmp_path / "new", store, quiet, engine)
     assert done.report["outcomes"] == {"crashed": 1, "success": 1}
     crashed = done.report["entries"][0]
-    assert crashed["reason"] == "the worker process was killed by SIGSEGV while it had this item"
+    assert (
+        crashed["reason"]
+        == "the worker process was killed by SIGSEGV while it had this item"
+    )
     assert crashed["scene_seed"] == some.scene_seed(0)
     said = "has no actions to show; its outcome is crashed: the worker process"
     with pytest.raises(TaccorlError, match=said):
         attempt_episode(done.made[0].artefact.path)
-    assert produce(plan(episodes=1), tmp_path / "new", store, quiet).report == done.report
+    assert (
+        produce(plan(episodes=1), tmp_path / "new", store, quiet).report == done.report
+    )
 
 
 @pytest.mark.slow
@@ -151,13 +190,21 @@ def test_an_attempt_that_hung_is_counted_with_the_limit(plan, tmp_path):
     some.run(store, 0, end)
     report = produce(some, tmp_path / "new", store, quiet).report
     assert report["outcomes"] == {"hung": 1, "success": 1}
-    assert report["entries"][0]["reason"] == "no end after 600 s; the worker process was killed"
+    assert (
+        report["entries"][0]["reason"]
+        == "no end after 600 s; the worker process was killed"
+    )
 
 
 def test_what_hardly_ever_succeeds_is_stopped(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(AugmentPlan, "many", 4)
-    monkeypatch.setattr("taccorl.episodes.sources.mimicgen.attempt.Attempts.run", lambda self, k: 1 / 0)
-    with pytest.raises(TaccorlError, match=r"assembly_2: 4 of 4 failed \(4 error\); nothing was written.*taccorl view"):
+    monkeypatch.setattr(
+        "taccorl.episodes.sources.mimicgen.attempt.Attempts.run", lambda self, k: 1 / 0
+    )
+    with pytest.raises(
+        TaccorlError,
+        match=r"assembly_2: 4 of 4 failed \(4 error\); nothing was written.*taccorl view",
+    ):
         produce(plan(), tmp_path / "new", Store(tmp_path / "store"), quiet)
     assert not (tmp_path / "new").exists()
 
@@ -170,8 +217,12 @@ def test_ray_gives_the_bytes_of_this_process(augmented, plan, tmp_path, monkeypa
     ray.init(address="local", num_cpus=2, include_dashboard=False)
     try:
         engine = RayEngine()
-        told = produce(plan(), tmp_path / "new", Store(tmp_path / "store"), quiet, engine).report
+        told = produce(
+            plan(), tmp_path / "new", Store(tmp_path / "store"), quiet, engine
+        ).report
     finally:
         ray.shutdown()
     assert told == report
-    assert (tmp_path / "new" / PARQUET).read_bytes() == (folder / "new" / PARQUET).read_bytes()
+    assert (tmp_path / "new" / PARQUET).read_bytes() == (
+        folder / "new" / PARQUET
+    ).read_bytes()

@@ -5,8 +5,18 @@ import re
 import pytest
 import yaml
 
-from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, Cue, Schedule, rehearse
-from taccorl.episodes.sources.mimicgen.spec import check_task, load_mimic_spec, mimic_spec_path, with_options
+from taccorl.episodes.sources.mimicgen.schedule import (
+    ConstraintSpec,
+    Cue,
+    Schedule,
+    rehearse,
+)
+from taccorl.episodes.sources.mimicgen.spec import (
+    check_task,
+    load_mimic_spec,
+    mimic_spec_path,
+    with_options,
+)
 from taccorl.errors import DeadlockError, SpecError, TaccorlError
 from taccorl.sim.task import tasks
 
@@ -65,15 +75,31 @@ def test_a_slip_in_a_spec_is_named_with_its_place(old, new, said, tmp_path):
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(SpecError, match=rf"mine\.yaml:\d+: .*{said}") as error:
         load_mimic_spec(path)
-    assert re.search(r"mine\.yaml:(?!1:)\d+", str(error.value)) or "spec_version" in old or "deadlock" in said
+    assert (
+        re.search(r"mine\.yaml:(?!1:)\d+", str(error.value))
+        or "spec_version" in old
+        or "deadlock" in said
+    )
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("grasp plug", "grasp plog", r"right → 0: no subtask 'grasp plog'; did you mean 'grasp plug'"),
-        ("held_object: cradle", "held_object: cradel", r"left → 1 → held_object: no 'cradel'; did you mean 'cradle'"),
-        ("task: assembly_2", "task: assembly_1", r"mimicgen spec of assembly_1: the task is assembly_2"),
+        (
+            "grasp plug",
+            "grasp plog",
+            r"right → 0: no subtask 'grasp plog'; did you mean 'grasp plug'",
+        ),
+        (
+            "held_object: cradle",
+            "held_object: cradel",
+            r"left → 1 → held_object: no 'cradel'; did you mean 'cradle'",
+        ),
+        (
+            "task: assembly_2",
+            "task: assembly_1",
+            r"mimicgen spec of assembly_1: the task is assembly_2",
+        ),
         (
             "task_constraint_configs",
             "symmetry: {plugg: 2}\ntask_constraint_configs",
@@ -96,7 +122,9 @@ HOLD, INSERT = ("left", 1), ("right", 1)
 
 
 def after(former, latter, kind="sequential", **more):
-    return ConstraintSpec(eef_subtask_constraint_tuple=(former, latter), constraint_type=kind, **more)
+    return ConstraintSpec(
+        eef_subtask_constraint_tuple=(former, latter), constraint_type=kind, **more
+    )
 
 
 def together(one, other, **more):
@@ -114,7 +142,10 @@ def table(schedule, lengths, together=None, held=None):
             place = arm, schedule.subtask(arm)
             schedule.plan(arm, lengths[place], (together or {}).get(place, 0))
         cues = schedule.tick((held or {}).get(len(rows), ()))
-        told = [f"{cues[a].subtask}.{cues[a].step}" if a in cues else "-" for a in ("left", "right")]
+        told = [
+            f"{cues[a].subtask}.{cues[a].step}" if a in cues else "-"
+            for a in ("left", "right")
+        ]
         rows.append(" ".join(told))
     return rows
 
@@ -123,9 +154,21 @@ LENGTHS = {("left", 0): 2, ("left", 1): 3, ("right", 0): 3, ("right", 1): 2}
 
 
 def test_without_constraints_each_arm_goes_its_own_way_and_then_stands():
-    assert table(Schedule(SIGNALS), LENGTHS) == ["0.0 0.0", "0.1 0.1", "1.0 0.2", "1.1 1.0", "1.2 1.1"]
+    assert table(Schedule(SIGNALS), LENGTHS) == [
+        "0.0 0.0",
+        "0.1 0.1",
+        "1.0 0.2",
+        "1.1 1.0",
+        "1.2 1.1",
+    ]
     shorter = LENGTHS | {("left", 1): 1}
-    assert table(Schedule(SIGNALS), shorter) == ["0.0 0.0", "0.1 0.1", "1.0 0.2", "- 1.0", "- 1.1"]
+    assert table(Schedule(SIGNALS), shorter) == [
+        "0.0 0.0",
+        "0.1 0.1",
+        "1.0 0.2",
+        "- 1.0",
+        "- 1.1",
+    ]
 
 
 def test_a_latter_subtask_begins_when_the_former_has_ended():
@@ -150,7 +193,16 @@ def test_ends_of_coordinated_subtasks_run_side_by_side():
     lengths = {("left", 0): 1, ("left", 1): 5, ("right", 0): 5, ("right", 1): 3}
     coordination = together(HOLD, INSERT)
     rows = table(Schedule(SIGNALS, [coordination]), lengths, {HOLD: 2, INSERT: 2})
-    expected = ["0.0 0.0", "1.0 0.1", "1.1 0.2", "1.2 0.3", "- 0.4", "- 1.0", "1.3 1.1", "1.4 1.2"]
+    expected = [
+        "0.0 0.0",
+        "1.0 0.1",
+        "1.1 0.2",
+        "1.2 0.3",
+        "- 0.4",
+        "- 1.0",
+        "1.3 1.1",
+        "1.4 1.2",
+    ]
     assert rows == expected
 
 
@@ -189,10 +241,18 @@ def test_a_deadlock_is_named():
 
 def test_crossed_coordinations_and_one_that_nobody_comes_to_are_deadlocks():
     crossed = [together(("left", 0), INSERT), together(HOLD, ("right", 0))]
-    with pytest.raises(DeadlockError, match=r"left waits in 'grasp' for right to come to its part of 'insert'"):
+    with pytest.raises(
+        DeadlockError,
+        match=r"left waits in 'grasp' for right to come to its part of 'insert'",
+    ):
         rehearse(SIGNALS, crossed)
-    both = [together(HOLD, INSERT, coordination_synchronize_start=True), after(INSERT, ("left", 0))]
-    said = r"left waits to begin 'grasp'.*right waits to begin 'insert' until left begins"
+    both = [
+        together(HOLD, INSERT, coordination_synchronize_start=True),
+        after(INSERT, ("left", 0)),
+    ]
+    said = (
+        r"left waits to begin 'grasp'.*right waits to begin 'insert' until left begins"
+    )
     with pytest.raises(DeadlockError, match=said):
         rehearse(SIGNALS, both)
 

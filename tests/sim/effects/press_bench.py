@@ -42,7 +42,14 @@ class PressBench(Task):
     def add_parts(self, spec: mujoco.MjSpec) -> None:
         block = spec.worldbody.add_body(name="block", mocap=True)
         half = [0.006, BLOCK_M / 2, 0.01]
-        block.add_geom(name="block", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, contype=1, conaffinity=7, mass=0)
+        block.add_geom(
+            name="block",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=half,
+            contype=1,
+            conaffinity=7,
+            mass=0,
+        )
 
     def reset(self, draw: dict[str, np.ndarray]) -> Reset:
         return Reset(poses={"block": block_pose()})
@@ -56,7 +63,9 @@ class PressBench(Task):
 
 
 def typical_effect(name: str) -> Effect:
-    return make_effect(name, **{p.name: p.typical for p in effects.get(name).parameters()})
+    return make_effect(
+        name, **{p.name: p.typical for p in effects.get(name).parameters()}
+    )
 
 
 def start(*present: Effect, num_sims: int = 1, num_threads: int = 1) -> Simulation:
@@ -64,7 +73,10 @@ def start(*present: Effect, num_sims: int = 1, num_threads: int = 1) -> Simulati
     config = TwinConfig(effects=list(present))
     sim = Simulation(PressBench(), config, num_sims=num_sims, num_threads=num_threads)
     sim.reset(range(num_sims))
-    joints, targets = np.r_[LEFT_HOME, BLOCK_M + 5e-4, RIGHT_HOME, 0.07], sim.targets[0].copy()
+    joints, targets = (
+        np.r_[LEFT_HOME, BLOCK_M + 5e-4, RIGHT_HOME, 0.07],
+        sim.targets[0].copy(),
+    )
     targets[6] = joints[6]
     sim.place_arms(joints, targets)
     return sim

@@ -46,13 +46,22 @@ def test_pictures_of_an_absent_effect_are_bit_identical(name: str):
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_fade_out_towards_the_absent_value(name: str):
     cls = effects.get(name)
-    nearly = {p.name: p.absent + 0.01 * (p.typical - p.absent) for p in cls.parameters() if p.absent is not None}
+    nearly = {
+        p.name: p.absent + 0.01 * (p.typical - p.absent)
+        for p in cls.parameters()
+        if p.absent is not None
+    }
     there = apart(swing(start(typical_effect(name))), nominal())
-    assert there > 0.2 and apart(swing(start(make_effect(name, **nearly))), nominal()) <= 0.05 * there
+    assert (
+        there > 0.2
+        and apart(swing(start(make_effect(name, **nearly))), nominal()) <= 0.05 * there
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pictures_are_the_same_alone_in_a_batch_from_a_snapshot_and_from_stored_states(name: str):
+def test_pictures_are_the_same_alone_in_a_batch_from_a_snapshot_and_from_stored_states(
+    name: str,
+):
     effect = typical_effect(name)
     alone = swing(start(effect))
     batch = start(effect, num_sims=2, num_threads=2)
@@ -87,11 +96,24 @@ def test_physics_and_the_other_cameras_do_not_change(name: str):
 
 def test_an_offset_mount_and_a_camera_pose_are_the_same_camera():
     turn, shift = (0.02, -0.03, 0.01), (0.01, -0.004, 0.006)
-    keys = [f"{kind}_{axis}_{unit}" for kind, unit in (("turn", "rad"), ("shift", "m")) for axis in "xyz"]
-    by_effect = start(make_effect("camera_pose", **dict(zip(keys, (*turn, *shift), strict=True)), cameras=["front"]))
+    keys = [
+        f"{kind}_{axis}_{unit}"
+        for kind, unit in (("turn", "rad"), ("shift", "m"))
+        for axis in "xyz"
+    ]
+    by_effect = start(
+        make_effect(
+            "camera_pose",
+            **dict(zip(keys, (*turn, *shift), strict=True)),
+            cameras=["front"],
+        )
+    )
     config = TwinConfig()
     offset = CameraOffset(rotation_rad=turn, translation_m=shift)
-    config.cameras = [dataclasses.replace(c, offset=offset) if c.name == "front" else c for c in config.cameras]
+    config.cameras = [
+        dataclasses.replace(c, offset=offset) if c.name == "front" else c
+        for c in config.cameras
+    ]
     by_mount = Simulation(PressBench(), config)
     camera, other = by_effect.model.camera("front"), by_mount.model.camera("front")
     np.testing.assert_allclose(camera.pos, other.pos, atol=1e-12)
@@ -103,7 +125,9 @@ def test_two_frames_of_latency_show_the_picture_of_two_frames_ago():
     moved = np.abs(late[4].astype(int) - nominal()[4]) > 20
     assert moved.mean() > 0.005  # the arm is seen elsewhere
     wrong = np.abs(late[2:].astype(int) - nominal()[:-2]) > 20
-    assert wrong.mean() < 2e-4  # but for pixels on an outline: kept positions go in straight lines
+    assert (
+        wrong.mean() < 2e-4
+    )  # but for pixels on an outline: kept positions go in straight lines
     resting = np.stack(list(start().render(size=SIZE).values()), axis=1)
     assert apart(late[1], resting) < 0.01  # the second frame shows the start
 
@@ -124,7 +148,9 @@ def test_a_reset_forgets_the_past():
     plain = start()
     swing(plain)
     plain.place_arms(plain.proprioception()[0], plain.targets[0])
-    np.testing.assert_array_equal(sim.render(size=SIZE)["front"], plain.render(size=SIZE)["front"])
+    np.testing.assert_array_equal(
+        sim.render(size=SIZE)["front"], plain.render(size=SIZE)["front"]
+    )
 
 
 def test_tone_is_the_equation():
@@ -151,7 +177,9 @@ def test_a_blurred_step_has_the_width_asked_for_and_keeps_its_light(sigma_px: fl
 def test_blur_is_in_pixels_of_the_stream_and_stops_at_the_bars():
     effect = make_effect("camera_exposure", gain=1.0, gamma=1.0, blur_px=4.0)
     sim = start(effect)
-    square = sim.render(["front"], size=(224, 224))["front"][0]  # 168 rows of picture, 28 of bars above and below
+    square = sim.render(["front"], size=(224, 224))["front"][
+        0
+    ]  # 168 rows of picture, 28 of bars above and below
     assert not square[:28].any() and not square[-28:].any()
     assert square[28].mean() > 60  # not darkened by the bar
     plain = start().render(["front"], size=(224, 224))["front"][0]
@@ -160,7 +188,9 @@ def test_blur_is_in_pixels_of_the_stream_and_stops_at_the_bars():
 
 
 def test_a_camera_that_is_not_there_is_named():
-    with pytest.raises(TaccorlError, match=r"camera_pose: the twin has no camera 'frnt'.*front"):
+    with pytest.raises(
+        TaccorlError, match=r"camera_pose: the twin has no camera 'frnt'.*front"
+    ):
         start(make_effect("camera_pose", turn_x_rad=0.01, cameras=["frnt"]))
     with pytest.raises(TaccorlError, match=r"cameras are .*each once"):
         make_effect("camera_pose", cameras=[])

@@ -16,7 +16,13 @@ from taccorl.sim.task import tasks
 from taccorl.sim.twin import PhysicsConfig, TwinConfig
 from taccorl.tasks.assembly_1.scene import Assembly1
 from taccorl.tasks.experts import expert_of
-from taccorl.tasks.experts.hands import DT_S, EXACT, Pulses, ScriptedExpertConfig, follow
+from taccorl.tasks.experts.hands import (
+    DT_S,
+    EXACT,
+    Pulses,
+    ScriptedExpertConfig,
+    follow,
+)
 from taccorl.tasks.experts.mating import Aim, Mating, deflection
 from taccorl.tasks.experts.scripted import Script, ScriptedExpert
 from taccorl.tasks.experts.se3 import inverse, rotvec, transform, turn
@@ -25,7 +31,13 @@ from taccorl.tasks.experts.se3 import inverse, rotvec, transform, turn
 class OneHand(ScriptedExpert):
     """The left arm does what a test asks for, the right one nothing."""
 
-    def __init__(self, sim: Simulation, work: Callable[["OneHand"], Script], config=EXACT, seed: int = 0) -> None:
+    def __init__(
+        self,
+        sim: Simulation,
+        work: Callable[["OneHand"], Script],
+        config=EXACT,
+        seed: int = 0,
+    ) -> None:
         super().__init__(sim, np.random.default_rng(seed), config)
         self.work = work
         sim.reset([0])
@@ -40,7 +52,9 @@ def sim() -> Simulation:
     return Simulation(Assembly1(), scale=0.0)
 
 
-def run(expert: OneHand, each: Callable[[], object] = lambda: None, longest: int = 300) -> list:
+def run(
+    expert: OneHand, each: Callable[[], object] = lambda: None, longest: int = 300
+) -> list:
     seen = []
     for _ in range(longest):
         expert.sim.step(expert.act()[None])
@@ -57,7 +71,9 @@ def shifted(pose: np.ndarray, by_m: tuple) -> np.ndarray:
 
 
 def off_m(expert: OneHand) -> float:
-    return float(np.linalg.norm(expert.tcp("left")[:3, 3] - expert.hands["left"].pose[:3, 3]))
+    return float(
+        np.linalg.norm(expert.tcp("left")[:3, 3] - expert.hands["left"].pose[:3, 3])
+    )
 
 
 def forgetful(learns: bool) -> Callable[[OneHand], Script]:
@@ -66,7 +82,9 @@ def forgetful(learns: bool) -> Callable[[OneHand], Script]:
     def work(expert: OneHand) -> Script:
         hand = expert.hands["left"]
         hand.bias_rad, hand.learns = np.zeros(6), learns
-        yield from expert.move("left", shifted(hand.pose, (0.05, 0.02, -0.02)), settle=True)
+        yield from expert.move(
+            "left", shifted(hand.pose, (0.05, 0.02, -0.02)), settle=True
+        )
 
     return work
 
@@ -95,7 +113,9 @@ def test_a_move_ends_where_it_was_asked_to_and_is_fastest_in_the_middle(sim):
     # the last step has no new arm_target
     path_m = np.array([goals["from"][1, 3], *(pose[1, 3] for pose in poses[:-1])])
     steps_m = -np.diff(path_m)
-    assert len(steps_m) == round(1.875 * 0.1 / 0.1 * 30)  # a minimum jerk's peak is 15/8 of its mean speed
+    assert len(steps_m) == round(
+        1.875 * 0.1 / 0.1 * 30
+    )  # a minimum jerk's peak is 15/8 of its mean speed
     assert steps_m.max() / DT_S == pytest.approx(0.1, rel=0.01)
     assert steps_m[0] < 0.002 * 0.1  # 10 x³ of the way after one of 56 steps
     assert steps_m[-1] < 0.002 * 0.1
@@ -106,7 +126,10 @@ def test_closing_asks_for_the_part_less_what_motor_and_pads_give(sim):
     expert = OneHand(sim, lambda expert: expert.close("left", 0.030, force_n=30.0))
     run(expert)
     robot = sim.config.robot
-    motor_m, pad_m = 30.0 / robot.grip_stiffness_n_per_m, 30.0 / robot.pad_stiffness_n_per_m
+    motor_m, pad_m = (
+        30.0 / robot.grip_stiffness_n_per_m,
+        30.0 / robot.pad_stiffness_n_per_m,
+    )
     assert motor_m == pytest.approx(0.015)  # 30 N / 2000 N/m
     assert expert.hands["left"].opening_m == pytest.approx(0.030 - 0.015 - 2 * pad_m)
 
@@ -121,7 +144,9 @@ def wander(expert: OneHand) -> Script:
     part = socket(expert.sim)
     yield from expert.move("left", expert.near(shifted(home, (0.03, 0.03, 0))))
     yield from expert.pause("left")
-    yield from expert.move("left", expert.grasp(part, "tail", lean_rad=0.4, lift_m=0.05, pivot_m=0.02))
+    yield from expert.move(
+        "left", expert.grasp(part, "tail", lean_rad=0.4, lift_m=0.05, pivot_m=0.02)
+    )
 
 
 def actions(sim: Simulation, config: ScriptedExpertConfig, seed: int) -> np.ndarray:
@@ -134,7 +159,9 @@ def actions(sim: Simulation, config: ScriptedExpertConfig, seed: int) -> np.ndar
 
 
 def test_the_tremor_has_the_spread_that_was_asked_for(sim):
-    expert = OneHand(sim, lambda expert: expert.pause("left", 1e3, 1e3), ScriptedExpertConfig())
+    expert = OneHand(
+        sim, lambda expert: expert.pause("left", 1e3, 1e3), ScriptedExpertConfig()
+    )
     hand, seen = expert.hands["left"], []
     for _ in range(3000):
         expert._shaken(hand)
@@ -151,7 +178,9 @@ def test_a_lean_turns_the_hand_about_the_part_and_not_about_the_tcp(sim):
     spot = (0, 0, 0.025, 1)
     np.testing.assert_allclose(leaning @ spot, upright @ spot, atol=1e-15)
     np.testing.assert_allclose(rotvec(upright, leaning), (0, 0.3, 0), atol=1e-12)
-    assert (leaning[:3, 3] - upright[:3, 3]) @ upright[:3, 0] == pytest.approx(-0.025 * np.sin(0.3))  # from −x
+    assert (leaning[:3, 3] - upright[:3, 3]) @ upright[:3, 0] == pytest.approx(
+        -0.025 * np.sin(0.3)
+    )  # from −x
 
 
 def test_grips_miss_what_is_meant_by_the_spread_that_was_asked_for(sim):
@@ -160,19 +189,32 @@ def test_grips_miss_what_is_meant_by_the_spread_that_was_asked_for(sim):
     grips = [inverse(meant) @ expert.gripped(meant) for _ in range(2000)]
     x, y, z = np.array([grip[:3, 3] for grip in grips]).T
     # x: normal, turned by some 0.06 rad; z: 2 |N| − 1, with mean 2 √(2 / π) − 1 = 0.596 and deviation 2 √(1 − 2 / π) = 1.206
-    assert np.std(x) == pytest.approx(0.004, rel=0.08) and abs(np.mean(x)) < 3 * 0.004 / np.sqrt(2000)
-    assert np.mean(z) == pytest.approx(0.596 * 0.004, rel=0.15) and np.std(z) == pytest.approx(1.206 * 0.004, rel=0.08)
+    assert np.std(x) == pytest.approx(0.004, rel=0.08) and abs(
+        np.mean(x)
+    ) < 3 * 0.004 / np.sqrt(2000)
+    assert np.mean(z) == pytest.approx(0.596 * 0.004, rel=0.15) and np.std(
+        z
+    ) == pytest.approx(1.206 * 0.004, rel=0.08)
     assert np.abs(y).max() < 0.002
     turned = np.array([rotvec(np.eye(4), grip) for grip in grips])
-    np.testing.assert_allclose(np.std(turned, axis=0), np.array((0.3, 1, 0.3)) * 0.06, rtol=0.1)
+    np.testing.assert_allclose(
+        np.std(turned, axis=0), np.array((0.3, 1, 0.3)) * 0.06, rtol=0.1
+    )
 
 
-def test_the_target_of_a_reach_is_the_grip_that_was_meant_and_the_hand_goes_elsewhere(sim):
+def test_the_target_of_a_reach_is_the_grip_that_was_meant_and_the_hand_goes_elsewhere(
+    sim,
+):
     meant: list[np.ndarray] = []
 
     def work(expert: OneHand) -> Script:
         meant.append(shifted(expert.hands["left"].pose, (0.05, 0, -0.03)))
-        yield from expert.reach("left", meant[0], lambda pose: pose @ transform((0, 0, -0.02)), speed_mps=0.1)
+        yield from expert.reach(
+            "left",
+            meant[0],
+            lambda pose: pose @ transform((0, 0, -0.02)),
+            speed_mps=0.1,
+        )
 
     for config in (ScriptedExpertConfig(grasp_m=0.004), EXACT):
         meant.clear()
@@ -187,7 +229,9 @@ def test_the_target_of_a_reach_is_the_grip_that_was_meant_and_the_hand_goes_else
 def test_actions_stay_within_the_limits_whatever_is_asked(sim):
     def work(expert: OneHand) -> Script:
         expert.hands["left"].opening_m = 0.2
-        yield from expert.move("left", shifted(expert.hands["left"].pose, (0.8, 0, 0.5)), speed_mps=1.0)
+        yield from expert.move(
+            "left", shifted(expert.hands["left"].pose, (0.8, 0, 0.5)), speed_mps=1.0
+        )
 
     expert = OneHand(sim, work)
     made = np.array(run(expert, expert.act))
@@ -228,7 +272,10 @@ def test_a_known_force_is_felt_in_its_direction_and_size(sim, axis):
     columns, tcp_columns = np.zeros((3, 6)), np.zeros((3, 6))
     for j, nudge in enumerate(np.eye(6) * 1e-6):
         plus, minus = kinematics.pose(joints + nudge), kinematics.pose(joints - nudge)
-        columns[:, j], tcp_columns[:, j] = ((plus - minus) @ com)[:3] / 2e-6, (plus - minus)[:3, 3] / 2e-6
+        columns[:, j], tcp_columns[:, j] = (
+            ((plus - minus) @ com)[:3] / 2e-6,
+            (plus - minus)[:3, 3] / 2e-6,
+        )
     expected = tcp_columns @ (columns.T @ force_n[:3] / ROBOT.kp_nm_per_rad)
     pushed = expert.pushed("left")[:3]
     assert pushed[axis] > 2e-4
@@ -258,7 +305,11 @@ def aim() -> tuple[Still, Mating, Aim]:
 
 def test_an_error_of_direction_turns_the_part_about_its_leading_end(aim):
     still, mating, aimed = aim
-    mate = aimed.pose(still, mating, 0.0) @ inverse(aimed.part_from_tcp) @ mating.held_from_mate
+    mate = (
+        aimed.pose(still, mating, 0.0)
+        @ inverse(aimed.part_from_tcp)
+        @ mating.held_from_mate
+    )
     off = inverse(still.holder @ mating.holder_from_hole) @ mate
     np.testing.assert_allclose(off[:3, 3], (0.001, -0.0005, 0), atol=1e-15)
     np.testing.assert_allclose(rotvec(np.eye(4), off), (0.01, 0, -0.02), atol=1e-12)
@@ -273,7 +324,10 @@ def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim)
     for config in (EXACT, replace(EXACT, tremor_m=0.0004, tremor_rad=0.004)):
         sim.reset([0])
         start = sim.tcp("left")[0]
-        goal, exact = shifted(start, (0.02, 0.001, 0.03)), shifted(start, (0.02, 0, 0.03))
+        goal, exact = (
+            shifted(start, (0.02, 0.001, 0.03)),
+            shifted(start, (0.02, 0, 0.03)),
+        )
         expert = OneHand(sim, work, config)
         left, kinematics = ROBOT.joint_slice("left"), expert.kinematics["left"]
         off_m, shaken = [], []
@@ -281,9 +335,14 @@ def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim)
             action = expert.act()
             intended = expert.intended(action)
             bias_rad = expert.hands["left"].bias_rad
-            meant, sent = (kinematics.pose(x[left].astype(float) + bias_rad) for x in (intended, action))
+            meant, sent = (
+                kinematics.pose(x[left].astype(float) + bias_rad)
+                for x in (intended, action)
+            )
             off_m.append(sent[:3, 3] - meant[:3, 3])
-            shaken.append(np.linalg.norm(sent[:3, 3] - expert.hands["left"].pose[:3, 3]))
+            shaken.append(
+                np.linalg.norm(sent[:3, 3] - expert.hands["left"].pose[:3, 3])
+            )
             sim.step(action[None])
             if expert.done:
                 break
@@ -311,19 +370,30 @@ def test_a_pulse_is_a_squared_sine_at_random_times():
         n = len(run)
         assert 8 <= n <= 22 and displaced[run[-1] + 3] and not displaced[run[-1] + 6]
         shape = np.sin(np.pi * np.arange(1, n + 1) / (n + 1)) ** 2
-        np.testing.assert_allclose(seen[run], shape[:, None] * seen[run[n // 2]] / shape[n // 2], atol=1e-12)
+        np.testing.assert_allclose(
+            seen[run], shape[:, None] * seen[run[n // 2]] / shape[n // 2], atol=1e-12
+        )
     amplitudes = np.concatenate([np.abs(seen[run]).max(0) for run in runs])
     assert 0.005 < np.sqrt(np.mean(amplitudes**2)) < 0.04
 
 
 @pytest.mark.parametrize(
     ("task", "held", "resting"),
-    [("assembly_1", "plug", ()), pytest.param("test_tube", "tube", ("left",), marks=pytest.mark.slow)],
+    [
+        ("assembly_1", "plug", ()),
+        pytest.param("test_tube", "tube", ("left",), marks=pytest.mark.slow),
+    ],
 )
-def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_stands(task, held, resting):
-    sim = Simulation(tasks.get(task)(), TwinConfig(physics=PhysicsConfig(steps_per_control_step=20)))
+def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_stands(
+    task, held, resting
+):
+    sim = Simulation(
+        tasks.get(task)(), TwinConfig(physics=PhysicsConfig(steps_per_control_step=20))
+    )
     sim.reset([4])
-    expert = expert_of(sim.task)(sim, np.random.default_rng(4), ScriptedExpertConfig(pulse_rad=0.02))
+    expert = expert_of(sim.task)(
+        sim, np.random.default_rng(4), ScriptedExpertConfig(pulse_rad=0.02)
+    )
     expert.start()
     near, pulsed = 0, {"open": 0, "gripped": 0}
     while not expert.done and expert.step_count < 900:
@@ -343,7 +413,11 @@ def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_
 
 def test_what_is_intended_and_what_the_hand_learns_have_no_pulses(sim):
     def slowly(expert: OneHand) -> Script:
-        yield from expert.move("left", shifted(expert.hands["left"].pose, (0.03, 0.03, 0.03)), speed_mps=0.02)
+        yield from expert.move(
+            "left",
+            shifted(expert.hands["left"].pose, (0.03, 0.03, 0.03)),
+            speed_mps=0.02,
+        )
 
     meant, off_rad = [], []
     for pulse_rad in (0.05, 0.0):
@@ -368,23 +442,35 @@ def test_a_motion_without_an_aim_brings_what_is_intended_back_to_the_pose(sim):
     goal, exact = shifted(start, (0, 0.001, 0.01)), shifted(start, (0, 0, 0.01))
     expert = OneHand(sim, work)
     run(expert)
-    np.testing.assert_allclose(expert.hands["left"].intended, expert.hands["left"].pose, atol=1e-12)
+    np.testing.assert_allclose(
+        expert.hands["left"].intended, expert.hands["left"].pose, atol=1e-12
+    )
 
 
-def test_a_wrist_that_is_held_aside_gives_way_until_nothing_pushes_but_along_the_axis(aim):
+def test_a_wrist_that_is_held_aside_gives_way_until_nothing_pushes_but_along_the_axis(
+    aim,
+):
     still, mating, aimed = aim
     wanted = aimed.pose(still, mating, 0.01)
     hole = (still.holder @ mating.holder_from_hole)[:3, :3]
-    held = wanted @ turn((0.01, -0.02, 0.015))  # a vice holds the hand 1 mm aside, 2 mm back and turned by 27 mrad
+    held = wanted @ turn(
+        (0.01, -0.02, 0.015)
+    )  # a vice holds the hand 1 mm aside, 2 mm back and turned by 27 mrad
     held[:3, 3] += hole @ (0.0008, -0.0006, -0.002)
     sizes = []
     for _ in range(60):
         pushed = deflection(aimed.pose(still, mating, 0.01), held)
-        sizes.append(np.linalg.norm(np.r_[(hole.T @ pushed[:3])[:2], 0.15 * pushed[3:]]))
+        sizes.append(
+            np.linalg.norm(np.r_[(hole.T @ pushed[:3])[:2], 0.15 * pushed[3:]])
+        )
         aimed = aimed.giving_way(still, mating, 0.1 * pushed)
-    assert all(after < 0.93 * before for before, after in pairwise(sizes))  # a tenth less each time
+    assert all(
+        after < 0.93 * before for before, after in pairwise(sizes)
+    )  # a tenth less each time
     left = deflection(aimed.pose(still, mating, 0.01), held)
-    np.testing.assert_allclose(hole.T @ left[:3], (0, 0, -0.002), atol=5e-6)  # what holds it back, it still feels
+    np.testing.assert_allclose(
+        hole.T @ left[:3], (0, 0, -0.002), atol=5e-6
+    )  # what holds it back, it still feels
     np.testing.assert_allclose(left[3:], 0, atol=1e-4)
 
 

@@ -29,7 +29,9 @@ from taccorl.tasks.experts import expert_of
 from taccorl.tasks.experts.kinematics import ArmKinematics, retargeted
 
 _UNREACHABLE_M = 0.005  # that inverse kinematics leaves: the hand would be elsewhere
-_AFTER_STEPS = round((HOLD_S + 0.5) * CONTROL_HZ)  # a goal reached last of all must still hold
+_AFTER_STEPS = round(
+    (HOLD_S + 0.5) * CONTROL_HZ
+)  # a goal reached last of all must still hold
 _DISTURBANCE = 3  # apart from the pads' noise, which draws from (scene seed, 2)
 _WORD = "mimicgen"  # apart from the scenes of ``taccorl collect`` with the same seed
 
@@ -60,7 +62,11 @@ class ExpertContact:
         hands = {arm: expert.hands[arm] for arm in expert.running}
         return {
             arm: ArmTarget(
-                goal=hand.goal, opening_m=hand.opening_m, contact=not hand.learns, noisy=False, intended=hand.intended
+                goal=hand.goal,
+                opening_m=hand.opening_m,
+                contact=not hand.learns,
+                noisy=False,
+                intended=hand.intended,
             )
             for arm, hand in hands.items()
         }
@@ -70,9 +76,13 @@ def attempt_seeds(root: int, task: str, k: int) -> tuple[int, np.random.Generato
     """Return the scene seed (0 … 2⁶² − 1) and the random generator of attempt ``k``: ``SeedSequence(root, spawn_key=(task, k))``,
     independent of other attempts.
     """
-    sequence = np.random.SeedSequence(root, spawn_key=(zlib.crc32(f"{_WORD} {task}".encode()), k))
+    sequence = np.random.SeedSequence(
+        root, spawn_key=(zlib.crc32(f"{_WORD} {task}".encode()), k)
+    )
     scene, rest = sequence.spawn(2)
-    return int(scene.generate_state(1, np.uint64)[0] >> np.uint64(2)), np.random.default_rng(rest)
+    return int(
+        scene.generate_state(1, np.uint64)[0] >> np.uint64(2)
+    ), np.random.default_rng(rest)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +108,12 @@ class _Physics:
     actions: list[np.ndarray] = field(default_factory=list)
     intended: list[np.ndarray | None] = field(default_factory=list)
 
-    def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
+    def step(
+        self,
+        action: np.ndarray,
+        watch: Watch | None = None,
+        intended: np.ndarray | None = None,
+    ) -> None:
         self.states.append(self.sim.state_rows()[0])
         self.actions.append(action)
         self.intended.append(intended)
@@ -148,14 +163,22 @@ class Hands:
             joints = sim.arrays["qpos"][0, self._joints[arm]]
             lag_s = np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad)
             self.joints_rad[arm] = joints
-            self._rest[arm] = RestOffset(joints, command[ROBOT.joint_slice(arm)].copy(), lag_s)
+            self._rest[arm] = RestOffset(
+                joints, command[ROBOT.joint_slice(arm)].copy(), lag_s
+            )
 
-    def action(self, arm_targets: Mapping[str, ArmTarget], pushed: Collection[str] = ()) -> np.ndarray:
+    def action(
+        self, arm_targets: Mapping[str, ArmTarget], pushed: Collection[str] = ()
+    ) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m] for ``arm_targets`` (arm → its target). The offset of ``pushed``
         (disturbed) arms is not estimated.
         """
         action, qpos = np.empty(ROBOT.num_actions), self.sim.arrays["qpos"][0]
-        may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not arm_targets[arm].contact]
+        may_learn = [
+            arm
+            for arm in ROBOT.arms
+            if self.learn and arm not in pushed and not arm_targets[arm].contact
+        ]
         still = [arm for arm in may_learn if self._rest[arm].is_still]
         if still:
             self._touching.look(self.sim.state_rows()[0])
@@ -164,7 +187,9 @@ class Hands:
             if arm in still and not self._touching.holds_fast(arm):
                 rest.see(qpos[self._joints[arm]])
             if arm_target.joints_rad is None:
-                joints, error_m = self.kinematics[arm].solve(arm_target.goal, self.joints_rad[arm])
+                joints, error_m = self.kinematics[arm].solve(
+                    arm_target.goal, self.joints_rad[arm]
+                )
                 if error_m > self.unreached_m:
                     self.unreached_m, self.unreached = (
                         error_m,
@@ -173,15 +198,25 @@ class Hands:
             else:
                 joints = arm_target.joints_rad
             last = self.joints_rad[arm]
-            self.joints_rad[arm] = joints = last + np.clip(joints - last, -self._max_step_rad, self._max_step_rad)
-            action[ROBOT.joint_slice(arm)] = rest.command(joints) if self.learn else joints
+            self.joints_rad[arm] = joints = last + np.clip(
+                joints - last, -self._max_step_rad, self._max_step_rad
+            )
+            action[ROBOT.joint_slice(arm)] = (
+                rest.command(joints) if self.learn else joints
+            )
             action[ROBOT.gripper_index(arm)] = arm_target.opening_m
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
-    def intended(self, action: np.ndarray, arm_targets: Mapping[str, ArmTarget]) -> np.ndarray:
+    def intended(
+        self, action: np.ndarray, arm_targets: Mapping[str, ArmTarget]
+    ) -> np.ndarray:
         """(14,) float32 the dataset's ``action`` for ``action`` (14,), which was computed for ``arm_targets``: without the error
         of an expert's aim."""
-        goals = {arm: target.intended for arm, target in arm_targets.items() if target.intended is not None}
+        goals = {
+            arm: target.intended
+            for arm, target in arm_targets.items()
+            if target.intended is not None
+        }
         return retargeted(action, self.kinematics, self.joints_rad, goals)
 
 
@@ -191,7 +226,9 @@ class Attempts:
 
     def __init__(self, pool: SourcePool, sim: Simulation, seed: int) -> None:
         self.pool, self.spec, self.sim, self.seed = pool, pool.spec, sim, seed
-        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
+        self.kinematics = {
+            arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms
+        }
         self._feels = self.spec.datagen_config.contact_mode == "closed_loop_expert"
         self._disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
         if self._feels:
@@ -203,14 +240,21 @@ class Attempts:
         sim.reset([scene_seed])
         director = self._director(rng)
         gates, made = GateKeeper(sim), _Physics(sim)
-        outcome, reason = act(sim, self._targets(director, scene_seed), made, gates.watch)
+        outcome, reason = act(
+            sim, self._targets(director, scene_seed), made, gates.watch
+        )
         actions = np.array(made.actions, np.float32).reshape(-1, ROBOT.num_actions)
-        intended, last_state = np.array(made.intended, np.float32).reshape(actions.shape), state_digest(sim)
+        intended, last_state = (
+            np.array(made.intended, np.float32).reshape(actions.shape),
+            state_digest(sim),
+        )
         provenance = self._provenance(director, k, scene_seed)
         if outcome == "success":
             gates.see_actions(actions)
             provenance["gates"] = gates.measured.record()
-            if refused := gates.measured.refused(self.spec.gates) or foreign_contact(sim, np.stack(made.states)):
+            if refused := gates.measured.refused(self.spec.gates) or foreign_contact(
+                sim, np.stack(made.states)
+            ):
                 outcome, reason = refused
         return Generated(
             attempt=k,
@@ -232,27 +276,50 @@ class Attempts:
             rng,
             hz=CONTROL_HZ,
             kinematics=self.kinematics,
-            contact_hands=functools.partial(ExpertContact, self.sim) if self._feels else None,
+            contact_hands=functools.partial(ExpertContact, self.sim)
+            if self._feels
+            else None,
         )
 
     def _targets(self, director: Director, scene_seed: int) -> Actions:
         """Raises DeadlockError: the arms wait for each other; UnreachableError: a pose is out of reach."""
         scene, generation, after = TwinScene(self.sim), self.spec.datagen_config, 0
-        max_speed, commanded = self.spec.gates.max_joint_speed_radps, generation.retarget == "eef_command"
-        hands = Hands(self.sim, self.kinematics, max_joint_speed_radps=max_speed, learn=not commanded)
-        drift = Disturbance(generation.disturbance, np.random.default_rng([scene_seed, _DISTURBANCE]))
+        max_speed, commanded = (
+            self.spec.gates.max_joint_speed_radps,
+            generation.retarget == "eef_command",
+        )
+        hands = Hands(
+            self.sim,
+            self.kinematics,
+            max_joint_speed_radps=max_speed,
+            learn=not commanded,
+        )
+        drift = Disturbance(
+            generation.disturbance, np.random.default_rng([scene_seed, _DISTURBANCE])
+        )
         exact = Exact(self.sim)
         while after < _AFTER_STEPS:
             arm_targets = director.step(scene, hands.joints_rad)
             if self._disturbs:
-                drift.update(arm_targets, {arm: director.ahead(arm) for arm in ROBOT.arms}, exact.look())
+                drift.update(
+                    arm_targets,
+                    {arm: director.ahead(arm) for arm in ROBOT.arms},
+                    exact.look(),
+                )
             action = hands.action(arm_targets, drift.pushed)
             if hands.unreached_m > _UNREACHABLE_M:
-                raise UnreachableError(f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm")
-            yield Targets(drift.executed(action) if self._disturbs else action, hands.intended(action, arm_targets))
+                raise UnreachableError(
+                    f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
+                )
+            yield Targets(
+                drift.executed(action) if self._disturbs else action,
+                hands.intended(action, arm_targets),
+            )
             after += director.done
 
-    def _provenance(self, director: Director, k: int, scene_seed: int) -> dict[str, object]:
+    def _provenance(
+        self, director: Director, k: int, scene_seed: int
+    ) -> dict[str, object]:
         choices = []
         for (arm, number), choice in sorted(director.choices.items()):
             choices.append(
@@ -266,8 +333,17 @@ class Attempts:
                 }
             )
         generation, feels = self.spec.datagen_config, director.contact_hands
-        felt = {"corrections": [list(event) for event in feels.corrections], INTENDED: True} if feels else {}
-        pushed = {"disturbance": asdict(generation.disturbance)} if self._disturbs else {}
+        felt = (
+            {
+                "corrections": [list(event) for event in feels.corrections],
+                INTENDED: True,
+            }
+            if feels
+            else {}
+        )
+        pushed = (
+            {"disturbance": asdict(generation.disturbance)} if self._disturbs else {}
+        )
         return {
             "attempt": k,
             "seed": self.seed,
@@ -277,6 +353,9 @@ class Attempts:
             "contact_mode": generation.contact_mode,
             **felt,
             **pushed,
-            "draw": {name: np.asarray(value).tolist() for name, value in self.sim.draws[0].items()},
+            "draw": {
+                name: np.asarray(value).tolist()
+                for name, value in self.sim.draws[0].items()
+            },
             "subtasks": choices,
         }

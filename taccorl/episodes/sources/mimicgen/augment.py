@@ -71,7 +71,9 @@ class AugmentPlan(Plan):
 
     def actor(self, sim: Simulation) -> Attempts:
         (sources,) = self.inputs(0)
-        return Attempts(SourcePool(self.spec, read_sources(sources.path, self.spec)), sim, self.seed)
+        return Attempts(
+            SourcePool(self.spec, read_sources(sources.path, self.spec)), sim, self.seed
+        )
 
     def actor_config(self) -> Any:
         return [self.config(0), self.inputs(0)[0].digest]
@@ -80,13 +82,19 @@ class AugmentPlan(Plan):
         return f"nothing was written. To view one: taccorl view {shlex.quote(str(failed.artefact.path))}"
 
     def config(self, item: int) -> dict[str, Any]:
-        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "videos": self.stored_as == "video"}
+        own = {
+            "spec": dataclasses.asdict(self.spec),
+            "images": self.images,
+            "videos": self.stored_as == "video",
+        }
         own |= {"part_poses": self.part_poses, **told_origin(self.origin)}
         return canonical(self.scene | own | {"root_seed": self.seed, "attempt": item})
 
     def inputs(self, item: int) -> list[Artefact]:
         if self.sources is None:
-            raise TaccorlError(f"mimicgen of {self.task}: no sources; give a dataset of demonstrations")
+            raise TaccorlError(
+                f"mimicgen of {self.task}: no sources; give a dataset of demonstrations"
+            )
         return [self.sources]
 
     @property
@@ -94,18 +102,33 @@ class AugmentPlan(Plan):
         # Rows are a function of the sources alone, as the attempt is: their key is known where the attempt is gone.
         return (Step(_ATTEMPT, self._physics), Step(_ROWS, self._rows))
 
-    def _physics(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
+    def _physics(
+        self, item: int, config: dict[str, Any], inputs: list[Path]
+    ) -> Attempt:
         done = self.opened().actor.run(item)
-        arrays = {"actions": done.actions} | ({} if done.intended is None else {"intended": done.intended})
+        arrays = {"actions": done.actions} | (
+            {} if done.intended is None else {"intended": done.intended}
+        )
         facts = {"last_state": done.last_state, "provenance": done.provenance}
-        return Attempt(outcome=done.outcome, reason=done.reason, arrays=arrays, facts=facts)
+        return Attempt(
+            outcome=done.outcome, reason=done.reason, arrays=arrays, facts=facts
+        )
 
     def _rows(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
-        (sources,), (sim, spec, _), folder = self.inputs(item), self.opened(), inputs[-1]
-        done, before = execute(sim, demonstration_of(folder), spec, self.spec.gates), read_json(folder / "entry.json")
+        (sources,), (sim, spec, _), folder = (
+            self.inputs(item),
+            self.opened(),
+            inputs[-1],
+        )
+        done, before = (
+            execute(sim, demonstration_of(folder), spec, self.spec.gates),
+            read_json(folder / "entry.json"),
+        )
         told = _without_spec(config) | {"sources": sources.digest} | done.provenance
         facts = {"last_state": before["last_state"], "provenance": before["provenance"]}
-        return dataclasses.replace(done, provenance=told, source_digest=sources.digest, facts=facts)
+        return dataclasses.replace(
+            done, provenance=told, source_digest=sources.digest, facts=facts
+        )
 
     def lost(self, item: int, end: Failed) -> Attempt:
         nothing = np.zeros((0, ROBOT.num_actions), np.float32)
@@ -113,17 +136,34 @@ class AugmentPlan(Plan):
 
     def entry(self, item: int, done: Attempt) -> Entry:
         rows = len(done.arrays.get("actions", ())) or done.rows
-        entry = {"attempt": item, "outcome": done.outcome, "rows": rows, "seconds": rows / CONTROL_HZ}
-        entry |= {"reason": done.reason, "scene_seed": self.scene_seed(item), "last_state": "", "provenance": {}}
+        entry = {
+            "attempt": item,
+            "outcome": done.outcome,
+            "rows": rows,
+            "seconds": rows / CONTROL_HZ,
+        }
+        entry |= {
+            "reason": done.reason,
+            "scene_seed": self.scene_seed(item),
+            "last_state": "",
+            "provenance": {},
+        }
         return entry | done.facts
 
     def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
-        own = super().dataset_config(entries) | {"spec": self.spec.digest} | self.kept_pictures
+        own = (
+            super().dataset_config(entries)
+            | {"spec": self.spec.digest}
+            | self.kept_pictures
+        )
         return own | ({} if entries is None else {"attempts": len(entries)})
 
     def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
         report = super().report(entries)
-        report["entries"] = [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries]
+        report["entries"] = [
+            {k: v for k, v in e.items() if k not in ("provenance", "last_state")}
+            for e in entries
+        ]
         return report | {"grips": grips_report(self.opened().actor.pool.sources)}
 
 
@@ -132,7 +172,10 @@ def demonstration_of(folder: Path) -> Demonstration:
     return Demonstration(
         actions=np.load(folder / "actions.npy"),
         intended=np.load(intended) if intended.is_file() else None,
-        **{key: entry[key] for key in ("attempt", "scene_seed", "last_state", "provenance")},
+        **{
+            key: entry[key]
+            for key in ("attempt", "scene_seed", "last_state", "provenance")
+        },
     )
 
 
@@ -147,14 +190,24 @@ def attempt_episode(folder: Path) -> Episode:
     episode. Raises TaccorlError: the attempt ended before its first action."""
     config, entry = read_manifest(folder)["config"], read_json(folder / "entry.json")
     if not entry["rows"]:
-        raise TaccorlError(f"{folder}: has no actions to show; its outcome is {entry['outcome']}: {entry['reason']}")
+        raise TaccorlError(
+            f"{folder}: has no actions to show; its outcome is {entry['outcome']}: {entry['reason']}"
+        )
     sim, stored = make_simulation(config), demonstration_of(folder)
-    spec = row_spec(sim, pictures=config["images"], executed=stored.intended is not None)
+    spec = row_spec(
+        sim, pictures=config["images"], executed=stored.intended is not None
+    )
     recorder = execute(sim, stored, spec, GatesSpec(**config["spec"]["gates"])).recorder
     assert recorder is not None
-    ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
+    ended = (
+        f"{entry['outcome']}: {entry['reason']}"
+        if entry["reason"]
+        else entry["outcome"]
+    )
     told = _without_spec(config) | {"mimicgen": entry["provenance"]}
-    episode = recorder.episode(f"{config['task']} attempt {entry['attempt']}, {ended}", told)
+    episode = recorder.episode(
+        f"{config['task']} attempt {entry['attempt']}, {ended}", told
+    )
     return dataclasses.replace(episode, success=entry["outcome"] == "success")
 
 

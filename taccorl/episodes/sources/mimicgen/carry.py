@@ -9,11 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, minimum_jerk, rotvec, turn
+from taccorl.tasks.experts.se3 import (
+    PEAK_OF_MEAN,
+    between,
+    inverse,
+    minimum_jerk,
+    rotvec,
+    turn,
+)
 
 NEAREST = 3
 """Number of source demonstrations, those whose object lies nearest to that of the new scene, from which one is drawn."""
-_M_PER_RAD = 0.2  # in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1
+_M_PER_RAD = (
+    0.2  # in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1
+)
 _BRIDGE_MPS, _BRIDGE_RADPS = 0.25, 1.5  # peak speeds
 _ROUNDING = 1e-6
 
@@ -27,7 +36,10 @@ class Distance(NamedTuple):
 
 def distance(one: np.ndarray, other: np.ndarray) -> Distance:
     """Distance of one pose (4, 4) from another (4, 4): that of the positions, and the angle between the rotations."""
-    return Distance(float(np.linalg.norm(one[:3, 3] - other[:3, 3])), float(np.linalg.norm(rotvec(one, other))))
+    return Distance(
+        float(np.linalg.norm(one[:3, 3] - other[:3, 3])),
+        float(np.linalg.norm(rotvec(one, other))),
+    )
 
 
 def look_alike(pose: np.ndarray, reference: np.ndarray, num_turns: int) -> np.ndarray:
@@ -52,7 +64,11 @@ def object_delta(new: np.ndarray, source: np.ndarray, num_turns: int = 1) -> np.
 
 
 def in_hand_correction(
-    tcp_src: np.ndarray, held_src: np.ndarray, tcp_new: np.ndarray, held_new: np.ndarray, num_turns: int = 1
+    tcp_src: np.ndarray,
+    held_src: np.ndarray,
+    tcp_new: np.ndarray,
+    held_new: np.ndarray,
+    num_turns: int = 1,
 ) -> np.ndarray:
     """C = G_src · G_new⁻¹ (4, 4) with G = TCP-from-held: a hand that follows T · C takes what it holds along the source's path.
 
@@ -68,7 +84,9 @@ def bridge(start: np.ndarray, end: np.ndarray, hz: float) -> list[np.ndarray]:
     and 1.5 rad/s; none if the two are the same. ``hz`` is the rate of control steps.
     """
     off = distance(start, end)
-    duration_s = PEAK_OF_MEAN * max(off.position_m / _BRIDGE_MPS, off.rotation_rad / _BRIDGE_RADPS)
+    duration_s = PEAK_OF_MEAN * max(
+        off.position_m / _BRIDGE_MPS, off.rotation_rad / _BRIDGE_RADPS
+    )
     num = math.ceil(duration_s * hz - _ROUNDING)
     return [between(start, end, minimum_jerk(k / num)) for k in range(1, num + 1)]
 

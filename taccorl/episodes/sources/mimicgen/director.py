@@ -20,17 +20,35 @@ from taccorl.episodes.sources.mimicgen.carry import (
     object_delta,
     one_of_nearest,
 )
-from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, Cue, Place, Schedule
-from taccorl.episodes.sources.mimicgen.source import ArmTrack, Segment, SourcePool, contact_row
+from taccorl.episodes.sources.mimicgen.schedule import (
+    ConstraintSpec,
+    Cue,
+    Place,
+    Schedule,
+)
+from taccorl.episodes.sources.mimicgen.source import (
+    ArmTrack,
+    Segment,
+    SourcePool,
+    contact_row,
+)
 from taccorl.episodes.sources.mimicgen.spec import SubtaskSpec
 from taccorl.tasks.experts.kinematics import ArmKinematics
 from taccorl.tasks.experts.se3 import minimum_jerk, turn
 
-_SETTLED_M, _SETTLED_RAD = 0.0004, 0.004  # a hand that moves less in a control step is at rest
-_ARRIVED_M, _ARRIVED_RAD = 0.0005, 0.005  # a hand that is no further from its goal is there
+_SETTLED_M, _SETTLED_RAD = (
+    0.0004,
+    0.004,
+)  # a hand that moves less in a control step is at rest
+_ARRIVED_M, _ARRIVED_RAD = (
+    0.0005,
+    0.005,
+)  # a hand that is no further from its goal is there
 _REACH_M = 0.4  # of a joint to the hand: how far noise of the joints moves it
 _JOINT_RADPS = 2.5  # peak speed of any joint in motions that are blended in joint space
-_HANDED_OVER_STEPS = 2  # of a path: one in which another takes over, one when it has finished
+_HANDED_OVER_STEPS = (
+    2  # of a path: one in which another takes over, one when it has finished
+)
 
 
 class SeenPoses(Protocol):
@@ -104,7 +122,9 @@ class Choice:
 
     source: int  # Index of the source in the pool, from 0
     segment: Segment  # Rows of the source that the subtask repeats
-    delta: np.ndarray  # Δ (4, 4), world to world: transform of the source's motion to the new scene
+    delta: (
+        np.ndarray
+    )  # Δ (4, 4), world to world: transform of the source's motion to the new scene
     correction: np.ndarray  # C = G_src · G_new⁻¹ (4, 4): correction for the present pose of the held object in the hand
 
 
@@ -119,7 +139,9 @@ class _Path:
     rows: np.ndarray  # Of the source, one for each step after the bridge
     contact: int  # First row that counts as contact
     joints_rad: np.ndarray | None  # (steps after the bridge, 6) where joints are told
-    is_handed_over: bool = False  # Another moves the hand in contact, for as long as it takes
+    is_handed_over: bool = (
+        False  # Another moves the hand in contact, for as long as it takes
+    )
 
     def __len__(self) -> int:
         return self.num_own + self.is_handed_over * _HANDED_OVER_STEPS
@@ -131,7 +153,11 @@ class _Path:
 
     def row(self, step: int) -> int | None:
         """Of the source; None on the bridge, and where another moves the hand."""
-        return int(self.rows[step - len(self.bridge)]) if len(self.bridge) <= step < self.num_own else None
+        return (
+            int(self.rows[step - len(self.bridge)])
+            if len(self.bridge) <= step < self.num_own
+            else None
+        )
 
 
 @dataclass
@@ -163,7 +189,12 @@ class Director:
     ) -> None:
         """``kinematics``: arm → its kinematics; only subtasks without an object_ref need it. ``contact_hands``: factory of the
         controller that moves the hands in contact, which gets its own random generator; None: the source's motion is used."""
-        self.pool, self.spec, self.hz, self.kinematics = pool, pool.spec, hz, kinematics or {}
+        self.pool, self.spec, self.hz, self.kinematics = (
+            pool,
+            pool.spec,
+            hz,
+            kinematics or {},
+        )
         self._rng, self._noise_rng = rng.spawn(2)
         self.contact_hands = contact_hands(rng.spawn(1)[0]) if contact_hands else None
         self._handed_over: set[str] = set()
@@ -171,7 +202,9 @@ class Director:
         self.schedule = Schedule(self.spec.signals, self.spec.task_constraint_configs)
         self.choices: dict[Place, Choice] = {}
         self._hands = {
-            arm: _Hand(ArmTarget(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False))
+            arm: _Hand(
+                ArmTarget(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False)
+            )
             for arm in self.spec.signals
         }
         self._source: int | None = None
@@ -189,14 +222,20 @@ class Director:
         """True if all subtasks have ended; targets then stay constant."""
         return self.schedule.done
 
-    def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, ArmTarget]:
+    def step(
+        self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None
+    ) -> dict[str, ArmTarget]:
         """Arm → its target for the next control step. ``joints_rad``: arm → (6,) joint angles that the caller computed for the
         arm's last target, if there was one. Raises DeadlockError: the arms wait for each other."""
         for arm, joints in (joints_rad or {}).items():
             self._hands[arm].joints_rad = joints
         for arm in self.schedule.to_plan():
             self._plan(arm, scene)
-        held = [arm for arm in self._hands if arm in self._handed_over or self._is_to_settle(arm, scene)]
+        held = [
+            arm
+            for arm in self._hands
+            if arm in self._handed_over or self._is_to_settle(arm, scene)
+        ]
         cues = self.schedule.tick(held) if not self.done else {}
         felt, arm_targets = self._in_contact(cues), {}
         for arm, hand in self._hands.items():
@@ -238,7 +277,9 @@ class Director:
             hand = self._hands[arm]
             assert hand.path is not None
             if hand.path.is_handed_over and cue.step == hand.path.num_own:
-                self.contact_hands.take(arm, self.spec.signals[arm][cue.subtask], hand.last)
+                self.contact_hands.take(
+                    arm, self.spec.signals[arm][cue.subtask], hand.last
+                )
         felt = self.contact_hands.step()
         self._handed_over = set(felt)
         return felt
@@ -248,25 +289,47 @@ class Director:
     def _is_to_settle(self, arm: str, scene: SeenPoses) -> bool:
         """Whether the arm's gripper would act next while the arm still moves, or what it holds meet its mate while the arm is not
         where it is to be."""
-        cue, hand, generation = self.schedule.upcoming(arm), self._hands[arm], self.spec.datagen_config
-        row = hand.path.row(cue.step) if cue is not None and hand.path is not None else None
+        cue, hand, generation = (
+            self.schedule.upcoming(arm),
+            self._hands[arm],
+            self.spec.datagen_config,
+        )
+        row = (
+            hand.path.row(cue.step)
+            if cue is not None and hand.path is not None
+            else None
+        )
         if row is None or hand.path is None or hand.seen is None:
             return False
-        if hand.path.track.gripper_acts[row] and hand.waited < generation.num_settle_steps_before_gripper:
+        if (
+            hand.path.track.gripper_acts[row]
+            and hand.waited < generation.num_settle_steps_before_gripper
+        ):
             moved = distance(hand.seen, scene.tcp(arm))
             return moved.position_m > _SETTLED_M or moved.rotation_rad > _SETTLED_RAD
-        if row == hand.path.contact and hand.path.held and hand.waited < generation.num_settle_steps_before_contact:
+        if (
+            row == hand.path.contact
+            and hand.path.held
+            and hand.waited < generation.num_settle_steps_before_contact
+        ):
             off = distance(hand.last.goal, scene.tcp(arm))
             return off.position_m > _ARRIVED_M or off.rotation_rad > _ARRIVED_RAD
         return False
 
     def _shaken(self, arm_target: ArmTarget) -> ArmTarget:
         std = self.spec.datagen_config.noise
-        if arm_target.contact or not arm_target.noisy or (std.position_m == 0 and std.rotation_rad == 0):
+        if (
+            arm_target.contact
+            or not arm_target.noisy
+            or (std.position_m == 0 and std.rotation_rad == 0)
+        ):
             return arm_target
         draw = self._noise_rng.normal(size=6)
         if arm_target.joints_rad is not None:
-            return replace(arm_target, joints_rad=arm_target.joints_rad + draw * std.position_m / _REACH_M)
+            return replace(
+                arm_target,
+                joints_rad=arm_target.joints_rad + draw * std.position_m / _REACH_M,
+            )
         goal = arm_target.goal @ turn(draw[3:] * std.rotation_rad)
         goal[:3, 3] += draw[:3] * std.position_m
         return replace(arm_target, goal=goal)
@@ -276,11 +339,19 @@ class Director:
     def _plan(self, arm: str, scene: SeenPoses) -> None:
         """The path of the arm's present subtask, from what the scene is now."""
         k = self.schedule.subtask(arm)
-        subtask, coordination = self.spec.subtask_configs[arm][k], self.spec.coordination(arm, k)
+        subtask, coordination = (
+            self.spec.subtask_configs[arm][k],
+            self.spec.coordination(arm, k),
+        )
         i, delta = self._source_and_delta(arm, k, subtask, coordination, scene)
-        source, segment = self.pool.sources[i], self.pool.segment(i, arm, k, self._offsets)
+        source, segment = (
+            self.pool.sources[i],
+            self.pool.segment(i, arm, k, self._offsets),
+        )
         hand, track = self._hands[arm], source.arms[arm]
-        keeps_path = subtask.held_object and self.spec.datagen_config.retarget == "held_object"
+        keeps_path = (
+            subtask.held_object and self.spec.datagen_config.retarget == "held_object"
+        )
         choice = self.choices[arm, k] = Choice(i, segment, delta, np.eye(4))
         hand.path = path = _Path(
             bridge=[],
@@ -288,18 +359,27 @@ class Director:
             track=track,
             held=subtask.held_object if keeps_path else None,
             rows=np.arange(segment.start, segment.end),
-            contact=contact_row(source, self._held_now(arm, k), segment, self.spec.datagen_config.contact_lead_steps),
+            contact=contact_row(
+                source,
+                self._held_now(arm, k),
+                segment,
+                self.spec.datagen_config.contact_lead_steps,
+            ),
             joints_rad=None,
         )
         self._look_into_hand(arm, path, segment.start, scene)
         num_together = segment.num_together
         if subtask.object_ref is None and coordination is None:
-            path.rows, path.joints_rad = self._along_joints(arm, track, segment, choice.correction)
+            path.rows, path.joints_rad = self._along_joints(
+                arm, track, segment, choice.correction
+            )
         else:
             before = track.goal[segment.start - 1] if segment.start else track.tcp[0]
             first = delta @ before @ choice.correction
             goals = bridge(hand.last.goal, first, self.hz)
-            path.bridge = [ArmTarget(goal=goal, opening_m=hand.last.opening_m) for goal in goals]
+            path.bridge = [
+                ArmTarget(goal=goal, opening_m=hand.last.opening_m) for goal in goals
+            ]
         if self.contact_hands is not None and path.contact < segment.end:
             num_together = self._hand_over(path, coordination)
         self.schedule.plan(arm, len(path), num_together)
@@ -307,8 +387,14 @@ class Director:
     def _hand_over(self, path: _Path, coordination: ConstraintSpec | None) -> int:
         """Cut a path where another takes over: at contact, but two hands that work together in the same row. Gives the number of
         its last steps that they do side by side."""
-        places, i = coordination.eef_subtask_constraint_tuple if coordination else (), path.choice.source
-        together = max((self.pool.segment(i, *p, self._offsets).start for p in places), default=path.contact)
+        places, i = (
+            coordination.eef_subtask_constraint_tuple if coordination else (),
+            path.choice.source,
+        )
+        together = max(
+            (self.pool.segment(i, *p, self._offsets).start for p in places),
+            default=path.contact,
+        )
         row = max(path.contact, together)
         path.rows, path.is_handed_over = path.rows[path.rows < row], True
         return row - together + _HANDED_OVER_STEPS
@@ -320,7 +406,11 @@ class Director:
         assert path is not None
         row = path.row(step)
         if row is None:
-            return path.bridge[step] if step < len(path.bridge) else replace(hand.last, noisy=False)
+            return (
+                path.bridge[step]
+                if step < len(path.bridge)
+                else replace(hand.last, noisy=False)
+            )
         choice, told = path.choice, None
         if path.joints_rad is not None:
             told = path.joints_rad[step - len(path.bridge)]
@@ -328,29 +418,52 @@ class Director:
         else:
             # Not for a part that the other hand or a fixture holds, too: each correction would raise the force.
             held = path.held
-            if held and self.pool.sources[choice.source].free[held][row] and not scene.mated(held):
+            if (
+                held
+                and self.pool.sources[choice.source].free[held][row]
+                and not scene.mated(held)
+            ):
                 self._look_into_hand(arm, path, row, scene)
             goal = choice.delta @ path.track.goal[row] @ choice.correction
         opening_m = float(path.track.opening_m[row])
-        return ArmTarget(goal=goal, opening_m=opening_m, joints_rad=told, contact=row >= path.contact)
+        return ArmTarget(
+            goal=goal, opening_m=opening_m, joints_rad=told, contact=row >= path.contact
+        )
 
-    def _look_into_hand(self, arm: str, path: _Path, row: int, scene: SeenPoses) -> None:
+    def _look_into_hand(
+        self, arm: str, path: _Path, row: int, scene: SeenPoses
+    ) -> None:
         """C = G_src · G_new⁻¹ of what the hand holds, now and in that row: what has slipped since is made good."""
         if path.held is None:
             return
         held_src = self.pool.sources[path.choice.source].objects[path.held][row]
         path.choice.correction = in_hand_correction(
-            path.track.tcp[row], held_src, scene.tcp(arm), scene.body(path.held), self._num_turns(path.held)
+            path.track.tcp[row],
+            held_src,
+            scene.tcp(arm),
+            scene.body(path.held),
+            self._num_turns(path.held),
         )
 
     def _held_now(self, arm: str, k: int) -> list[str]:
         """What this hand holds in its subtask ``k``, and the other one in what is coordinated with it."""
         coordination = self.spec.coordination(arm, k)
-        places = coordination.eef_subtask_constraint_tuple if coordination else ((arm, k),)
-        return [body for body in [self.spec.subtask_configs[a][j].held_object for a, j in places] if body is not None]
+        places = (
+            coordination.eef_subtask_constraint_tuple if coordination else ((arm, k),)
+        )
+        return [
+            body
+            for body in [self.spec.subtask_configs[a][j].held_object for a, j in places]
+            if body is not None
+        ]
 
     def _source_and_delta(
-        self, arm: str, k: int, subtask: SubtaskSpec, coordination: ConstraintSpec | None, scene: SeenPoses
+        self,
+        arm: str,
+        k: int,
+        subtask: SubtaskSpec,
+        coordination: ConstraintSpec | None,
+        scene: SeenPoses,
     ) -> tuple[int, np.ndarray]:
         """Which source the subtask repeats, and the transform Δ of it."""
         if coordination is None:
@@ -363,11 +476,17 @@ class Director:
             self._shared[key] = i, self._object_delta(i, arm, k, moved, scene)
         return self._shared[key]
 
-    def _object_delta(self, i: int, arm: str, k: int, body: str | None, scene: SeenPoses) -> np.ndarray:
+    def _object_delta(
+        self, i: int, arm: str, k: int, body: str | None, scene: SeenPoses
+    ) -> np.ndarray:
         if body is None:
             return np.eye(4)
         row = self.pool.segment(i, arm, k, self._offsets).start
-        return object_delta(scene.body(body), self.pool.sources[i].objects[body][row], self._num_turns(body))
+        return object_delta(
+            scene.body(body),
+            self.pool.sources[i].objects[body][row],
+            self._num_turns(body),
+        )
 
     def _along_joints(
         self, arm: str, track: ArmTrack, segment: Segment, correction: np.ndarray
@@ -378,14 +497,23 @@ class Director:
         """
         hand, kinematics = self._hands[arm], self.kinematics[arm]
         joints = track.joints_rad[segment.rows]
-        now = hand.joints_rad if hand.joints_rad is not None else kinematics.solve(hand.last.goal, joints[0])[0]
+        now = (
+            hand.joints_rad
+            if hand.joints_rad is not None
+            else kinematics.solve(hand.last.goal, joints[0])[0]
+        )
         end, _ = kinematics.solve(track.goal[segment.end - 1] @ correction, joints[-1])
-        share = np.array([minimum_jerk(x) for x in np.linspace(0, 1, len(joints))])[:, None]
+        share = np.array([minimum_jerk(x) for x in np.linspace(0, 1, len(joints))])[
+            :, None
+        ]
         joints = joints + (1 - share) * (now - joints[0]) + share * (end - joints[-1])
         fastest = np.abs(np.diff(joints, axis=0)).max(initial=0.0) * self.hz
         slower = max(1.0, fastest / _JOINT_RADPS)
         at = np.linspace(0, len(joints) - 1, math.ceil(len(joints) * slower))
-        resampled = np.stack([np.interp(at, np.arange(len(joints)), column) for column in joints.T], axis=1)
+        resampled = np.stack(
+            [np.interp(at, np.arange(len(joints)), column) for column in joints.T],
+            axis=1,
+        )
         return segment.start + np.round(at).astype(int), resampled
 
     # selection --------------------------------------------------------------------------------------------------------
@@ -394,15 +522,25 @@ class Director:
         """One source for the whole attempt, by the strategy of the subtask that begins first."""
         if self._source is None:
             subtask = self.spec.subtask_configs[arm][k]
-            if subtask.selection_strategy == "random" or (body := subtask.object_ref) is None:
+            if (
+                subtask.selection_strategy == "random"
+                or (body := subtask.object_ref) is None
+            ):
                 self._source = int(self._rng.integers(len(self.pool)))
             else:
-                distances = [self._object_distance(i, arm, k, body, scene) for i in range(len(self.pool))]
+                distances = [
+                    self._object_distance(i, arm, k, body, scene)
+                    for i in range(len(self.pool))
+                ]
                 self._source = one_of_nearest(distances, self._rng)
         return self._source
 
-    def _object_distance(self, i: int, arm: str, k: int, body: str, scene: SeenPoses) -> Distance:
-        then = self.pool.sources[i].objects[body][self.pool.segment(i, arm, k, self._offsets).start]
+    def _object_distance(
+        self, i: int, arm: str, k: int, body: str, scene: SeenPoses
+    ) -> Distance:
+        then = self.pool.sources[i].objects[body][
+            self.pool.segment(i, arm, k, self._offsets).start
+        ]
         return distance(look_alike(scene.body(body), then, self._num_turns(body)), then)
 
     def _num_turns(self, body: str) -> int:

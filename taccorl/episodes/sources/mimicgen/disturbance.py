@@ -24,10 +24,10 @@ from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
-_CLEAR_STEPS = 12  # before and after what must be exact: 0.4 s, four times the arm's lag
-_APPROACH_STEPS = (
-    12  # more before a gripper moves: a hand that comes down on a part beside its place turns or shifts it
+_CLEAR_STEPS = (
+    12  # before and after what must be exact: 0.4 s, four times the arm's lag
 )
+_APPROACH_STEPS = 12  # more before a gripper moves: a hand that comes down on a part beside its place turns or shifts it
 _RAMP_STEPS = 12
 _MOVES_M = 2e-4  # of an opening in a step
 
@@ -48,9 +48,18 @@ class Disturbance:
     @property
     def pushed(self) -> list[str]:
         """Arms that are disturbed now."""
-        return [arm for arm, strength in zip(ROBOT.arms, self.strength, strict=True) if strength > 0]
+        return [
+            arm
+            for arm, strength in zip(ROBOT.arms, self.strength, strict=True)
+            if strength > 0
+        ]
 
-    def update(self, arm_targets: Mapping[str, ArmTarget], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
+    def update(
+        self,
+        arm_targets: Mapping[str, ArmTarget],
+        ahead: Mapping[str, Ahead],
+        is_exact: np.ndarray,
+    ) -> None:
         """Advance the disturbance by one control step, and compute its strength for each arm. ``ahead``: of each arm, what
         follows the present targets. ``is_exact``: (2,) whether each arm must follow its source exactly now (``Exact``)."""
         contact = min(each.contact for each in ahead.values())
@@ -62,7 +71,9 @@ class Disturbance:
             before[a] = min(contact, max(ahead[arm].gripper - _APPROACH_STEPS, 0))
             must_be = moves or is_exact[a] or min(contact, ahead[arm].gripper) == 0
             self._since[a] = 0 if must_be else self._since[a] + 1
-        self.strength = np.clip((np.minimum(before, self._since) - _CLEAR_STEPS) / _RAMP_STEPS, 0, 1)
+        self.strength = np.clip(
+            (np.minimum(before, self._since) - _CLEAR_STEPS) / _RAMP_STEPS, 0, 1
+        )
         if not self._is_first:
             self._off_rad = drifted(self._off_rad, self._spec, self._rng)
         self._is_first = False
@@ -70,7 +81,9 @@ class Disturbance:
     def executed(self, intended: np.ndarray) -> np.ndarray:
         """(14,) float32 within the limits of actions: joints of ``intended`` (14,) [rad] drift, openings [m] do not."""
         executed = intended.astype(float)
-        executed[ROBOT.joint_indices] += np.repeat(self.strength, ROBOT.num_joints) * self._off_rad
+        executed[ROBOT.joint_indices] += (
+            np.repeat(self.strength, ROBOT.num_joints) * self._off_rad
+        )
         return np.clip(executed, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
 
@@ -89,12 +102,27 @@ class Exact:
         sim = self._sim
         self._touching.look(sim.state_rows()[0])
         for i, pair in enumerate(sim.task.mating):
-            is_held = any({arm, part} in self._touching.pairs for arm in ROBOT.arms for part in pair)
-            self._have_met[i] = is_held and (self._have_met[i] or sim.contact(*pair).touching[0])
-        return np.array([self._have_met.any() or self._touching.holds_fast(arm) for arm in ROBOT.arms])
+            is_held = any(
+                {arm, part} in self._touching.pairs
+                for arm in ROBOT.arms
+                for part in pair
+            )
+            self._have_met[i] = is_held and (
+                self._have_met[i] or sim.contact(*pair).touching[0]
+            )
+        return np.array(
+            [
+                self._have_met.any() or self._touching.holds_fast(arm)
+                for arm in ROBOT.arms
+            ]
+        )
 
 
-def drifted(off_rad: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator) -> np.ndarray:
+def drifted(
+    off_rad: np.ndarray, spec: DisturbanceSpec, rng: np.random.Generator
+) -> np.ndarray:
     """(12,) [rad] state of an Ornstein–Uhlenbeck process per joint, one control step after ``off_rad`` (12,)."""
     kept = math.exp(-1 / (CONTROL_HZ * spec.time_s))
-    return kept * off_rad + math.sqrt(1 - kept**2) * spec.joint_rad * rng.normal(size=off_rad.shape)
+    return kept * off_rad + math.sqrt(1 - kept**2) * spec.joint_rad * rng.normal(
+        size=off_rad.shape
+    )

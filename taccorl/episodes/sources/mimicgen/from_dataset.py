@@ -34,7 +34,9 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     kept = [episode for episode in episodes if episode.success]
     if not kept:
-        raise DatasetError(f"{root}: none of its {len(episodes)} episodes is a success; collect some: taccorl collect")
+        raise DatasetError(
+            f"{root}: none of its {len(episodes)} episodes is a success; collect some: taccorl collect"
+        )
     reader = SourceReader(simulation_of(kept[0], spec.task))
     return [reader.read(episode) for episode in kept]
 
@@ -49,8 +51,15 @@ def open_sources(root: Path, task: str) -> Dataset:
             f"{root}: has no {', '.join(missing)}: the poses of objects are unknown, as in every recording of a robot, so that "
             f"it cannot be a source. Collect sources in the twin: taccorl collect --task={task} --out=outputs/{task}"
         )
-    made = dataset.episode_facts(0).get("provenance", {}).get("simulation", {}).get("source")
-    is_collected = isinstance(made, dict) and not made.get("hands", {}).get("pulse_rad", 0.0)
+    made = (
+        dataset.episode_facts(0)
+        .get("provenance", {})
+        .get("simulation", {})
+        .get("source")
+    )
+    is_collected = isinstance(made, dict) and not made.get("hands", {}).get(
+        "pulse_rad", 0.0
+    )
     if EXECUTED in dataset.info["features"] and not is_collected:
         raise DatasetError(
             f"{root}: its hands deviate from their actions, because its arms were disturbed (--source.hands.pulse_rad, "
@@ -65,9 +74,13 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
     state its simulation."""
     told = episode.provenance.get("simulation")
     if not isinstance(told, dict) or "twin" not in told:
-        raise DatasetError(f"{episode.name}: does not state in which twin it was made; collect it again")
+        raise DatasetError(
+            f"{episode.name}: does not state in which twin it was made; collect it again"
+        )
     if told["task"] != task:
-        raise DatasetError(f"{episode.name}: is of {told['task']}: --task={told['task']}, or a dataset of {task}")
+        raise DatasetError(
+            f"{episode.name}: is of {told['task']}: --task={told['task']}, or a dataset of {task}"
+        )
     return make_simulation(told)
 
 
@@ -76,7 +89,11 @@ def make_simulation(told: Mapping[str, Any]) -> Simulation:
     ``randomization``.
     """
     twin = twin_of_text(told["twin"])
-    return Simulation(tasks.get(told["task"])(told["difficulty"]), twin, scale=float(told["randomization"]))
+    return Simulation(
+        tasks.get(told["task"])(told["difficulty"]),
+        twin,
+        scale=float(told["randomization"]),
+    )
 
 
 class SourceReader:
@@ -84,26 +101,49 @@ class SourceReader:
 
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim
-        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
+        self.kinematics = {
+            arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms
+        }
         self._touching = Touching(sim)
 
     def read(self, episode: Episode) -> Source:
         """Read one episode as a source. Raises DatasetError: the states are of another scene than this simulation's."""
         states, actions = episode.arrays["sim.state"], episode.executed().astype(float)
-        if states.shape[1] != self.sim.row_size or (states[:, 0] != self.sim.scene).any():
+        if (
+            states.shape[1] != self.sim.row_size
+            or (states[:, 0] != self.sim.scene).any()
+        ):
             raise DatasetError(
                 f"{episode.name}: its states are of another scene than {self.sim.task.name}, {self.sim.task.difficulty}, in "
                 "the twin that the episode names: an older version of taccorl made it. Collect it again"
             )
-        task, touching, data, num = self.sim.task, self._touching, self._touching.data, len(states)
+        task, touching, data, num = (
+            self.sim.task,
+            self._touching,
+            self._touching.data,
+            len(states),
+        )
         objects = {name: np.empty((num, 4, 4)) for name in (*task.parts, *task.clamped)}
-        mated, free = ({name: np.empty(num, bool) for name in task.parts} for _ in range(2))
-        held = {arm: {name: np.empty(num, bool) for name in task.parts} for arm in ROBOT.arms}
-        tcp, joints = ({arm: np.empty((num, *size)) for arm in ROBOT.arms} for size in ((4, 4), (ROBOT.num_joints,)))
+        mated, free = (
+            {name: np.empty(num, bool) for name in task.parts} for _ in range(2)
+        )
+        held = {
+            arm: {name: np.empty(num, bool) for name in task.parts}
+            for arm in ROBOT.arms
+        }
+        tcp, joints = (
+            {arm: np.empty((num, *size)) for arm in ROBOT.arms}
+            for size in ((4, 4), (ROBOT.num_joints,))
+        )
         holds_fast = {arm: np.empty(num, bool) for arm in ROBOT.arms}
         for t, row in enumerate(states):
             touching.look(row)
-            met = {name for pair in task.mating if set(pair) in touching.pairs for name in pair}
+            met = {
+                name
+                for pair in task.mating
+                if set(pair) in touching.pairs
+                for name in pair
+            }
             for name, poses in objects.items():
                 poses[t] = _pose(data.body(name))
             for name in task.parts:
@@ -120,9 +160,21 @@ class SourceReader:
         for arm in ROBOT.arms:
             own = ROBOT.joint_slice(arm)
             commands = actions[:, own]
-            goals = self._goals(arm, joints[arm], commands, rest_command[own], touched | holds_fast[arm])
-            goal, command = (np.stack([self.kinematics[arm].pose(row) for row in rows]) for rows in (goals, commands))
-            arms[arm] = ArmTrack(tcp[arm], goal, goals, actions[:, ROBOT.gripper_index(arm)], command, commands)
+            goals = self._goals(
+                arm, joints[arm], commands, rest_command[own], touched | holds_fast[arm]
+            )
+            goal, command = (
+                np.stack([self.kinematics[arm].pose(row) for row in rows])
+                for rows in (goals, commands)
+            )
+            arms[arm] = ArmTrack(
+                tcp[arm],
+                goal,
+                goals,
+                actions[:, ROBOT.gripper_index(arm)],
+                command,
+                commands,
+            )
         subtask = episode.arrays["sim.subtask"]
         signals = {
             arm: {s.name: subtask[:, a] > k for k, s in enumerate(task.subtasks()[arm])}
@@ -135,12 +187,19 @@ class SourceReader:
         return self.sim.row_memory(row[None])["targets"][0]
 
     def _goals(
-        self, arm: str, joints: np.ndarray, commands: np.ndarray, at_rest: np.ndarray, held_back: np.ndarray
+        self,
+        arm: str,
+        joints: np.ndarray,
+        commands: np.ndarray,
+        at_rest: np.ndarray,
+        held_back: np.ndarray,
     ) -> np.ndarray:
         """(T, 6) where the commands (T, 6) were to bring the joints (T, 6). Where contact has ``held_back`` (T,) the arm, nothing
         is learnt of its rest."""
         gains = self.sim.config.controller_of(arm)
-        rest = RestOffset(joints[0], at_rest, np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad))
+        rest = RestOffset(
+            joints[0], at_rest, np.divide(gains.kd_nms_per_rad, gains.kp_nm_per_rad)
+        )
         goals = []
         for now, command, is_held_back in zip(joints, commands, held_back, strict=True):
             if not is_held_back:

@@ -34,8 +34,12 @@ def tcp_from_part(source: Source, arm: str, part: str) -> np.ndarray | None:
 
 def is_same(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two poses (4, 4) differ by less than ``SAME_M`` and ``SAME_RAD``."""
-    angle_rad = np.arccos(np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1))
-    return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < SAME_M and angle_rad < SAME_RAD)
+    angle_rad = np.arccos(
+        np.clip((np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2, -1, 1)
+    )
+    return bool(
+        np.linalg.norm(one[:3, 3] - other[:3, 3]) < SAME_M and angle_rad < SAME_RAD
+    )
 
 
 def grips_report(sources: Sequence[Source]) -> dict[str, Any]:
@@ -46,26 +50,52 @@ def grips_report(sources: Sequence[Source]) -> dict[str, Any]:
     found = []
     for arm in ROBOT.arms:
         for part in sources[0].held[arm]:
-            poses = [pose for source in sources if (pose := tcp_from_part(source, arm, part)) is not None]
+            poses = [
+                pose
+                for source in sources
+                if (pose := tcp_from_part(source, arm, part)) is not None
+            ]
             different: list[np.ndarray] = []
             for pose in poses:
                 if not any(is_same(pose, known) for known in different):
                     different.append(pose)
             if poses:
-                found.append({"arm": arm, "part": part, "sources": len(poses), "different": len(different)})
+                found.append(
+                    {
+                        "arm": arm,
+                        "part": part,
+                        "sources": len(poses),
+                        "different": len(different),
+                    }
+                )
     return {"hands": found, "few": any(grips["different"] < FEWEST for grips in found)}
 
 
 def grips_words(report: dict[str, Any]) -> str:
     """The numbers of ``grips_report`` as a line."""
-    each = (f"{g['part']} in the {g['arm']} hand {g['different']} of {g['sources']} sources" for g in report["hands"])
-    return "different grips: " + (", ".join(each) or "no hand holds a part with both pads")
+    each = (
+        f"{g['part']} in the {g['arm']} hand {g['different']} of {g['sources']} sources"
+        for g in report["hands"]
+    )
+    return "different grips: " + (
+        ", ".join(each) or "no hand holds a part with both pads"
+    )
 
 
 def grips_warning(task: str) -> tuple[str, str]:
     """Why few grips are too few, and the command that makes many demonstrations whose grips differ."""
-    words = ["taccorl", "collect", f"--task={task}", "--episodes=3500", "--source.hands.grasp_m=0.004"]
-    words += ["--source.hands.grasp_rad=0.06", "--source.hands.pulse_rad=0.02", "--pictures=cache"]
+    words = [
+        "taccorl",
+        "collect",
+        f"--task={task}",
+        "--episodes=3500",
+        "--source.hands.grasp_m=0.004",
+    ]
+    words += [
+        "--source.hands.grasp_rad=0.06",
+        "--source.hands.pulse_rad=0.02",
+        "--pictures=cache",
+    ]
     words += ["--resolution=84x112", "--part_poses=true", f"--out=outputs/{task}_many"]
     why = (
         f"fewer than {FEWEST} different grips: policies learn to recognise few grips instead of measuring where a part lies in "

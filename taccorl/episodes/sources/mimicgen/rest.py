@@ -10,19 +10,25 @@ import numpy as np
 from taccorl.robots import ROBOT
 from taccorl.tasks.experts.hands import LEARNED, follow
 
-_STILL_RAD = 0.001  # of a joint in a control step: what a tremor makes; 12 mm/s of a hand
+_STILL_RAD = (
+    0.001  # of a joint in a control step: what a tremor makes; 12 mm/s of a hand
+)
 
 
 def joint_addresses(model: mujoco.MjModel, arm: str) -> np.ndarray:
     """Indices (6,) of an arm's joints in ``qpos``."""
-    return np.array([model.joint(f"{arm}_{joint}").qposadr[0] for joint in ROBOT.joints])
+    return np.array(
+        [model.joint(f"{arm}_{joint}").qposadr[0] for joint in ROBOT.joints]
+    )
 
 
 class RestOffset:
     """Estimate of the offset of one arm's joints (6,): command = goal − offset. The first-order lag behind moving goals is
     not part of it."""
 
-    def __init__(self, joints_rad: np.ndarray, command_rad: np.ndarray, lag_s: np.ndarray) -> None:
+    def __init__(
+        self, joints_rad: np.ndarray, command_rad: np.ndarray, lag_s: np.ndarray
+    ) -> None:
         """Start at rest, with joint angles, commands, and the controller's time constants K_d / K_p [s], each (6,)."""
         self.offset_rad = joints_rad - command_rad
         self._goal, self._predicted, self._lag_s = joints_rad, joints_rad, lag_s

@@ -99,14 +99,20 @@ class Schedule:
 
     def to_plan(self) -> list[str]:
         """Names of the arms whose present subtask may begin and has no trajectory yet."""
-        idle = [arm for arm, state in self._arms.items() if not state.done and state.num_steps is None]
+        idle = [
+            arm
+            for arm, state in self._arms.items()
+            if not state.done and state.num_steps is None
+        ]
         return [arm for arm in idle if not self._kept_from_beginning(arm)]
 
     def plan(self, arm: str, num_steps: int, num_together: int = 0) -> None:
         """Set the length of the arm's present subtask: ``num_steps`` steps, the last ``num_together`` of them together with
         the other arm."""
         if num_steps < 1 or not 0 <= num_together <= num_steps:
-            raise TaccorlError(f"schedule: {arm}: {num_together} of {num_steps} steps together: 0 … all, at least 1")
+            raise TaccorlError(
+                f"schedule: {arm}: {num_together} of {num_steps} steps together: 0 … all, at least 1"
+            )
         state = self._arms[arm]
         state.num_steps, state.step, state.num_together = num_steps, 0, num_together
 
@@ -114,7 +120,11 @@ class Schedule:
         """Advance by one control step: returns arm → its step, for the arms that move. ``held`` are arms that must not move.
         Raises DeadlockError: no arm moves, and ``held`` is empty."""
         why = {arm: self._waits_for(arm) for arm in self._arms}
-        moving = {arm for arm, state in self._arms.items() if not state.done and not why[arm] and arm not in held}
+        moving = {
+            arm
+            for arm, state in self._arms.items()
+            if not state.done and not why[arm] and arm not in held
+        }
         for arm in list(moving):
             partner = self._partner(arm)
             if partner and partner not in moving and self._is_together(arm):
@@ -129,7 +139,12 @@ class Schedule:
                 cues[arm] = Cue(state.subtask, state.step)
                 state.step += 1
                 if state.step == state.num_steps:
-                    state.subtask, state.step, state.num_steps, state.num_together = state.subtask + 1, 0, None, 0
+                    state.subtask, state.step, state.num_steps, state.num_together = (
+                        state.subtask + 1,
+                        0,
+                        None,
+                        0,
+                    )
         return cues
 
     # ------------------------------------------------------------------------------------------------------------------
@@ -138,10 +153,18 @@ class Schedule:
         """Why the arm's present subtask may not begin; empty if it may."""
         state = self._arms[arm]
         for c in self.constraints:
-            if c.latter == (arm, state.subtask) and not c.coordinated and not self._ended(c.former):
+            if (
+                c.latter == (arm, state.subtask)
+                and not c.coordinated
+                and not self._ended(c.former)
+            ):
                 return f"waits to begin {state.name!r} until {c.former[0]} has ended {self._name(c.former)!r}"
         c = self._coordination(arm)
-        if c and c.coordination_synchronize_start and not self._at(other := self._other(c, arm)):
+        if (
+            c
+            and c.coordination_synchronize_start
+            and not self._at(other := self._other(c, arm))
+        ):
             return f"waits to begin {state.name!r} until {other[0]} begins {self._name(other)!r}"
         return ""
 
@@ -151,19 +174,26 @@ class Schedule:
         if state.done:
             return ""
         if state.num_steps is None:
-            return self._kept_from_beginning(arm) or f"has no trajectory of {state.name!r}"
+            return (
+                self._kept_from_beginning(arm) or f"has no trajectory of {state.name!r}"
+            )
         if self._is_together(arm):
             c = self._coordination(arm)
             assert c is not None
             other = self._other(c, arm)
-            if not (self._at(other) and self._is_together(other[0])) and not self._ended(other):
+            if not (
+                self._at(other) and self._is_together(other[0])
+            ) and not self._ended(other):
                 return f"waits in {state.name!r} for {other[0]} to come to its part of {self._name(other)!r}"
         return ""
 
     def _is_together(self, arm: str) -> bool:
         """Whether the arm is in the stretch of its subtask that runs at the partner's side."""
         state = self._arms[arm]
-        in_it = state.num_steps is not None and state.step >= state.num_steps - state.num_together
+        in_it = (
+            state.num_steps is not None
+            and state.step >= state.num_steps - state.num_together
+        )
         return in_it and self._coordination(arm) is not None
 
     def _partner(self, arm: str) -> str | None:
@@ -174,7 +204,14 @@ class Schedule:
 
     def _coordination(self, arm: str) -> ConstraintSpec | None:
         place = (arm, self._arms[arm].subtask)
-        return next((c for c in self.constraints if c.coordinated and place in (c.former, c.latter)), None)
+        return next(
+            (
+                c
+                for c in self.constraints
+                if c.coordinated and place in (c.former, c.latter)
+            ),
+            None,
+        )
 
     @staticmethod
     def _other(c: ConstraintSpec, arm: str) -> Place:
@@ -190,7 +227,9 @@ class Schedule:
         return self._arms[place[0]].names[place[1]]
 
 
-def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[ConstraintSpec]) -> None:
+def rehearse(
+    signals: Mapping[str, Sequence[str]], constraints: Sequence[ConstraintSpec]
+) -> None:
     """Run the schedule of ``signals`` (arm → names of its subtasks) with one step per subtask, to find deadlocks. Raises
     DeadlockError: the schedule cannot end, for any lengths of the subtasks."""
     schedule = Schedule(signals, constraints)

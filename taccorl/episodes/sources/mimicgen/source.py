@@ -31,7 +31,9 @@ class ArmTrack:
     def gripper_acts(self) -> np.ndarray:
         """(T,) bool: action t begins to open or close a gripper that was still."""
         moves = np.diff(self.opening_m, prepend=self.opening_m[0]) != 0
-        still = np.array([not moves[max(t - _AT_REST_ROWS, 0) : t].any() for t in range(len(moves))])
+        still = np.array(
+            [not moves[max(t - _AT_REST_ROWS, 0) : t].any() for t in range(len(moves))]
+        )
         return moves & still
 
 
@@ -60,7 +62,8 @@ class Source:
     def as_commanded(self) -> "Source":
         """The source with commands in place of goals, for ``retarget: eef_command``."""
         arms = {
-            arm: replace(track, goal=track.command, joints_rad=track.command_rad) for arm, track in self.arms.items()
+            arm: replace(track, goal=track.command, joints_rad=track.command_rad)
+            for arm, track in self.arms.items()
         }
         return replace(self, arms=arms)
 
@@ -102,8 +105,12 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
         if end is None:
             early = first_rise(signals[name].astype(bool), 0)
             if early is None:
-                raise DatasetError(f"{where}: the subtask never ends; collect successes, or remove this one")
-            raise DatasetError(f"{where}: ends at row {early}, before {names[k - 1]!r} at {before}, unlike the spec")
+                raise DatasetError(
+                    f"{where}: the subtask never ends; collect successes, or remove this one"
+                )
+            raise DatasetError(
+                f"{where}: ends at row {early}, before {names[k - 1]!r} at {before}, unlike the spec"
+            )
         ends.append(end)
         before = end
     return (*ends[:-1], source.num_rows)
@@ -116,17 +123,27 @@ class SourcePool:
         """Raises DatasetError: there is no source, or one does not fit: its order of subtasks contradicts the spec, or an offset
         could leave a subtask without rows."""
         if not sources:
-            raise DatasetError(f"mimicgen of {spec.task}: no sources; taccorl collect --task={spec.task} makes some")
+            raise DatasetError(
+                f"mimicgen of {spec.task}: no sources; taccorl collect --task={spec.task} makes some"
+            )
         commanded = spec.datagen_config.retarget == "eef_command"
-        self.spec, self.sources = spec, [source.as_commanded if commanded else source for source in sources]
-        self._ends = [{arm: subtask_ends(s, arm, names) for arm, names in spec.signals.items()} for s in self.sources]
+        self.spec, self.sources = (
+            spec,
+            [source.as_commanded if commanded else source for source in sources],
+        )
+        self._ends = [
+            {arm: subtask_ends(s, arm, names) for arm, names in spec.signals.items()}
+            for s in self.sources
+        ]
         for i, source in enumerate(self.sources):
             self._check_lengths(i, source)
 
     def __len__(self) -> int:
         return len(self.sources)
 
-    def segment(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> Segment:
+    def segment(
+        self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]
+    ) -> Segment:
         """Rows of source ``i`` that are subtask ``k`` of ``arm``, each subtask's end moved by its offset: ``offsets`` maps (arm,
         index of the subtask) → rows.
 
@@ -137,24 +154,39 @@ class SourcePool:
         coordination = self.spec.coordination(arm, k)
         if coordination is None:
             return Segment(start, end)
-        (other, j) = next(p for p in coordination.eef_subtask_constraint_tuple if p != (arm, k))
+        (other, j) = next(
+            p for p in coordination.eef_subtask_constraint_tuple if p != (arm, k)
+        )
         other_start = self._begin(i, other, j, offsets)
         if coordination.coordination_synchronize_start:
             start = other_start = max(start, other_start)
-        return Segment(start, end, min(end - start, self._end(i, other, j, offsets) - other_start))
+        return Segment(
+            start, end, min(end - start, self._end(i, other, j, offsets) - other_start)
+        )
 
-    def _begin(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> int:
+    def _begin(
+        self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]
+    ) -> int:
         own = [self._end(i, arm, k - 1, offsets)] if k else [0]
-        return max(own + [self._end(i, *former, offsets) for former in self.spec.formers(arm, k)])
+        return max(
+            own
+            + [self._end(i, *former, offsets) for former in self.spec.formers(arm, k)]
+        )
 
-    def _end(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> int:
-        return min(self._ends[i][arm][k] + offsets.get((arm, k), 0), self.sources[i].num_rows)
+    def _end(
+        self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]
+    ) -> int:
+        return min(
+            self._ends[i][arm][k] + offsets.get((arm, k), 0), self.sources[i].num_rows
+        )
 
     def _check_lengths(self, i: int, source: Source) -> None:
         """Whatever offsets are drawn, every subtask has rows."""
         spec, limits = self.spec, {}
         for arm, subtasks in spec.subtask_configs.items():
-            limits |= {(arm, k): s.subtask_term_offset_range for k, s in enumerate(subtasks)}
+            limits |= {
+                (arm, k): s.subtask_term_offset_range for k, s in enumerate(subtasks)
+            }
         latest_start = {place: high for place, (_, high) in limits.items()}
         for arm, k in limits:
             earliest_end = latest_start | {(arm, k): limits[arm, k][0]}
@@ -167,17 +199,28 @@ class SourcePool:
                 )
 
     def _why_late(self, arm: str, k: int) -> str:
-        formers = [f"{other} {self.spec.signals[other][j]!r}" for other, j in self.spec.formers(arm, k)]
+        formers = [
+            f"{other} {self.spec.signals[other][j]!r}"
+            for other, j in self.spec.formers(arm, k)
+        ]
         before = [f"its own {self.spec.signals[arm][k - 1]!r}"] if k else []
         return f"after {' and '.join(before + formers) or 'the beginning'}"
 
 
-def contact_row(source: Source, bodies: Collection[str], segment: Segment, lead: int) -> int:
+def contact_row(
+    source: Source, bodies: Collection[str], segment: Segment, lead: int
+) -> int:
     """First row of a segment that counts as contact: ``lead`` rows before one of ``bodies`` touches its mate, but not before the
     segment's first row; the segment's end if none does.
     """
-    mated = [source.mated[body][segment.rows] for body in bodies if body in source.mated]
+    mated = [
+        source.mated[body][segment.rows] for body in bodies if body in source.mated
+    ]
     if not mated:
         return segment.end
     touching = np.flatnonzero(np.logical_or.reduce(mated))
-    return max(segment.start + int(touching[0]) - lead, segment.start) if len(touching) else segment.end
+    return (
+        max(segment.start + int(touching[0]) - lead, segment.start)
+        if len(touching)
+        else segment.end
+    )

@@ -47,7 +47,11 @@ class SubtaskSpec:
     @property
     def name(self) -> str:
         """Name of the subtask for schedules and messages."""
-        return UNTIL_THE_END if self.subtask_term_signal is None else self.subtask_term_signal
+        return (
+            UNTIL_THE_END
+            if self.subtask_term_signal is None
+            else self.subtask_term_signal
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +103,9 @@ class GenerationSpec:
     def has_intended(self) -> bool:
         """Whether ``action`` may differ from the target that was sent to the twin (``sim.executed``), because arms are disturbed
         or an expert has an aiming error."""
-        return self.contact_mode == "closed_loop_expert" or self.disturbance.joint_rad > 0
+        return (
+            self.contact_mode == "closed_loop_expert" or self.disturbance.joint_rad > 0
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,12 +137,17 @@ class MimicSpec:
     @property
     def digest(self) -> str:
         """SHA-256 of everything in the spec that affects the result; layout and comments of the file do not."""
-        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps(dataclasses.asdict(self), sort_keys=True).encode()
+        ).hexdigest()
 
     @property
     def signals(self) -> dict[str, tuple[str, ...]]:
         """Arm → names of its subtasks."""
-        return {arm: tuple(s.name for s in subtasks) for arm, subtasks in self.subtask_configs.items()}
+        return {
+            arm: tuple(s.name for s in subtasks)
+            for arm, subtasks in self.subtask_configs.items()
+        }
 
     def coordination(self, arm: str, k: int) -> ConstraintSpec | None:
         """Constraint that ties subtask ``k`` of ``arm`` to a simultaneous subtask of the other arm; None without one."""
@@ -144,10 +155,18 @@ class MimicSpec:
 
     def formers(self, arm: str, k: int) -> list[tuple[str, int]]:
         """Return the subtasks (arm, index) that must have ended before subtask ``k`` of ``arm`` begins."""
-        return [c.former for c in self._of(arm, k) if not c.coordinated and c.latter == (arm, k)]
+        return [
+            c.former
+            for c in self._of(arm, k)
+            if not c.coordinated and c.latter == (arm, k)
+        ]
 
     def _of(self, arm: str, k: int) -> Iterator[ConstraintSpec]:
-        return (c for c in self.task_constraint_configs if (arm, k) in c.eef_subtask_constraint_tuple)
+        return (
+            c
+            for c in self.task_constraint_configs
+            if (arm, k) in c.eef_subtask_constraint_tuple
+        )
 
 
 def load_mimic_spec(name: str | Path) -> MimicSpec:
@@ -166,23 +185,44 @@ def mimic_spec_path(name: str | Path) -> Path:
     if Path(name).is_file():
         return Path(name)
     if str(name) not in tasks:
-        raise SpecError(f"no MimicGen spec {str(name)!r}: neither a file nor a task; {nearest(Path(name).stem, tasks)}")
+        raise SpecError(
+            f"no MimicGen spec {str(name)!r}: neither a file nor a task; {nearest(Path(name).stem, tasks)}"
+        )
     path = tasks.get(str(name)).mimicgen
     if path is None:
-        raise SpecError(f"task {name} has no MimicGen spec: name one by its attribute mimicgen, or give --spec=FILE")
+        raise SpecError(
+            f"task {name} has no MimicGen spec: name one by its attribute mimicgen, or give --spec=FILE"
+        )
     return path
 
 
 def _rules(spec: MimicSpec) -> Rules:
-    counts = ", ".join(f"{arm} has 0 … {len(subtasks) - 1}" for arm, subtasks in spec.subtask_configs.items())
+    counts = ", ".join(
+        f"{arm} has 0 … {len(subtasks) - 1}"
+        for arm, subtasks in spec.subtask_configs.items()
+    )
     for arm, subtasks in spec.subtask_configs.items():
-        yield arm not in ROBOT.arms, f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ROBOT.arms)}"
+        yield (
+            arm not in ROBOT.arms,
+            f"subtask_configs/{arm}",
+            f"no arm {arm!r}; {nearest(arm, ROBOT.arms)}",
+        )
         for k, subtask in enumerate(subtasks):
-            yield from _subtask_rules(f"subtask_configs/{arm}/{k}", subtask, last=k == len(subtasks) - 1)
+            yield from _subtask_rules(
+                f"subtask_configs/{arm}/{k}", subtask, last=k == len(subtasks) - 1
+            )
     for arm in ROBOT.arms:
-        yield not spec.subtask_configs.get(arm), "subtask_configs", f"the {arm} arm has no subtasks"
+        yield (
+            not spec.subtask_configs.get(arm),
+            "subtask_configs",
+            f"the {arm} arm has no subtasks",
+        )
     for body, turns in spec.symmetry.items():
-        yield turns < 0, f"symmetry/{body}", f"{turns}: how many turns look the same; 0 for any"
+        yield (
+            turns < 0,
+            f"symmetry/{body}",
+            f"{turns}: how many turns look the same; 0 for any",
+        )
     yield from _number_rules(spec)
     bound: dict[tuple[str, int], int] = {}
     for i, constraint in enumerate(spec.task_constraint_configs):
@@ -204,14 +244,25 @@ def _rules(spec: MimicSpec) -> Rules:
 
 
 def _subtask_rules(key: str, subtask: SubtaskSpec, *, last: bool) -> Rules:
-    (low, high), ends = subtask.subtask_term_offset_range, f"{key}/subtask_term_offset_range"
+    (low, high), ends = (
+        subtask.subtask_term_offset_range,
+        f"{key}/subtask_term_offset_range",
+    )
     yield low > high, ends, f"[{low}, {high}]: the lower bound comes first"
     unnamed = subtask.subtask_term_signal is None and not last
-    yield unnamed, f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
+    yield (
+        unnamed,
+        f"{key}/subtask_term_signal",
+        "null: only an arm's last subtask needs no signal",
+    )
     text = f"[{low}, {high}]: an arm's last subtask ends where the source ends"
     yield last and (low, high) != (0, 0), ends, text
     needs = subtask.selection_strategy != "random" and subtask.object_ref is None
-    yield needs, f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
+    yield (
+        needs,
+        f"{key}/selection_strategy",
+        f"{subtask.selection_strategy} needs an object_ref",
+    )
 
 
 def _numbers(config: object, place: str = "") -> Iterator[tuple[str, float]]:
@@ -230,18 +281,32 @@ def _number_rules(spec: MimicSpec) -> Rules:
         yield not value > 0, name, f"{value:g}: nothing would pass; give a number > 0"
     for name, value in _numbers(generation):
         positive = name.endswith("time_s")
-        text = f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
-        yield not value >= 0 or (positive and value == 0), f"datagen_config/{name}", text
+        text = (
+            f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
+        )
+        yield (
+            not value >= 0 or (positive and value == 0),
+            f"datagen_config/{name}",
+            text,
+        )
     disturbance = generation.disturbance
     alone = disturbance.joint_rad == 0 and disturbance != DisturbanceSpec()
-    yield alone, "datagen_config/disturbance/time_s", "has no effect without joint_rad; give joint_rad: 0.02"
+    yield (
+        alone,
+        "datagen_config/disturbance/time_s",
+        "has no effect without joint_rad; give joint_rad: 0.02",
+    )
     yield from _closed_loop_rules(generation)
 
 
 def _closed_loop_rules(generation: GenerationSpec) -> Rules:
     closed = generation.contact_mode == "closed_loop_expert"
     text = "eef_command sends poses as commanded, closed_loop_expert says where the hands are to be; take "
-    yield closed and generation.retarget == "eef_command", "datagen_config/retarget", f"{text}held_object or eef"
+    yield (
+        closed and generation.retarget == "eef_command",
+        "datagen_config/retarget",
+        f"{text}held_object or eef",
+    )
 
 
 def check_task(spec: MimicSpec, task: Task) -> None:
@@ -253,17 +318,27 @@ def check_task(spec: MimicSpec, task: Task) -> None:
     bodies = (*task.parts, *task.clamped)
     for arm, subtasks in task.subtasks().items():
         known = [s.name for s in subtasks]
-        named = [s.subtask_term_signal for s in spec.subtask_configs[arm] if s.subtask_term_signal is not None]
+        named = [
+            s.subtask_term_signal
+            for s in spec.subtask_configs[arm]
+            if s.subtask_term_signal is not None
+        ]
         for k, name in enumerate(named):
             if name not in known:
-                raise SpecError(f"{where}: subtask_configs → {arm} → {k}: no subtask {name!r}; {nearest(name, known)}")
+                raise SpecError(
+                    f"{where}: subtask_configs → {arm} → {k}: no subtask {name!r}; {nearest(name, known)}"
+                )
         if named != known:
-            raise SpecError(f"{where}: subtask_configs → {arm}: {', '.join(named)}; the task has {', '.join(known)}")
+            raise SpecError(
+                f"{where}: subtask_configs → {arm}: {', '.join(named)}; the task has {', '.join(known)}"
+            )
         for k, subtask in enumerate(spec.subtask_configs[arm]):
             for key in ("object_ref", "held_object"):
                 body = getattr(subtask, key)
                 if body is not None and body not in bodies:
-                    raise SpecError(f"{where}: {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}")
+                    raise SpecError(
+                        f"{where}: {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}"
+                    )
     for body in spec.symmetry:
         if body not in bodies:
             raise SpecError(f"{where}: symmetry: no {body!r}; {nearest(body, bodies)}")
@@ -277,7 +352,10 @@ def check_closed_loop(spec: MimicSpec) -> None:
     for wrong, key, text in _closed_loop_rules(spec.datagen_config):
         if wrong:
             raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
-    if spec.datagen_config.contact_mode == "closed_loop_expert" and not expert_of(tasks.get(spec.task)).can_finish():
+    if (
+        spec.datagen_config.contact_mode == "closed_loop_expert"
+        and not expert_of(tasks.get(spec.task)).can_finish()
+    ):
         raise SpecError(
             f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot start in the "
             "middle of a subtask: implement its finish(), or set contact_mode: replay"
@@ -296,4 +374,6 @@ def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
             raise TaccorlError(
                 f"datagen_config: {name}: {value!r} is not one of {', '.join(words[name])}; {nearest(str(value), words[name])}"
             )
-    return dataclasses.replace(spec, datagen_config=dataclasses.replace(spec.datagen_config, **changes))  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(
+        spec, datagen_config=dataclasses.replace(spec.datagen_config, **changes)
+    )  # pyright: ignore[reportArgumentType]

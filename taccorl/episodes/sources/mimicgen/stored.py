@@ -37,18 +37,27 @@ class Demonstration:
     provenance: dict[str, object] = field(default_factory=dict)
 
 
-def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, gates: GatesSpec) -> Attempt:
+def execute(
+    sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, gates: GatesSpec
+) -> Attempt:
     """Execute a demonstration again and record its rows. Facts of the result: ``differs``, whether its last state is another one.
 
     MuJoCo on another CPU may differ in the last bit, and contact amplifies the difference: then success and the acceptance
     criteria ``gates`` decide. Outcomes: ``success``; a failure category of the task; ``not reproduced``; a criterion (gate) that
     was not met.
     """
-    seed, actions, intended = demonstration.scene_seed, demonstration.actions, demonstration.intended
+    seed, actions, intended = (
+        demonstration.scene_seed,
+        demonstration.actions,
+        demonstration.intended,
+    )
     if intended is None and EXECUTED in rows.features:
         intended = actions
     sim.reset([seed])
-    recorder, keeper = EpisodeRecorder(sim, rows, np.random.default_rng([seed, _PAD_NOISE])), GateKeeper(sim)
+    recorder, keeper = (
+        EpisodeRecorder(sim, rows, np.random.default_rng([seed, _PAD_NOISE])),
+        GateKeeper(sim),
+    )
     labels = intended if intended is not None else itertools.repeat(None)
     outcome, reason = act(sim, map(Targets, actions, labels), recorder, keeper.watch)
     differs = state_digest(sim) != demonstration.last_state
@@ -56,11 +65,17 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
         outcome, reason = "success", ""  # as it was judged when it was made
     elif outcome != "success":
         outcome = "not reproduced" if outcome == "unfinished" else outcome
-        reason = "executed again, the stored actions end in another state, without success"
+        reason = (
+            "executed again, the stored actions end in another state, without success"
+        )
     else:
         keeper.see_actions(actions)
         states = np.stack([row["sim.state"] for row in recorder.rows])
-        outcome, reason = keeper.measured.refused(gates) or foreign_contact(sim, states) or ("success", "")
+        outcome, reason = (
+            keeper.measured.refused(gates)
+            or foreign_contact(sim, states)
+            or ("success", "")
+        )
     made = demonstration.provenance | ({DIFFERS: True} if differs else {})
     return Attempt(
         outcome=outcome,
@@ -74,4 +89,6 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
 
 def state_digest(sim: Simulation) -> str:
     """SHA-256 (64 hexadecimal digits) of the state row of simulation 0, bit for bit."""
-    return hashlib.sha256(np.ascontiguousarray(sim.state_rows()[0]).tobytes()).hexdigest()
+    return hashlib.sha256(
+        np.ascontiguousarray(sim.state_rows()[0]).tobytes()
+    ).hexdigest()
