@@ -1,4 +1,6 @@
-"""``python .ci/gpu/warp_kernels.py OUT [TASK [arch]]``: compile MuJoCo Warp's kernels of a twin for a GPU (sm_90) without one.
+"""Compile MuJoCo Warp's kernels of a twin for a GPU (sm_90) without one:
+
+    python .ci/gpu/warp_kernels.py OUT [TASK [arch [SETTINGS]]]
 
 A step is taken with launches that are only noted, and with a device that says it is a GPU; each module is then compiled into
 OUT/<version of Warp>, which WARP_CACHE_PATH=OUT names on the GPU machine: 82 kernels in 5 minutes on two busy cores. What is
@@ -57,11 +59,17 @@ wp.launch, wp.launch_tiled = (
 )
 import mujoco_warp as mjw  # noqa: E402
 
-from taccorl.sim import warp_batch  # noqa: E402
+from taccorl.robots import ROBOT  # noqa: E402
+from taccorl.sim import ray_renderer, warp_batch  # noqa: E402
+from taccorl.sim.ray_renderer import RayRenderer  # noqa: E402
 from taccorl.sim.vector_env import TaccorlVectorEnv  # noqa: E402
 
+ray_renderer.WORLDS_AT_ONCE = 2  # drawn here once, to be made
 batch = TaccorlVectorEnv(
-    (sys.argv[2:] or ["assembly_1"])[0], 4, physics="warp:device=cpu", num_threads=2
+    (sys.argv[2:] or ["assembly_1"])[0],
+    4,
+    physics=",".join(["warp:device=cpu", *sys.argv[4:]]),
+    num_threads=2,
 ).sim.batch
 varied = [
     name
@@ -77,6 +85,12 @@ wp.get_device = lambda *name: Gpu(get_device(*name))
 noting = True
 mjw.step(worlds._model, worlds._data)
 mjw.forward(worlds._model, worlds._data)
+wp.launch(warp_batch.kernels.put_targets)
+for size in ((84, 112), (224, 224)):
+    noting, wp.get_device = False, get_device
+    rays = RayRenderer(batch.model, ROBOT.cameras, *size, device="cpu")
+    noting, wp.get_device = True, lambda *name: Gpu(get_device(*name))
+    rays._work()
 noting, wp.get_device = False, get_device
 for number, (module, block_dim) in enumerate(noted.values()):
     module.get_module_hash(block_dim)

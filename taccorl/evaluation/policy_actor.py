@@ -74,11 +74,16 @@ def needs_images(config: Any) -> bool:
 
 
 def policy_batch(
-    preprocessor: Processor, observation: Observation, instructions: Sequence[str]
+    preprocessor: Processor,
+    observation: Observation,
+    instructions: Sequence[str],
+    *,
+    on_device: bool = False,
 ) -> dict[str, torch.Tensor | Any]:
     """Input of a policy, LeRobot key → tensor with N rows: LeRobot's conversion of an environment's ``observation`` of N
     environments, then the policy's own preprocessor. Pictures may be absent; ``PICTURES_CHANGED``, if it is there, is passed
-    on. ``instructions``: (N,)."""
+    on. ``instructions``: (N,). ``on_device``: the preprocessor computes on the policy's device, not before it: for thousands of
+    environments."""
     steps = getattr(preprocessor, "steps", ())
     device = next(
         (step.tensor_device for step in steps if isinstance(step, DeviceProcessorStep)),
@@ -92,6 +97,8 @@ def policy_batch(
     }
     batch: dict[str, Any] = preprocess_observation(raw_names(numbers))
     batch |= {key: pictures_on(device, values) for key, values in pictures.items()}
+    if on_device:
+        batch = {key: values.to(device) for key, values in batch.items()}
     batch["task"] = list(instructions)
     batch = preprocessor(batch)
     if PICTURES_CHANGED in observation:

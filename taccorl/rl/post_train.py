@@ -40,9 +40,12 @@ from taccorl.rl.rollout import Clock, collect, first_episodes
 from taccorl.rl.settings import PostTrainSettings
 from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard
 from taccorl.rl.start_states import NUM_STATES, StartStates
-from taccorl.rl.twin_shard import make_shard
+from taccorl.rl.twin_shard import DrawnPictures, make_shard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.rl.watched_episode import EpisodeWatch, executed_again
+from taccorl.robots import ROBOT
+from taccorl.sim.cameras import letterbox_window
+from taccorl.sim.spaces import IMAGE_KEYS
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 
@@ -113,6 +116,7 @@ class PostTraining:
             _shards(settings, twin, policy.config), self._opened, self._clock, pictures
         )
         self.world.restart(settings.seed)
+        self._report_pictures()
         critic = Critic(
             self._actor.num_features, self.world.observe().privileged_NP.shape[1]
         ).to(device)
@@ -172,6 +176,21 @@ class PostTraining:
             self._report_noise(twin)
             if self.settings.noise_check:
                 self._check_noise()
+
+    def _report_pictures(self) -> None:
+        """Report how far pictures that a GPU draws are from those in which policies learn."""
+        try:
+            apart = self.world.picture_difference()
+        except TaccorlError as error:
+            self._report(
+                f"pictures by ray tracing, not compared with OpenGL's: {error}"
+            )
+            return
+        if apart is not None:
+            self._report(
+                f"pictures by ray tracing: {apart:.2f} of 255 from OpenGL's, which datasets have (mean of a few scenes); "
+                "OpenGL: --env.physics=warp:pictures=opengl"
+            )
 
     def _report_noise(self, twin: TwinConfig) -> None:
         batch, postprocess, seed = (
@@ -291,7 +310,7 @@ class PostTraining:
         rrd = out / ROLLOUTS / f"iteration_{self._iteration:04d}.rrd"
         scenes = Scenes(
             tasks=(str(env.task),), episodes=1, seed=watched.seed, difficulty=env.difficulty, twin=env.twin,
-            randomization=env.randomization, episode_length=env.episode_length,
+            randomization=env.randomization, episode_length=self.world.limit_steps,
         )  # fmt: skip
         name = f"{out.name}, iteration {self._iteration}, with noise"
         try:
@@ -413,9 +432,11 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             envs,
             history=config.tactile_history,
             stride=config.tactile_stride,
+            num_actions=config.n_action_steps,
             starts=StartStates(env.start_share, max(1, NUM_STATES // env.shards)),
             privileged=settings.ppo.privileged_critic,
             first=int(numbers[0]),
+            drawn=_drawn(config, twin, on_host=ray is not None or env.shards > 1),
         )
         if ray is not None:
             return RayShard(ray, make, envs["num_threads"])
@@ -425,6 +446,18 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
         shard(numbers)
         for numbers in np.array_split(np.arange(env.num_envs), env.shards)
     ]
+
+
+def _drawn(config: Any, twin: TwinConfig, *, on_host: bool) -> DrawnPictures | None:
+    """Pictures that a GPU may draw for the policy at its own size: letterboxed into a square, or of the cameras' aspect. None:
+    other sizes, which are cut from larger pictures, and policies without cameras."""
+    names = [n for n in ROBOT.cameras if IMAGE_KEYS[n] in config.input_features]
+    rows, columns = size = tuple(config.image_resolution)
+    for camera in twin.cameras:
+        window = letterbox_window(camera.recording_size, size)
+        if rows != columns and (window.rows, window.columns) != size:
+            return None
+    return DrawnPictures(names, size, on_host) if names else None
 
 
 def _check_folder(settings: PostTrainSettings) -> None:

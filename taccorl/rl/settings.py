@@ -55,7 +55,7 @@ class EnvSettings:
     randomisation (crop, rotation, brightness, contrast, saturation, noise); each scene draws them once for each camera, noise
     anew in each picture. The anchor's images are changed as in training in either case."""
     episode_length: int | None = None
-    """Control steps after which an episode ends; the task's own limit if not given."""
+    """Control steps after which an episode ends; the task's own limit if not given. Rounded down to whole decisions."""
     start_share: float = 0.0
     """Share of episodes, 0 or more and below 1, that begin in a stored state of one of the policy's earlier episodes instead of a
     reset. The newest 256 states after each arm has grasped its part are stored. progress.jsonl counts these episodes apart

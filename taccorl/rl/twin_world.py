@@ -17,7 +17,7 @@ from taccorl.evaluation.policy_actor import Checkpoint, policy_batch, require_sa
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
-from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
+from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures, channels_first
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import Clock, Observations
 from taccorl.rl.shards import Shard
@@ -119,8 +119,7 @@ class TwinWorld:
         observation = parts[0]
         if len(parts) > 1:
             observation = {
-                key: np.concatenate([part[key] for part in parts])
-                for key in observation
+                key: self._joined([part[key] for part in parts]) for key in observation
             }
         privileged_NP = (
             torch.from_numpy(observation[PRIVILEGED]).float().to(self._device)
@@ -132,7 +131,10 @@ class TwinWorld:
                 if key in observation
             }
             found = policy_batch(
-                self._preprocessor, numbers, [self._instruction] * len(privileged_NP)
+                self._preprocessor,
+                numbers,
+                [self._instruction] * len(privileged_NP),
+                on_device=True,
             )
             batch: Batch = {
                 k: x.to(self._device) for k, x in found.items() if k in self._kept
@@ -142,14 +144,17 @@ class TwinWorld:
             )
         return Observations(batch, privileged_NP)
 
+    def _joined(self, parts: list[Any]) -> Any:
+        """One array of those of all shards, or one tensor on the policy's device."""
+        if isinstance(parts[0], Tensor):
+            return torch.cat([part.to(self._device) for part in parts])
+        return np.concatenate(parts)
+
     def _seen_pictures(self, clear: Observation, scene_N2: np.ndarray) -> Batch:
         """(N, 3, rows, columns) uint8, a quarter of float32: what is stored for the update is what the policy saw."""
         if self._pictures is None or not clear:
             return {
-                key: torch.from_numpy(x)
-                .to(self._device)
-                .permute(0, 3, 1, 2)
-                .contiguous()
+                key: channels_first(x, self._device).contiguous()
                 for key, x in clear.items()
             }
         changed = self._pictures(clear, scene_N2[:, 0], scene_N2[:, 1])
@@ -159,6 +164,11 @@ class TwinWorld:
                 len(scene_N2), dtype=torch.bool, device=self._device
             ),
         }
+
+    def picture_difference(self) -> float | None:
+        """That of the first shard (``TwinShard.picture_difference``)."""
+        self.shards[0].start("picture_difference")
+        return self.shards[0].result()
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls

@@ -1,6 +1,8 @@
 """Read-only accessors of N simulations: joint states, touch, images, and privileged poses and contacts for predicates."""
 
 from collections.abc import Iterator, Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,10 +14,12 @@ from taccorl.sim.blocks import Blocks
 from taccorl.sim.controller import MotorEffort
 from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
 from taccorl.sim.effects.camera_past import place_past
-from taccorl.sim.pad import PadArray
+from taccorl.sim.pad import KINEMATIC_FIELDS, PadArray
+from taccorl.sim.ray_renderer import Positions, RayRenderer
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.sensors import Noise, Sensor
 from taccorl.sim.sensors.noise import ScanNoise
+from taccorl.sim.spaces import IMAGE_SHAPE
 from taccorl.sim.task import Contact, Task
 from taccorl.sim.twin import TwinConfig
 
@@ -47,6 +51,7 @@ class SeenScene:
     _touching: dict[str, np.ndarray]
     _mating: dict[tuple[str, str], tuple[int, int]]
     _renderers: dict[tuple, Renderer]
+    _ray_renderers: dict[tuple, RayRenderer]
 
     @property
     def row_size(self) -> int:
@@ -65,38 +70,41 @@ class SeenScene:
         """(N, 14) torque of the joints' motors [N·m] and force of the grippers' [N] in the newest physics step."""
         return self._effort()
 
-    def reading(self) -> np.ndarray:
-        """(N, 4, 32, 12) float32 readings of the pads before gain, noise and rounding: a function of the state and of the memory
-        of effects only."""
+    def reading(self, ids: np.ndarray | None = None) -> np.ndarray:
+        """(n, 4, 32, 12) float32 readings of the pads of the simulations ``ids`` (n,) (all by default) before gain, noise and
+        rounding: a function of the state and of the memory of effects only."""
         spec = self.sensor.spec
-        reading = np.empty(
-            (self.num_sims, len(ROBOT.pads), spec.rows, spec.columns), np.float32
-        )
+        num = self.num_sims if ids is None else len(ids)
+        state: Any = self.batch
+        if ids is not None:
+            rows = {name: getattr(self.batch, name)[ids] for name in KINEMATIC_FIELDS}
+            state = SimpleNamespace(**rows)
+        reading = np.empty((num, len(ROBOT.pads), spec.rows, spec.columns), np.float32)
 
         def read(start: int, end: int) -> None:
             reading[start:end] = self.sensor.reading(
-                *self.pads.touch(self.batch, start, end), None
+                *self.pads.touch(state, start, end), None
             )
 
-        self.blocks.run(read, self.num_sims)
+        self.blocks.run(read, num)
         for transform in self.sensor.transforms:
-            reading = transform(reading)
+            reading = transform(reading) if ids is None else transform(reading, ids)
         return reading
 
-    def touch(self, noise: Noise = None) -> np.ndarray:
-        """(N, 1536) int16 counts above baseline at the present state. ``noise``: one random generator, or one per simulation;
-        without it no noise is added."""
-        reading = self.reading()
+    def touch(self, noise: Noise = None, ids: np.ndarray | None = None) -> np.ndarray:
+        """(n, 1536) int16 counts above baseline of the simulations ``ids`` (n,) (all by default) at the present state. ``noise``:
+        one random generator, or one per simulation; without it no noise is added."""
+        reading = self.reading(ids)
         if not isinstance(noise, ScanNoise):
             return self.sensor.above_baseline(self.sensor.digitise(reading, noise))
-        above = np.empty((self.num_sims, reading[0].size), np.int16)
+        above = np.empty((len(reading), reading[0].size), np.int16)
 
         def convert(start: int, end: int) -> None:
             above[start:end] = self.sensor.above_baseline(
                 self.sensor.digitise(reading[start:end], noise.of(start, end))
             )
 
-        self.blocks.run(convert, self.num_sims)
+        self.blocks.run(convert, len(reading))
         return above
 
     def render(
@@ -120,11 +128,56 @@ class SeenScene:
                 if past:
                     place_past(data, past.positions[sim], past.time_s[sim], age_s)
 
-            pictures = self._renderer(same, size).render_batch(
-                self.batch, ids, late if age_s else None
-            )
+            rays = None if age_s else self._rays(same, size)
+            if rays is not None:
+                pictures = rays.render_batch(self.batch, ids)
+            else:
+                pictures = self._renderer(same, size).render_batch(
+                    self.batch, ids, late if age_s else None
+                )
             found |= {name: pictures[:, k] for k, name in enumerate(same)}
         return {name: self._given(name, found[name]) for name in names}
+
+    @property
+    def draws_on_device(self) -> bool:
+        """True if ``draw_on_device`` gives what ``render`` does: physics and ray tracer on a device, and no effect that
+        changes pictures."""
+        names = [camera.name for camera in self.config.cameras]
+        settings = getattr(self.batch, "settings", None)
+        return (
+            settings is not None
+            and settings.pictures == "rays"
+            and not any(self.effects.changes_pictures(name) for name in names)
+        )
+
+    def draw_on_device(
+        self, cameras: Sequence[str], ids: np.ndarray, size: tuple[int, int]
+    ) -> Any:
+        """Torch tensor (n, cameras, 3, rows, columns) uint8 RGB of the simulations ``ids`` (n,), letterboxed into ``size``
+        (rows, columns), on the device of the physics; only if ``draws_on_device``."""
+        rays = self._rays(tuple(cameras), size)
+        assert rays is not None
+        return rays.draw(Positions.of(self.batch, ids))
+
+    def render_by_opengl(
+        self, cameras: Sequence[str], ids: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As ``render`` at the size of a dataset's pictures, by OpenGL whatever the physics, without effects on pictures."""
+        names = tuple(cameras)
+        pictures = self._renderer(names, IMAGE_SHAPE[:2]).render_batch(self.batch, ids)
+        return {name: pictures[:, k] for k, name in enumerate(names)}
+
+    def _rays(
+        self, cameras: tuple[str, ...], size: tuple[int, int]
+    ) -> RayRenderer | None:
+        settings = getattr(self.batch, "settings", None)
+        if settings is None or settings.pictures != "rays":
+            return None
+        if (cameras, size) not in self._ray_renderers:
+            self._ray_renderers[cameras, size] = RayRenderer(
+                self.model, cameras, *size, device=settings.device
+            )
+        return self._ray_renderers[cameras, size]
 
     def render_states(
         self,
@@ -211,9 +264,10 @@ class SeenScene:
     def close(self) -> None:
         """Free OpenGL contexts and threads."""
         self.blocks.close()
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
+        for renderers in (self._renderers, self._ray_renderers):
+            for renderer in renderers.values():
+                renderer.close()
+            renderers.clear()
 
     def poses(self, body: str) -> np.ndarray:
         """World-from-body poses (N, 4, 4) of ``body`` in N simulations."""

@@ -22,12 +22,13 @@ from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.outcome import Judge
 from taccorl.sim.pad import PadArray
 from taccorl.sim.randomize import draw
+from taccorl.sim.ray_renderer import RayRenderer
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.scene_digest import scene_digest
 from taccorl.sim.seen_scene import SeenScene
 from taccorl.sim.task import Reset, Task
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
-from taccorl.sim.warp_batch import Unsupported, check_supported, make_batch
+from taccorl.sim.warp_batch import Unsupported, WarpBatch, check_supported, make_batch
 
 SUB_COMMANDS = 5
 """Number of intermediate targets in one control step: targets change linearly, at 150 Hz, since a robot's driver does not jump
@@ -53,6 +54,16 @@ _BOUND = (
     "geom_xpos",
 )
 _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat")
+_JUDGED = (
+    "xpos",
+    "xmat",
+    "cvel",
+    "subtree_com",
+    "site_xpos",
+    "site_xmat",
+    "sensordata",
+)
+"""What joint states and predicates are computed from."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +162,7 @@ class Simulation(SeenScene):
         self.targets = np.zeros((num_sims, ROBOT.num_actions))
         """(N, A) the newest requested targets; effects may delay them on the way to the controllers."""
         self._renderers: dict[tuple, Renderer] = {}
+        self._ray_renderers: dict[tuple, RayRenderer] = {}
         self._index()
 
     def _batch(self, num_threads: int, physics: str) -> Batch:
@@ -184,7 +196,8 @@ class Simulation(SeenScene):
             )
             for arm in ROBOT.arms
         }
-        self._free = {part: m.joint(part) for part in self.task.parts}
+        self._free = {part: m.joint(part).qposadr[0] for part in self.task.parts}
+        self._mocap = {body: m.body(body).mocapid[0] for body in self.task.clamped}
         self._bodies = {
             name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)
         }
@@ -257,10 +270,9 @@ class Simulation(SeenScene):
         scene = self.task.reset(self.draws[i])
         self._write_model(i, scene)
         qpos = self.arrays["qpos"]
-        for part, joint in self._free.items():
-            qpos[i, joint.qposadr[0] : joint.qposadr[0] + 7] = scene.poses[part]
-        for body in self.task.clamped:
-            slot = self.model.body(body).mocapid[0]
+        for part, at in self._free.items():
+            qpos[i, at : at + 7] = scene.poses[part]
+        for body, slot in self._mocap.items():
             self.arrays["mocap_pos"][i, slot], self.arrays["mocap_quat"][i, slot] = (
                 np.split(scene.poses[body], [3])
             )
@@ -272,11 +284,10 @@ class Simulation(SeenScene):
             rest = np.array(controller.torque_ff_nm) / np.array(
                 controller.kp_nm_per_rad
             )
-            self.arrays["ctrl"][
-                i, [self.model.actuator(f"{arm}_{j}").id for j in ROBOT.joints]
-            ] = home - rest
             opening_m = ROBOT.action_high[ROBOT.gripper_index(arm)]
-            self.arrays["ctrl"][i, self.model.actuator(f"{arm}_gripper").id] = opening_m
+            controls = self.arrays["ctrl"][i]
+            controls[self.action_actuators[ROBOT.joint_slice(arm)]] = home - rest
+            controls[self.action_actuators[ROBOT.gripper_index(arm)]] = opening_m
             qpos[i, self._fingers[arm]] = ROBOT.finger_stroke_m
 
     def place_arms(self, joints: np.ndarray, targets: np.ndarray) -> None:
@@ -313,11 +324,14 @@ class Simulation(SeenScene):
         action: np.ndarray,
         ids: np.ndarray | None = None,
         watch: Watch | None = None,
+        *,
+        lean: bool = False,
     ) -> None:
         """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], linearly interpolated over the step.
 
         Simulations outside ``ids`` (all by default) are frozen, with their targets and outcomes; their rows are not used.
-        ``watch`` is called after physics steps within the control step; it must not change the state."""
+        ``watch`` is called after physics steps within the control step; it must not change the state. ``lean``: on a GPU only
+        proprioception and outcomes are current afterwards, until ``refresh``."""
         goal = self._checked(action, ids)
         now = self.targets.copy()
         line = np.arange(1, SUB_COMMANDS + 1)[:, None, None] / SUB_COMMANDS
@@ -328,8 +342,14 @@ class Simulation(SeenScene):
             self.config.physics.steps_per_control_step // SUB_COMMANDS,
             ids,
             watch,
+            lean=lean,
         )
         self.judge.update(self, ids)
+
+    def refresh(self) -> None:
+        """Make everything current after ``lean`` steps."""
+        if isinstance(self.batch, WarpBatch):
+            self.batch.refresh()
 
     def advance(
         self,
@@ -337,20 +357,48 @@ class Simulation(SeenScene):
         num_steps: int,
         ids: np.ndarray | None = None,
         watch: Watch | None = None,
+        *,
+        lean: bool = False,
     ) -> None:
         """Physics only: ``commands`` (S, N, A) [rad, m] are S targets, each held for ``num_steps`` physics steps. For replay and
         recording.
 
-        ``ids`` and ``watch``: as ``step``; steps are counted over all S targets."""
+        ``ids``, ``watch`` and ``lean``: as ``step``; steps are counted over all S targets."""
+        stepped = (
+            np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
+        )
+        arrive = self._send(commands, num_steps, ids)
+        num = len(commands) * num_steps
+        scans = self._scan_steps(stepped, num) if self.effects.remember_touch else {}
+        in_parts = watch is not None or bool(scans) or self.effects.rewrites
+        if isinstance(self.batch, WarpBatch) and not in_parts:
+            fields = _JUDGED if lean and not self.effects.past else None
+            targets_SNA = np.stack(arrive)
+            self.batch.step_targets(
+                ids, self.action_actuators, targets_SNA, num_steps, fields
+            )
+            self._sound(ids, at_end=True)
+        else:
+            self._advance_in_parts(arrive, num_steps, ids, watch, scans)
+        if self.effects.past:
+            self.effects.past.keep()
+
+    def _advance_in_parts(
+        self,
+        arrive: list[np.ndarray],
+        num_steps: int,
+        ids: np.ndarray | None,
+        watch: Watch | None,
+        scans: dict[int, np.ndarray],
+    ) -> None:
+        """Physics up to each change of a target, each scan of the pads and each step that is watched."""
         stepped = (
             np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
         )
         watched = set(watch.at) if watch else set()
-        total = len(commands) * num_steps
-        arrive = self._send(commands, num_steps, ids)
+        total = len(arrive) * num_steps
         done = 0
         step_by_step = 1 if self.effects.rewrites else num_steps
-        scans = self._scan_steps(stepped, total) if self.effects.remember_touch else {}
         for end in sorted(
             {*range(step_by_step, total + 1, step_by_step), *watched, *scans}
         ):
@@ -380,8 +428,6 @@ class Simulation(SeenScene):
                 )
             if watch and end in watched:
                 watch.see(end)
-        if self.effects.past:
-            self.effects.past.keep()
 
     def _scan_steps(self, ids: np.ndarray, num_steps: int) -> dict[int, np.ndarray]:
         """Physics step of the next ``num_steps`` → simulations of ``ids`` whose boards scan the pads after it.

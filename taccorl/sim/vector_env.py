@@ -75,7 +75,8 @@ class Chunk:
         np.ndarray
     )  # (N,) number of executed actions; a finished episode executes none
     tactile: np.ndarray
-    """(N, H, 1536) int16 counts above baseline after every control step, for policies that read a history."""
+    """(N, H / every, 1536) int16 counts above baseline after every ``touch_every``-th control step, for policies that read a
+    history; after the end of an episode, those of its end."""
     info: dict[str, Any]
     """Privileged information as of ``TaccorlVectorEnv``, after the chunk; ``final_obs`` and ``final_info`` of episodes that
     ended."""
@@ -198,6 +199,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._reason = np.full(num_envs, "", dtype=object)
         self._unseen = np.zeros(num_envs, dtype=bool)
         """(N,) bool: moved since its pictures were rendered."""
+        self._unfelt = np.zeros(num_envs, dtype=bool)
+        """(N,) bool: moved since its pads were read."""
         self._facts: dict[str, Any] = {}
 
     @property
@@ -270,24 +273,43 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             chunk.info,
         )
 
-    def step_chunk(self, actions: np.ndarray) -> Chunk:
+    def step_chunk(self, actions: np.ndarray, *, touch_every: int = 1) -> Chunk:
         """H control steps with the targets ``actions`` (N, H, 14) [rad, m], as a policy gives them. An episode that ends within
-        the chunk is frozen until autoreset. Raises TaccorlError: wrong shape."""
+        the chunk is frozen until autoreset.
+
+        Args:
+            touch_every: the pads are read after every so many control steps, for callers that need no other readings. Physics
+                on a GPU stay there in between.
+
+        Raises:
+            TaccorlError: wrong shape, or H is no multiple of ``touch_every``.
+        """
         self._check_open("step")
         actions = shaped(actions, self.num_envs, None)
+        horizon = actions.shape[1]
+        if touch_every < 1 or horizon % touch_every:
+            raise TaccorlError(
+                f"touch_every={touch_every}: must divide the {horizon} control steps of a chunk"
+            )
         if not self._begun:
             raise TaccorlError("step: call reset() first")
         reward, num_steps = (
             np.zeros(self.num_envs),
             np.zeros(self.num_envs, dtype=np.int64),
         )
-        tactile = np.empty((*actions.shape[:2], ROBOT.num_taxels), dtype=np.int16)
+        num_readings = horizon // touch_every
+        tactile = np.empty(
+            (self.num_envs, num_readings, ROBOT.num_taxels), dtype=np.int16
+        )
         self._clipped = np.zeros(self.num_envs, dtype=bool)
-        for k in range(actions.shape[1]):
-            advanced, earned = self._advance(actions[:, k])
+        for k in range(horizon):
+            is_read = (k + 1) % touch_every == 0
+            advanced, earned = self._advance(actions[:, k], lean=not is_read)
             num_steps += advanced
             reward += earned
-            tactile[:, k] = self._tactile
+            if is_read:
+                self._feel()
+                tactile[:, k // touch_every] = self._tactile
         facts = self._facts
         truncated = np.asarray(facts["failure"] == "timeout")
         observation, info = self._end()
@@ -379,14 +401,19 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             "",
         )
         self._take(np.isin(self._all, ids))
+        self._feel()
 
-    def _advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One control step of those that are not over: (N,) bool, which of them it moved, and (N,) reward."""
+    def _advance(
+        self, actions: np.ndarray, *, lean: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One control step of those that are not over: (N,) bool, which of them it moved, and (N,) reward. ``lean``: as
+        ``Simulation.step``."""
         actions = self._refuse_bad(actions)
         running = ~self._over
         if not running.any():
             return running, np.zeros(self.num_envs)
-        self.sim.step(actions, None if running.all() else np.flatnonzero(running))
+        ids = None if running.all() else np.flatnonzero(running)
+        self.sim.step(actions, ids, lean=lean)
         self._clipped = self._clipped | (running & self.sim.clipped)
         self._take(running)
         outcome = self.sim.judge.outcome
@@ -409,22 +436,36 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         return np.where(bad[:, None], self.sim.targets, actions)
 
     def _take(self, rows: np.ndarray) -> None:
-        """Read what has changed in ``rows`` (N,) bool. A diverged simulation's sensors keep what they read before.
-
-        The pads' noise follows from scene seed and step alone, so that neither company nor a restored state changes it."""
+        """Read joints, parts and outcomes in ``rows`` (N,) bool, which have moved. A diverged simulation's sensors keep what
+        they read before."""
         valid = rows & ~self.sim.diverged
         self._state = np.where(
             valid[:, None], self.sim.proprioception(), self._state
         ).astype(np.float32)
         if self._parts is not None:
             self._parts = np.where(valid[:, None], part_poses(self.sim), self._parts)
-        tactile = self.sim.touch(ScanNoise(self.sim.seeds, self.sim.judge.steps))
-        self._tactile = (
-            tactile if valid.all() else np.where(valid[:, None], tactile, self._tactile)
-        )
+        self._unfelt |= valid
         self._unseen |= valid
         facts = self._judged()
         self._facts = facts if rows.all() else _rows_from(self._facts, facts, rows)
+
+    def _feel(self) -> None:
+        """Read the pads of those that have moved since they were read.
+
+        The pads' noise follows from scene seed and step alone, so that neither company nor a restored state changes it."""
+        self.sim.refresh()
+        rows = self._unfelt & ~self.sim.diverged
+        self._unfelt[:] = False
+        if not rows.any():
+            return
+        noise = ScanNoise(self.sim.seeds, self.sim.judge.steps)
+        if rows.all():
+            self._tactile = self.sim.touch(noise)
+            return
+        ids = np.flatnonzero(rows)
+        noise = ScanNoise(noise.seeds[ids], noise.steps[ids])
+        self._tactile = self._tactile.copy()  # it may have been handed out
+        self._tactile[ids] = self.sim.touch(noise, ids)
 
     def _judged(self) -> dict[str, Any]:
         judge = self.sim.judge

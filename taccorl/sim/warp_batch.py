@@ -7,7 +7,7 @@ copies back what is bound. MuJoCo Warp and Torch are imported at the first use. 
 import copy
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -21,6 +21,7 @@ from taccorl.sim.rendering import TABLE
 mjw: Any = OnUse("mujoco_warp")
 wp: Any = OnUse("warp")
 torch: Any = OnUse("torch")
+kernels: Any = OnUse("taccorl.sim.warp_kernels")
 
 _INPUTS = (
     "ctrl",
@@ -39,6 +40,8 @@ _ROWS = 16
 ``_regularize_constraint``): without padding it counts them, and ``overflow`` reports it."""
 _FEW = (16, 64)  # worlds whose memory is measured
 _WAY_OUT = "use physics=c"
+PICTURES = ("rays", "opengl")
+"""Values of ``WarpSettings.pictures``."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,6 +55,11 @@ class WarpSettings:
     four tasks need up to 23."""
     constraints: int = 576
     """Rows of the constraint solver for which each world has room. Experts need up to 94, a learnt policy of the puzzle 283."""
+    iterations: int = 0
+    """Most iterations of the constraint solver in a step; 0: the model's own limit. All worlds wait for the one that needs most:
+    the mean is 1.8. A world that reaches the limit goes on with what it has, as in MuJoCo C."""
+    pictures: str = "rays"
+    """How pictures are drawn. rays: by MuJoCo Warp's ray tracer on the device; opengl: as those of MuJoCo C."""
 
     @classmethod
     def parse(cls, physics: str) -> "WarpSettings | None":
@@ -69,11 +77,16 @@ class WarpSettings:
                 raise TaccorlError(
                     f"physics={physics}: no setting {key!r}; {nearest(key, names)}"
                 )
-            if key != "device" and not (value.isdecimal() and int(value) > 0):
+            is_text = key in ("device", "pictures")
+            if not is_text and not (value.isdecimal() and int(value) > 0):
                 raise TaccorlError(
                     f"physics={physics}: {key}={value!r} is no whole number ≥ 1"
                 )
-            values[key] = value if key == "device" else int(value)
+            if key == "pictures" and value not in PICTURES:
+                raise TaccorlError(
+                    f"physics={physics}: pictures={value!r}; {nearest(value, PICTURES)}"
+                )
+            values[key] = value if is_text else int(value)
         return cls(**values)
 
 
@@ -161,6 +174,8 @@ class WarpBatch(Batch):
         """(N,) bool: the device has another state than the simulation."""
         self._behind = np.zeros(nsim, dtype=bool)
         """(N,) bool: the arrays have an older state than the device."""
+        self._partial = np.zeros(nsim, dtype=bool)
+        """(N,) bool: only some of the derived fields are of the device's state."""
         self._unsound = np.ones(nsim, dtype=bool)
         """(N,) bool: the device's state is NaN, or none of the twin's."""
         self._refreshed_s = np.zeros(nsim)
@@ -213,17 +228,66 @@ class WarpBatch(Batch):
             TaccorlError: more contacts or constraints than the buffers hold; the message states the setting to raise. The
                 worlds are then as they were when they were last refreshed.
         """
+        is_refreshed = int(stage) != _NONE
+
+        def work(worlds: "_Worlds", run: np.ndarray) -> None:
+            worlds.run(nstep, refresh=is_refreshed)
+
+        fields = tuple(self._bound) if is_refreshed else ()
+        self._advance(ids, nstep, work, fields, with_state=is_refreshed)
+
+    def step_targets(
+        self,
+        ids: Any,
+        columns: np.ndarray,
+        targets_SNA: np.ndarray,
+        nstep: int,
+        fields: Sequence[str] | None = None,
+    ) -> None:
+        """S times: write ``targets_SNA[s]`` into the controls ``columns`` (A,) and take ``nstep`` physics steps. One launch and
+        one wait for all of it; the model's sensors are computed once, at the end.
+
+        Args:
+            ids: simulations that step, as in ``Batch.step``; their rows of ``targets_SNA`` (S, N, A) are used.
+            fields: derived fields that are current afterwards, among those that are bound; the states stay on the device, as
+                after a ``step`` with ``mjSTAGE_NONE``. None: all of them, and the states.
+
+        Raises:
+            TaccorlError: as ``step``.
+        """
+
+        def work(worlds: "_Worlds", run: np.ndarray) -> None:
+            worlds.run_targets(columns, targets_SNA, nstep)
+            controls = self._columns["ctrl"]
+            rows = np.flatnonzero(run)
+            controls[rows[:, None], columns] = targets_SNA[-1][rows]
+            self._known["ctrl"][run] = controls[run]
+
+        chosen = tuple(self._bound) if fields is None else tuple(fields)
+        num = nstep * len(targets_SNA)
+        self._advance(ids, num, work, chosen, with_state=fields is None)
+
+    def _advance(
+        self,
+        ids: Any,
+        num_steps: int,
+        work: Callable[["_Worlds", np.ndarray], None],
+        fields: Sequence[str],
+        *,
+        with_state: bool,
+    ) -> None:
+        """Take ``num_steps`` physics steps by ``work``, then copy ``fields`` back, and with ``with_state`` the states."""
         chosen = self._mask(ids)
         sound = np.isfinite(self._columns["qpos"]).all(1) & np.isfinite(
             self._columns["qvel"]
         ).all(1)
         run = chosen & sound
         if run.any():
-            self._pull_state(self._behind & ~run)
+            self._pull(self._behind & ~run)
             worlds = self._worlds()
             self._push(worlds, run)
             self._park(worlds, ~run, int(np.argmax(run)))
-            self._fitting(lambda: worlds.run(nstep, refresh=int(stage) != _NONE))
+            self._fitting(lambda: work(worlds, run))
             self._lost |= ~run
             finite = worlds.finite()
             full, unfound = worlds.overflow(run & finite)
@@ -232,21 +296,20 @@ class WarpBatch(Batch):
                 self._lost[:], self._behind[:] = True, False
                 raise TaccorlError(full)
             self._lost &= ~run
-            self._tick(run, nstep)
+            self._tick(run, num_steps)
             self._unsound = bad = ~finite | unfound
             self._behind |= run
-            if int(stage) != _NONE:
-                self._pull_state(run)
-                self._pull_fields(worlds, run)
-            else:
-                self._pull_state(run & bad)
+            self._pull_state(run if with_state else run & bad)
+            self._pull_fields(worlds, run, fields)
+            self._partial[run] = bool(fields) and not with_state
             self._lost |= bad
             sound &= ~bad
         self.warning[chosen & ~sound, _BAD_STATE, 1] += 1
 
     def refresh(self) -> None:
-        """Copy the states of all worlds from the device, after steps with ``mjSTAGE_NONE``."""
-        self._pull_state(self._behind)
+        """Copy what steps left on the device: the states of all worlds, and the derived fields that ``step_targets`` was not
+        asked for."""
+        self._pull(self._behind)
 
     def tensor(self, name: str) -> Any:
         """The device's own values of a field of ``mujoco.MjData`` as a Torch tensor (N, …) of float32, not a copy; for reading.
@@ -369,6 +432,14 @@ class WarpBatch(Batch):
                 worlds.copy_row(worlds.tensor(name), sound, rows)
             self._unsound &= ~rows
 
+    def _pull(self, rows: np.ndarray) -> None:
+        """States of ``rows`` (N,) bool, and those derived fields of theirs that are older."""
+        partial = rows & self._partial
+        if partial.any() and self._world is not None:
+            self._pull_fields(self._world, partial, tuple(self._bound))
+            self._partial &= ~partial
+        self._pull_state(rows)
+
     def _pull_state(self, rows: np.ndarray) -> None:
         if rows.any() and self._world is not None:
             for name, values in self._columns.items():
@@ -377,8 +448,11 @@ class WarpBatch(Batch):
                     self._known[name][rows] = values[rows]
             self._behind &= ~rows
 
-    def _pull_fields(self, worlds: "_Worlds", rows: np.ndarray) -> None:
-        for name, values in self._bound.items():
+    def _pull_fields(
+        self, worlds: "_Worlds", rows: np.ndarray, fields: Sequence[str]
+    ) -> None:
+        for name in fields:
+            values = self._bound[name]
             values.flags.writeable = True
             worlds.read(worlds.tensor(name), rows, values)
             values.flags.writeable = False
@@ -403,6 +477,8 @@ class _Worlds:
             )
             self._model.opt.warn_overflow = False  # ``overflow`` reads it
             self._model.opt.contact_sensor_maxmatch = settings.contacts
+            if settings.iterations:
+                self._model.opt.iterations = settings.iterations
             if self._device.is_cuda and not wp.is_conditional_graph_supported():
                 self._model.opt.graph_conditional = False  # a driver before CUDA 12.4
             self._data = self._allocate(model)
@@ -411,7 +487,9 @@ class _Worlds:
         }
         self._index_of: tuple[bytes, Any] = (b"", None)
         self._tensors: dict[str, Any] = {}
-        self._graphs: dict[tuple[int, bool], Any] = {}
+        self._graphs: dict[tuple[Any, ...], Any] = {}
+        self._quiet = self._without_sensors()
+        self._targets: Any = None
 
     def _allocate(self, model: mujoco.MjModel) -> Any:
         rows = -(-self._settings.constraints // _ROWS) * _ROWS
@@ -425,17 +503,62 @@ class _Worlds:
             self._tensors[name] = wp.to_torch(getattr(self._data, name))
         return self._tensors[name]
 
+    def _without_sensors(self) -> Any:
+        """The model for steps whose sensors nobody reads; it shares all arrays. Delayed sensors need every step."""
+        if self._model.nhistory:
+            return self._model
+        quiet = copy.copy(self._model)
+        quiet.opt = copy.copy(self._model.opt)
+        quiet.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        return quiet
+
     def run(self, nstep: int, *, refresh: bool | None = None) -> None:
         """``nstep`` physics steps, then with ``refresh`` what follows from the new positions and velocities; on a GPU as a
         captured graph, but for ``refresh=None``."""
+        if refresh is None:
+            with wp.ScopedDevice(self._device):
+                self._steps(nstep, False)
+            return
+        self._launch((nstep, refresh), lambda: self._steps(nstep, refresh))
+
+    def run_targets(
+        self, columns: np.ndarray, targets_SNA: np.ndarray, nstep: int
+    ) -> None:
+        """S times: write a target into the controls ``columns`` (A,) of all worlds, then ``nstep`` steps; at the end what
+        follows from the new positions and velocities."""
         with wp.ScopedDevice(self._device):
-            if not self._device.is_cuda or refresh is None:
-                self._steps(nstep, bool(refresh))
+            new = wp.array(np.ascontiguousarray(targets_SNA, np.float32), dtype=float)
+            if self._targets is None or self._targets.shape != new.shape:
+                self._targets = wp.clone(new)
+                self._columns = wp.array(columns.astype(np.int32), dtype=int)
+            else:
+                wp.copy(self._targets, new)
+            wp.synchronize_device(self._device)
+
+        def work() -> None:
+            for s in range(len(targets_SNA)):
+                wp.launch(
+                    kernels.put_targets,
+                    dim=self._targets.shape[1:],
+                    inputs=[self._targets, s, self._columns],
+                    outputs=[self._data.ctrl],
+                )
+                for _ in range(nstep):
+                    mjw.step(self._quiet, self._data)
+            mjw.forward(self._model, self._data)
+
+        self._launch(("targets", len(targets_SNA), nstep), work)
+
+    def _launch(self, key: tuple[Any, ...], work: Callable[[], None]) -> None:
+        """Do ``work``, and wait; on a GPU as a captured graph, which ``key`` names."""
+        with wp.ScopedDevice(self._device):
+            if not self._device.is_cuda:
+                work()
                 return
             torch.cuda.synchronize(self._settings.device)
-            if (nstep, refresh) not in self._graphs:
-                self._graphs[nstep, refresh] = self._captured(nstep, refresh)
-            wp.capture_launch(self._graphs[nstep, refresh])
+            if key not in self._graphs:
+                self._graphs[key] = self._captured(work)
+            wp.capture_launch(self._graphs[key])
             wp.synchronize_device(self._device)
 
     def _steps(self, nstep: int, refresh: bool) -> None:
@@ -444,25 +567,24 @@ class _Worlds:
         if refresh:
             mjw.forward(self._model, self._data)
 
-    def _captured(self, nstep: int, refresh: bool) -> Any:
-        if not self._graphs:  # compile all kernels first, then put everything back
-            tensors = [
-                self.tensor(name)
-                for name in ("time", *_STATE)
-                if getattr(self._data, name).size
-            ]
-            kept = [(tensor, tensor.clone()) for tensor in tensors]
-            torch.cuda.synchronize(
-                self._settings.device
-            )  # Torch and Warp have streams of their own
-            self._steps(1, True)
-            wp.synchronize_device(self._device)
-            for tensor, values in kept:
-                tensor.copy_(values)
-            self._data.overflow.zero_()
-            torch.cuda.synchronize(self._settings.device)
+    def _captured(self, work: Callable[[], None]) -> Any:
+        """Graph of ``work``. All kernels are compiled first: what they change of the state is put back."""
+        tensors = [
+            self.tensor(name)
+            for name in ("time", *_STATE)
+            if getattr(self._data, name).size
+        ]
+        kept = [(tensor, tensor.clone()) for tensor in tensors]
+        # Torch and Warp have streams of their own
+        torch.cuda.synchronize(self._settings.device)
+        work()
+        wp.synchronize_device(self._device)
+        for tensor, values in kept:
+            tensor.copy_(values)
+        self._data.overflow.zero_()
+        torch.cuda.synchronize(self._settings.device)
         with wp.ScopedCapture() as capture:
-            self._steps(nstep, refresh)
+            work()
         return capture.graph
 
     def finite(self) -> np.ndarray:
@@ -526,7 +648,8 @@ class _Worlds:
     def read(self, tensor: Any, rows: np.ndarray, values: np.ndarray) -> None:
         """Read a device's tensor (N, …) into ``rows`` (N,) bool of ``values`` (N, …)."""
         found = tensor[self._index(rows)].cpu().numpy()
-        values[rows] = found.reshape(-1, *values.shape[1:])
+        chosen = slice(None) if rows.all() else rows  # a mask costs three times a copy
+        values[chosen] = found.reshape(-1, *values.shape[1:])
 
     def _index(self, rows: np.ndarray) -> Any:
         if rows.all():

@@ -355,7 +355,7 @@ def run(
 
     settings = PostTrainSettings(
         policy=PolicySettings(path=start),
-        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=12),
+        env=EnvSettings(task="assembly_2", num_envs=2, decisions=2, episode_length=15),
         out=out,
         **{"anchor": AnchorSettings(weight=0), **changes},
     )
@@ -365,7 +365,7 @@ def run(
 def test_a_collapse_goes_back_to_the_best_checkpoint(start, tmp_path):
     lines: list[str] = []
     made = run(start, tmp_path / "out", lines, noise_check=False, keep_checkpoints=1)
-    # 2 decisions of 5 of 12 steps: only short episodes have ended
+    # 2 decisions of 5 of 15 steps: only short episodes have ended
     for iteration, counted in ((1, []), (2, [(1.0, 4)])):
         made._iteration = iteration
         made._remember({"episodes": 4, "success": 1.0})

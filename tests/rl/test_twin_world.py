@@ -71,6 +71,7 @@ def world_of(
     size: int = 1,
     history: int = 10,
     stride: int = 1,
+    num_actions: int = 1,
     pictures: str = "clear",
 ) -> TwinWorld:
     first, shards = 0, []
@@ -78,6 +79,7 @@ def world_of(
         options = {
             "history": history,
             "stride": stride,
+            "num_actions": num_actions,
             "privileged": privileged,
             "starts": StartStates(share, size),
         }
@@ -126,9 +128,12 @@ def test_without_noise_actions_are_those_of_evaluation(envs, opened, pictures):
     world.restart(5)
     executed: list[np.ndarray] = []
     step = envs.step_chunk
-    envs.step_chunk = lambda actions: (executed.append(actions.copy()), step(actions))[
-        1
-    ]  # pyright: ignore
+
+    def noted(actions: np.ndarray, **options: Any) -> Any:
+        executed.append(actions.copy())
+        return step(actions, **options)
+
+    envs.step_chunk = noted  # pyright: ignore
     quiet = FlowSDE(FlowSDESettings(level=0.0))
     for k in range(2):
         seen = world.observe().batch
@@ -218,8 +223,8 @@ def test_readings_after_the_end_are_not_in_the_last_window(
     readings = [envs.observe()[TOUCH]]
     step = envs.step_chunk
 
-    def keep(actions: np.ndarray) -> Any:
-        chunk = step(actions)
+    def keep(actions: np.ndarray, **options: Any) -> Any:
+        chunk = step(actions, **options)
         readings.extend(chunk.tactile[:, k] for k in range(int(chunk.num_steps[0])))
         return chunk
 
@@ -229,6 +234,37 @@ def test_readings_after_the_end_are_not_in_the_last_window(
     assert acted.last is not None and len(readings) == 13
     expected = np.stack(readings[-1 - (history - 1) * stride :: stride], axis=1) / 75
     np.testing.assert_allclose(acted.last.batch[TOUCH].numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("stride", "reads"), [(4, 1), (8, 1), (2, 2), (3, 4)])
+def test_pads_are_read_only_where_a_window_needs_it(opened, stride, reads):
+    """Decisions of 4 actions and 12 control steps an episode: the same windows as with a reading after every control step, also
+    the last one before time runs out, by 4 / gcd(stride, 4) … readings a decision."""
+    rare, each = envs_of(2, 12), envs_of(2, 12)
+    worlds = [
+        make_world(rare, opened, history=3, stride=stride, num_actions=4),
+        make_world(each, opened, history=3, stride=stride),
+    ]
+    assert [twins(world)._touch_every for world in worlds] == [4 // reads, 1]
+    num_read, touch = 0, rare.sim.touch
+
+    def counted(noise: Any) -> np.ndarray:
+        nonlocal num_read
+        num_read += 1
+        return touch(noise)
+
+    rare.sim.touch = counted  # pyright: ignore
+    for _ in range(3):
+        actions = home(worlds[0], 4)
+        acted = [world.act(actions) for world in worlds]
+        seen = [world.observe().batch[TOUCH] for world in worlds]
+        assert torch.equal(*seen)
+    assert num_read == 3 * reads + 1  # and one after the reset
+    last = [one.last.batch[TOUCH] for one in acted]
+    assert len(last[0]) == 2
+    assert torch.equal(*last)
+    for envs in (rare, each):
+        envs.close()
 
 
 def test_an_action_that_is_no_action_ends_the_episode_as_a_failure(envs, opened):

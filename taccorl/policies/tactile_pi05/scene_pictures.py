@@ -66,12 +66,12 @@ class ScenePictures:
     @torch.no_grad()
     def __call__(
         self,
-        pictures: Mapping[str, np.ndarray],
+        pictures: Mapping[str, np.ndarray | Tensor],
         seeds_N: np.ndarray,
         steps_N: np.ndarray,
     ) -> dict[str, Tensor]:
         """Changed pictures, (N, 3, R, C) uint8 on the device, of each camera. Whole values, as a camera's: what is stored is what
-        the policy saw. ``pictures``: key of the camera (``IMAGE_KEYS``) → (N, rows, columns, 3) uint8. ``seeds_N``, ``steps_N``:
+        the policy saw. ``pictures``: key of the camera (``IMAGE_KEYS``) → as in ``channels_first``. ``seeds_N``, ``steps_N``:
         scene seed of each environment, and number of control steps since the scene's start."""
         return {
             key: self._of_camera(key, clear, seeds_N, steps_N)
@@ -79,16 +79,15 @@ class ScenePictures:
         }
 
     def _of_camera(
-        self, key: str, clear_NRC3: np.ndarray, seeds_N: np.ndarray, steps_N: np.ndarray
+        self,
+        key: str,
+        clear: np.ndarray | Tensor,
+        seeds_N: np.ndarray,
+        steps_N: np.ndarray,
     ) -> Tensor:
         draws_7N, noise_seeds_N = scene_draws(key, seeds_N)
         images_N3RC = (
-            torch.from_numpy(clear_NRC3)
-            .to(self._device)
-            .permute(0, 3, 1, 2)
-            .contiguous()
-            .to(torch.float32)
-            / 255
+            channels_first(clear, self._device).contiguous().to(torch.float32) / 255
         )
         if self._resolution is not None:
             images_N3RC = at_resolution(
@@ -105,6 +104,14 @@ class ScenePictures:
             None if noise is None else torch.from_numpy(noise).to(self._device),
         )
         return (changed_N3RC * 255).round().to(torch.uint8)
+
+
+def channels_first(pictures: np.ndarray | Tensor, device: Any) -> Tensor:
+    """(N, 3, R, C) uint8 on ``device``, of an array (N, R, C, 3) of uint8 as OpenGL's are; tensors, which a device has drawn, are
+    (N, 3, R, C) already."""
+    if isinstance(pictures, Tensor):
+        return pictures.to(device)
+    return torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2)
 
 
 def scene_draws(key: str, seeds_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

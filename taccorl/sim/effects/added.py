@@ -99,11 +99,13 @@ class AddedEffects:
             values = effect.encoder(values)
         return values
 
-    def __call__(self, reading: np.ndarray) -> np.ndarray:
-        """Reading of the pads (N, P, R, C) for the ideal ``reading`` (N, P, R, C). Does not change the memory."""
-        return self._read(
-            reading, self._copied(np.arange(len(reading))), np.arange(len(reading))
-        )
+    def __call__(
+        self, reading: np.ndarray, ids: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Reading of the pads (n, P, R, C) of the simulations ``ids`` (n,) (all by default) for their ideal ``reading``
+        (n, P, R, C). Does not change the memory."""
+        rows = np.arange(len(reading)) if ids is None else ids
+        return self._read(reading, self._copied(rows), rows)
 
     def scan(self, reading: np.ndarray, ids: np.ndarray) -> None:
         """Advance the memory of touch effects. The reading counts as constant since the last scan.
@@ -141,14 +143,21 @@ class AddedEffects:
             if camera in effect.acts_on()
         )
 
+    def changes_pictures(self, camera: str) -> bool:
+        """True if the camera's pictures are late, or changed after they are rendered."""
+        return self.picture_age_s(camera) > 0 or bool(self._of_pictures(camera))
+
+    def _of_pictures(self, camera: str) -> list[Effect]:
+        return [
+            e
+            for e in self.present
+            if camera in e.acts_on() and type(e).picture is not Effect.picture
+        ]
+
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
         """Pictures of ``camera`` with effects, from rendered ``pictures`` (n, rows, columns, 3) uint8 RGB, letterboxed; same
         shape."""
-        acting = [
-            e
-            for e in self.present
-            if camera.name in e.acts_on() and type(e).picture is not Effect.picture
-        ]
+        acting = self._of_pictures(camera.name)
         if not acting:
             return pictures
         window = letterbox_window(camera.recording_size, pictures.shape[1:3])

@@ -33,9 +33,11 @@ class Transform(Protocol):
 
     Letters in shapes: N simulations, P pads, R rows and C columns of taxels."""
 
-    def __call__(self, reading: np.ndarray, /) -> np.ndarray:
-        """Change a reading (N, P, R, C); the shape stays the same. A transform with a memory keeps it per simulation and is
-        called once per scan."""
+    def __call__(
+        self, reading: np.ndarray, ids: np.ndarray | None = None, /
+    ) -> np.ndarray:
+        """Change a reading (n, P, R, C) of the simulations ``ids`` (n,) (all by default); the shape stays the same. A transform
+        with a memory keeps it per simulation and is called once per scan."""
         ...
 
 
