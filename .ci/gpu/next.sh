@@ -1,5 +1,5 @@
 # bash .ci/gpu/next.sh SECOND, in every call after the one that began learn.sh or ppo.sh: waits until SECOND of the machine's clock or the
-# end of the job; into $OUT come scores, logs, and the weights of one more policy (bfloat16, zstd, in parts).
+# end of the job; into $OUT come scores, logs, and, but for WEIGHTS=false, those of one more policy (bfloat16, zstd, in parts).
 [ -e /dev/shm/t0 ] || { echo "another machine: nothing of the job is here"; exit 1; }
 . /dev/shm/env.sh
 now() { echo $(($(date +%s) - $(cat /dev/shm/t0))); }
@@ -7,6 +7,7 @@ echo "from $(now) s"
 while [ "$(now)" -lt "$1" ] && [ ! -e /dev/shm/done ]; do sleep 1; done
 cd /dev/shm || exit 1
 for policy in learn_*/*/policy_*/checkpoints/0*/pretrained_model; do # not last, a link to one of these
+  if [ "${WEIGHTS:-true}" = false ]; then break; fi
   if [ -e "$policy/model.safetensors" ] && ! grep -qs "$policy" fetched && [ $(($(date +%s) - $(stat -c %Y "$policy/model.safetensors"))) -gt 10 ]; then
     echo "$policy" >>fetched
     python3 - "$policy" "$OUT" <<'P'
@@ -27,7 +28,7 @@ P
   fi
 done
 tar czf "$OUT/scores.tgz" --ignore-failed-read $(find learn_* -path '*score_*' \( -name '*.json' -o -name '*.jsonl' -o -name '*.log' \) ! -path '*failures*') \
-  $(find learn_* -name scores.md -o -name progress.jsonl) $(ls learn_ppo/*/policy_*.log) ./*.log times study*.jsonl
+  $(find learn_* -name scores.md -o -name progress.jsonl) $(ls learn_ppo/*/policy_*.log learn_speed/*.log) ./*.log times study*.jsonl
 cat times
 tail -qn 1 made_*.log
 for log in learn_*/*/policy_*.log; do echo "$log $(tail -c 120 "$log" | tr '\r' '\n' | tail -n 1)"; done

@@ -3,8 +3,7 @@
 # Two policies of $EPISODES demonstrations of $TASK learn on GPU 0; beside them, on GPU 1 and half of the cores, iterations of
 # post-training by both builds are timed (settings in speed below). Then PPO of each policy on a GPU of its own by
 # configs/post_train/gpu.yaml, until SECOND of the machine's clock, and scores of starts and results on the same scenes.
-. /dev/shm/warp_env.sh
-export OMP_NUM_THREADS=4
+. /dev/shm/env.sh
 end=$1 task=${TASK:-assembly_1} episodes=${EPISODES:-300} steps=${STEPS:-2500} scored=${SCORED:-192}
 threads=$(env -u OMP_NUM_THREADS nproc) half=$((threads / 2))
 seeds=(1000 2000)
@@ -34,10 +33,12 @@ speed() { # BUILD NAME SECONDS OPTIONS: two iterations of PPO
   path=${PYTHONPATH//\/dev\/shm\/repo/\/dev\/shm\/$1}
   (cd "/dev/shm/$1" && PYTHONPATH=$path on 1 "$half" "$half" timeout "$3" python3 -m taccorl.cli.main post-train --config_path=configs/post_train/small.yaml \
     --policy.path="$start" --env.task="$task" --env.twin="$twin" --anchor.weight=0 --noise_check=false --rerun=false --env.start_share=0 --ppo.critic_warmup=0 \
-    --ppo.epochs=1 --iterations=2 --save_freq=100 "${@:4}" --out="$out" >"$out.log" 2>&1)
+    --ppo.epochs=1 --iterations="${ITERATIONS:-2}" --save_freq=100 "${@:4}" --out="$out" >"$out.log" 2>&1)
   since "$2 timed: $?"
 }
 twin=/dev/shm/learn_1/$task/twin_of_20_steps.yaml
+while [ ! -e /dev/shm/warp_ready ]; do sleep 1; done
+. /dev/shm/warp_env.sh
 while [ -z "$(policy 1000 000500)" ] && [ "$(now)" -lt "$end" ] && kill -0 $learning; do sleep 1; done
 sleep 3 # until it is written
 start=$(policy 1000 000500)
@@ -45,7 +46,7 @@ big=(--env.shards=1 --env.threads="$half" --ppo.batch_size=2048)
 fast=(--policy.tf32=true --ppo.micro_batch=2048)
 few=contacts=32,constraints=288
 speed repo new_2048 150 "${big[@]}" --env.physics=warp --env.num_envs=2048 --env.decisions=36
-speed old old_2048 260 "${big[@]}" --env.physics=warp --env.num_envs=2048 --env.decisions=36 --iterations=1
+ITERATIONS=1 speed old old_2048 260 "${big[@]}" --env.physics=warp --env.num_envs=2048 --env.decisions=36
 speed repo new_2048_fast 120 "${big[@]}" "${fast[@]}" --env.physics=warp:iterations=8,$few --env.num_envs=2048 --env.decisions=36
 speed repo new_8192_fast 150 "${big[@]}" "${fast[@]}" --env.physics=warp:iterations=8,$few --env.num_envs=8192 --env.decisions=12
 

@@ -23,3 +23,4 @@ export PYTHONPATH=$PYTHONPATH:/dev/shm/warp_site WARP_CACHE_PATH=/dev/shm/warp_k
 X
 . /dev/shm/warp_env.sh
 python3 -c "import warp; warp.init()"
+touch /dev/shm/warp_ready
