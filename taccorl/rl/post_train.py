@@ -189,7 +189,7 @@ class PostTraining:
         if apart is not None:
             self._report(
                 f"pictures by ray tracing: {apart:.2f} of 255 from OpenGL's, which datasets have (mean of a few scenes); "
-                "OpenGL: --env.physics=warp:pictures=opengl"
+                "OpenGL: --env.physics=warp:mode=copied"
             )
 
     def _report_noise(self, twin: TwinConfig) -> None:

@@ -22,6 +22,7 @@ from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.spaces import IMAGE_SHAPE
 from taccorl.sim.task import Contact, Task
 from taccorl.sim.twin import TwinConfig
+from taccorl.sim.warp_batch import WarpBatch
 
 DRAWN_TOGETHER = 64
 """Number of stored states whose pictures are read back from OpenGL at once."""
@@ -143,10 +144,9 @@ class SeenScene:
         """True if ``draw_on_device`` gives what ``render`` does: physics and ray tracer on a device, and no effect that
         changes pictures."""
         names = [camera.name for camera in self.config.cameras]
-        settings = getattr(self.batch, "settings", None)
         return (
-            settings is not None
-            and settings.pictures == "rays"
+            isinstance(self.batch, WarpBatch)
+            and self.batch.is_resident
             and not any(self.effects.changes_pictures(name) for name in names)
         )
 
@@ -170,12 +170,11 @@ class SeenScene:
     def _rays(
         self, cameras: tuple[str, ...], size: tuple[int, int]
     ) -> RayRenderer | None:
-        settings = getattr(self.batch, "settings", None)
-        if settings is None or settings.pictures != "rays":
+        if not (isinstance(self.batch, WarpBatch) and self.batch.is_resident):
             return None
         if (cameras, size) not in self._ray_renderers:
             self._ray_renderers[cameras, size] = RayRenderer(
-                self.model, cameras, *size, device=settings.device
+                self.model, cameras, *size, device=self.batch.settings.device
             )
         return self._ray_renderers[cameras, size]
 

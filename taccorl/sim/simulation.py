@@ -371,10 +371,11 @@ class Simulation(SeenScene):
         num = len(commands) * num_steps
         scans = self._scan_steps(stepped, num) if self.effects.remember_touch else {}
         in_parts = watch is not None or bool(scans) or self.effects.rewrites
-        if isinstance(self.batch, WarpBatch) and not in_parts:
+        batch = self.batch
+        if isinstance(batch, WarpBatch) and batch.is_resident and not in_parts:
             fields = _JUDGED if lean and not self.effects.past else None
             targets_SNA = np.stack(arrive)
-            self.batch.step_targets(
+            batch.step_targets(
                 ids, self.action_actuators, targets_SNA, num_steps, fields
             )
             self._sound(ids, at_end=True)

@@ -1,9 +1,10 @@
-"""Pictures by MuJoCo Warp's ray tracer beside OpenGL's, on Warp's CPU device; touch and targets of a chunk that stay there."""
+"""MuJoCo Warp's ray tracer beside OpenGL, on a GPU or Warp's CPU device; touch and targets of a chunk that stay there."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
@@ -20,7 +21,9 @@ from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 from taccorl.sim.warp_batch import WarpSettings
 
-ON_CPU = "warp:device=cpu"
+DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
+"""Where there is a GPU these tests are of it: pictures and physics have been wrong there alone."""
+WARP = f"warp:device={DEVICE},mode=resident"
 SIZE = (84, 112)
 """Rows and columns of a policy's pictures."""
 
@@ -31,7 +34,7 @@ def few_worlds(monkeypatch):
     monkeypatch.setattr(ray_renderer, "WORLDS_AT_ONCE", 2)
 
 
-def scenes(num: int, physics: str = ON_CPU, **settings) -> Simulation:
+def scenes(num: int, physics: str = WARP, **settings) -> Simulation:
     sim = Simulation(
         tasks.get("assembly_1")(), num_sims=num, physics=physics, **settings
     )
@@ -53,7 +56,10 @@ def test_pictures_are_those_of_opengl(few_worlds):
     rays = sim.render(ROBOT.cameras)
     opengl = sim._renderer(ROBOT.cameras, (224, 224)).render_batch(sim.batch)
     small = sim.draw_on_device(ROBOT.cameras, np.arange(3), SIZE)
-    assert small.shape == (3, 3, 3, *SIZE) and small.device.type == "cpu"
+    assert (
+        small.shape == (3, 3, 3, *SIZE)
+        and small.device.type == torch.device(DEVICE).type
+    )
     for k, name in enumerate(ROBOT.cameras):
         assert rays[name].shape == (3, 224, 224, 3) and rays[name].dtype == np.uint8
         assert not rays[name][:, :28].any()  # a black bar
@@ -62,7 +68,8 @@ def test_pictures_are_those_of_opengl(few_worlds):
         assert (apart.max(-1) > 48).mean() < 0.002
         mean_of_four = halved(opengl[:, k])
         assert (
-            np.abs(small[:, k].permute(0, 2, 3, 1).numpy() - mean_of_four).mean() < 1.0
+            np.abs(small[:, k].permute(0, 2, 3, 1).cpu().numpy() - mean_of_four).mean()
+            < 1.0
         )
         others = np.abs(rays[name][0].astype(int) - rays[name][1].astype(int))
         # Scenes differ by more than renderers do.
@@ -78,6 +85,23 @@ def test_order_and_company_change_no_pixel(few_worlds):
 
 
 @pytest.mark.slow
+def test_every_group_shows_its_own_simulations_in_every_draw(few_worlds):
+    """Three groups of two, drawn again and again after the parts have moved: each part is where OpenGL shows it."""
+    sim = scenes(6)
+    for shift_m in (0.0, 0.03, -0.05):
+        part = sim.model.joint(sim.task.parts[0]).qposadr[0]
+        sim.arrays["qpos"][:, part] += shift_m * np.linspace(-1, 1, 6)
+        sim.batch.forward()
+        drawn = sim.draw_on_device(ROBOT.cameras[:1], np.arange(6), SIZE)[:, 0]
+        rays = drawn.permute(0, 2, 3, 1).cpu().numpy()
+        opengl = halved(sim.render_by_opengl(ROBOT.cameras[:1], np.arange(6))["front"])
+        far = (np.abs(rays - opengl).max(-1) > 48).mean((1, 2))
+        assert far.max() < 0.001
+        others = (np.abs(rays - np.roll(opengl, 1, axis=0)).max(-1) > 48).mean((1, 2))
+        assert others.min() > 0.002  # of another simulation it would be seen
+
+
+@pytest.mark.slow
 def test_a_diverged_world_is_drawn_and_harms_no_other(few_worlds):
     sim = scenes(2)
     before = sim.draw_on_device(ROBOT.cameras[:1], np.array([1]), SIZE)
@@ -90,10 +114,10 @@ def test_a_diverged_world_is_drawn_and_harms_no_other(few_worlds):
 def test_what_the_ray_tracer_does_not_draw_is_refused_with_the_way_out(few_worlds):
     sim = scenes(2)
     sim.batch.expand("geom_rgba")
-    with pytest.raises(TaccorlError, match=r"geom_rgba.*pictures=opengl"):
+    with pytest.raises(TaccorlError, match=r"geom_rgba.*mode=copied"):
         Positions.of(sim.batch, np.arange(2))
     with pytest.raises(TaccorlError, match=r"frnt.*front"):
-        RayRenderer(sim.model, ["frnt"], device="cpu")
+        RayRenderer(sim.model, ["frnt"], device=DEVICE)
 
 
 @pytest.mark.slow
@@ -104,10 +128,10 @@ def test_late_pictures_are_left_to_opengl(few_worlds):
     assert sim.render(["front"])["front"].any()
 
 
-def test_the_kind_of_pictures_is_a_setting():
-    assert WarpSettings.parse("warp:pictures=opengl") == WarpSettings(pictures="opengl")
-    with pytest.raises(TaccorlError, match="did you mean 'rays'"):
-        WarpSettings.parse("warp:pictures=ray")
+def test_what_stays_on_the_device_is_a_setting():
+    assert WarpSettings.parse("warp:mode=resident") == WarpSettings(mode="resident")
+    with pytest.raises(TaccorlError, match="did you mean 'resident'"):
+        WarpSettings.parse("warp:mode=residen")
 
 
 def shard(physics: str, num_actions: int, drawn: DrawnPictures | None) -> TwinShard:
@@ -137,7 +161,7 @@ def shard(physics: str, num_actions: int, drawn: DrawnPictures | None) -> TwinSh
 def test_decisions_that_stay_on_the_device_give_what_single_steps_do(few_worlds):
     """Two decisions of four control steps, the second one up to the time limit, and the resets after it."""
     drawn = DrawnPictures(ROBOT.cameras, SIZE)
-    whole, single = shard(ON_CPU, 4, drawn), shard(ON_CPU, 1, None)
+    whole, single = shard(WARP, 4, drawn), shard(WARP, 1, None)
     c = shard("c", 4, drawn)
     assert c._drawn is None  # MuJoCo C's pictures are OpenGL's
     targets = whole.envs.sim.targets[:, None] + 0.01
@@ -158,10 +182,10 @@ def test_decisions_that_stay_on_the_device_give_what_single_steps_do(few_worlds)
     key = IMAGE_KEYS["front"]
     assert last[key].shape == (2, 3, *SIZE)
     opengl = halved(acted[1].last[key])
-    rays = last[key].permute(0, 2, 3, 1).numpy()
+    rays = last[key].permute(0, 2, 3, 1).cpu().numpy()
     assert np.abs(rays - opengl).mean() < 1.0
     new = halved(seen[1][key])  # of the episodes that follow
-    assert np.abs(seen[0][key].permute(0, 2, 3, 1).numpy() - new).mean() < 1.0
+    assert np.abs(seen[0][key].permute(0, 2, 3, 1).cpu().numpy() - new).mean() < 1.0
     assert np.abs(new - opengl).mean() > 1.0
     for one in (whole, single, c):
         one.close()
@@ -170,8 +194,8 @@ def test_decisions_that_stay_on_the_device_give_what_single_steps_do(few_worlds)
 @pytest.mark.slow
 def test_an_episode_that_ends_within_a_decision_keeps_its_own_reading(few_worlds):
     """A bad action ends one of two: its state, touch and picture are of its last step, whatever the device went on with."""
-    whole = shard(ON_CPU, 4, DrawnPictures(ROBOT.cameras[:1], SIZE))
-    single = shard(ON_CPU, 1, None)
+    whole = shard(WARP, 4, DrawnPictures(ROBOT.cameras[:1], SIZE))
+    single = shard(WARP, 1, None)
     chunk = np.repeat(whole.envs.sim.targets[:, None] + 0.01, 4, axis=1)
     chunk[0, 2:] = np.nan
     whole.envs.step_chunk(chunk, touch_every=4)
