@@ -372,7 +372,8 @@ class Pads:
         """Why (taxels,) counts are not those of a pad that works; empty if they are."""
         is_new = self._repeats[name].is_new(values)
         if self.baseline is not None:
-            rest = np.split(self.baseline, len(self.names))[self.names.index(name)]
+            start = self.names.index(name) * len(values)
+            rest = self.baseline[start : start + len(values)]
             dead = int(((values == 0) & (rest >= _LEAST_REST_COUNT)).sum())
             if dead >= self._line:
                 return DEAD

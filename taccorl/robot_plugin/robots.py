@@ -69,6 +69,9 @@ class TouchRobot(Robot):
         lerobot_hooks.install()  # LeRobot's scripts are loaded by now
         self.config, self._clock = config, clock
         positive("--robot.fps", config.fps)
+        if config.picture_px < 0:
+            text = f"--robot.picture_px={config.picture_px}: must not be below 0"
+            raise TaccorlError(text)
         self.body: Body = self._body()
         pads, name = (
             self._pads_config(),
@@ -176,10 +179,10 @@ class TouchRobot(Robot):
             thread = threading.Thread(target=self._watch, daemon=True, name="watchdog")
             thread.start()
         except BaseException as error:
-            if self._log is not None:
-                self._log.discard()
-                self._log = None
+            log = self._log
             failures = self._close()
+            if log is not None:
+                log.discard()
             if isinstance(error, KeyboardInterrupt):
                 raise
             is_ours = isinstance(error, TaccorlError)
@@ -275,7 +278,8 @@ class TouchRobot(Robot):
                 now_s, rows=rows, period_s=stride / self.config.fps
             )
             ages |= {f"pad:{name}": age_s for name, age_s in felt.items()}
-            notes |= {f"pad:{name}": text for name, text in self.pads.faults.items()}
+            faults = self.pads.faults.copy()  # the pads' threads change it
+            notes |= {f"pad:{name}": text for name, text in faults.items()}
             parts = dict(
                 zip(
                     self.pads.names,
@@ -425,9 +429,8 @@ class TouchRobot(Robot):
                         self.guard.stop("the connection is lost", is_lost=True)
                     else:
                         self._tick()
-            except (
-                BaseException
-            ) as error:  # whatever a driver raises: the thread goes on
+            except BaseException as error:
+                # Whatever a driver raises: the thread goes on.
                 self._stop(f"the watchdog fails: {described(error)}")
 
     def _tick(self) -> None:

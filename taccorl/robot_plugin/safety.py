@@ -338,18 +338,9 @@ class Guard:
     @property
     def is_late(self) -> bool:
         """True if a channel of the newest observation is older than ``max_age_s``."""
-        if self._observed is None:
+        if (seen := self._observed) is None:  # asked by another thread, too
             return False
-        return any(age_s > self._most_s(c) for c, age_s in self._ages_s().items())
-
-    def _ages_s(self) -> dict[str, float]:
-        """Channel → age of the newest observation's last new sample [s]."""
-        assert self._observed is not None
-        unchanged_s = self._observed.unchanged_s
-        return {
-            channel: max(age_s, unchanged_s.get(channel, 0.0))
-            for channel, age_s in self._observed.ages_s.items()
-        }
+        return any(age_s > self._most_s(c) for c, age_s in _ages_s(seen).items())
 
     def _most_s(self, channel: str) -> float:
         return self._max_age_s[channel.partition(":")[0]]
@@ -406,7 +397,7 @@ class Guard:
         hold repeats the present position once, and logs each of its causes once."""
         assert self._observed is not None
         causes = {}
-        for channel, age_s in self._ages_s().items():
+        for channel, age_s in _ages_s(self._observed).items():
             most_s, last_s = self._most_s(channel), self.config.stop_after_s
             if age_s <= min(most_s, last_s):
                 continue
@@ -493,6 +484,14 @@ class Guard:
                 f"{text}; give one per second: --robot.safety.{option}='{{pos: 90}}' for degrees"
             )
         return np.array(found)
+
+
+def _ages_s(seen: Observed) -> dict[str, float]:
+    """Channel → age of its last new sample [s]."""
+    return {
+        channel: max(age_s, seen.unchanged_s.get(channel, 0.0))
+        for channel, age_s in seen.ages_s.items()
+    }
 
 
 def _hands() -> Callable[[np.ndarray], list[np.ndarray]]:

@@ -272,3 +272,27 @@ def test_of_any_two_faults_each_has_its_reaction(
     for second in FAULTS:
         if second != first:
             check(robot, [first, second], caplog)
+
+
+@pytest.mark.parametrize(
+    "name", ["state nan", "state inf", "state shape", "effort nan"]
+)
+def test_without_a_finite_position_nothing_is_sent(
+    name: str, robot: DrivenRobot
+) -> None:
+    robot.connect()
+    run(robot, {name: range(END)})
+    assert robot.guard.stopped
+    assert robot.bench.commands == []
+    robot.disconnect()
+
+
+def test_a_stop_repeats_the_last_finite_position(robot: DrivenRobot) -> None:
+    """Joints move by 0.01 a period, which is extrapolated for at most two periods."""
+    robot.connect()
+    robot.loop(5)
+    measured, bench = robot.bench.position.copy(), robot.bench
+    bench.change_sample = [put("position", NAN3)]
+    assert robot.loop(1)
+    np.testing.assert_allclose(bench.commands[-1], measured, atol=2 * 0.01)
+    robot.disconnect()
