@@ -101,14 +101,15 @@ def dead(part: Any) -> Callable[[Bench, np.ndarray], np.ndarray]:
     """Frames whose taxels ``part`` read 0."""
 
     def change(bench: Bench, frame: np.ndarray) -> np.ndarray:
-        frame[part] = 0
+        if frame.shape == bench.rest.shape:  # not one of another size
+            frame[part] = 0
         return frame
 
     return change
 
 
 def acting(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
-    return lambda action: action | {name: value}
+    return lambda action: (action or {}) | {name: value}
 
 
 NAN3 = np.array([0.1, np.nan, 0.0])
@@ -169,7 +170,7 @@ FAULTS = {
     "clock back": Fault("stop", "the clock went from|ahead of the clock", bench=("clock_offset_s", -1.0)),
     "clock nan": Fault("stop", "the clock went from .* to nan", bench=("clock_offset_s", math.nan)),
 }  # fmt: skip
-FIRST, SECOND, END = range(5, 16), range(14, 27), 37
+FIRST, SECOND, END = range(5, 20), range(14, 30), 40
 """Periods of the first fault, of the second, which begins when the arms hold because of
 the first and outlasts it, and of the end."""
 
