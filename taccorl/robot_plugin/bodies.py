@@ -14,6 +14,7 @@ from lerobot.robots.robot import Robot
 
 from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError
+from taccorl.robot_plugin.faults import close_all
 from taccorl.robot_plugin.pads import PadDriver, PadsConfig
 from taccorl.robot_plugin.surrogate_link import SurrogateLink
 from taccorl.robots import ROBOT
@@ -103,7 +104,11 @@ class LeRobotBody:
         self.robot.connect()
 
     def disconnect(self) -> None:
-        self.robot.disconnect()
+        """Disconnect the robot, or those of its parts that are connected: LeRobot's
+        robots refuse to disconnect where one part failed. Raises TaccorlError, after
+        all were tried: one could not be closed."""
+        if failures := close_all(_connected_parts(self.robot)):
+            raise TaccorlError("; ".join(failures))
 
     @property
     def is_connected(self) -> bool:
@@ -130,6 +135,22 @@ class LeRobotBody:
 
     def send(self, target: np.ndarray) -> None:
         self.robot.send_action(dict(zip(self.names, target.tolist(), strict=True)))
+
+
+def _connected_parts(device: Any, name: str = "robot") -> dict[str, Callable[[], Any]]:
+    """Name → ``disconnect`` of a LeRobot device if it is connected, else of the buses,
+    cameras and arms in its attributes that are."""
+    if device.is_connected:
+        return {name: device.disconnect}
+    found: dict[str, Callable[[], Any]] = {}
+    for key, value in vars(device).items():
+        parts = value if isinstance(value, dict) else {"": value}
+        for own, part in parts.items():
+            if hasattr(part, "is_connected") and callable(
+                getattr(part, "disconnect", None)
+            ):
+                found |= _connected_parts(part, f"{name}.{key}.{own}".rstrip("."))
+    return found
 
 
 class SurrogateArms:

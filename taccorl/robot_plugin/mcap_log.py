@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import functools
 import logging
 import threading
 import time
@@ -17,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from taccorl.data.origin import RATE_OF, Origin, labelled
 from taccorl.errors import TaccorlError
+from taccorl.robot_plugin.faults import described
 from taccorl.robots import ROBOT
 from taccorl.surrogate import driver_messages as messages
 from taccorl.surrogate import drivers
@@ -26,9 +28,23 @@ _JPEG_QUALITY = 90
 _log = logging.getLogger(__name__)
 
 
+def _never_raises(method: Callable[..., None]) -> Callable[..., None]:
+    """``method`` of a log; an exception in it ends the recording, not the robot."""
+
+    @functools.wraps(method)
+    def call(self: "McapLog", *values: Any) -> None:
+        try:
+            method(self, *values)
+        except Exception as error:
+            self._end(error)
+
+    return call
+
+
 class McapLog:
-    """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists. If it cannot be
-    written any more (a full disk), the recording ends with an error in the log, and the robot goes on."""
+    """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists, or cannot be
+    made. If it cannot be written any more (a full disk, a value that no message can hold), the recording ends with an error in
+    the log, and the robot goes on: no method but the constructor raises."""
 
     def __init__(
         self,
@@ -43,8 +59,11 @@ class McapLog:
             raise TaccorlError(
                 f"--robot.record={path}: exists; give another file, or remove it"
             )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file, self._lock = path.open("wb"), threading.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file, self._lock = path.open("wb"), threading.Lock()
+        except OSError as error:
+            raise TaccorlError(f"--robot.record={path}: {error.strerror}") from error
         self._writer = Writer(self._file, compression=CompressionType.LZ4)
         self._messages = MessageWriter(self._writer)
         self._writer.start(profile=self._messages.profile, library="taccorl")
@@ -57,10 +76,12 @@ class McapLog:
         self.instruction, self._open, self._in_episode = instruction, True, False
         self._last: dict[str, float] = {}
 
+    @_never_raises
     def state(self, stamp_s: float, values: np.ndarray) -> None:
         """(3, 14) position [rad, m], velocity and effort; NaN where they are not measured."""
         self._joints(drivers.STATE_TOPICS, stamp_s, *values)
 
+    @_never_raises
     def command(self, target: np.ndarray) -> None:
         """(14,) command [rad, m] that is sent now. The first one begins an episode."""
         if not self._in_episode:
@@ -74,6 +95,7 @@ class McapLog:
         none = np.zeros(ROBOT.num_actions)
         self._joints(drivers.COMMAND_TOPICS, self._last["command"], target, none, none)
 
+    @_never_raises
     def picture(self, stamp_s: float, camera: str, picture: np.ndarray | bytes) -> None:
         """A JPEG file's bytes, or (rows, columns, 3) uint8 RGB."""
         if self._last.get(camera) == stamp_s:
@@ -87,11 +109,13 @@ class McapLog:
         message = {"header": header, "format": "jpeg", "data": picture}
         self._write(drivers.CAMERA_TOPICS[camera], messages.COMPRESSED_IMAGE, message)
 
+    @_never_raises
     def pad(self, stamp_s: float, pad: str, frame: np.ndarray) -> None:
         """Frame (12, 32) uint8 of a pad as on the wire, whose log time is its only one."""
         topic = drivers.PAD_TOPICS[drivers.PADS[ROBOT.pads.index(pad)]]
         self._write(topic, messages.UINT8_ARRAY, drivers.pad_message(frame), stamp_s)
 
+    @_never_raises
     def pause(self) -> None:
         """End the episode at its last command; the next one begins another."""
         if self._in_episode:
@@ -106,10 +130,23 @@ class McapLog:
     def close(self) -> None:
         """Finish the file; later samples are dropped."""
         self.pause()
+        self._finish()
+
+    def discard(self) -> None:
+        """Remove the file: the connection that it was made for has failed."""
         with self._lock:
-            for last in (self._writer.finish, self._file.close):
-                self._unless_full(last)
             self._open = False
+            with contextlib.suppress(OSError):
+                self._file.close()
+            Path(self._file.name).unlink(missing_ok=True)
+
+    @_never_raises
+    def _finish(self) -> None:
+        with self._lock:
+            if self._open:
+                self._writer.finish()
+                self._file.close()
+                self._open = False
 
     def _joints(
         self, topics: dict[str, str], stamp_s: float, *values: np.ndarray
@@ -143,27 +180,19 @@ class McapLog:
     ) -> None:
         now_s = self._clock() if log_s is None else log_s
         with self._lock:
-            self._unless_full(
-                self._messages.write,
-                topic,
-                kind,
-                message,
-                self._zero_ns + round(now_s * 1e9),
-            )
+            if self._open:
+                time_ns = self._zero_ns + round(now_s * 1e9)
+                self._messages.write(topic, kind, message, time_ns)
 
-    def _unless_full(self, write: Callable[..., Any], *values: Any) -> None:
-        if self._open:
-            try:
-                write(*values)
-            except OSError as error:
-                self._open = False
-                _log.error(
-                    "%s: the recording ends here, unfinished: %s",
-                    self._file.name,
-                    error,
-                )
-                with contextlib.suppress(OSError):
-                    self._file.close()
+    def _end(self, error: Exception) -> None:
+        with self._lock:
+            if not self._open:
+                return
+            self._open = False
+            name, text = self._file.name, described(error)
+            _log.error("%s: the recording ends here, unfinished: %s", name, text)
+            with contextlib.suppress(OSError):
+                self._file.close()
 
 
 def _known(values: np.ndarray) -> list[float]:

@@ -23,6 +23,7 @@ from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
 from taccorl.data.spec import data_specs_folder
 from taccorl.data.timing import NS_PER_S, match
 from taccorl.errors import TaccorlError
+from taccorl.robot_plugin.faults import Repeats, Unfit, close_all, described, number
 
 _log = logging.getLogger(__name__)
 SENSOR = "flexitac_v2"
@@ -30,6 +31,9 @@ SAME_PAD = 0.8
 """Least correlation of a pad's resting counts with those that were stored: they differ from taxel to taxel, and so tell pads
 apart."""
 _KEPT_S = 5.0  # of frames, for windows of touch
+_LEAST_REST_COUNT = 5  # resting counts from which a taxel's noise does not reach 0
+REPEATED = "it repeats its frames"
+DEAD = "a line of its taxels reads 0 that is above 0 at rest"
 
 
 class PadDriver(Protocol):
@@ -37,7 +41,8 @@ class PadDriver(Protocol):
 
     def read(self) -> tuple[float, np.ndarray]:
         """Wait for the next frame; returns its time [s of ``time.monotonic``] and its counts as on the wire, (rows, columns)
-        uint8. Raises TimeoutError or OSError: the pad sends nothing."""
+        uint8. Raises OSError (such as TimeoutError) or ValueError: the pad sends nothing usable, and may do so again. Any
+        other exception is a stop."""
         ...
 
     def close(self) -> None:
@@ -48,6 +53,10 @@ class PadDriver(Protocol):
 @dataclass(kw_only=True)
 class PadsConfig(draccus.ChoiceRegistry):
     """Pads of a robot, in the order of ``observation.tactile``."""
+
+    raw: bool = True
+    """Whether frames are an ADC's counts, whose noise makes every frame new and which are above 0 at rest. False
+    for a driver that filters or subtracts: frames that repeat, and zeros, are then no fault."""
 
     def open(self, name: str) -> PadDriver:
         """Open the driver of the pad of that name. Raises TaccorlError: a package is missing, or the port cannot be opened."""
@@ -138,9 +147,12 @@ class Pads:
         identity: Path | None = None,
         listen: Callable[[float, str, np.ndarray], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        max_skew_s: float = 0.05,
     ) -> None:
+        """``max_skew_s``: as that of ``SafetyConfig``."""
         self.config, self.names = config, config.names
         self._identity, self._listen, self._clock = identity, listen, clock
+        self._max_skew_s = max_skew_s
         self.spec: SensorSpec = load_sensor_spec(
             data_specs_folder() / "sensors" / f"{SENSOR}.yaml"
         )
@@ -157,7 +169,12 @@ class Pads:
         self._drivers: dict[str, PadDriver] = {}
         self._threads: list[threading.Thread] = []
         self._ended = threading.Event()
-        self._faults: dict[str, str] = {}
+        self._stamps_s: dict[str, float] = {}
+        self._repeats: dict[str, Repeats] = {}
+        self.faults: dict[str, str] = {}
+        """Pad → why nothing newer of it can be used, if that is so."""
+        self.broken = ""
+        """Why a pad's driver must not be read any more; empty if all may be."""
 
     @property
     def num_taxels(self) -> int:
@@ -172,20 +189,31 @@ class Pads:
     def connect(self, timeout_s: float = 3.0) -> None:
         """Open all pads, take their baseline, and check which is which. Raises TaccorlError: a pad is missing, silent, touched,
         or not the one that was there before."""
-        self._ended.clear()
+        self._ended = threading.Event()  # of this connection: its threads keep it
+        self.broken, self.baseline = "", None
+        self._stamps_s, self.faults = {}, {}
+        self._repeats = {name: Repeats() for name in self.names}
+        for frames in self._frames.values():
+            frames.clear()
         try:
             for name in self.names:
                 self._drivers[name] = self.config.open(name)
-                self._threads.append(
-                    threading.Thread(
-                        target=self._read, args=(name,), daemon=True, name=f"pad {name}"
-                    )
+            for name, driver in self._drivers.items():
+                thread = threading.Thread(
+                    target=self._read,
+                    args=(name, driver, self._ended),
+                    daemon=True,
+                    name=f"pad {name}",
                 )
-                self._threads[-1].start()
+                self._threads.append(thread)
+                thread.start()
             self.calibrate(timeout_s)
             self._identify()
-        except TaccorlError:
-            self.close()
+        except BaseException as error:
+            failures = close_all({"pads": self.close})
+            if failures and isinstance(error, Exception):
+                text = "; ".join([described(error), *failures])
+                raise TaccorlError(text) from error
             raise
 
     def calibrate(self, timeout_s: float = 3.0) -> None:
@@ -203,6 +231,12 @@ class Pads:
                 raise TaccorlError(
                     f"{text} at rest: is it touched? Open the grippers, and connect again"
                 )
+            ends = (first == 0) | (first == self.spec.max_count)
+            stuck = int((ends.all(axis=0) & (first == first[0]).all(axis=0)).sum())
+            if self.config.raw and stuck >= self._line:
+                text = f"pad {name}: {stuck} of {len(baseline)} taxels always read 0 or"
+                text += f" {self.spec.max_count} at rest: is it unplugged or pressed? A"
+                raise TaccorlError(f"{text} driver that subtracts needs pads.raw=false")
             parts.append(baseline)
         self.baseline = np.concatenate(parts)
 
@@ -220,22 +254,30 @@ class Pads:
         while (
             len(new := [f for t, f in list(self._frames[name]) if t >= begin_s]) < count
         ):
+            if self.broken:
+                raise TaccorlError(self.broken)
             if self._clock() - begin_s > timeout_s:
                 text = f"pad {name}: {len(new)} frames in {timeout_s:g} s, not {count}"
                 raise TaccorlError(
-                    f"{text}: {self._faults.get(name) or 'is it plugged in?'}"
+                    f"{text}: {self.faults.get(name) or 'is it plugged in?'}"
                 )
             time.sleep(0.005)
         return new[:count]
 
     def close(self) -> None:
-        """End the threads and close the ports."""
+        """End the threads and close the ports. Raises TaccorlError, after all were
+        tried: one could not be closed, or a thread hangs in its driver."""
         self._ended.set()
         for thread in self._threads:
             thread.join(timeout=2.0)
-        for driver in self._drivers.values():
-            driver.close()
+        failures = close_all({f"pad {n}": d.close for n, d in self._drivers.items()})
+        for thread in self._threads:
+            thread.join(timeout=0.5)  # one that waits on a port ends with the port
+            if thread.is_alive():
+                failures.append(f"{thread.name}: its driver does not return")
         self._threads, self._drivers = [], {}
+        if failures:
+            raise TaccorlError("; ".join(failures))
 
     def at(
         self, time_s: float, *, rows: int = 1, period_s: float = 0.0
@@ -273,27 +315,69 @@ class Pads:
         above = np.concatenate(parts, axis=1) - self.baseline
         return above.astype(np.int16), ages
 
-    def _read(self, name: str) -> None:
-        wire = (self.spec.wire.rows, self.spec.wire.columns)
-        while not self._ended.is_set():
+    @property
+    def _line(self) -> int:
+        """Number of taxels on the shorter lines of the matrix, which fail together."""
+        return min(self.spec.wire.rows, self.spec.wire.columns)
+
+    def _read(self, name: str, driver: PadDriver, ended: threading.Event) -> None:
+        while not ended.is_set():
             try:
-                stamp_s, frame = self._drivers[name].read()
-            except (
-                OSError,
-                ValueError,
-            ) as error:  # TimeoutError is an OSError; a pad that comes back is read again
-                self._faults[name] = str(error) or type(error).__name__
-                self._ended.wait(0.01)
-                continue
-            if frame.shape != wire:
-                self._faults[name] = (
-                    f"frames of {frame.shape}, but {self.spec.name} sends {wire}"
-                )
+                stamp_s, frame = driver.read()
+                self._take(name, stamp_s, frame)
+            except (OSError, ValueError) as error:
+                # TimeoutError is an OSError; a pad that comes back is read again
+                self.faults[name] = described(error)
+                ended.wait(0.01)
+            except BaseException as error:
+                if not ended.is_set():
+                    prefix = "" if isinstance(error, Unfit) else f"pad {name}: "
+                    self.broken = prefix + described(error)
                 return
-            if self._listen is not None:
-                self._listen(stamp_s, name, frame)
-            values = (frame.T if self.spec.wire.transpose else frame).reshape(-1)
-            self._frames[name].append((stamp_s, values))
+
+    def _take(self, name: str, stamp_s: float, frame: np.ndarray) -> None:
+        """Keep a frame that is new and whole; state in ``faults`` why another is not.
+        Raises Unfit: its time cannot be."""
+        stamp_s = number(f"the time of pad {name}", stamp_s)
+        last_s, most_s = self._stamps_s.get(name, stamp_s), self._max_skew_s
+        if (ahead_s := stamp_s - self._clock()) > most_s:
+            text = f"pad {name} is stamped {ahead_s:.3g} s ahead of the clock"
+            raise Unfit(f"{text}, at most {most_s:g} s")
+        if (back_s := last_s - stamp_s) > most_s:
+            text = f"the time of pad {name} went back by {back_s:.3g} s"
+            raise Unfit(f"{text}, at most {most_s:g} s")
+        self._stamps_s[name] = max(stamp_s, last_s)
+        wire = self.spec.wire
+        shape, dtype = np.shape(frame), getattr(frame, "dtype", type(frame).__name__)
+        if shape != (wire.rows, wire.columns) or dtype != wire.dtype:
+            sent = shape if dtype == wire.dtype else f"{shape} {dtype}"
+            needed = f"{self.spec.name} sends {(wire.rows, wire.columns)} {wire.dtype}"
+            self.faults[name] = f"frames of {sent}, but {needed}"
+            return
+        if self._listen is not None:
+            self._listen(stamp_s, name, frame)
+        values = (frame.T if wire.transpose else frame).reshape(-1)
+        fault = self._fault(name, values) if self.config.raw else ""
+        if fault:
+            self.faults[name] = fault
+            return
+        self.faults.pop(name, None)
+        frames = self._frames[name]
+        frames.append((stamp_s, values))
+        if stamp_s < last_s:  # it came late
+            in_order = sorted(frames, key=itemgetter(0))
+            self._frames[name] = deque(in_order, maxlen=frames.maxlen)
+
+    def _fault(self, name: str, values: np.ndarray) -> str:
+        """Why (taxels,) counts are not those of a pad that works; empty if they are."""
+        is_new = self._repeats[name].is_new(values)
+        if self.baseline is not None:
+            start = self.names.index(name) * len(values)
+            rest = self.baseline[start : start + len(values)]
+            dead = int(((values == 0) & (rest >= _LEAST_REST_COUNT)).sum())
+            if dead >= self._line:
+                return DEAD
+        return "" if is_new else REPEATED
 
     def _identify(self) -> None:
         """Compare the resting counts with those of the first connection: a pad in another's port shows another's."""

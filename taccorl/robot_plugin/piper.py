@@ -6,6 +6,7 @@ grippers as 0 … 100 of its own ranges (0.001°, 0.001 mm), and clips what lies
 
 import importlib
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from taccorl.data.origin import UNSTATED
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin.bodies import ARM_NAMES, Listener, Sample, tell
 from taccorl.robot_plugin.config_robots import BiPiperFlexitacConfig
+from taccorl.robot_plugin.faults import close_all, described
 from taccorl.robots import ROBOT
 
 MOTORS = (*ROBOT.joints, "gripper")  # the plug-in's names: joint1 … joint6, gripper
@@ -75,19 +77,30 @@ class TwoPipers:
         for arm, robot in self.arms.items():
             try:
                 robot.connect(calibrate=False)
-            except (OSError, RuntimeError, ValueError) as error:
+            except (Exception, SystemExit) as error:
                 raise TaccorlError(
-                    f"the {arm} arm does not answer: {error}; piper-doctor says more"
+                    f"the {arm} arm does not answer: {described(error)}; piper-doctor says more"
                 ) from error
-        for camera in self._cameras.values():
-            camera.connect()
+        for name, camera in self._cameras.items():
+            try:
+                camera.connect()
+            except (Exception, SystemExit) as error:
+                text = f"the camera {name} does not answer: {described(error)}"
+                raise TaccorlError(text) from error
 
     def disconnect(self) -> None:
-        """Disconnect; the arms keep their torque, so that they do not fall."""
-        for robot in self.arms.values():
-            robot.disconnect(disable_torque=False)
-        for camera in self._cameras.values():
-            camera.disconnect()
+        """Disconnect what is connected; the arms keep their torque, so that they do not
+        fall. Raises TaccorlError, after all were tried: one could not be closed."""
+        parts = {
+            f"{arm} arm": partial(robot.disconnect, disable_torque=False)
+            for arm, robot in self.arms.items()
+            if robot.is_connected
+        }
+        for name, camera in self._cameras.items():
+            if camera.is_connected:
+                parts[f"camera {name}"] = camera.disconnect
+        if failures := close_all(parts):
+            raise TaccorlError("; ".join(failures))
 
     @property
     def is_connected(self) -> bool:

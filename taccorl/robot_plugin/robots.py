@@ -1,11 +1,14 @@
 """LeRobot robots with touch and safety: any robot with pads, the surrogate, two PiPERs; and the surrogate's leader."""
 
 import logging
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,13 +24,22 @@ from taccorl.robot_plugin.bodies import (
     ARM_NAMES,
     Body,
     LeRobotBody,
+    Sample,
     SurrogateArms,
     SurrogatePads,
 )
 from taccorl.robot_plugin.config_robots import TouchOptions, TouchRobotConfig
+from taccorl.robot_plugin.faults import (
+    Repeats,
+    Unfit,
+    close_all,
+    described,
+    number,
+    positive,
+)
 from taccorl.robot_plugin.lerobot_hooks import TouchFeature, TouchReading
 from taccorl.robot_plugin.mcap_log import McapLog
-from taccorl.robot_plugin.pads import Pads, PadsConfig
+from taccorl.robot_plugin.pads import REPEATED, Pads, PadsConfig
 from taccorl.robot_plugin.piper import TwoPipers
 from taccorl.robot_plugin.safety import Guard, Observed, Reaction, Stopped
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
@@ -37,10 +49,6 @@ from taccorl.views.colors import heat
 _log = logging.getLogger(__name__)
 TOUCH = "tactile"
 """Key of touch in an observation: ``observation.tactile`` of datasets and policies."""
-_NO_ANSWER = (
-    OSError,
-    RuntimeError,
-)  # of LeRobot's robots and cameras; its DeviceNotConnectedError is an OSError
 HELD_SHARE = 1.2
 """Longest p99 of the period of a loop that is held, in periods: 40 ms at 30 Hz."""
 
@@ -60,13 +68,23 @@ class TouchRobot(Robot):
         super().__init__(config)
         lerobot_hooks.install()  # LeRobot's scripts are loaded by now
         self.config, self._clock = config, clock
+        positive("--robot.fps", config.fps)
+        if config.picture_px < 0:
+            text = f"--robot.picture_px={config.picture_px}: must not be below 0"
+            raise TaccorlError(text)
         self.body: Body = self._body()
         pads, name = (
             self._pads_config(),
             config.type + (f"_{self.id}" if self.id else ""),
         )  # not one of two kinds
         self.pads = (
-            Pads(pads, self.calibration_dir / f"{name}_pads.json", self._felt, clock)
+            Pads(
+                pads,
+                self.calibration_dir / f"{name}_pads.json",
+                self._felt,
+                clock,
+                config.safety.max_skew_s,
+            )
             if pads
             else None
         )
@@ -83,7 +101,7 @@ class TouchRobot(Robot):
         self._log: McapLog | None = None
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
-        self._new_picture: dict[str, tuple[np.ndarray, float]] = {}
+        self._new_picture: dict[str, _Picture] = {}
         self._seen_s = self._sent_s = -np.inf
         self.body.listeners.append(self._sampled)
 
@@ -125,7 +143,9 @@ class TouchRobot(Robot):
 
     @property
     def is_connected(self) -> bool:
-        return self.body.is_connected
+        """True from ``connect`` to ``disconnect``, also if the body is lost meanwhile:
+        LeRobot disconnects only what is connected."""
+        return self._thread is not None
 
     def calibrate(self) -> None:
         """Take the pads' baseline again."""
@@ -134,39 +154,70 @@ class TouchRobot(Robot):
 
     def configure(self) -> None: ...
     def connect(self, calibrate: bool = True) -> None:
-        """Connect arms, cameras and pads, and take the pads' baseline. Raises TaccorlError: the policy that LeRobot has loaded
-        does not fit the robot; a part does not answer; pads are touched, exchanged or unplugged."""
+        """Connect arms, cameras and pads, and take the pads' baseline. If one part fails, all are closed again. Raises
+        TaccorlError: the policy that LeRobot has loaded does not fit the robot; a part does not answer; pads are touched,
+        exchanged, dead or unplugged."""
+        if self.is_connected:
+            raise TaccorlError(f"{self.name} is connected already: disconnect it first")
         lerobot_hooks.check_policy(
             self.observation_features, self.body.names, self.pads, self.config.fps
         )
         if self.is_piper:
             lerobot_hooks.check_units()
-        self.body.connect()
+        self._ended = threading.Event()  # of this connection: its watchdog keeps it
+        self._new_picture, self.timing = {}, {}
+        part = "arms and cameras"
         try:
+            self.body.connect()
             if self.config.record is not None:
-                said = getattr(self.body, "instruction", "") or "not stated"
-                is_polled = not isinstance(
-                    self.body, SurrogateArms
-                )  # states come with the loop, as commands do
-                topics = [
-                    *COMMAND_TOPICS.values(),
-                    *(STATE_TOPICS.values() if is_polled else ()),
-                ]
-                rates_hz = dict.fromkeys(topics, self.config.fps)
-                self._log = McapLog(
-                    self.config.record, self.body.origin, said, self._clock, rates_hz
-                )
+                part = "recording"
+                self._log = self._new_log(self.config.record)
             if self.pads is not None:
+                part = "pads"
                 self.pads.connect()
-        except TaccorlError:
-            self.body.disconnect()
-            raise
-        self.guard, self.timing = self._new_guard(), {}
-        self._ended.clear()
-        self._thread = threading.Thread(
-            target=self._watch, daemon=True, name="watchdog"
-        )
-        self._thread.start()
+            self.guard = self._new_guard()
+            thread = threading.Thread(target=self._watch, daemon=True, name="watchdog")
+            thread.start()
+        except BaseException as error:
+            log = self._log
+            failures = self._close()
+            if log is not None:
+                log.discard()
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            is_ours = isinstance(error, TaccorlError)
+            text = described(error) if is_ours else f"{part}: {described(error)}"
+            raise TaccorlError("; ".join([text, *failures])) from error
+        self._thread = thread
+
+    def _new_log(self, path: Path) -> McapLog:
+        said = getattr(self.body, "instruction", "") or "not stated"
+        is_polled = not isinstance(
+            self.body, SurrogateArms
+        )  # states come with the loop, as commands do
+        topics = [
+            *COMMAND_TOPICS.values(),
+            *(STATE_TOPICS.values() if is_polled else ()),
+        ]
+        rates_hz = dict.fromkeys(topics, self.config.fps)
+        return McapLog(path, self.body.origin, said, self._clock, rates_hz)
+
+    def _close(self) -> list[str]:
+        """Close every part, also after one has failed; returns what failed and why."""
+        self._ended.set()
+        parts: dict[str, Callable[[], object]] = {}
+        if self._thread is not None:
+            parts["watchdog"] = partial(self._thread.join, timeout=1.0)
+        if self.pads is not None:
+            parts["pads"] = self.pads.close
+        parts["arms and cameras"] = self.body.disconnect
+        if self._log is not None:
+            parts["recording"] = self._log.close
+        failures = close_all(parts)
+        if self._thread is not None and self._thread.is_alive():
+            failures.append("watchdog: it waits for a driver that does not return")
+        self._thread = self._log = None
+        return failures
 
     def begin_episode(self, seed: int | None = None) -> None:
         """Begin an episode; a surrogate in the scene of ``seed``, or the next one. Raises TaccorlError: it does not answer."""
@@ -187,45 +238,48 @@ class TouchRobot(Robot):
             self._log.instruction = text
 
     def get_observation(self) -> dict[str, Any]:
-        """The present observation. Raises Stopped: the connection is lost, or the robot does not answer."""
+        """The present observation. Raises Stopped: the connection is lost, the robot does not answer, or a number of the
+        observation is not finite, of another shape, or of an impossible time."""
+        doing = "the robot does not answer"
         try:
             if self.body.is_lost:
                 raise ConnectionError("the connection is lost")
             sample = self.body.read()
-        except _NO_ANSWER as error:
-            with self._lock:
-                self._react(
-                    self.guard.stop(f"the robot does not answer: {error}", is_lost=True)
-                )
+            doing = "the observation is unfit"
+            now_s = number("the time of the clock", self._clock())
+            return self._observation(sample, now_s)
+        except (KeyboardInterrupt, Stopped):
+            raise
+        except BaseException as error:  # whatever a driver raises
+            self._stop(f"{doing}: {described(error)}")
             raise Stopped(f"stopped: {self.guard.stopped}") from error
-        now_s = self._clock()
+
+    def _observation(self, sample: Sample, now_s: float) -> dict[str, Any]:
+        """Observation of a sample that was read at ``now_s``, which the guard sees first. Raises Stopped: the guard refuses it;
+        Unfit: a camera or a pad gives nothing usable."""
         ages = {
-            channel: now_s - stamp_s for channel, stamp_s in sample.stamps_s.items()
+            channel: math.inf
+            if stamp_s == -math.inf
+            else now_s - number(f"the time of {channel}", stamp_s)
+            for channel, stamp_s in sample.stamps_s.items()
         }
-        for name, picture in sample.pictures.items():
-            # A camera that repeats itself is as old as its last new picture: a sensor's noise is never twice the same.
-            if not np.array_equal(
-                self._new_picture.get(name, (np.empty(0), 0.0))[0], picture
-            ):
-                self._new_picture[name] = picture.copy(), now_s - ages[f"camera:{name}"]
-            ages[f"camera:{name}"] = max(
-                ages[f"camera:{name}"], now_s - self._new_picture[name][1]
-            )
-        px = self.config.picture_px
-        seen: dict[str, Any] = dict(
-            zip(self.body.names, sample.position.tolist(), strict=True)
-        )
-        seen |= {
-            name: letterbox(p, px, px) if px else p
-            for name, p in sample.pictures.items()
+        notes: dict[str, str] = {}
+        for name in self.body.cameras:
+            self._look(name, sample, notes)
+        unchanged_s = {
+            f"camera:{n}": now_s - p.stamp_s for n, p in self._new_picture.items()
         }
-        sums = {}
+        sums, reading = {}, {}
         if self.pads is not None:
+            if self.pads.broken:
+                raise Unfit(self.pads.broken)
             rows, stride = lerobot_hooks.window()
             touch, felt = self.pads.at(
                 now_s, rows=rows, period_s=stride / self.config.fps
             )
             ages |= {f"pad:{name}": age_s for name, age_s in felt.items()}
+            faults = self.pads.faults.copy()  # the pads' threads change it
+            notes |= {f"pad:{name}": text for name, text in faults.items()}
             parts = dict(
                 zip(
                     self.pads.names,
@@ -237,18 +291,54 @@ class TouchRobot(Robot):
                 name: float(np.maximum(counts, 0).sum())
                 for name, counts in parts.items()
             }
-            seen[TOUCH] = TouchReading(
+            reading[TOUCH] = TouchReading(
                 touch[-1], touch, partial(_shown, parts, self.pads.spec.max_count)
             )
         found = Observed(
-            position=sample.position, ages_s=ages, pad_counts=sums, effort=sample.effort
+            position=sample.position,
+            ages_s=ages,
+            pad_counts=sums,
+            effort=sample.effort,
+            unchanged_s=unchanged_s,
+            notes=notes,
+            at_s=now_s,
         )
         with self._lock:
             self._react(self.guard.observed(found))
+            if self.guard.is_unfit:
+                raise Stopped(f"stopped: {self.guard.stopped}")
+        px = self.config.picture_px
+        seen: dict[str, Any] = dict(
+            zip(self.body.names, map(float, sample.position), strict=True)
+        )
+        seen |= {
+            name: letterbox(p.picture, px, px) if px else p.picture
+            for name, p in self._new_picture.items()
+        }
         for channel, age_s in ages.items():
+            age_s = max(age_s, unchanged_s.get(channel, 0.0))
             self._timed(f"age of {channel}", age_s)
         self._seen_s = self._clock()
-        return seen
+        return seen | reading
+
+    def _look(self, name: str, sample: Sample, notes: dict[str, str]) -> None:
+        """Keep a camera's picture if it is new and fit, else state in ``notes`` why not.
+        Raises Unfit: there is none to keep in its place, or its time is not finite."""
+        channel, shown = f"camera:{name}", self._new_picture.get(name)
+        picture = sample.pictures.get(name)
+        stamp_s = number(f"the time of {channel}", sample.stamps_s.get(channel))
+        fault = _picture_fault(picture, self.body.cameras[name], shown)
+        if fault and shown is None:
+            raise Unfit(f"{channel}: {fault}")
+        if fault:
+            notes[channel] = fault
+            return
+        assert picture is not None, "that would be a fault"
+        repeats = Repeats() if shown is None else shown.repeats
+        if repeats.is_new(picture) or shown is None:
+            self._new_picture[name] = _Picture(picture.copy(), stamp_s, repeats)
+        elif stamp_s != shown.stamp_s:  # else no new picture came
+            notes[channel] = REPEATED
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Send an action as far as safety lets it pass; returns what was sent. Raises Stopped: the robot was stopped."""
@@ -272,17 +362,14 @@ class TouchRobot(Robot):
         )
 
     def disconnect(self) -> None:
-        """Disconnect everything, and say how the loop went."""
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join(timeout=1.0)
-        if self.pads is not None:
-            self.pads.close()
-        self.body.disconnect()
-        if self._log is not None:
-            self._log.close()
+        """Disconnect everything, and say how the loop went. Raises TaccorlError, after all parts were tried: what failed."""
+        failures = self._close()
         for line in self.summary():
             (print if self.config.dry_run else _log.info)(line)
+        if failures:
+            raise TaccorlError(
+                f"{self.name} is not closed whole: {'; '.join(failures)}"
+            )
 
     def summary(self) -> list[str]:
         """Lines: p50 and p99 of ages, latencies and the period [ms]; whether the loop is held; what safety did."""
@@ -303,6 +390,8 @@ class TouchRobot(Robot):
             lines.append(
                 f"  a loop of {self.config.fps:g} Hz {verdict} be held: {text}"
             )
+        if self.config.dry_run:
+            lines += ["  limits in force:", *(f"    {x}" for x in self.guard.limits())]
         counts = ", ".join(f"{n} {kind}" for kind, n in self.guard.counts.items() if n)
         return [
             *lines,
@@ -310,29 +399,43 @@ class TouchRobot(Robot):
         ]
 
     def _react(self, reaction: Reaction | None) -> None:
-        if (
-            reaction is None
-            or reaction.target is None
-            or self.config.dry_run
-            or self.body.is_lost
-        ):
+        """Send the command of a reaction. Any exception of the driver is a stop."""
+        if reaction is None or reaction.target is None or self.config.dry_run:
+            return
+        try:
+            if self.body.is_lost:
+                return
+            self.body.send(reaction.target)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # also in the watchdog's thread
+            text = f"the robot takes no command: {described(error)}"
+            self.guard.stop(text, is_lost=True)
             return
         if self._log is not None:
             self._log.command(reaction.target)
-        try:
-            self.body.send(reaction.target)
-        except _NO_ANSWER as error:  # also in the watchdog's thread, which must go on
-            self.guard.stop(f"the robot takes no command: {error}", is_lost=True)
+
+    def _stop(self, reason: str) -> None:
+        """Stop because of a driver; the present position is the last command."""
+        with self._lock:
+            self._react(self.guard.stop(reason, is_lost=True))
 
     def _watch(self) -> None:
-        while not self._ended.wait(1 / self.config.fps):
-            with self._lock:
-                if self.body.is_lost:
-                    self.guard.stop("the connection is lost", is_lost=True)
-                else:
-                    self._tick()
+        ended = self._ended
+        while not ended.wait(1 / self.config.fps):
+            try:
+                with self._lock:
+                    if self.body.is_lost:
+                        self.guard.stop("the connection is lost", is_lost=True)
+                    else:
+                        self._tick()
+            except BaseException as error:
+                # Whatever a driver raises: the thread goes on.
+                self._stop(f"the watchdog fails: {described(error)}")
 
     def _tick(self) -> None:
+        if self.pads is not None and self.pads.broken:
+            self._stop(self.pads.broken)
         reaction = self.guard.tick()
         self._react(reaction)
         if self._log is not None and (self.guard.stopped or self.guard.idle):
@@ -352,6 +455,33 @@ class TouchRobot(Robot):
     def _felt(self, stamp_s: float, name: str, frame: np.ndarray) -> None:
         if self._log is not None:
             self._log.pad(stamp_s, name, frame)
+
+
+@dataclass
+class _Picture:
+    """Newest picture of a camera that is none of those before it, and its time [s]."""
+
+    picture: np.ndarray
+    stamp_s: float
+    repeats: Repeats
+
+
+def _picture_fault(
+    picture: Any, size: tuple[int | None, ...], before: _Picture | None
+) -> str:
+    """Why ``picture`` is none of its camera, empty if it is. ``size``: rows and columns
+    that the camera states, None if it does not; ``before``: its last picture."""
+    if not isinstance(picture, np.ndarray) or picture.dtype.kind not in "ui":
+        return "it gives no picture"
+    kind = f"its pictures are {picture.shape} {picture.dtype}"
+    if not picture.size or (None not in size and picture.shape[:2] != tuple(size)):
+        return f"{kind}, not {tuple(size)}"
+    if before is None or (picture.shape, picture.dtype) == (
+        before.picture.shape,
+        before.picture.dtype,
+    ):
+        return ""
+    return f"{kind}, not {before.picture.shape} {before.picture.dtype}"
 
 
 def _shown(
@@ -388,6 +518,7 @@ class TaccorlSurrogate(TouchRobot):
 
     def _body(self) -> SurrogateArms:
         assert isinstance(self.config, config_robots.TaccorlSurrogateConfig)
+        positive("--robot.lost_after_s", self.config.lost_after_s)
         link = SurrogateLink(
             self.config.port, lost_s=self.config.lost_after_s, clock=self._clock
         )

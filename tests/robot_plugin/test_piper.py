@@ -168,7 +168,7 @@ def test_a_driver_of_ones_own_gives_counts_above_its_baseline_at_the_right_taxel
     tmp_path: Path,
 ) -> None:
     pads = Pads(
-        DriverPads(open_with=f"{__name__}:Steady", pads=["one", "two"]),
+        DriverPads(open_with=f"{__name__}:Steady", pads=["one", "two"], raw=False),
         tmp_path / "pads.json",
     )
     pads.connect()
@@ -194,7 +194,7 @@ def test_a_driver_of_ones_own_gives_counts_above_its_baseline_at_the_right_taxel
     np.testing.assert_array_equal(found[0], expected.reshape(-1))
     assert max(ages.values()) < 0.1
     swapped = Pads(
-        DriverPads(open_with=f"{__name__}:Steady", pads=["two", "one"]),
+        DriverPads(open_with=f"{__name__}:Steady", pads=["two", "one"], raw=False),
         tmp_path / "pads.json",
     )
     swapped.connect()  # the names follow their pads
