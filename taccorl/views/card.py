@@ -126,7 +126,8 @@ def _summary(dataset: Dataset) -> list[str]:
         f"{size}; outcomes: {said}",
         f"robot: {escaped(spec.robot_type)}; data spec {escaped(spec.name)}",
         f"instruction{'s' if len(texts) > 1 else ''}: {listed(texts, MOST_INSTRUCTIONS)}",
-        f"format: [LeRobot](https://github.com/huggingface/lerobot) {escaped(dataset.info['codebase_version'])}, written by taccorl",
+        "format: [LeRobot](https://github.com/huggingface/lerobot) "
+        f"{escaped(dataset.info['codebase_version'])}, written by taccorl",
     ]
 
 
@@ -284,9 +285,11 @@ def _use(dataset: Dataset) -> str:
             "",
             "It has no videos: its pictures are in the frame cache (STORE) of the machine that made it, at ROWS × COLUMNS.",
         ]
+    repository, version = f"USER/{name}", dataset.info["codebase_version"]
+    upload = f"hf upload {repository} {quoted} --repo-type=dataset"
+    tag = f"hf repos tag create {repository} {version} --repo-type=dataset"
     publish = (
-        f"{code(f'hf upload USER/{name} {quoted} --repo-type=dataset')}, then "
-        f"{code(f'hf repos tag create USER/{name} {dataset.info["codebase_version"]} --repo-type=dataset')}, publish it with this card (LeRobot's `push_to_hub` "
+        f"{code(upload)}, then {code(tag)}, publish it with this card (LeRobot's `push_to_hub` "
         "writes its own card). Its licence is not stated here: add `license:` at the top."
     )
     return "\n".join([*lines, "", publish])

@@ -4,7 +4,6 @@ from html.parser import HTMLParser
 
 import pytest
 
-
 from taccorl.report.markdown import code, escaped, markdown
 from taccorl.report.section import Cell, Section
 
@@ -60,7 +59,24 @@ def test_texts_of_strangers_are_shown_as_they_are_wherever_they_stand(name: str)
         "bold": Section(heads=("a",), rows=[[Cell(text, "bold")]]),
         "command": Section(command=text),
     }
-    allowed = {*"h2 p ul li strong em table thead tbody tr th td code pre".split()}
+    allowed = {
+        *[
+            "h2",
+            "p",
+            "ul",
+            "li",
+            "strong",
+            "em",
+            "table",
+            "thead",
+            "tbody",
+            "tr",
+            "th",
+            "td",
+            "code",
+            "pre",
+        ]
+    }
     for place, section in places.items():
         found = rendered(section)
         assert found.tags <= allowed, place
