@@ -6,6 +6,7 @@ a store do, and then finds what the first one made: it goes on from there, finds
 
 import contextlib
 import hashlib
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -38,13 +39,17 @@ def released_at_the_end() -> Iterator[None]:
 def hold(out: Path) -> None:
     """Lock the place ``out`` for the command that runs; wait while another command has it. Nothing is locked outside of a
     command, or in a folder in which nothing can be written."""
-    path = lock_file(out)
-    if _held is None or path in _held:
-        return
+    for path in lock_files(out):
+        if _held is not None and path not in _held:
+            _acquire(path, out)
+
+
+def _acquire(path: Path, out: Path) -> None:
     from filelock import FileLock, Timeout
 
     from taccorl.lineage.files import this_process
 
+    assert _held is not None
     lock = FileLock(path, fallback_to_soft=False)
     try:
         path.touch()  # where that fails, filelock would try for ever
@@ -82,12 +87,15 @@ def check_apart(out: Path, places: Iterable[tuple[str, Path]]) -> None:
             )
 
 
-def lock_file(out: Path) -> Path:
-    """Lock file of a place: beside it, or in the nearest folder above that exists."""
-    whole = out.absolute()
-    folder = next(
-        (parent for parent in whole.parents if parent.is_dir()), whole.parent
-    ).resolve()
-    if folder == whole.parent.resolve():
-        return folder / f".{whole.name}.lock"
-    return folder / f".{hashlib.sha256(str(whole).encode()).hexdigest()[:16]}.lock"
+def lock_files(out: Path) -> list[Path]:
+    """Lock files of a place, in the order in which they are locked; the last one is its own. Symbolic links are resolved.
+
+    The own one lies beside the place, or in the nearest folder above that exists. A command that creates the folders between
+    moves that spot down, but keeps its lock further up: such locks come first."""
+    # Unlike Path.resolve, it does not raise for links that form a loop.
+    place = Path(os.path.realpath(out))
+    parents = [parent for parent in place.parents if parent.is_dir()]
+    early = f".{hashlib.sha256(os.fsencode(place)).hexdigest()[:16]}.lock"
+    own = f".{place.name}.lock" if place.parent in parents else early
+    above = [folder / early for folder in parents if (folder / early).exists()]
+    return [*(path for path in above if path != parents[0] / own), parents[0] / own]

@@ -188,6 +188,10 @@ class Dataset:
             f"{path}, episode {index}",
             list(dict.fromkeys(["frame_index", *keys])),
         )
+        if absent := [key for key in columns if key not in features]:
+            raise DatasetError(
+                f"{self.root}/meta/info.json: has no feature {absent[0]}: copy the dataset again"
+            )
         with plainly(path, PARQUET):
             table = pq.read_table(
                 path, columns=columns, filters=[("episode_index", "==", index)]
@@ -199,8 +203,7 @@ class Dataset:
                 f"{where}: has {table.num_rows} rows, which are not rows 0 to {num_rows - 1} in order"
             )
         return {
-            key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}")
-            for key in keys
+            key: _column(table[key], features[key], f"{where}, {key}") for key in keys
         }
 
     def frames(
@@ -266,6 +269,7 @@ class Dataset:
             *pictures,
             instruction,
             videos=videos,
+            stored_rows=self.num_rows(index),
             **told,
         )
 
@@ -484,10 +488,9 @@ def _checked_info(root: Path) -> dict[str, Any]:
         raise DatasetError(
             f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}"
         )
-    if vague := [
-        key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)
-    ]:
-        raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
+    for key, feature in info["features"].items():
+        if why := _no_feature(feature):
+            raise DatasetError(f"{path}: feature {key}: {why}; copy the dataset again")
     if (
         not math.isfinite(info["fps"])
         or int(info["fps"]) != info["fps"]
@@ -497,6 +500,22 @@ def _checked_info(root: Path) -> dict[str, Any]:
             f"{path}: fps {info['fps']}; only whole numbers up to {MOST_FPS} are supported"
         )
     return info
+
+
+def _no_feature(feature: Any) -> str:
+    """Text on what makes an entry of ``features`` no description; empty if nothing does."""
+    if not isinstance(feature, dict):
+        return f"expected dtype, shape and names, found {str(feature)[:80]!r}"
+    dtype, shape = feature.get("dtype"), feature.get("shape")
+    if not isinstance(dtype, str):
+        return f"has no dtype, or one that is no text: {str(dtype)[:80]!r}"
+    if not isinstance(shape, list) or not all(
+        type(size) is int and size > 0 for size in shape
+    ):
+        return f"shape is {str(shape)[:80]!r}, expected a list of whole numbers above 0"
+    if not isinstance(feature.get("info") or {}, dict):
+        return f"info is {str(feature['info'])[:80]!r}, expected names and values"
+    return ""
 
 
 def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
@@ -701,6 +720,26 @@ def flattened(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return column
 
 
+def numbers_of(column: pa.ChunkedArray, where: str) -> np.ndarray:
+    """All numbers of a column, one after the other. Raises DatasetError: it has values of another type, or empty ones."""
+    values = flattened(column)
+    kind = values.type
+    # True and false are the numbers of `next.done`.
+    if not (
+        pa.types.is_integer(kind)
+        or pa.types.is_floating(kind)
+        or pa.types.is_boolean(kind)
+    ):
+        raise DatasetError(
+            f"{where}: a column of {column.type}, not of numbers: was it written by another tool? Copy the dataset again"
+        )
+    if values.null_count:
+        raise DatasetError(
+            f"{where}: {values.null_count} of {len(values)} values are empty: copy the dataset again"
+        )
+    return values.to_numpy()
+
+
 def data_files(root: Path) -> list[Path]:
     """Parquet files of rows in the order in which LeRobot joins them."""
     return sorted((root / "data").glob("*/*.parquet"))
@@ -713,19 +752,40 @@ def feature_rows(root: Path, key: str) -> np.ndarray:
         with plainly(path, PARQUET):
             column = pq.read_table(path, columns=[key])[key]
         parts += (
-            [flattened(column).to_numpy().reshape(len(column), -1)]
+            [numbers_of(column, f"{path}, {key}").reshape(len(column), -1)]
             if len(column)
             else []
         )
     return np.concatenate(parts)
 
 
-def _column(rows: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """(T, *shape); texts (T,)."""
-    num_rows, column = len(rows), flattened(rows)
+def _column(
+    rows: pa.ChunkedArray, feature: Mapping[str, Any], where: str
+) -> np.ndarray:
+    """(T, *shape) of numbers; (T,) of texts. Raises DatasetError: the column has values of
+    another type or number than ``feature`` states."""
+    num_rows, column, shape = len(rows), flattened(rows), tuple(feature["shape"])
     text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
+    number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
+    stated = feature["dtype"]
+    if (stated in READ_AS and not number) or (stated == "string" and not text):
+        raise DatasetError(
+            f"{where}: a column of {column.type}, but meta/info.json states {stated}: "
+            "was it written by another tool? Copy the dataset again"
+        )
     if column.null_count or len(column) != num_rows * (1 if text else math.prod(shape)):
         found = f"{where}: {len(column)} values, {column.null_count} of them empty, for {num_rows} rows of shape "
         raise DatasetError(f"{found}{list(shape)}")
     values = column.to_numpy()
-    return values if text else values.reshape(num_rows, *shape)
+    if text:
+        return values
+    if (
+        np.dtype(READ_AS.get(stated, "float64")).kind == "i"
+        and values.dtype.kind == "f"
+    ):
+        odd = values != np.floor(values)
+        if odd.any():
+            raise DatasetError(
+                f"{where}: {values[odd][0]:g} is no whole number, but meta/info.json states {stated}: copy the dataset again"
+            )
+    return values.reshape(num_rows, *shape)

@@ -28,7 +28,7 @@ from taccorl.data.dataset import (
     Dataset,
     data_files,
     feature_rows,
-    flattened,
+    numbers_of,
     write_info,
 )
 from taccorl.data.exact_statistics import known_rows, statistics_of_rows
@@ -88,9 +88,9 @@ def read_rows(dataset: Dataset) -> Rows:
                     f"{path}: lacks the column {absent[0]}, which every LeRobot dataset has"
                 )
             table = pq.read_table(path, columns=list(BOOKKEEPING))
-            tables.append(
-                {key: flattened(table[key]).to_numpy() for key in BOOKKEEPING}
-            )
+        tables.append(
+            {key: numbers_of(table[key], f"{path}, {key}") for key in BOOKKEEPING}
+        )
     return Rows(
         **{
             k: np.concatenate([t[k] for t in tables]) if tables else np.empty(0)

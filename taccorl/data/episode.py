@@ -99,13 +99,16 @@ class Episode:
     ] = ()  # (first row, name) of the task's stages, where known
     provenance: dict[str, object] = field(default_factory=dict)
     """Facts about how the episode was made, as JSON values: recording, simulation …"""
+    stored_rows: int = 0
+    """T of an episode of a dataset, for one of which no numbers are read."""
     findings: tuple[Finding, ...] = ()
     """Findings about the recording's samples, at the full rate of the channels (rows hold only some of the samples)."""
 
     @property
     def num_rows(self) -> int:
-        """T: number of rows."""
-        return len(next(iter(self.arrays.values())))
+        """T: number of rows, of pictures where there are no numbers."""
+        columns = (*self.arrays.values(), *self.picture_rows.values())
+        return len(columns[0]) if columns else self.stored_rows
 
     @property
     def time_s(self) -> np.ndarray:

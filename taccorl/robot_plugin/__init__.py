@@ -5,3 +5,4 @@ LeRobot finds the robots through ``taccorl.lerobot_plugin``, which imports ``con
 
 DEFAULT_PORT = 8730  # TCP port of a surrogate on this machine
 LOST_S = 0.3  # [s] without any message of a surrogate after which its connection counts as lost
+MOST_PX = 2048  # Most rows and columns of a camera's pictures

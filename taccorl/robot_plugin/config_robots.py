@@ -7,6 +7,7 @@ An SO-101 with pads, as a file for --config_path:
             pads: {type: flexitac, ports: {left: /dev/ttyUSB0, right: /dev/ttyUSB1}}}
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,13 @@ from lerobot.cameras import CameraConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 
-from taccorl.robot_plugin import DEFAULT_PORT, LOST_S
+from taccorl.errors import TaccorlError
+from taccorl.robot_plugin import DEFAULT_PORT, LOST_S, MOST_PX
 from taccorl.robot_plugin.pads import FlexiTacPads, PadsConfig
 from taccorl.robot_plugin.safety import SafetyConfig
 from taccorl.robots import ROBOT
+
+MOST_FPS = 1000.0  # Highest rate of a loop [Hz]
 
 
 @dataclass(kw_only=True)
@@ -35,6 +39,18 @@ class TouchOptions(RobotConfig):
     """MCAP file of everything that the robot measures and is told; PiPER arms only."""
     dry_run: bool = False
     """Send no command; at the end, print ages and latencies, and whether the loop can be held."""
+
+    def __post_init__(self) -> None:
+        """Raises TaccorlError: a number is out of its range."""
+        super().__post_init__()
+        if not 0 <= self.picture_px <= MOST_PX:
+            raise TaccorlError(
+                f"--robot.picture_px={self.picture_px}: give 0 … {MOST_PX}"
+            )
+        if not 0 < self.fps <= MOST_FPS:
+            raise TaccorlError(
+                f"--robot.fps={self.fps:g}: give a rate above 0, at most {MOST_FPS:g} Hz"
+            )
 
 
 @RobotConfig.register_subclass("touch_robot")
@@ -63,6 +79,18 @@ class TaccorlSurrogateConfig(TouchOptions):
     """Rows and columns of its pictures (serve-surrogate --camera_px)."""
     lost_after_s: float = LOST_S
     """Time without any message of it after which the connection counts as lost [s]."""
+
+    def __post_init__(self) -> None:
+        """Raises TaccorlError: a number is out of its range."""
+        super().__post_init__()
+        if not 0 <= self.camera_px <= MOST_PX:
+            raise TaccorlError(
+                f"--robot.camera_px={self.camera_px}: give 0 … {MOST_PX}, as serve-surrogate has it"
+            )
+        if not 0 < self.lost_after_s < math.inf:
+            raise TaccorlError(
+                f"--robot.lost_after_s={self.lost_after_s:g}: give a time above 0 s"
+            )
 
 
 @RobotConfig.register_subclass("bi_piper_flexitac")

@@ -13,8 +13,9 @@ import numpy as np
 
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, UnreachableError, nearest
+from taccorl.robot_plugin import MOST_PX
 from taccorl.robots import ROBOT
-from taccorl.sim.simulation import Simulation, Watch
+from taccorl.sim.simulation import Simulation, Watch, checked_seeds
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -43,6 +44,7 @@ FAULTS = {
 }
 """Name of a fault that can be injected → what it does."""
 LATE_S, JITTER_S = 0.3, 0.03
+LEAST_PX = 8  # Fewest rows and columns of a camera's pictures
 _CAMERA_LATENCY_S = DriverConfig.camera_latency_s
 _DRAWN_MAX_BEHIND = 2  # ticks behind the clock at which a picture is left out: motion and touch come first
 _DRAWN_AT_LEAST = 10  # ticks after which it is drawn all the same
@@ -111,6 +113,14 @@ class SurrogateBody:
             raise TaccorlError(
                 f"--task={config.task}: {nearest(config.task, list(tasks))}"
             )
+        if config.camera_px and not LEAST_PX <= config.camera_px <= MOST_PX:
+            raise TaccorlError(
+                f"--camera_px={config.camera_px}: give {LEAST_PX} … {MOST_PX}, or 0 for no cameras"
+            )
+        for option in ("secret", "seed"):
+            value = getattr(config, option)
+            if value is not None and value < 0:
+                raise TaccorlError(f"--{option}={value}: give a whole number from 0 on")
         self.config, self.faults = config, set(config.faults)
         self.sim = Simulation(
             tasks.get(config.task)(config.difficulty), hidden_twin(config)
@@ -137,8 +147,10 @@ class SurrogateBody:
         self.reset(config.seed)
 
     def reset(self, seed: int | None = None) -> int:
-        """A new scene with the arms at home: of ``seed``, or the next one. Returns its seed."""
-        self.scene_seed = self.scene_seed + 1 if seed is None else seed
+        """A new scene with the arms at home: of ``seed``, or the next one. Returns its
+        seed. Raises TaccorlError: ``seed`` is no seed; nothing was changed."""
+        found = (self.scene_seed + 1) % 2**63 if seed is None else seed
+        self.scene_seed = int(checked_seeds([found])[0])
         self.sim.reset([self.scene_seed])
         self._rng = np.random.default_rng([self.scene_seed, 2])
         self._from = self._goal = self._target = self.sim.targets[0].copy()

@@ -12,7 +12,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from socket import create_connection
 from typing import Any
 
@@ -22,11 +22,18 @@ import zmq
 
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin import LOST_S
+from taccorl.robot_plugin.surrogate_messages import (
+    MOST_REPLY_BYTES,
+    finite_numbers,
+    read_object,
+)
 from taccorl.robots import ROBOT
 from taccorl.surrogate.drivers import PAD_WIRE_SHAPE
 
 ROBOT_ROLE, LEADER_ROLE = "robot", "leader"
 PING_S = 0.05
+FACTS = {"task": str, "instruction": str, "cameras": dict, "origin": dict}
+"""Facts on a surrogate that its reply to hello states: key → type."""
 
 
 class SurrogateLink:
@@ -54,6 +61,8 @@ class SurrogateLink:
         self.listeners: list[Any] = []
         """Called with (kind, stamp [s], name, value) of every sample, in the link's thread."""
         self.heard_s = -np.inf
+        self.malformed = 0
+        """Number of messages that were dropped because they are none of a surrogate."""
         self._replies: queue.Queue[dict[str, Any]] = queue.Queue()
         self._numbers = itertools.count()
         self._lock = threading.Lock()
@@ -87,9 +96,16 @@ class SurrogateLink:
         )
         self._thread.start()
         try:
-            return self.request(
+            facts = self.request(
                 "hello", timeout_s, role=self.role, name=f"process {os.getpid()}"
             )
+            for key, kind in FACTS.items():
+                if not isinstance(facts.get(key), kind):
+                    raise TaccorlError(
+                        f"port {self.port} of this machine: no surrogate of this version answers: {key} is missing; give "
+                        "the port that taccorl serve-surrogate prints"
+                    )
+            return facts
         except TaccorlError:
             self.close()
             raise
@@ -128,6 +144,11 @@ class SurrogateLink:
         raise self._absent()
 
     def _absent(self) -> TaccorlError:
+        if self.malformed:
+            return TaccorlError(
+                f"port {self.port} of this machine: {self.malformed} messages are none of a surrogate; give the port that "
+                "taccorl serve-surrogate prints"
+            )
         text = f"no surrogate answers on port {self.port} of this machine: start one with taccorl serve-surrogate "
         return TaccorlError(
             f"{text}--port={self.port}, and wait until it says listening"
@@ -138,6 +159,7 @@ class SurrogateLink:
         socket.setsockopt(
             zmq.LINGER, 0
         )  # nothing of this connection may reach the next server on the port
+        socket.setsockopt(zmq.MAXMSGSIZE, MOST_REPLY_BYTES)
         socket.connect(f"tcp://127.0.0.1:{self.port}")
         poller = zmq.Poller()
         for one in (receiver, socket):
@@ -151,52 +173,71 @@ class SurrogateLink:
                     break
                 socket.send(text)
             if socket in ready:
-                self._take(*socket.recv_multipart()[:2])
+                self._take(*socket.recv_multipart())
             if time.monotonic() - pinged_s > PING_S:
                 socket.send(b'{"do": "ping"}')
                 pinged_s = time.monotonic()
         socket.close()
         receiver.close()
 
-    def _take(self, text: bytes, payload: bytes) -> None:
-        header = json.loads(text)
-        kind, stamps_s = header["kind"], header.get("stamps_s")
-        if kind == "reply":
-            if (
-                "seed" in header
-            ):  # of hello or reset: the samples so far are of another scene
-                self.states.clear()
-                self.pictures.clear()
-            self._replies.put(header)
+    def _take(self, *frames: bytes) -> None:
+        try:
+            samples = self._read(frames)
+        except (TaccorlError, ValueError, cv2.error):
+            self.malformed += 1
             return
-        self.heard_s = self._clock()
-        if kind == "state":
-            self.lead = header["lead"]
-            found = np.frombuffer(payload).reshape(-1, 3, ROBOT.num_actions)
-            self.states.extend(zip(stamps_s, found, strict=True))
-            samples = [
-                ("state", stamp, "", value)
-                for stamp, value in zip(stamps_s, found, strict=True)
-            ]
-        elif kind == "camera":
-            decoded = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
-            assert decoded is not None, "the surrogate sends JPEG"
-            self.pictures[header["camera"]] = (
-                stamps_s[0],
-                cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB),
-            )
-            samples = [("camera", stamps_s[0], header["camera"], payload)]
-        else:
-            names = [ROBOT.pads[k] for k in header["pads"]]
-            frames = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
-            samples = [
-                ("pad", stamps_s[0], name, frame)
-                for name, frame in zip(names, frames, strict=True)
-            ]
-            for _, stamp, name, frame in samples:
-                self.pads[name].put((stamp, frame))
-                if self.pads[name].qsize() > 4096:  # 40 s: nobody reads them
-                    self.pads[name].get_nowait()
         for listener in self.listeners:
             for sample in samples:
                 listener(*sample)
+
+    def _read(self, frames: Sequence[bytes]) -> list[tuple[str, float, str, Any]]:
+        """Keep the content of a message; returns its samples: kind, stamp [s], name and
+        value. Raises TaccorlError, ValueError or cv2.error: it is no message of a
+        surrogate; nothing was kept."""
+        text, payload = frames
+        samples: list[tuple[str, float, str, Any]]
+        header = read_object(text)
+        kind = header.get("kind")
+        if kind == "reply":
+            self._keep_reply(header)
+            return []
+        stamps_s = finite_numbers(header, "stamps_s").tolist()
+        if kind == "state":
+            found = np.frombuffer(payload).reshape(-1, 3, ROBOT.num_actions)
+            new = list(zip(stamps_s, found, strict=True))
+            self.lead = finite_numbers(header, "lead", ROBOT.num_actions).tolist()
+            self.states.extend(new)
+            samples = [("state", stamp_s, "", value) for stamp_s, value in new]
+        elif kind == "camera" and header.get("camera") in ROBOT.cameras:
+            decoded = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+            if decoded is None:
+                raise TaccorlError("the picture is no JPEG")
+            picture = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+            self.pictures[header["camera"]] = (stamps_s[0], picture)
+            samples = [("camera", stamps_s[0], header["camera"], payload)]
+        elif kind == "pads":
+            numbers = header.get("pads")
+            if not isinstance(numbers, list) or any(
+                type(k) is not int or not 0 <= k < len(ROBOT.pads) for k in numbers
+            ):
+                raise TaccorlError(f"pads: expected numbers in 0 … {len(ROBOT.pads)}")
+            scans = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
+            samples = [
+                ("pad", stamps_s[0], ROBOT.pads[k], scan)
+                for k, scan in zip(numbers, scans, strict=True)
+            ]
+            for _, stamp_s, name, scan in samples:
+                self.pads[name].put((stamp_s, scan))
+                if self.pads[name].qsize() > 4096:  # 40 s: nobody reads them
+                    self.pads[name].get_nowait()
+        else:
+            raise TaccorlError("kind: expected reply, state, camera or pads")
+        self.heard_s = self._clock()
+        return samples
+
+    def _keep_reply(self, header: dict[str, Any]) -> None:
+        if "seed" in header:
+            # Of hello or reset: the samples so far are of another scene.
+            self.states.clear()
+            self.pictures.clear()
+        self._replies.put(header)

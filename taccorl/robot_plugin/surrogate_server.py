@@ -7,23 +7,34 @@ Joints at 200 Hz, pads at 100 Hz, three cameras at 30 Hz as JPEG, on a ZeroMQ so
 a client that falls silent is let go, and the arms come to rest. Each connection begins with a new scene. Stop it by Ctrl-C.
 """
 
+import itertools
 import json
+import math
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import zmq
 
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin import DEFAULT_PORT
 from taccorl.robot_plugin.surrogate_body import Message, SurrogateBody, SurrogateConfig
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, ROBOT_ROLE
+from taccorl.robot_plugin.surrogate_messages import (
+    MOST_REQUEST_BYTES,
+    finite_numbers,
+    name_of,
+    read_object,
+)
+from taccorl.robots import ROBOT
 
 GONE_S = 1.0
 """Time without a message, of which it sends one every 50 ms, after which a client counts as dead, and another is accepted [s]."""
+_FRAMES_PER_TICK = 64
+"""Frames that are received in a tick whose time is used up; more while time remains."""
 _SLIPPED_S = 0.25  # further behind than this, the surrogate's time stands still instead of hurrying
 
 
@@ -57,6 +68,7 @@ class SurrogateServer:
         self._socket = zmq.Context.instance().socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, 300)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MOST_REQUEST_BYTES)
         try:
             self._socket.bind(f"tcp://127.0.0.1:{port or '*'}")
         except zmq.ZMQError as error:
@@ -70,7 +82,10 @@ class SurrogateServer:
         self._clients: dict[bytes, _Client] = {}
         self._pending: list[Message] = []  # in the order in which they are due
         self._driven = False  # whether a command has come since the scene began
+        self._frames: list[bytes] = []  # of a message that is not yet received whole
         self.commands = 0  # received
+        self.dropped: Counter[str] = Counter()
+        """Kind of fault → number of messages that were not carried out because of it."""
         self.slipped_s = (
             0.0  # time by which it has fallen behind the clock, and which it lets pass
         )
@@ -99,9 +114,7 @@ class SurrogateServer:
             wait_s = zero + (self.body.ticks + 1) * self.body.TICK_S - self._clock()
             if self._pending:
                 wait_s = min(wait_s, zero + self._pending[0].due_s - self._clock())
-            while self._socket.poll(max(0, round(wait_s * 1e3))):
-                self._receive()
-                wait_s = 0.0
+            self._receive_until(self._clock() + wait_s)
             for name, client in list(
                 self._clients.items()
             ):  # after a slow tick, their messages have waited until here
@@ -131,71 +144,114 @@ class SurrogateServer:
             if client.role == ROBOT_ROLE or message.kind == "state":
                 self._socket.send_multipart([name, *parts], zmq.DONTWAIT)
 
+    def _receive_until(self, end_s: float) -> None:
+        """Receive frames until ``end_s`` [s of the clock]; if that has passed, those that
+        wait, at most _FRAMES_PER_TICK."""
+        for count in itertools.count():
+            wait_s = end_s - self._clock()
+            if wait_s <= 0 and count >= _FRAMES_PER_TICK:
+                return
+            if not self._socket.poll(max(0, math.ceil(wait_s * 1e3))):
+                return
+            self._receive()
+
     def _receive(self) -> None:
-        name, text = self._socket.recv_multipart()[:2]
-        if "lost_socket" in self.body.faults:
+        """Receive one frame, and carry out the message that it ends."""
+        frame = self._socket.recv()
+        # Sender, request, and one more that shows that there are too many.
+        self._frames += [frame] if len(self._frames) < 3 else []
+        if self._socket.getsockopt(zmq.RCVMORE):
             return
-        try:
-            asked = json.loads(text)
-        except ValueError:
+        (name, *parts), self._frames = self._frames, []
+        if "lost_socket" in self.body.faults:
             return
         client = self._clients.get(name)
         if client is not None:
             client.heard_s = self._clock()
-        reply = self._answer(name, client, asked)
-        if reply is not None:
-            text = json.dumps(
-                {"kind": "reply", "id": asked.get("id"), **reply}
-            ).encode()
+        number = None
+        try:
+            if len(parts) != 1:
+                raise TaccorlError("is not one frame")
+            request = read_object(parts[0])
+            number = request.get("id")
+            if number is not None and type(number) is not int:
+                raise TaccorlError("id: expected a whole number")
+        except TaccorlError:
+            self.dropped["malformed"] += 1
+            return
+        try:
+            reply = self._answer(name, client, request)
+        except TaccorlError as error:
+            self.dropped["refused"] += 1
+            reply = {"refused": str(error)}
+        # Without a number, nobody waits for a reply.
+        if reply is not None and number is not None:
+            text = json.dumps({"kind": "reply", "id": number, **reply}).encode()
             self._socket.send_multipart([name, text, b""], zmq.DONTWAIT)
 
     def _answer(
-        self, name: bytes, client: _Client | None, asked: dict[str, Any]
+        self, name: bytes, client: _Client | None, request: dict[str, Any]
     ) -> dict[str, Any] | None:
-        """Carry out one request of a client; returns the reply, None for requests that get none."""
-        do = asked.get("do")
+        """Carry out one request of a client; returns the reply, None for requests that get
+        none. Raises TaccorlError: the request is refused; nothing was changed."""
+        do = request.get("do")
         if do == "hello":
-            role = str(asked.get("role"))
-            other = self._owner(role)
-            if other is not None and other != name:
-                return {
-                    "refused": f"another {role} is connected: {self._clients[other].name}"
-                }
-            if role == LEADER_ROLE and not self.body.sim.task.expert:
-                return {
-                    "refused": f"task {self.body.config.task} has no scripted expert to lead"
-                }
-            if role == ROBOT_ROLE:  # somebody has put the bench in order
-                self._reset(None)
-            self._clients[name] = _Client(role, str(asked.get("name")), self._clock())
-            return dict(self.body.facts())
+            return self._hello(name, client, request)
         if client is None:
-            return {"refused": "say hello first"}
+            raise TaccorlError("say hello first")
+        if do == "ping":
+            return None
         if do == "bye":
             del self._clients[name]
             if client.role == ROBOT_ROLE:
                 self.body.hold()
             return {}
-        elif do == "outcome":
+        if do == "outcome":
             return {"outcome": self.body.outcome()}
-        elif client.role != ROBOT_ROLE:
-            return None
-        elif do == "command":
-            self.commands += 1
-            self._driven = True
-            self.body.command(np.array(asked["target"], dtype=float))
-        elif do == "reset":
-            return {"seed": self._reset(asked.get("seed"))}
+        if do not in ("command", "reset"):
+            raise TaccorlError("unknown request")
+        if client.role != ROBOT_ROLE:
+            raise TaccorlError(f"{do} is for the client that drives")
+        if do == "reset":
+            seed = request.get("seed")
+            if seed is not None and type(seed) is not int:
+                raise TaccorlError("seed: expected a whole number in 0 … 2^63 - 1")
+            return {"seed": self._reset(seed)}
+        target = finite_numbers(request, "target", ROBOT.num_actions)
+        self.body.command(target)
+        self.commands += 1
+        self._driven = True
         return None
+
+    def _hello(
+        self, name: bytes, client: _Client | None, request: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Accept a client; returns the facts on the robot."""
+        role, label = request.get("role"), name_of(request)
+        if role not in (ROBOT_ROLE, LEADER_ROLE):
+            raise TaccorlError(f"role: expected {ROBOT_ROLE} or {LEADER_ROLE}")
+        if client is not None and client.role != role:
+            raise TaccorlError(f"is connected as {client.role}; say bye first")
+        other = self._owner(role)
+        if other is not None and other != name:
+            raise TaccorlError(
+                f"another {role} is connected: {self._clients[other].name}"
+            )
+        if role == LEADER_ROLE and not self.body.sim.task.expert:
+            raise TaccorlError(
+                f"task {self.body.config.task} has no scripted expert to lead"
+            )
+        if role == ROBOT_ROLE:  # somebody has put the bench in order
+            self._reset(None)
+        self._clients[name] = _Client(role, label, self._clock())
+        return dict(self.body.facts())
 
     def _reset(self, seed: int | None) -> int:
         """Begin the scene of ``seed``; without one, the next, or the present one again if nobody has commanded in it."""
         again = None if self._driven else self.body.scene_seed
-        self._pending, self._driven = (
-            [],
-            False,
-        )  # what is pending is of the scene before
-        return self.body.reset(again if seed is None else seed)
+        found = self.body.reset(again if seed is None else seed)
+        self._pending, self._driven = [], False  # they are of the scene before
+        return found
 
 
 def serve(config: ServeConfig) -> int:
@@ -235,4 +291,7 @@ def serve(config: ServeConfig) -> int:
         f"; it was {server.slipped_s:.1f} s too slow in all" if server.slipped_s else ""
     )
     print(f"ended after {server.commands} commands{slow}")
+    if server.dropped:
+        counts = ", ".join(f"{n} {kind}" for kind, n in sorted(server.dropped.items()))
+        print(f"messages not carried out: {counts}")
     return 128 + signal.SIGTERM if signal.SIGTERM in signals else 0

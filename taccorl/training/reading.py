@@ -421,7 +421,8 @@ class FastReader(DatasetReader):
         )
         episode_T = episode.stored().reshape(-1).numpy()
         state_TA, action_TA = (
-            column.stored().numpy().astype(np.float64) for column in (state, action)
+            column.stored().numpy().astype(np.float64).reshape(len(episode_T), -1)
+            for column in (state, action)
         )
         state_TA = state_TA[:, : len(relative_A)] * relative_A
 

@@ -22,7 +22,7 @@ from taccorl.data.origin import Domain, Origin
 from taccorl.data.spec import FeatureSpec
 from taccorl.errors import printable
 from taccorl.lineage.manifest import CARD
-from taccorl.report.markdown import markdown
+from taccorl.report.markdown import code, escaped, markdown
 from taccorl.report.section import Cell, Section
 from taccorl.views.contact_sheet import draw_sheet
 
@@ -72,7 +72,7 @@ def card_text(dataset: Dataset) -> str:
     front = yaml.safe_dump(
         _front_matter(dataset, origins), sort_keys=False, allow_unicode=True
     )
-    said = "; ".join(str(origin) for origin in origins)
+    said = "; ".join(escaped(origin) for origin in origins)
     shown = f"![Episode 0: pictures and pads at six instants, grippers and touch over time]({PICTURE})"
     body = markdown(
         Section(text=[f"Data: {said}"], style="data"),
@@ -81,7 +81,7 @@ def card_text(dataset: Dataset) -> str:
         _origin(dataset, origins),
         Section(title="Checks", text=_checks(dataset)),
     )
-    return f"---\n{front}---\n\n# {printable(dataset.root.resolve().name)}\n\n{body}\n\n## Use\n\n{_use(dataset)}\n"
+    return f"---\n{front}---\n\n# {escaped(dataset.root.resolve().name)}\n\n{body}\n\n## Use\n\n{_use(dataset)}\n"
 
 
 def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def _summary(dataset: Dataset) -> list[str]:
     said = ", ".join(
         f"{num} {words[outcome]}" for outcome, num in outcomes.most_common()
     )
-    texts, seconds = [f"*{text}*" for text in dataset.instructions], rows / spec.fps
+    texts, seconds = [f"*{escaped(x)}*" for x in dataset.instructions], rows / spec.fps
     duration = (
         f"{seconds / 3600:.2f} hours"
         if seconds >= 360
@@ -124,9 +124,10 @@ def _summary(dataset: Dataset) -> list[str]:
     size = f"{_count(dataset.num_episodes, 'episode')}, {rows} rows at {spec.fps} a second, {duration}"
     return [
         f"{size}; outcomes: {said}",
-        f"robot: {spec.robot_type}; data spec {spec.name}",
+        f"robot: {escaped(spec.robot_type)}; data spec {escaped(spec.name)}",
         f"instruction{'s' if len(texts) > 1 else ''}: {listed(texts, MOST_INSTRUCTIONS)}",
-        f"format: [LeRobot](https://github.com/huggingface/lerobot) {dataset.info['codebase_version']}, written by taccorl",
+        "format: [LeRobot](https://github.com/huggingface/lerobot) "
+        f"{escaped(dataset.info['codebase_version'])}, written by taccorl",
     ]
 
 
@@ -197,8 +198,8 @@ def _origin(dataset: Dataset, origins: Counter[Origin]) -> Section:
             else f"{_count(len(manifest['inputs']), 'result')} of other stages"
         )
         notes.append(
-            f"Made by stage `{manifest['stage']}` from {made_of}, with {software}. "
-            f"`taccorl lineage explain {_quoted(dataset)}` shows what it was made from, down to the raw files."
+            f"Made by stage {code(manifest['stage'])} from {made_of}, with {escaped(software)}. "
+            f"{code(f'taccorl lineage explain {_quoted(dataset)}')} shows what it was made from, down to the raw files."
         )
     return Section(
         title="Origin",
@@ -216,33 +217,35 @@ def _checks(dataset: Dataset) -> list[str]:
     lines = []
     if report := _read(dataset, "ingest_report.json", None):
         outcomes = ", ".join(
-            f"{num} {outcome}" for outcome, num in report["outcomes"].items()
+            f"{num} {escaped(outcome)}" for outcome, num in report["outcomes"].items()
         )
         lines.append(
             f"recordings: {outcomes}; {report['episodes_quarantined']} episodes quarantined"
         )
         found = Counter((f["severity"], f["check"]) for f in _findings(report))
         named = [
-            f"{severity} `{check}` ({num})"
+            f"{escaped(severity)} {code(check)} ({num})"
             for (severity, check), num in sorted(found.items())
         ]
         lines.append(f"findings in its episodes: {', '.join(named) or 'none'}")
     if report := _read(dataset, "collect_report.json", None):
         if "attempts" in report and "outcomes" in report:
             outcomes = ", ".join(
-                f"{num} {outcome}" for outcome, num in report["outcomes"].items()
+                f"{num} {escaped(outcome)}"
+                for outcome, num in report["outcomes"].items()
             )
             lines.append(f"{_count(report['attempts'], 'attempt')}: {outcomes}")
         if report.get("dropped"):
             dropped = ", ".join(
-                f"{num} {outcome}" for outcome, num in report["dropped"].items()
+                f"{num} {escaped(outcome)}"
+                for outcome, num in report["dropped"].items()
             )
             lines.append(
                 f"left out, because they did not succeed when they were executed: {dropped}"
             )
     if dataset.spec.keys("video"):
         lines.append("every row had a video frame of its own when it was written")
-    command = f"`taccorl check {_quoted(dataset)}`"
+    command = code(f"taccorl check {_quoted(dataset)}")
     return [
         *lines,
         f"{command} compares all files with their digests and looks at timing, joints, pictures and touch",
@@ -258,7 +261,7 @@ def _findings(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _use(dataset: Dataset) -> str:
-    name, quoted = dataset.root.resolve().name, _quoted(dataset)
+    name, quoted = printable(dataset.root.resolve().name), _quoted(dataset)
     own = f"--policy.push_to_hub=false --dataset.repo_id={shlex.quote(f'local/{name}')} --dataset.root={quoted}"
     train = f"lerobot-train --policy.type=act {own}"  # a policy that refuses data without pictures
     lines = [
@@ -282,16 +285,18 @@ def _use(dataset: Dataset) -> str:
             "",
             "It has no videos: its pictures are in the frame cache (STORE) of the machine that made it, at ROWS × COLUMNS.",
         ]
+    repository, version = f"USER/{name}", dataset.info["codebase_version"]
+    upload = f"hf upload {repository} {quoted} --repo-type=dataset"
+    tag = f"hf repos tag create {repository} {version} --repo-type=dataset"
     publish = (
-        f"`hf upload USER/{name} {quoted} --repo-type=dataset`, then `hf repos tag create USER/{name} "
-        f"{dataset.info['codebase_version']} --repo-type=dataset`, publish it with this card (LeRobot's `push_to_hub` "
+        f"{code(upload)}, then {code(tag)}, publish it with this card (LeRobot's `push_to_hub` "
         "writes its own card). Its licence is not stated here: add `license:` at the top."
     )
     return "\n".join([*lines, "", publish])
 
 
 def _quoted(dataset: Dataset) -> str:
-    return shlex.quote(dataset.root.resolve().name)
+    return shlex.quote(printable(dataset.root.resolve().name))
 
 
 def _read(dataset: Dataset, name: str, default: Any) -> Any:

@@ -27,7 +27,7 @@ from taccorl.diagnosis.comparison.result import (
     shown_unit,
 )
 from taccorl.report.compared import how_far
-from taccorl.report.markdown import markdown
+from taccorl.report.markdown import escaped, markdown
 from taccorl.report.section import Section
 from taccorl.views.blueprint import arranged, plot
 from taccorl.views.colors import GROUND_COLOR, NOISE_COLOR
@@ -258,11 +258,11 @@ def _page(comparison: Comparison, after: Comparison | None) -> str:
     """What was compared with what, in Markdown."""
     twins = [comparison] if after is None else [comparison, after]
     names = [
-        f"{name}: {c.twin}, effects {', '.join(c.effects) or 'none'}"
+        f"{name}: {escaped(c.twin)}, effects {escaped(', '.join(c.effects) or 'none')}"
         for name, c in zip(TWIN_NAMES, twins, strict=False)
     ]
     return markdown(
-        Section(text=[origin_words(comparison.origins)], style="data"),
-        Section(text=[*names, f"split: {comparison.split.get('rule', '')}"]),
+        Section(text=[escaped(origin_words(comparison.origins))], style="data"),
+        Section(text=[*names, f"split: {escaped(comparison.split.get('rule', ''))}"]),
         how_far(*twins),
     )

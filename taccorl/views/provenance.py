@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from taccorl.data.episode import ChannelTiming, Episode
-from taccorl.report.markdown import markdown
+from taccorl.report.markdown import escaped, markdown
 from taccorl.report.section import Section
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, pads_of
 
@@ -27,16 +27,16 @@ def provenance(episode: Episode) -> str:
         if v is not None
     ]
     lines = [
-        f"instruction: *{episode.instruction}*",
+        f"instruction: *{escaped(episode.instruction)}*",
         f"outcome: {outcome(episode)}",
         f"{episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps",
-        f"data spec {spec.name}, robot {spec.robot_type}",
-        *(f"{name}: {value}" for name, value in facts),
+        f"data spec {escaped(spec.name)}, robot {escaped(spec.robot_type)}",
+        *(f"{escaped(name)}: {escaped(value)}" for name, value in facts),
         *_touch(episode),
     ]
     return markdown(
-        Section(text=[f"data: {episode.origin}"], style="data"),
-        Section(text=[episode.name], style="data"),
+        Section(text=[f"data: {escaped(episode.origin)}"], style="data"),
+        Section(text=[escaped(episode.name)], style="data"),
         Section(text=lines),
         *([_timing(episode.timing)] if episode.timing else []),
     )
@@ -54,16 +54,16 @@ def _touch(episode: Episode) -> list[str]:
     for sensor in {pad.sensor.name: pad.sensor for pad in pads}.values():
         own = [pad for pad in pads if pad.sensor.name == sensor.name]
         lines.append(
-            f"sensor {sensor.name}: {len(own)} pads of {sensor.rows} × {sensor.columns} taxels, counts above "
+            f"sensor {escaped(sensor.name)}: {len(own)} pads of {sensor.rows} × {sensor.columns} taxels, counts above "
             f"baseline up to {sensor.max_count}, noise floor {sensor.noise_count:g}"
         )
         lines.append(
-            f"scheme {sensor.scheme}: reading = counts × {sensor.gain_per_count:.4g}; contact gate: "
+            f"scheme {escaped(sensor.scheme)}: reading = counts × {sensor.gain_per_count:.4g}; contact gate: "
             f"≥ {MIN_ACTIVE_TAXELS} taxel beyond {CONTACT_THRESHOLD} ({own[0].gate_count:.3g} counts)"
         )
     for key, counts in episode.baselines.items():
         lines.append(
-            f"baseline of {key}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
+            f"baseline of {escaped(key)}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
         )
     return lines
 
@@ -79,7 +79,11 @@ def _timing(timing: tuple[ChannelTiming, ...]) -> Section:
         rows.append([t.channel, str(t.align), *numbers])
     notes = []
     for name in ("duplicates", "out_of_order", "zero_stamps"):
-        odd = [f"{t.channel} {getattr(t, name)}" for t in timing if getattr(t, name)]
+        odd = [
+            f"{escaped(t.channel)} {getattr(t, name)}"
+            for t in timing
+            if getattr(t, name)
+        ]
         notes += [f"{name.replace('_', ' ')}: {', '.join(odd)}"] * bool(odd)
     heads = ("channel", "align", "Hz", "gaps", "ms", "age", "oldest")
     title = [Section(notes=[f"**timing**: {TIMING_COLUMNS}"])]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from taccorl.cli.output_lock import hold, lock_file, released_at_the_end
+from taccorl.cli.output_lock import hold, lock_files, released_at_the_end
 from taccorl.cli.parse import parse
 from taccorl.cli.surrogate import SurrogateConfig
 
@@ -77,14 +77,59 @@ def test_two_names_of_one_place_are_one_lock_and_others_are_free(
     (tmp_path / "link").symlink_to(tmp_path / "a")
     monkeypatch.chdir(tmp_path / "a")
     places = [Path("x"), tmp_path / "a" / "x", tmp_path / "link" / "x"]
-    assert len({lock_file(place) for place in places}) == 1
-    assert lock_file(Path("y")) != lock_file(Path("x"))
+    assert len({*map(str, map(lock_files, places))}) == 1
+    assert lock_files(Path("y")) != lock_files(Path("x"))
     with released_at_the_end():
         hold(Path("x"))
         hold(tmp_path / "link" / "x")  # again, by the same command
         hold(Path("y"))
         assert len([*Path().glob(".*.lock")]) == 2
     assert [*Path().iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("link", "target", "out"),
+    [
+        ("link", "made", "link"),
+        ("link", "not/yet", "link"),
+        ("link", "made", "link/not/yet"),
+        ("second", "link", "second"),
+    ],
+)
+def test_a_symbolic_link_to_the_place_is_the_same_lock(
+    link: str, target: str, out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("made").mkdir()
+    Path("link").symlink_to("made") if link != "link" else None
+    Path(link).symlink_to(target)
+    assert lock_files(Path(out)) == lock_files(Path(out).resolve())
+
+
+def test_a_second_process_waits_after_the_first_created_the_folders_between(
+    tmp_path: Path,
+):
+    first = start(tmp_path, "-c", HOLDER, "new/folder/made")
+    assert line(first.stdout) == "has it"
+    (tmp_path / "new/folder").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("new")
+    second = start(tmp_path, "-c", HOLDER, "link/folder/made")
+    assert f"held by process {first.pid}" in line(second.stderr)
+    first.communicate("\n")
+    assert line(second.stdout) == "has it"
+    third = start(tmp_path, "-c", HOLDER, "new/folder/made")
+    assert f"held by process {second.pid}" in line(third.stderr)
+    second.communicate("\n")
+    assert line(third.stdout) == "has it"
+    third.communicate("\n")
+    assert [*tmp_path.rglob("*.lock")] == []
+
+
+def test_links_that_form_a_loop_are_left_to_the_command(tmp_path: Path):
+    (tmp_path / "loop").symlink_to("loop")
+    with released_at_the_end():
+        hold(tmp_path / "loop")
+        hold(tmp_path / "loop" / "x")
 
 
 def test_what_cannot_be_locked_is_left_to_the_command(tmp_path: Path):
@@ -99,7 +144,7 @@ def test_what_cannot_be_locked_is_left_to_the_command(tmp_path: Path):
 def test_every_option_out_is_locked_where_it_is_parsed(tmp_path: Path):
     with released_at_the_end():
         parse(SurrogateConfig, [f"--out={tmp_path / 'made'}"])
-        assert lock_file(tmp_path / "made").is_file()
+        assert lock_files(tmp_path / "made")[-1].is_file()
     assert [*tmp_path.iterdir()] == []
 
 

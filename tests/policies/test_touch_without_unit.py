@@ -44,12 +44,14 @@ LAYOUTS: dict[str, tuple[int, str | None, Touch]] = {
             "observation.tactile.fsr": ("float32", (1,)),
         },
     ),
+    "gripper": (1, None, {"observation.tactile": ("float32", (1,))}),
 }
 """Dataset → number of joints, kind of its pictures, its touch."""
 NETWORKS = {
     "leflexitac": ["observation/tactile/primary"],
     "anyskin": ["observation/tactile/left", "observation/tactile/right"],
     "paxini": ["observation/tactile", "observation/tactile/fsr"],
+    "gripper": ["observation/tactile"],
 }
 HISTORY, STRIDE = 3, 2
 
@@ -121,7 +123,10 @@ def train(root: Path, out: Path, *words: str) -> Path:
     scope="module",
     params=[
         "leflexitac",
-        *(pytest.param(p, marks=pytest.mark.slow) for p in ("anyskin", "paxini")),
+        *(
+            pytest.param(p, marks=pytest.mark.slow)
+            for p in ("anyskin", "paxini", "gripper")
+        ),
     ],
 )
 def trained(
@@ -173,7 +178,7 @@ def test_touch_of_any_shape_is_trained_by_lerobots_command_and_used(trained, tmp
             key: torch.stack([rows[8 - age][key] for age in ages])[None]
             for key in trained.touch
         }
-        | {"action": torch.zeros(1, config.chunk_size, len(rows[0]["action"]))}
+        | {"action": torch.zeros(1, config.chunk_size, rows[0]["action"].numel())}
     )
     # Gradients reach the network of every feature.
     policy.train().zero_grad()

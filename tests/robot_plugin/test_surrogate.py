@@ -1,17 +1,23 @@
 """The surrogate: rates, commands, faults, what a client is told; its server: one client, silence, death; the robot through it."""
 
+import json
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from simulated_robot import SimulatedRobot
 
 from taccorl.errors import TaccorlError
+from taccorl.robot_plugin import surrogate_server
 from taccorl.robot_plugin.bodies import ARM_NAMES, SurrogateArms
 from taccorl.robot_plugin.config_robots import TaccorlSurrogateConfig
 from taccorl.robot_plugin.robots import TaccorlSurrogate
@@ -23,6 +29,7 @@ from taccorl.robot_plugin.surrogate_body import (
     hidden_twin,
 )
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
+from taccorl.robot_plugin.surrogate_messages import MOST_REQUEST_BYTES
 from taccorl.robot_plugin.surrogate_server import SurrogateServer
 from taccorl.robots import ROBOT
 from taccorl.sim.seen_scene import SeenScene
@@ -126,6 +133,40 @@ def test_names_that_are_unknown_are_refused_with_the_nearest() -> None:
         SurrogateBody(SurrogateConfig(task="asembly_1"))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"camera_px": -5},
+        {"camera_px": 3},
+        {"camera_px": 100_000},
+        {"secret": -1},
+        {"seed": -1},
+    ],
+)
+def test_numbers_out_of_range_are_refused_with_the_option(options: dict) -> None:
+    (option, value), *_ = options.items()
+    with pytest.raises(TaccorlError, match=f"--{option}={value}: give "):
+        SurrogateBody(SurrogateConfig(task="bench", **options))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"camera_px": -5},
+        {"picture_px": -1},
+        {"picture_px": 10**6},
+        {"fps": 0.0},
+        {"fps": float("nan")},
+        {"fps": -30.0},
+        {"lost_after_s": float("inf")},
+        {"lost_after_s": -1.0},
+    ],
+)
+def test_numbers_of_the_robot_out_of_range_are_refused(options: dict) -> None:
+    with pytest.raises(TaccorlError, match=f"--robot.{next(iter(options))}=.*: give "):
+        TaccorlSurrogateConfig(**options)
+
+
 def test_no_client_gets_privileged_state(
     body: SurrogateBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,6 +210,15 @@ def running(port: int = 0) -> Iterator[SurrogateServer]:
 def server() -> Iterator[SurrogateServer]:
     with running() as server:
         yield server
+
+
+@pytest.fixture
+def patient_server(
+    server: SurrogateServer, monkeypatch: pytest.MonkeyPatch
+) -> SurrogateServer:
+    """A busy machine may stop a process for a second, after which a client is let go."""
+    monkeypatch.setattr(surrogate_server, "GONE_S", 60.0)
+    return server
 
 
 def connected(port: int, folder: Path) -> TaccorlSurrogate:
@@ -228,6 +278,179 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(
     assert second.request("reset", 10.0, seed=5)["seed"] == 5
     assert second.request("outcome", 10.0)["outcome"]["success"] is False
     second.close()
+
+
+STRANGER = """
+import sys, time, zmq
+socket = zmq.Context().socket(zmq.DEALER)
+socket.setsockopt(zmq.LINGER, 0)
+socket.connect(f"tcp://127.0.0.1:{sys.argv[1]}")
+end = time.monotonic() + 20
+while time.monotonic() < end:
+    socket.send(b'{"do": "ping"}')
+"""
+
+
+@contextmanager
+def stranger(port: int) -> Iterator[zmq.Socket]:
+    """A peer that sends what it likes."""
+    socket = zmq.Context.instance().socket(zmq.DEALER)
+    socket.setsockopt(zmq.LINGER, 2000)
+    socket.connect(f"tcp://127.0.0.1:{port}")
+    yield socket
+    socket.close()
+
+
+def drives_on(server: SurrogateServer, link: SurrogateLink) -> bool:
+    """True if states still arrive, and the next command is carried out."""
+    assert until(lambda: bool(link.states))
+    before, commands = link.states[-1][0], server.commands
+    link.send("command", target=[0.1] * 14)
+    return until(
+        lambda: server.commands == commands + 1 and link.states[-1][0] > before
+    )
+
+
+MALFORMED = {
+    "no JSON": b"{",
+    "not UTF-8": b"\xff\xfe{",
+    "a list": b"[]",
+    "a number": b"1e999",
+    "nested": b"[" * 3000,
+    "number of another type": b'{"do": "reset", "id": [1]}',
+}
+REFUSED = {
+    "no request": b"{}",
+    "unknown request": b'{"do": ["hello"]}',
+    "no target": b'{"do": "command"}',
+    "short target": b'{"do": "command", "target": [0.1]}',
+    "long target": b'{"do": "command", "target": [%s]}' % b",".join([b"0"] * 15),
+    "nested target": b'{"do": "command", "target": [[%s]]}' % b",".join([b"0"] * 14),
+    "NaN": b'{"do": "command", "target": [%s]}' % b",".join([b"NaN"] * 14),
+    "infinite": b'{"do": "command", "target": [%s]}' % b",".join([b"-1e999"] * 14),
+    "huge": b'{"do": "command", "target": [1%s%s]}' % (b"0" * 400, b",0" * 13),
+    "texts": b'{"do": "command", "target": [%s]}' % b",".join([b'"0.1"'] * 14),
+    "true": b'{"do": "command", "target": [%s]}' % b",".join([b"true"] * 14),
+    "seed below 0": b'{"do": "reset", "seed": -1}',
+    "seed of a text": b'{"do": "reset", "seed": "5"}',
+    "seed with a point": b'{"do": "reset", "seed": 5.0}',
+    "seed above 64 bits": b'{"do": "reset", "seed": 99999999999999999999}',
+    "list of seeds": b'{"do": "reset", "seed": [5]}',
+    "other role": b'{"do": "hello", "role": "leader", "name": "x"}',
+    "unknown role": b'{"do": "hello", "role": [], "name": "x"}',
+    "no name": b'{"do": "hello", "role": "robot"}',
+    "control characters": b'{"do": "hello", "role": "robot", "name": "\\u001b[2J"}',
+}
+
+
+def test_malformed_messages_of_any_peer_are_counted_and_the_robot_runs_on(
+    patient_server: SurrogateServer,
+) -> None:
+    server = patient_server
+    link = SurrogateLink(server.port)
+    link.connect(10.0)
+    seed = server.body.scene_seed
+    texts = [*MALFORMED.values(), *REFUSED.values()]
+    with stranger(server.port) as peer:
+        for text in texts:
+            link._wake.send(text)
+            peer.send(text)
+        peer.send_multipart([b"", b'{"do": "ping"}'])  # as zmq.REQ does
+        peer.send_multipart([b"x"] * 100)
+    expected = {"malformed": 2 * len(MALFORMED) + 2, "refused": 2 * len(REFUSED)}
+    assert until(lambda: server.dropped == expected), server.dropped
+    assert server.commands == 0 and server.body.scene_seed == seed
+    assert drives_on(server, link)
+    with pytest.raises(TaccorlError, match=r"target\[13\]: expected a finite number"):
+        link.request("command", target=[0.0] * 13 + [float("nan")])
+    assert link.request("reset", 10.0, seed=2**63 - 1)["seed"] == 2**63 - 1
+    assert drives_on(server, link)
+    assert link.request("reset", 10.0)["seed"] == 0
+    link.close()
+
+
+def test_a_peer_that_did_not_say_hello_drives_nothing(server: SurrogateServer) -> None:
+    with stranger(server.port) as peer:
+        for do in ("command", "reset", "bye", "outcome", "ping"):
+            peer.send_json({"do": do, "id": 7, "target": [0.1] * 14, "seed": 3})
+            assert peer.poll(5000)
+            reply = json.loads(peer.recv_multipart()[0])
+            assert reply == {"kind": "reply", "id": 7, "refused": "say hello first"}
+    assert server.commands == 0 and server.body.scene_seed == 0
+
+
+def test_a_frame_above_the_limit_is_not_received(
+    patient_server: SurrogateServer,
+) -> None:
+    server = patient_server
+    link = SurrogateLink(server.port)
+    link.connect(10.0)
+    with stranger(server.port) as peer:
+        monitor = peer.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        padding = " " * MOST_REQUEST_BYTES
+        peer.send_json({"do": "outcome", "id": 1, "padding": padding})
+        assert monitor.poll(5000), "ZeroMQ closed the connection"
+        peer.disable_monitor()
+    assert not server.dropped and drives_on(server, link)
+    link.close()
+
+
+def test_pings_of_a_stranger_cost_no_tick(patient_server: SurrogateServer) -> None:
+    server = patient_server
+    link = SurrogateLink(server.port)
+    link.connect(10.0)
+    words = [sys.executable, "-c", STRANGER, str(server.port)]
+    with subprocess.Popen(words) as flood:
+        assert until(lambda: server.dropped["refused"] > 2000)
+        begin = server.body.ticks
+        assert until(lambda: server.body.ticks > begin + 50)
+        assert drives_on(server, link) and flood.poll() is None
+        flood.kill()
+    link.close()
+
+
+def test_messages_that_are_none_of_a_surrogate_are_counted_by_the_link() -> None:
+    """A program that answers everything with the same message, on a port of its own."""
+    stamp, lead, state = '"stamps_s": [1.0]', [0.0] * 14, np.zeros((1, 3, 14)).tobytes()
+    header = f'{{"kind": "state", {stamp}, "lead": {lead}}}'
+    messages = {
+        "one frame": [header],
+        "three frames": [header, state, b""],
+        "no JSON": ["{", state],
+        "a list": ["[]", state],
+        "no kind": ["{}", state],
+        "unknown kind": [header.replace("state", "lidar"), state],
+        "no stamp": ['{"kind": "state"}', state],
+        "stamp NaN": [header.replace("1.0", "NaN"), state],
+        "two stamps": [header.replace("1.0", "1.0, 2.0"), state],
+        "cut off": [header, state[:-1]],
+        "no lead": [f'{{"kind": "state", {stamp}}}', state],
+        "no JPEG": [f'{{"kind": "camera", "camera": "front", {stamp}}}', b"x" * 99],
+        "empty": [f'{{"kind": "camera", "camera": "front", {stamp}}}', b""],
+        "unknown camera": [f'{{"kind": "camera", "camera": [], {stamp}}}', b""],
+        "unknown pad": [f'{{"kind": "pads", "pads": [9], {stamp}}}', bytes(384)],
+        "small pad": [f'{{"kind": "pads", "pads": [0], {stamp}}}', bytes(383)],
+    }
+    link = SurrogateLink(1)
+    for text, *payload in messages.values():
+        link._take(text.encode(), *payload)
+    assert link.malformed == len(messages)
+    assert not link.states and not link.pictures and link.is_lost
+    link._take(header.encode(), state)
+    assert link.malformed == len(messages) and not link.is_lost
+    answers = ([b"[]", b""], [b'{"kind": "reply", "id": 0}', b""])
+    for answer, text in zip(answers, ("1 messages are none", "task"), strict=True):
+        with (
+            zmq.Context.instance().socket(zmq.ROUTER) as other,
+            ThreadPoolExecutor(1) as pool,
+        ):
+            link = SurrogateLink(other.bind_to_random_port("tcp://127.0.0.1"))
+            connecting = pool.submit(link.connect, 0.5)
+            assert other.poll(5000)
+            other.send_multipart([other.recv_multipart()[0], *answer])
+            with pytest.raises(TaccorlError, match=text):
+                connecting.result()
+            assert not link.is_connected
 
 
 @pytest.mark.timeout(30)  # a missing one is said at once

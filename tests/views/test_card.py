@@ -6,6 +6,8 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from huggingface_hub import DatasetCard
@@ -77,6 +79,21 @@ def test_card_states_size_units_origin_and_checks(dataset: Path):
     )
     assert str(dataset.parent) not in text, (
         "the folders of this machine are nobody's business"
+    )
+
+
+def test_an_instruction_cannot_put_markup_or_links_into_the_card(copy: Path):
+    text = "<img src=x onerror=alert(1)> [x](javascript:alert(1)) **now**"
+    path = copy / "meta/tasks.parquet"
+    tasks = pq.read_table(path)
+    number = tasks.column_names.index("task")
+    changed = pa.array([text] * len(tasks), tasks["task"].type)
+    pq.write_table(tasks.set_column(number, "task", changed), path)
+    card = card_text(Dataset(copy))
+    line = next(x for x in card.splitlines() if x.startswith("- instruction"))
+    assert line == (
+        r"- instruction: *\<img src=x onerror=alert(1)\> [x\](javascript:alert(1)) "
+        r"\*\*now\*\**"
     )
 
 

@@ -150,13 +150,15 @@ def check_values(t: Trial) -> Iterator[Finding]:
 @check("warning", "short", needs="rows")
 def check_length(t: Trial) -> Iterator[Finding]:
     """Motion, from the first change of a command to the last, that is too short for a fit."""
+    if t.m.num_rows < 2 or not (np.diff(t.m.time_s) > 0).all():
+        return  # check_time reports it
     changed = np.flatnonzero(np.any(np.diff(t.m.target, axis=0) != 0, axis=1))
     seconds = (
         float(t.m.time_s[changed[-1] + 1] - t.m.time_s[changed[0]])
         if len(changed)
         else 0.0
     )
-    if 0.0 <= seconds < SHORT_S and t.moves.any():  # negative: time_backwards
+    if seconds < SHORT_S and t.moves.any():
         text = (
             f"{seconds:.2f} s of motion in {t.m.num_rows} rows: three parameters of a joint want 10 s that sweep it "
             "from slow to fast"

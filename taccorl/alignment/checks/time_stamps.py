@@ -16,6 +16,9 @@ RATE_HZ = (
 )  # Range of plausible row rates [Hz]; outside it the times are probably in another unit
 GAP, JITTER = 1.5, 0.1
 """Steps above the first [median periods] are lost rows; at most a twentieth of the steps may deviate by more than the second."""
+FLOAT32_S = 1e-3
+"""Least distance of neighbouring numbers of 32 bits at which equal times are attributed
+to that rounding [s]. A choice."""
 RATE_SHARE = 0.8  # Least rate, as a share of the rate that the spec states
 
 
@@ -33,7 +36,7 @@ def check_time(t: Trial) -> Iterator[Finding]:
         if (steps[bad] == 0).all():
             how, ways = (
                 f"stands still at {m.time_s[row]:.6f} s",
-                "leave repeated rows out, or log stamps of their own",
+                _float32(m) or "leave repeated rows out, or log stamps of their own",
             )
         elif bad.all():
             how, ways = f"{how}, backwards as all through,", "sort the table by time"
@@ -55,6 +58,25 @@ def check_time(t: Trial) -> Iterator[Finding]:
             "the last sample, or have no stamps): measure gains and delays from the recordings themselves"
         )
         yield find("row_times", "time", text)
+
+
+def _float32(m: Measurement) -> str:
+    """Way out if the times are those of a column of float32, which rounds them to equal
+    ones; empty if they are not."""
+    written_s = m.start_ns * 1e-9 + m.time_s
+    stored = written_s.astype(np.float32)
+    spacing_s = float(np.spacing(np.abs(stored).max()))
+    changed = np.diff(m.time_s) > 0
+    if (
+        not FLOAT32_S <= spacing_s < np.inf
+        or (np.abs(written_s - stored) > 0.01 * spacing_s).any()
+        or (np.diff(m.time_s)[changed] < 0.5 * spacing_s).any()
+    ):
+        return ""
+    return (
+        f"at {written_s[0]:.0f} s numbers of 32 bits are {spacing_s:g} s apart; write "
+        "the column of times with 64 bits, or from the start of the recording on"
+    )
 
 
 @check("error", "dropped_rows", "jitter")

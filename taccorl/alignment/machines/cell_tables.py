@@ -28,7 +28,11 @@ import numpy as np
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.table_files import read_columns, table_origin
+from taccorl.alignment.measurements.table_files import (
+    first_ns,
+    read_columns,
+    table_origin,
+)
 from taccorl.alignment.measurements.tables import POSITION, TIME_S, Column, ColumnsFile
 from taccorl.data.finding import Finding, listed
 from taccorl.data.strict_yaml import Document, Rules
@@ -380,8 +384,8 @@ def read_cell_table(
             f"{path}: {len(time_s)} rows, too few for a measurement; record it again, or remove the file"
         )
     steps = np.diff(time_s)
-    if (steps <= 0).any():
-        row = int(np.argmax(steps <= 0)) + 2
+    if not (steps > 0).all():
+        row = int(np.argmin(steps > 0)) + 2
         raise RecordingError(
             f"{path}: time does not increase at row {row}: {time_s[row - 1]:.6g} s; remove such rows"
         )
@@ -411,7 +415,7 @@ def read_cell_table(
         quantum=np.array([find_quantum(column) for column in reading.T]),
         source=path,
         origin=table_origin(path, own),
-        start_ns=round(time_s[0] * 1e9),
+        start_ns=first_ns(path, time_s),
         temperature_c=columns[own.temperature.column]
         if own.temperature
         else np.empty(0),

@@ -19,11 +19,17 @@ from taccorl.errors import TaccorlError, plain_name
 
 MOST_BYTES = 1 << 24  # Largest model file that is read
 MOST_DEEP = 200  # Most elements, or links of a chain, within one another
-MOST_ELEMENTS = 200_000
-"""Most elements of a file after ``<replicate>``, and most parts of a ``<composite>`` or ``<flexcomp>``."""
+MOST_ELEMENTS = 20_000
+"""Most elements of a file, also after ``<replicate>`` and with parts of a ``<composite>`` or ``<flexcomp>``. MuJoCo takes
+minutes for ten times as many."""
+MOST_MADE = 5000
+"""Most elements that ``<replicate>``, ``<composite>`` and ``<flexcomp>`` make. MuJoCo
+4.0 takes a time that grows with their square: 7 s for 15 000."""
 MOST_JOINTS = 1000  # Most joints of a robot
-MOST_VALUES = 4_000_000  # Most values of a height field, a texture, or another array whose size an attribute states
+MOST_VALUES = 4_000_000
+"""Most values of all height fields together, of a texture, and of the other arrays whose sizes attributes state."""
 MOST_FILES = 20  # Most files that a model includes
+MESH_VALUES = 12  # Numbers in a quadrilateral of a mesh that MuJoCo builds
 BALANCE = '<mujoco><compiler balanceinertia="true"/></mujoco>'
 _SIZES = ("nrow", "ncol", "width", "height", "size", "dim")
 _BODIES = ("body", "worldbody")
@@ -106,6 +112,7 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
     parser = expat.ParserCreate()
     top: list[Element] = []
     inside: list[Element] = []
+    elements = 0
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         parent = inside[-1] if inside else None
@@ -121,6 +128,12 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
             raise TaccorlError(
                 f"{one.place}: <{tag}> is nested deeper than {MOST_DEEP} elements; is it a model file?"
             )
+        nonlocal elements
+        elements += 1
+        if elements > MOST_ELEMENTS:
+            raise TaccorlError(
+                f"{one.place}: <{tag}> is one of more than {MOST_ELEMENTS:,} elements; is it the model of one robot?"
+            )
         (parent.children if parent is not None else top).append(one)
         inside.append(one)
 
@@ -133,6 +146,10 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
     except expat.ExpatError as error:
         raise TaccorlError(
             f"{path}:{error.lineno}: is not XML: {error}; give an MJCF or URDF file"
+        ) from error
+    except (ValueError, LookupError) as error:  # of Python's codec for its encoding
+        raise TaccorlError(
+            f"{path}:1: the encoding that it states is not read: {error}; save it as UTF-8, and state that or none"
         ) from error
     return top[0], content
 
@@ -161,46 +178,49 @@ def _include(root: Element) -> None:
 
 
 def _refuse_large(root: Element) -> None:
-    """Refuse what MuJoCo would expand without end."""
-    total = 0
+    """Refuse what MuJoCo would expand without end, by the numbers that the file states."""
+    total = made = joints = values = 0
+    sizes: list[Element] = []
     waiting = [(root, 1)]
     while waiting:
         one, times = waiting.pop()
-        own = {
-            key: _whole(value)
-            for key, value in one.attributes.items()
-            if key in (*_SIZES, "count")
-        }
-        counts = [n for key, n in own.items() if key == "count" for n in n]
+        own = {key: _whole(value) for key, value in one.attributes.items()}
+        counts = [max(n, 1) for n in own.get("count", ())]
+        parts = times
         if one.tag == "replicate":
             times *= max(1, *counts, 1)
         elif counts:
-            total += times * math.prod(max(n, 1) for n in counts)
-        total += times
-        if total > MOST_ELEMENTS:
+            parts *= math.prod(counts)
+        total += parts
+        made += parts if parts > 1 else 0
+        if one.tag in ("joint", "freejoint", "composite", "flexcomp"):
+            joints += parts
+        if total > MOST_ELEMENTS or made > MOST_MADE or joints > MOST_JOINTS:
             raise TaccorlError(
-                f"{one.place}: <{one.tag}> makes more than {MOST_ELEMENTS:,} elements of this file; give the model that it "
-                "makes, or smaller counts"
+                f"{one.place}: <{one.tag}> makes more than {MOST_ELEMENTS:,} elements, {MOST_MADE:,} by counts, or "
+                f"{MOST_JOINTS:,} joints of this file; is it one robot? Give the model that it makes, or smaller counts"
             )
-        values = math.prod(
-            max(n, 1) for key, all_n in own.items() if key != "count" for n in all_n
-        )
-        if one.tag in ("hfield", "texture", "numeric") and values > MOST_VALUES:
+        stated = [max(n, 1) for key in _SIZES for n in own.get(key, ())]
+        held = math.prod(stated) * times
+        if one.tag == "mesh" and one.get("builtin"):
+            held = MESH_VALUES * math.prod(max(n, 1) for n in own.get("params", ()))
+        if one.tag in ("hfield", "numeric", "mesh"):
+            values += held
+            held = values
+        if one.tag in ("hfield", "texture", "numeric", "mesh") and held > MOST_VALUES:
             raise TaccorlError(
-                f"{one.place}: <{one.tag}> has {values:,} values, more than {MOST_VALUES:,}; it is not used: remove it"
+                f"{one.place}: <{one.tag}>: {held:,} values up to here, more than {MOST_VALUES:,}; it is not used: remove it"
             )
-        if one.tag == "size":
-            for key, value in one.attributes.items():
-                if key != "memory" and any(n > MOST_VALUES for n in _whole(value)):
-                    raise TaccorlError(
-                        f'{one.place}: <size {key}="{value}">: more than {MOST_VALUES:,}; remove it'
-                    )
+        sizes += [one] if one.tag == "size" else []
         waiting += [(child, times) for child in one.children]
-    joints = root.all("joint")
-    if len(joints) > MOST_JOINTS:
-        raise TaccorlError(
-            f"{root.path}: has {len(joints):,} joints, more than {MOST_JOINTS:,}; is it one robot?"
-        )
+    for one in sizes:
+        for key, value in one.attributes.items():
+            # Of each element, or of each joint in a key.
+            each = total if key == "nkey" or key.startswith("nuser_") else 1
+            if key != "memory" and any(n * each > MOST_VALUES for n in _whole(value)):
+                raise TaccorlError(
+                    f'{one.place}: <size {key}="{value}">: more than {MOST_VALUES:,} values; remove it'
+                )
 
 
 def _whole(text: str) -> list[int]:

@@ -111,6 +111,17 @@ def _chosen(
     return wanted
 
 
+def first_ns(path: Path, time_s: np.ndarray) -> int:
+    """Time [ns] of the first of the rows at ``time_s`` (T,). Raises RecordingError: it is
+    no time."""
+    if not math.isfinite(time_s[0] * 1e9):
+        raise RecordingError(
+            f"{path}: the time of the first row is {time_s[0]:g} s: correct it, state the unit in the columns file, or remove "
+            "the row"
+        )
+    return round(time_s[0] * 1e9)
+
+
 def origin_lines(origin: Origin) -> str:
     """Lines ``# domain: …`` and ``# origin: …`` of a CSV file, each with its line break, to be written before the header."""
     return "".join(f"# {key}: {value}\n" for key, value in labelled(origin).items())

@@ -39,6 +39,7 @@ from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.table_files import (
     SUFFIXES,
     FileForm,
+    first_ns,
     read_columns,
     table_origin,
 )
@@ -520,7 +521,7 @@ def measurement_of_columns(
         source=path,
         origin=origin,
         instruction=spec.instruction,
-        start_ns=round(start * 1e9),
+        start_ns=first_ns(path, time_s[rows]),
     )
     return even_rows(found)
 

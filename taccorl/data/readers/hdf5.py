@@ -6,9 +6,10 @@ the file is refused. Pictures may be raw or compressed one by one, padded or not
 """
 
 import contextlib
+import functools
 import math
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,14 @@ from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20  # Number of bytes that are read at once
 MOST_ROWS = 1_000_000  # Most rows of a dataset: 9 h at 30 Hz; a file of a few kB can hold any number
+FREE_ROWS = 200_000
+"""Rows of all topics of a recording, together, that are read whatever the file holds of
+them; more must have a byte of the file each."""
+FREE_BYTES = 1 << 28
+"""Bytes of values that are read whatever the file holds of them; of more, the file must
+hold at least one in ``MOST_SHRUNK``. Deflate leaves one of 1032 at best."""
+MOST_SHRUNK = 300
+MOST_EPISODES = 10_000  # Most groups of a file that are episodes
 MOST_BLOCK_BYTES = (
     1 << 30
 )  # Largest block read at once, a chunk or a row; 1000 pictures of 480×640 are 0.9 GB
@@ -152,13 +161,9 @@ class Hdf5Reader(Reader):
         whole = super().sources(path, split_bag=split_bag)
         if whole is not None and no_recording(path) is None:
             # whoever reads it says what is wrong
-            with (
-                contextlib.suppress(OSError, RuntimeError, KeyError),
-                h5py.File(path, "r", locking=False) as file,
-            ):
-                return [
-                    Source(path, (path,), part) for part in _episode_groups(file)
-                ] or whole
+            with contextlib.suppress(OSError, RuntimeError, KeyError):
+                parts = _groups_of_file(path, *_version(path))
+                return [Source(path, (path,), part) for part in parts] or whole
         return whole
 
     def topics(self) -> dict[str, TopicType]:
@@ -200,6 +205,8 @@ class Hdf5Reader(Reader):
                     query.reads(topic) and _topic_type(datasets[topic]).undecodable
                 ):
                     raise RecordingError(f"{self.source.path}: {topic}: {problem}")
+            if problem := _hollow([datasets[topic] for topic in asked]):
+                raise RecordingError(f"{self.source.path}: {problem}")
             blocks = {
                 topic: _Blocks(datasets[topic]) for topic in asked if query.reads(topic)
             }
@@ -254,7 +261,8 @@ class Hdf5Reader(Reader):
         with file:
             try:
                 part = self.source.part
-                found = "/" if part is None else _episode_groups(file).get(part, "")
+                groups = {} if part is None else _groups_of_file(path, *_version(path))
+                found = "/" if part is None else groups.get(part, "")
                 if not isinstance(group := file[found] if found else None, h5py.Group):
                     raise RecordingError(
                         f"{self.source.name}: no such group of an episode"
@@ -425,9 +433,30 @@ def _unreadable(dataset: h5py.Dataset) -> str | None:
     if block_bytes > MOST_BLOCK_BYTES:
         text = f"{at_once:,} rows of shape {list(dataset.shape[1:])} are {block_bytes / 2**30:.1f} GiB; "
         return f"{text}at most {MOST_BLOCK_BYTES / 2**30:.0f} GiB are read: write smaller chunks"
-    if rows and not dataset.id.get_storage_size():
+    stored = dataset.id.get_storage_size()
+    if rows and not stored:
         return f"none of its {rows:,} rows was ever written: did the recorder die?"
+    if rows and block_bytes > max(FREE_BYTES, MOST_SHRUNK * stored):
+        return f"{at_once:,} rows at once are {block_bytes:,} bytes, of which the file holds {stored:,}: write smaller chunks"
     return None
+
+
+def _hollow(datasets: Sequence[h5py.Dataset]) -> str | None:
+    """Reason why the datasets must not be read: they state far more rows or bytes than the
+    file holds; None if they may. Reads no values."""
+    rows = sum(map(_length, datasets))
+    values = sum(_length(d) * _row_bytes(d) for d in datasets)
+    stored = sum(d.id.get_storage_size() for d in datasets)
+    if rows > FREE_ROWS and rows > stored:
+        claimed = f"{rows:,} rows"
+    elif values > FREE_BYTES and values > MOST_SHRUNK * stored:
+        claimed = f"{values:,} bytes of values"
+    else:
+        return None
+    return (
+        f"its {len(datasets)} datasets claim {claimed}, of which the file holds {stored:,} bytes: did the recorder die "
+        "before it wrote them? Write recordings with the rows that were measured"
+    )
 
 
 def _topic_type(dataset: h5py.Dataset) -> TopicType:
@@ -507,6 +536,19 @@ def _unprotected(datasets: dict[str, h5py.Dataset]) -> str:
     return f"{text}with create_dataset(…, fletcher32=True)" if names else ""
 
 
+def _version(path: Path) -> tuple[int, int]:
+    """Time of the last change [ns] and size [bytes] of a file."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size
+
+
+@functools.lru_cache(maxsize=16)
+def _groups_of_file(path: Path, changed_ns: int, size: int) -> dict[str, str]:
+    """``_episode_groups`` of a file in one version: each of its episodes asks for them."""
+    with h5py.File(path, "r", locking=False) as file:
+        return _episode_groups(file)
+
+
 def _episode_groups(file: h5py.File) -> dict[str, str]:
     """Name of each episode in the file → path of its group, in natural order; empty if the file is one episode. A numbered group
     is an episode if its name says so, or if several have the same contents but not the same number of rows, and hold all rows."""
@@ -533,6 +575,11 @@ def _episode_groups(file: h5py.File) -> dict[str, str]:
             if _are_episodes(file, word, paths)
             for path in paths
         ]
+        if len(found) > MOST_EPISODES:
+            raise RecordingError(
+                f"{file.filename}: {len(found):,} groups are episodes; at most {MOST_EPISODES:,} of a file are read: write "
+                "several files"
+            )
         if found:
             break
     names = [path.rpartition("/")[2] for path in found]

@@ -18,7 +18,7 @@ from lerobot.processor import (
     make_policy_processor_pipelines,
 )
 from lerobot.processor.relative_action_processor import to_relative_actions
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
@@ -135,6 +135,33 @@ def center_and_scale(
 
 
 @dataclass
+class OneNumberStep(KeepsFeatures):
+    """Step that gives state and actions of one number their last axis.
+
+    LeRobot 0.6.1 reads a feature of shape [1] as a scalar, so that the batch has states
+    (B,) and actions (B, H); its own next step takes (B,) for one state of B numbers."""
+
+    state: bool = False
+    """Whether the state is one number."""
+    action: bool = False
+    """Whether an action is one number."""
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        observation = transition.get(TransitionKey.OBSERVATION) or {}
+        state = observation.get(OBS_STATE)
+        if self.state and isinstance(state, Tensor) and state.dim() == 1:
+            observation = {**observation, OBS_STATE: state[:, None]}
+            transition = _with(transition, TransitionKey.OBSERVATION, observation)
+        action = transition.get(TransitionKey.ACTION)
+        if self.action and isinstance(action, Tensor) and action.dim() == 2:
+            transition = _with(transition, TransitionKey.ACTION, action[..., None])
+        return transition
+
+    def get_config(self) -> dict[str, Any]:
+        return {"state": self.state, "action": self.action}
+
+
+@dataclass
 class RawStateStep(KeepsFeatures):
     """Step that, at inference, also passes the unnormalised state to the policy: its relative actions refer to it.
 
@@ -221,11 +248,15 @@ def make_tactile_pi05_pre_post_processors(
         enabled=config.use_relative_actions, **names
     )
     common = make_default_policy_processor_steps(config, dataset_stats)
-    before: list[ProcessorStep] = [
-        common.rename_observations,
-        common.add_batch_dim,
-        relative,
-    ]
+    before: list[ProcessorStep] = [common.rename_observations]
+    state = (config.input_features or {}).get(OBS_STATE)
+    action = (config.output_features or {}).get(ACTION)
+    one_number = OneNumberStep(
+        state=state is not None and tuple(state.shape) == (1,),
+        action=action is not None and tuple(action.shape) == (1,),
+    )
+    before += [one_number] if one_number.state or one_number.action else []
+    before += [common.add_batch_dim, relative]
     before += [RawStateStep()] if config.use_relative_actions else []
     before += [HandPosesStep()] if config.knows_hands else []
     if config.part_poses or config.pose_loss:

@@ -1230,6 +1230,25 @@ def test_time_that_runs_backwards_or_in_milliseconds_stops_everything_else(clean
     }
 
 
+@pytest.mark.parametrize("epoch_s", [1.76e9, 2e5])
+def test_times_that_32_bits_made_equal_are_named_with_the_reason(clean, epoch_s):
+    """Numbers of 32 bits near 1.76e9 are 128 apart, near 2e5 1/64 = 0.0156."""
+    stored = (epoch_s + clean.time_s).astype(np.float32).astype(float)
+    first_ns = round(stored[0] * 1e9)
+    m = dataclasses.replace(clean, time_s=stored - stored[0], start_ns=first_ns)
+    spacing = "128" if epoch_s > 1e9 else "0.015625"
+    assert f"32 bits are {spacing} s apart" in text_of(m, "time_backwards")
+
+
+@pytest.mark.parametrize("time_s", [5.0, 0.0])
+def test_times_that_are_all_equal_stop_everything_else(clean, time_s):
+    stamps = np.full(clean.num_rows, time_s)
+    m = dataclasses.replace(clean, time_s=stamps, start_ns=round(time_s * 1e9))
+    assert found(m) == {"time_backwards": ["time"]}
+    assert "stands still" in text_of(m, "time_backwards")
+    assert "32 bits" not in text_of(m, "time_backwards")
+
+
 def test_a_wrapped_angle_is_named_and_a_fast_joint_is_not(clean):
     turned = clean.measured[:, 4] + np.pi - clean.measured[:, 4].mean()
     m = with_column(clean, clean.signals[4], (turned + np.pi) % (2 * np.pi) - np.pi)

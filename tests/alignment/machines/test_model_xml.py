@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from taccorl.alignment.machines import model_xml
+from taccorl.alignment.machines.model_xml import read_model
 from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.errors import TaccorlError
@@ -189,6 +191,66 @@ def test_models_that_would_never_end_or_steer_are_refused_at_once_in_one_line(
         and len(text) < 600
     )
     assert time.process_time() - began < 5.0
+
+
+GEOM = "<body><geom size='1'/></body>"
+HFIELD = "<hfield name='{}' nrow='6' ncol='6' size='1 1 1 1'/>"
+LIMITS = {
+    "elements": ("MOST_ELEMENTS", 20, "<site/>" * 30, ""),
+    "sites": ("MOST_MADE", 20, "<replicate count='30'><site/></replicate>", ""),
+    "bodies": ("MOST_MADE", 20, f"<replicate count='30'>{GEOM}</replicate>", ""),
+    "cable": (
+        "MOST_JOINTS",
+        20,
+        "<body><composite type='cable' count='30 1 1' size='1'/></body>",
+        "",
+    ),
+    "joints": (
+        "MOST_JOINTS",
+        20,
+        f"<replicate count='30'>{GEOM.replace('<geom', '<joint/><geom')}</replicate>",
+        "",
+    ),
+    "hfields": (
+        "MOST_VALUES",
+        100,
+        "",
+        f"<asset>{''.join(map(HFIELD.format, 'abc'))}</asset>",
+    ),
+    "mesh": (
+        "MOST_VALUES",
+        100,
+        "",
+        "<asset><mesh name='m' builtin='plate' params='9 9'/></asset>",
+    ),
+    "keys": ("MOST_VALUES", 100, "", "<size nkey='50'/>"),
+    "user": ("MOST_VALUES", 100, "", "<size nuser_body='50'/>"),
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_what_counts_and_sizes_make_together_has_a_limit(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A harmless file, which passes with the usual limit, and not with a lower one."""
+    limit, value, inside, beside = LIMITS[name]
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        f"<mujoco>{beside}<worldbody>{BODY.format('')}{inside}</worldbody></mujoco>"
+    )
+    read_model(path)
+    monkeypatch.setattr(model_xml, limit, value, raising=False)
+    with pytest.raises(TaccorlError, match=r"arm\.xml:1: <\w+.*more than"):
+        read_model(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-7", "big5", "zlib", "idna", "none-such"])
+def test_an_encoding_that_is_not_read_is_named(encoding: str, tmp_path: Path):
+    path = tmp_path / "arm.urdf"
+    text = f"<robot name='r'>{link('a')}{link('b')}{joint('j', 'a', 'b')}</robot>"
+    path.write_text(f"<?xml version='1.0' encoding='{encoding}'?>{text}")
+    with pytest.raises(TaccorlError, match=r"arm\.urdf:1: .*encoding.*UTF-8"):
+        load_robot_model(path)
 
 
 def test_the_memory_that_a_model_asks_for_is_not_taken(tmp_path: Path):

@@ -17,6 +17,7 @@ from taccorl.data.cutting import Cutter
 from taccorl.data.dataset import Dataset
 from taccorl.data.draft import draft_specs
 from taccorl.data.inspection import inspect_source
+from taccorl.data.readers import hdf5
 from taccorl.data.recording import Source, find_sources, load_recording, opened, readers
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import RecordingError
@@ -547,3 +548,57 @@ def test_a_rate_of_the_file_may_be_a_text(tmp_path, fps, rate):
             reader="hdf5",
         )
         assert ingest(path, spec, "--replace=true")[1]["outcome"] == "written"
+
+
+# ---- files that state more than they hold ----
+
+
+def stated(path: Path, rows: int, **how: Any) -> Path:
+    """Two topics of ``rows`` equal rows of 8 numbers, compressed to next to nothing."""
+    with h5py.File(path, "w") as file:
+        for name in ("qpos", "action"):
+            values = np.zeros((rows, 8))
+            file.create_dataset(name, data=values, **{"compression": "gzip", **how})
+    return path
+
+
+@pytest.mark.parametrize("limit", ["FREE_ROWS", "FREE_BYTES"])
+def test_more_rows_or_bytes_than_the_file_can_hold_are_refused_unread(
+    limit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """12 800 rows of 64 bytes are 819 200, of which about 2000 are stored: a harmless
+    file, which passes with the usual limits."""
+    path = stated(tmp_path / "e.hdf5", 6400, chunks=(6400, 8))
+    reader = readers.get("hdf5")(Source(path, (path,)))
+    assert sum(1 for _ in reader.messages(None)) == 2 * 6400
+    monkeypatch.setattr(hdf5, limit, 10_000, raising=False)
+    with pytest.raises(RecordingError, match=r"e\.hdf5: .* of which the file holds"):
+        next(reader.messages({"/qpos", "/action"}))
+
+
+def test_a_file_that_holds_its_rows_is_read_beyond_these_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "e.hdf5"
+    with h5py.File(path, "w") as file:
+        values = np.random.default_rng(0).normal(size=(500, 8))
+        file.create_dataset("qpos", data=values, compression="gzip")
+        file.create_dataset("effort", data=np.zeros((500, 8)), compression="gzip")
+    monkeypatch.setattr(hdf5, "FREE_ROWS", 10, raising=False)
+    monkeypatch.setattr(hdf5, "FREE_BYTES", 10, raising=False)
+    reader = readers.get("hdf5")(Source(path, (path,)))
+    assert sum(1 for _ in reader.messages(None)) == 1000
+
+
+def test_more_episodes_than_the_limit_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "e.hdf5"
+    with h5py.File(path, "w") as file:
+        for k in range(5):
+            file[f"data/demo_{k}/qpos"] = np.zeros((3, 2))
+    assert len(find_sources(path, reader="hdf5")) == 5
+    monkeypatch.setattr(hdf5, "MOST_EPISODES", 4, raising=False)
+    hdf5._groups_of_file.cache_clear()
+    with pytest.raises(RecordingError, match=r"5 groups .* at most 4"):
+        find_sources(path, reader="hdf5")
