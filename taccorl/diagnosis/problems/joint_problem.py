@@ -386,8 +386,10 @@ class JointProblem(WithoutMaps):
         )
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
-        # lower bound is a little below that value, so that a fit to such a drive does not end at the bound.
-        delay = dataclasses.replace(SPEED_DELAY, low=-0.6 * joint.speed_delay_s)
+        # lower bound is a little below that value, so that a fit to such a drive does not end at the bound. A loop below 200 Hz
+        # would have a bound that no file may state.
+        newest = max(-0.6 * joint.speed_delay_s, -SPEED_DELAY.high)
+        delay = dataclasses.replace(SPEED_DELAY, low=newest)
         units = Scale(unit=joint.unit)
         scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (
             self.effort and not self._left_out

@@ -47,16 +47,20 @@ class Free:
     unless: str = ""
     """Name of an effect with the same influence on the recordings: in a fit with that effect this number is held at ``start``."""
 
+    def within(self, value: float) -> float:
+        """``value`` clipped to the bounds."""
+        return min(max(value, self.low), self.high)
+
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
         ``scale``, so that a relevant change is of order 1."""
-        value = min(max(value, self.low), self.high)
+        value = self.within(value)
         return math.log(value) if self.log else value / self.scale
 
     def value(self, coordinate: float) -> float:
         """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
         raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
-        return min(max(raw, self.low), self.high)
+        return self.within(raw)
 
 
 def free(p: Parameter, cls: type[Effect]) -> Free:
@@ -142,13 +146,20 @@ def candidate(
 ) -> Candidate:
     """Candidate for an effect, from its class.
 
+    Start values are clipped to the bounds of their parameters: facts of recordings may lead beyond them, as a drive that the
+    fit finds softer than the file says leads to a softer gear.
+
     Args:
         seen: facts of the recordings from which start values follow (``Effect.starts``), such as ``duration_s``.
         selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
     """
     frees = tuple(free(p, cls) for p in cls.parameters() if p.name not in selectors)
     starts = [
-        {f"{cls.name}.{k}": v for k, v in start.items() if k not in selectors}
+        {
+            f"{cls.name}.{k}": cls.clipped(k, v)
+            for k, v in start.items()
+            if k not in selectors
+        }
         for start in cls.starts(seen)
     ]
     unlike = {tuple(start.items()): start for start in starts}.values()
