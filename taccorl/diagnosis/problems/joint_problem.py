@@ -85,7 +85,13 @@ EFFORT_SCALE = Free(
 )
 """Ratio of reported effort to torque, which differs between versions of PiPER firmware."""
 SPEED_DELAY = Free(
-    name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3
+    name="speed_delay_s",
+    unit="s",
+    start=0.0,
+    low=0.0,
+    high=TIMING_S,
+    scale=1e-3,
+    leaves=True,
 )
 """τ of the effect speed_delay: how late a sampled loop damps the speed. It is fitted if something besides the inertia
 determines the scale of the torques; otherwise a change of K_p is equivalent (``taccorl.diagnosis.search.identifiable``)."""
@@ -95,7 +101,13 @@ POSITION_AGE = Free(
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
 LOOP = Free(
-    name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4
+    name="loop_s",
+    unit="s",
+    start=0.0,
+    low=0.0,
+    high=2.0 * TIMING_S,
+    scale=1e-4,
+    leaves=True,
 )
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
