@@ -66,7 +66,7 @@ TORQUE_FF = Free(
     start=0.0,
     low=-40.0,
     high=40.0,
-    unless="integral_action",
+    unless=("integral_action", "position_integral"),
 )
 """Bounds of the fitted T_ref [N·m], wider than the paper's ± 8: a stiff joint with an error of 10 mrad has 18. An integral,
 which begins in balance, takes up any constant torque: beside it nothing determines T_ref."""
@@ -76,8 +76,9 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
 ``gravity_mismatch``."""
-_NOT_ON_PIPER = ("presliding", "unbalance")
-"""Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
+_NOT_ON_PIPER = ("position_integral", "presliding", "unbalance")
+"""Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them. Its loop is no
+cascade, so that the first one is ``integral_action``."""
 WEIGHS = 3.0
 """Least motion due to weight [noise floors of the angle, rms] at which it determines the scale of the torques. A choice."""
 EFFORT_SCALE = Free(

@@ -48,8 +48,8 @@ class Free:
     leaves: bool = False
     """True: the machine's file need not state it. Where the recordings do not tell it from what the file has, the last refit
     leaves it out (``Fits.as_stated``)."""
-    unless: str = ""
-    """Name of an effect with the same influence on the recordings: in a fit with that effect this number is held at ``start``."""
+    unless: tuple[str, ...] = ()
+    """Names of effects with the same influence on the recordings: in a fit with one of them this number is held at ``start``."""
 
     def within(self, value: float) -> float:
         """``value`` clipped to the bounds."""
@@ -90,7 +90,7 @@ def free(p: Parameter, cls: type[Effect]) -> Free:
         scale=scale,
     )
     return dataclasses.replace(
-        found, optional=optional, unless=cls.optional.get(p.name, "")
+        found, optional=optional, unless=(cls.optional.get(p.name, ""),)
     )
 
 

@@ -234,6 +234,38 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
         assert held.effort == pytest.approx(np.full(50, given), abs=2e-3)
 
 
+@pytest.mark.parametrize("speed_rate", [0.0, 15.0])
+def test_an_integral_of_the_position_of_a_cascade_is_before_its_speed_loop(
+    speed_rate: float,
+):
+    """τ = kd (u + r_s ∫ u dt), u = kp (e + 3 ∫ e dt) − q̇, alone and beside an integral of u: both hold a spring at the target."""
+    axis = AxisConfig(
+        name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0
+    )
+    numbers = {
+        "position_integral": {"rate_per_s": 3.0},
+        "integral_action": {"rate_per_s": speed_rate},
+        "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0},
+    }
+    axis.effects = tuple(EffectEntry(*one) for one in numbers.items())
+    target, total = np.where(np.arange(400) < 10, 0.0, 0.3), np.zeros(2)
+
+    def torque(goal: float, q: float, v: float) -> float:
+        total[0] += DT_S * (goal - q)
+        u = 25.0 * (goal - q + 3.0 * total[0]) - v
+        total[1] += DT_S * u
+        return 4.0 * (u + speed_rate * total[1]) - 2.0 * q
+
+    found = answer(axis, recording(target))
+    assert np.abs(found.reported - integrated(target, torque, 0.08)).max() < 1e-4
+    plain = dataclasses.replace(axis, effects=axis.effects[1:])
+    assert np.abs(answer(plain, recording(target)).reported - found.reported).max() > (
+        1e-3
+    )
+    others = (SERVO, dataclasses.replace(axis, law="impedance", effects=()))
+    assert not any(law.allows_effect("position_integral") for law in others)
+
+
 @pytest.mark.parametrize("law", ["cascade", "velocity"])
 def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_the_rest(
     law,
