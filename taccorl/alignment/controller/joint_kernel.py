@@ -165,7 +165,8 @@ def _asked(
         )
         stiffness = where(far, stiffness, 0.0)
     if holds(p.position_integral__rate_per_s > 0.0):
-        newest = 0.5 * p.speed_age * (command - p.encoder_scale__factor * q)
+        # Its positions are as old as half a period, which gives back what the newest one takes away.
+        newest = 0.5 * p.speed_age * command
         error += p.position_integral__rate_per_s * (of_position + newest)
     of_way = p.commands_speed * p.encoder_scale__factor
     stiffness += (
