@@ -470,17 +470,20 @@ class Fits:
     def as_stated(self, model: Fit, keep: Collection[str] = ()) -> Fit:
         """``model`` without the numbers of a drive's loop (``Free.leaves``) whose 95 % interval holds what the file has: they
         stay as they are there, and all others are refitted. With them where the error would rise, and those in ``keep``."""
-        ends, has = model.intervals(), dict(self.given)
-        if "loop_s" in model.values and SPEED_DELAY in has:
-            has[SPEED_DELAY] += (
-                0.5 * model.values["loop_s"]
-            )  # as old as that is a speed without delay
+
+        def stated(
+            name: str, values: Values
+        ) -> float:  # a speed is half a fitted period older than its delay in the file
+            later_s = 0.5 * values.get("loop_s", 0.0)
+            return self.given[name] + later_s * (name == SPEED_DELAY)
+
+        ends = model.intervals()
         same = [
             f.name
             for f in model.frees
             if f.leaves
             and f.name not in keep
-            and ends[f.name][0] <= has[f.name] <= ends[f.name][1]
+            and ends[f.name][0] <= stated(f.name, model.values) <= ends[f.name][1]
         ]
         fitted = {f.name for f in model.frees}
         held = {f.name: model.values[f.name] for f in self.problem.base}
@@ -494,7 +497,8 @@ class Fits:
             if is_as_good(other.error, model.error) and is_as_good(
                 self.error(other), self.error(model)
             ):
-                return other
+                of_file = {name: stated(name, other.values) for name in names}
+                return dataclasses.replace(other, values=other.values | of_file)
         return model
 
     def _with_intervals(self, problem: Problem, fine: Fit) -> Fit:

@@ -173,7 +173,7 @@ def diagnose(
         if other and tied
         else ("", 1.0),
         present=fits.present,
-        base=_base(model),
+        base=_base(fits, model),
         start=fits.given,
         intervals=model.intervals(),
         rounds=rounds,
@@ -632,7 +632,7 @@ def _offers(
             Offer(
                 added=names,
                 effects=tuple(_described(fits, own, {}, {})),
-                base=_base(own),
+                base=_base(fits, own),
                 intervals=own.intervals(),
                 errors=fits.errors(own.values, own.effects, test),
                 at_bound=tuple(f.name for f in own.ended),
@@ -649,7 +649,7 @@ def _found(fits: Fits, answer: Model) -> Found:
         f"accepted: {names}, validation error {answer.error:.2f} noise floors",
         effects=answer.fit.effects,
         present=fits.present,
-        base=_base(answer.fit),
+        base=_base(fits, answer.fit),
         errors={"after": {"fit": answer.fit.error, "validation": answer.error}},
         intervals={},
         finished=False,
@@ -662,9 +662,11 @@ def _named(changed: Sequence[Changed]) -> set[str]:
     return names | {*OF_LOOP} if "loop_hz" in names else names
 
 
-def _base(model: Fit) -> Values:
-    """The always fitted numbers of ``model``."""
-    return {f.name: model.values[f.name] for f in model.frees if "." not in f.name}
+def _base(fits: Fits, model: Fit) -> Values:
+    """The always fitted numbers of ``model``, with those that its last refit left as the file has them."""
+    names = [f.name for f in model.frees if "." not in f.name]
+    names += [f.name for f in fits.problem.base if f.leaves and not f.held]
+    return {name: model.values[name] for name in names if name in model.values}
 
 
 def _status(
