@@ -151,6 +151,10 @@ def _diagnosed(
             f"{path}: was made with another twin ({made_with}); run `taccorl diagnose` with this one. Effects that one diagnosis "
             "found are added together: taccorl add-effect NAME,NAME"
         )
+    if not report.get("finished", True):
+        print(
+            f"warning: {path}: is of a diagnosis that is not finished; what was not tried may be missing instead"
+        )
     diagnoses = report["diagnoses"]
     parts = machine.select(list(diagnoses), config.joints, config.pads)
     told = {

@@ -10,6 +10,9 @@ ties, with the recording that would separate them; a residual that no known effe
 import dataclasses
 import itertools
 import shlex
+import signal
+import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -48,7 +51,8 @@ class DiagnoseConfig(PartsConfig):
 @verb(DiagnoseConfig, positional="measurements")
 def run(config: DiagnoseConfig) -> int:
     """Diagnose, and print and write the result. Returns the exit status, 0: the remaining error is at the noise floor, 1:
-    something else remains, or the measurements have errors, or efforts of other gains than the file's."""
+    something else remains, or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM ended the
+    search, and what it had found was written."""
     from taccorl.report.report import check_folder
 
     check_folder(config.out, config.measurements)
@@ -96,13 +100,18 @@ def run(config: DiagnoseConfig) -> int:
     )
     if not parts:
         return 1
-    found = _diagnosed(config, machine, parts, measurements)
+    found, stopped_by = _diagnosed(config, machine, parts, measurements)
     left = [part for part in parts if part not in {f.part for f in found}]
     refused += [f"{part}: stopped before an effect was found" for part in left]
+    if not found and stopped_by == signal.SIGTERM:
+        return 128 + stopped_by
     if not found:
         raise KeyboardInterrupt
     mended, disagree = machine.mended(found)
     report = _report(config, machine, found, beside, measurements, mended)
+    if stopped_by:
+        words = "This diagnosis is not finished: it was stopped."
+        report = dataclasses.replace(report, stopped=" ".join([words, *refused]))
     verdicts = report.verdicts()
     show(*(brief(f, verdicts[f.part], report.options) for f in found))
     clocks = [
@@ -123,6 +132,8 @@ def run(config: DiagnoseConfig) -> int:
         f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor")
         for f in found
     )
+    if stopped_by == signal.SIGTERM:
+        return 128 + stopped_by
     return int(not done or bool(disagree or refused))
 
 
@@ -131,30 +142,58 @@ def _diagnosed(
     machine: "Machine",
     parts: Sequence[str],
     measurements: "Measurements",
-) -> "list[Finding]":
+) -> "tuple[list[Finding], int]":
+    """Findings, and the signal that stopped the search, or 0. What was found before anything ended it is in ``config.out``."""
     from taccorl.cli.progress import Bars, Steps
     from taccorl.diagnosis.machines.machine import diagnose_parts
     from taccorl.diagnosis.search.result import SearchConfig
+    from taccorl.report.interim import Interim
 
     search = (
         SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
     )
     with (
         Bars(len(parts), f"diagnosing {len(parts)} parts") as bars,
-        Steps().until_interrupted() as steps,
+        tempfile.TemporaryDirectory() as kept,
     ):
-        count = itertools.count(1)
-        return diagnose_parts(
-            machine,
-            parts,
-            measurements,
-            gains=config.gains,
-            search=search,
-            without=config.without,
-            workers=config.workers,
-            done=lambda part: bars.update(part, next(count), len(parts)),
-            progress=steps,
+        count, steps = itertools.count(1), Steps()
+        steps.interim = Interim(
+            folder=config.out,
+            kept=Path(kept),
+            title=f"What {machine.name} lacks, from {config.measurements.name}",
+            provenance=_provenance(config, machine),
         )
+        try:
+            with steps.until_interrupted():
+                found = diagnose_parts(
+                    machine,
+                    parts,
+                    measurements,
+                    gains=config.gains,
+                    search=search,
+                    without=config.without,
+                    workers=config.workers,
+                    done=lambda part: bars.update(part, next(count), len(parts)),
+                    progress=steps,
+                )
+                return found, steps.stopped_by
+        except BaseException:
+            if some := steps.interim.parts:
+                steps.interim.write()
+                print(
+                    f"\nnot finished; {config.out}/report.json has what was found at {', '.join(some)}",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            raise
+
+
+def _provenance(config: DiagnoseConfig, machine: "Machine") -> dict[str, str]:
+    return {
+        "command": shlex.join(command("diagnose", config, "measurements")),
+        "twin": str(config.twin) if config.twin else "nominal twin",
+        "twin, SHA-256": machine.digest(),
+    }
 
 
 def _report(
@@ -185,11 +224,7 @@ def _report(
             for word in (f"--measurements={config.measurements}", *_given(config))
         ],
         findings=beside.findings,
-        provenance={
-            "command": shlex.join(command("diagnose", config, "measurements")),
-            "twin": str(config.twin) if config.twin else "nominal twin",
-            "twin, SHA-256": machine.digest(),
-        },
+        provenance=_provenance(config, machine),
     )
 
 

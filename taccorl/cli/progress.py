@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -23,6 +23,9 @@ from rich.progress import (
 )
 
 from taccorl.errors import printable
+
+if TYPE_CHECKING:
+    from taccorl.report.interim import Interim
 
 LINE_EVERY_S = 5.0
 """Time between two lines of progress without a terminal [s]."""
@@ -101,12 +104,21 @@ class Steps:
     line_s: float = field(default_factory=lambda: time.monotonic())
     """Time of the last line [s]."""
     asked: Path | None = None
-    """File that is there once the user has typed Ctrl-C; all processes see it."""
+    """File that is there once the user has typed Ctrl-C, or SIGTERM came; all processes see it."""
+    interim: "Interim | None" = None
+    """Writer of what a search has found so far; None: it is not written."""
+
+    @property
+    def stopped_by(self) -> int:
+        """Number of the signal that asked the command to stop; 0: none did."""
+        if self.asked is None or not self.asked.exists():
+            return 0
+        return int(self.asked.read_text() or signal.SIGINT)
 
     @contextmanager
     def until_interrupted(self) -> Iterator["Steps"]:
-        """Context manager. After the first Ctrl-C, calls of this object raise ``Stopped``, in worker processes, too; a second one
-        ends the command."""
+        """Context manager. After the first Ctrl-C or SIGTERM, calls of this object raise ``Stopped``, in worker processes, too; a
+        second one ends the command."""
         if (
             threading.current_thread() is not threading.main_thread()
         ):  # in which alone signals can be handled
@@ -115,31 +127,40 @@ class Steps:
         with tempfile.TemporaryDirectory() as folder:
             asked = self.asked = Path(folder) / "stop"
 
-            def ask(*_: object) -> None:
-                asked.touch()
-                signal.signal(signal.SIGINT, before)
+            def ask(number: int, *_: object) -> None:
+                asked.write_text(str(int(number)))
+                as_before()
                 print(
                     "\nstopping with what was found; Ctrl-C again ends without it",
                     file=sys.stderr,
                     flush=True,
                 )
 
-            before = signal.signal(signal.SIGINT, ask)
+            def as_before() -> None:
+                for number, handler in before.items():
+                    signal.signal(number, handler)
+
+            both = (signal.SIGINT, signal.SIGTERM)
+            before = {number: signal.signal(number, ask) for number in both}
             try:
                 yield self
             finally:
-                signal.signal(signal.SIGINT, before)
+                as_before()
 
     def __call__(self, part: str, text: str = "") -> None:
-        """Print the present step ``text`` of ``part``, with the time since the beginning."""
+        """Print the present step ``text`` of ``part``, with the time since the beginning. What a search has found so far is
+        written at once (``interim``)."""
         if self.asked is not None:
-            from taccorl.diagnosis.search.problem import Stopped
+            from taccorl.diagnosis.search.problem import Found, Stopped
+
+            if self.interim is not None and isinstance(text, Found):
+                self.interim.add(part, text)
 
             if (
                 multiprocessing.parent_process() is not None
             ):  # a worker, which its parent stops
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
-            if self.asked.exists():
+            if self.stopped_by:
                 raise Stopped
         now_s = time.monotonic()
         if now_s - self.line_s >= self.every_s:

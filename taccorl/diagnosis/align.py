@@ -436,7 +436,7 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
             if n.name in Gains._fields and not n.fixed
         }
         if a.part in joints.SIGNALS:
-            joints.set_numbers(config, a.part, values, {})
+            joints.set_numbers(config, a.part, values)
         elif a.twin is not None:
             camera = a.part.removeprefix("camera ")
             new = next(c for c in a.twin.cameras if c.name == camera)

@@ -5,6 +5,7 @@ Files of a report are replaced by the next one; other files of their names are n
 
 import base64
 import io
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def write(texts: dict[Path, str]) -> None:
     """Write each file as a whole or not at all; folders are created. Raises TaccorlError: the disk is full, or a folder cannot
     be written to."""
     for path, text in texts.items():
-        part = path.with_name(f".{path.name}.part")
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             part.write_text(text, encoding="utf-8")

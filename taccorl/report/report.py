@@ -58,6 +58,8 @@ class Report:
     """Recording → findings of the checks before the comparison."""
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Origin of the report, by name: the command, the twin's file, digests."""
+    stopped: str = ""
+    """Sentence: which parts the search did not finish, because it was stopped; empty if it was not."""
 
     @property
     def origins(self) -> tuple[Origin, ...]:
@@ -190,6 +192,7 @@ class Report:
         twins = [one for one in (c, self.refitted, self.after) if one is not None]
         return [
             Section(text=[origin_words(self.origins)], style="data"),
+            *([Section(text=[self.stopped])] if self.stopped else []),
             *(
                 map(verdict_section, verdicts.values())
                 if verdicts
@@ -287,6 +290,7 @@ def as_json(report: Report) -> dict[str, Any]:
     return {
         "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
         "title": report.title,
+        "finished": not report.stopped,
         "data": [str(origin) for origin in report.origins],
         "domains": sorted({origin.domain or "not stated" for origin in report.origins}),
         "provenance": dict(report.provenance),
@@ -348,15 +352,16 @@ def _diagnosis(d: Diagnosis) -> dict[str, Any]:
     kept = {
         f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in left
     }
-    offers = [plain(o) | {"effects": _effects(o.effects)} for o in d.offers]
+    offers = [plain(o) | {"effects": effects_as_json(o.effects)} for o in d.offers]
     return plain(kept) | {
         "words": d.words,
-        "effects": _effects(d.effects),
+        "effects": effects_as_json(d.effects),
         "offers": offers,
     }
 
 
-def _effects(found: Sequence[Effect]) -> list[dict[str, Any]]:
+def effects_as_json(found: Sequence[Effect]) -> list[dict[str, Any]]:
+    """Effects as JSON objects: name, numbers, intervals and evidence."""
     return [{"effect": e.name} | plain(e) for e in found]
 
 

@@ -244,7 +244,8 @@ def clean(value: float, width: float) -> str:
     """A number with four digits, or those of which the half ``width`` of its interval has two; 0 if it is nothing beside it."""
     known = 0.0 < width < math.inf and 0.0 < abs(value) < math.inf
     digits = 2 + math.ceil(math.log10(2.0 * abs(value) / width)) if known else 4
-    return f"{0.0 if abs(value) < 1e-6 * width else value + 0.0:.{max(4, digits)}g}"
+    is_nothing = width < math.inf and abs(value) < 1e-6 * width
+    return f"{0.0 if is_nothing else value + 0.0:.{max(4, digits)}g}"
 
 
 def added(d: Diagnosis) -> tuple[str, ...]:

@@ -70,6 +70,8 @@ _OF_LOOPS: Mapping[str, tuple[TargetKind, ...]] = {
     "velocity_feedforward": ("position",),
 }
 """Effects in a controller → kinds of targets whose controllers can have them."""
+_OF_LAWS: Mapping[str, tuple[Law, ...]] = {"position_integral": ("cascade",)}
+"""Effects in a controller → laws that can have them; under law impedance it is ``integral_action``."""
 
 
 @dataclass(kw_only=True)
@@ -271,7 +273,9 @@ class DriveLaw:
             return effect == "payload" or (
                 bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS
             )
-        return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
+        return self.law in _OF_LAWS.get(effect, (self.law,)) and (
+            self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
+        )
 
     @property
     def numbers(self) -> dict[str, tuple[float, str]]:

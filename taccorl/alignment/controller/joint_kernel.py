@@ -122,13 +122,15 @@ def _asked(
     q: Any,
     v: Any,
     integral: Any,
+    of_position: Any,
     supply: float,
     on: float,
     added: float,
 ) -> Any:
     """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
     error lies within the dead band is known from it. A sampled loop adds its newest error for a whole period, of which half is to
-    come, to its ``integral``. ``kind`` is ``Drive.command``; ``supply``, ``on`` and ``added`` are as in ``simulate``."""
+    come, to its ``integral``, and to that of the position's error in a cascade, ``of_position``. ``kind`` is ``Drive.command``;
+    ``supply``, ``on`` and ``added`` are as in ``simulate``."""
     if kind == TORQUE:
         none = 0.0 * p.kp
         return on * (command + p.torque_ff), none, none
@@ -162,6 +164,10 @@ def _asked(
             0.0,
         )
         stiffness = where(far, stiffness, 0.0)
+    if holds(p.position_integral__rate_per_s > 0.0):
+        # Its positions are as old as half a period, which gives back what the newest one takes away.
+        newest = 0.5 * p.speed_age * command
+        error += p.position_integral__rate_per_s * (of_position + newest)
     of_way = p.commands_speed * p.encoder_scale__factor
     stiffness += (
         of_way * (p.kd + 0.5 * p.speed_age * p.kp) * p.integral_action__rate_per_s
@@ -324,6 +330,8 @@ def _simulated(
         p.gravity_mismatch__share,
         p.integral_action__rate_per_s,
     )
+    position_rate = p.position_integral__rate_per_s
+    has_integral = (integral_rate > 0.0) | (position_rate > 0.0)
     lag_s, fade_rate = p.torque_lag__time_constant_s, p.torque_fade__rate_per_min / 60.0
     torque_scale, reverse_gain = p.torque_scale__factor, p.direction_gain__factor
     compliance = p.joint_compliance__compliance_rad_per_nm
@@ -389,6 +397,7 @@ def _simulated(
         holds(stop_stiffness > 0.0),
     )
     with_integral, with_load = holds(integral_rate > 0.0), holds(load_share > 0.0)
+    with_position_integral = holds(position_rate > 0.0)
     with_given = (with_load and not midpoint) or holds(reverse_gain != 1.0)
     rubs = (
         with_load
@@ -419,12 +428,22 @@ def _simulated(
             )  # of the play
             hanging -= where(compliance == 0.0, soft_end, 0.0)
             gear = where(abs(load_nm) > 1e-9, hanging, gear)
-    integral = came = none
+    integral = came = of_position = came_of_position = none
     until_now = (
         none if kind == VELOCITY else load(command, 0)
     )  # who rests was commanded no velocity
     torque = _asked(
-        p, kind, until_now, until_now, q, v, integral, supply[0], on[0], added[0]
+        p,
+        kind,
+        until_now,
+        until_now,
+        q,
+        v,
+        integral,
+        of_position,
+        supply[0],
+        on[0],
+        added[0],
     )[0]
     needed = (
         weight
@@ -436,7 +455,7 @@ def _simulated(
     if kind == TORQUE:
         needed -= added[0]
     holding = torque_scale * _of_direction(
-        p, where(integral_rate > 0.0, needed, torque + carried)
+        p, where(has_integral, needed, torque + carried)
     )
     missing = needed - holding * (torque + carried)
     speeds = (
@@ -457,7 +476,8 @@ def _simulated(
         0.5 * p.midpoint * way * h,
     )
     of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
-    if with_integral:
+    of_errors = of_error + position_rate * p.kp
+    if with_integral or with_position_integral:
         most = coulomb + static + yield_nm
         seen_nm = p.start_nm + where(
             p.effort_holds_weight == 0.0, holding * carried, 0.0
@@ -468,8 +488,15 @@ def _simulated(
         integral = where(
             integral_rate > 0.0, (missing - rubbed) / (holding * of_error), 0.0
         )
-        torque += where(integral_rate > 0.0, (missing - rubbed) / holding, 0.0)
-        missing = where(integral_rate > 0.0, rubbed, missing)
+        of_position = (
+            where(  # beside the integral of a speed, whose error is 0 at rest, it is 0
+                (position_rate > 0.0) & (integral_rate <= 0.0),
+                (missing - rubbed) / (holding * of_errors),
+                0.0,
+            )
+        )
+        torque += where(has_integral, (missing - rubbed) / holding, 0.0)
+        missing = where(has_integral, rubbed, missing)
     z = where(has_bristle, min(max(-missing, -static), static) / bristle, 0.0)
     missing += z * bristle
     bent = where(bends, min(max(-missing, -coulomb), coulomb) / bending, 0.0)
@@ -520,7 +547,17 @@ def _simulated(
         )  # the sum of a late speed lacks so much of the way
         if with_given:
             given = _asked(
-                p, kind, acts, acts, q, v, summed, supply[part], on[part], added[part]
+                p,
+                kind,
+                acts,
+                acts,
+                q,
+                v,
+                summed,
+                of_position,
+                supply[part],
+                on[part],
+                added[part],
             )[0]
             given = where(lag_s > 0.0, torque, given)
         if within == 0:
@@ -528,11 +565,21 @@ def _simulated(
                 by = load(command, n + hold * min(effort_after - 1, parts - 1))
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(
-                p, kind, by, by, q, v, summed, supply[part], on[part], added[seen]
+                p,
+                kind,
+                by,
+                by,
+                q,
+                v,
+                summed,
+                of_position,
+                supply[part],
+                on[part],
+                added[seen],
             )
             by_speed -= on[part] * p.back_emf  # which has no age
             older = (
-                p.effort_age * (by_position * v - of_error * (by - way * q))
+                p.effort_age * (by_position * v - of_errors * (by - way * q))
                 + shown_lead * by_speed * acceleration
             )
             if with_filter:
@@ -562,14 +609,29 @@ def _simulated(
             store(readings, n, _reading(p, q))
 
         strength *= _of_direction(p, given + carried)
+        if with_position_integral:
+            came_of_position = h * (now - way * q)
+            of_position += 0.5 * p.midpoint * came_of_position
         if (
             with_integral
         ):  # that of a speed is taken ahead as the position is, which is its other part
             came = h * (now - way * q)
+            if with_position_integral:
+                came += h * position_rate * of_position
             integral += along * came
             summed += along * came
         asked, stiffness, damping = _asked(
-            p, kind, now, acts, q, v, summed, supply[part], on[part], added[part]
+            p,
+            kind,
+            now,
+            acts,
+            q,
+            v,
+            summed,
+            of_position,
+            supply[part],
+            on[part],
+            added[part],
         )
         by_controller = (
             damping - on[part] * p.back_emf
@@ -734,6 +796,9 @@ def _simulated(
             )
         if with_integral:
             integral += (1.0 - along) * came - went * moved
+        if with_position_integral:
+            half = 0.5 * p.midpoint
+            of_position += (1.0 - half) * came_of_position - half * way * h * moved
         if with_filter:
             late_v = where(
                 fresh_share < 1.0,

@@ -314,7 +314,7 @@ def _side_by_side(
         drive["gravity_cos"] += weight * case.lever.cos_m
         drive["command_delay__delay_s"] += case.waits_s
         drive["effort_age"] -= case.waits_s
-        if drive["integral_action__rate_per_s"] > 0.0:
+        if any(drive[f"{name}__rate_per_s"] > 0.0 for name in INTEGRALS):
             drive["start_nm"] = motion.start_nm / case.effort_scale
         if (
             held := motion.held_nm_per_rad
@@ -459,6 +459,8 @@ def _in_time(
     return found
 
 
+INTEGRALS = ("integral_action", "position_integral")
+"""Effects that hold what acts on a joint at rest with any effort within the dry friction."""
 OTHER = 0.05  # Share by which numbers are changed to see what they do to a response
 
 

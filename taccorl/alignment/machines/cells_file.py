@@ -309,7 +309,7 @@ def cells_text(config: CellsConfig) -> str:
     plain |= {"load": _short(config.load), "reading": _short(config.reading)}
     for key in ("gain", "offset"):
         if key in plain:
-            plain[key] = [float(f"{x:.7g}") for x in plain[key]]
+            plain[key] = [float(f"{x:.12g}") for x in plain[key]]
     plain["effects"] = [
         {k: v for k, v in effect_entry(e).items() if k != "pads"}
         for e in config.effects

@@ -17,7 +17,7 @@ from taccorl.alignment.checks.robot import (
     wrong_inertia,
 )
 from taccorl.alignment.checks.telemetry import least_motion
-from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S, with_gains
+from taccorl.alignment.controller.drive_law import with_gains
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.machines.axis_file import (
@@ -208,10 +208,7 @@ class Axis(Machine):
     def with_additions(self, additions: Sequence[Addition]) -> "Axis":
         config = self.config
         for a in additions:
-            timing = (
-                {"loop_s": 0.0} if a.base.get("loop_s", 0.0) < SHORTEST_STEP_S else {}
-            )  # faster than a step
-            config = config.with_numbers({**a.base, **timing}).with_effects(a.effects)
+            config = config.with_numbers(a.base).with_effects(a.effects)
         return dataclasses.replace(self, config=config)
 
 

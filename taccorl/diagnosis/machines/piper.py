@@ -213,7 +213,7 @@ class PiperTwin(Machine):
             pads.set_numbers(config, pads.agreed(of_pads))
         for a in additions:
             if a.base and a.part in _SIGNALS:
-                joints.set_numbers(config, a.part, a.base, a.intervals)
+                joints.set_numbers(config, a.part, a.base)
             for effect in a.effects:
                 joints.add_effect(config, effect)
         return PiperTwin(config, self.name)

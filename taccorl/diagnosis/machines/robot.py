@@ -769,14 +769,8 @@ class RobotMachine(Machine):
             if half_s > 0.0:
                 numbers["loop_hz"] = 0.5 / half_s
             if "speed_delay_s" in a.base:  # in the file beyond a whole period
-                low, high = a.intervals["speed_delay_s"]
-                sure = low > half_s or high < half_s
-                new.append(
-                    make_effect(
-                        "speed_delay",
-                        delay_s=(float(a.base["speed_delay_s"]) - half_s) * sure,
-                    )
-                )
+                delay_s = float(a.base["speed_delay_s"]) - half_s
+                new.append(make_effect("speed_delay", delay_s=delay_s))
             kept = [e for e in config.effects if e.name not in {n.name for n in new}]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]
             robot = robot.with_joint(

@@ -181,7 +181,7 @@ class AxisProblem(WithoutMaps):
     def numbers(self) -> str:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         names = [
-            f.name for f in self.base if not f.held and f.unless not in self.present
+            f.name for f in self.base if not (f.held or {*f.unless} & {*self.present})
         ]
         stated = self.axis.gains == "commanded" and self.axis.law != "pwm"
         near = (
@@ -312,7 +312,7 @@ class AxisProblem(WithoutMaps):
                 high=max(TIMING_S, at),
                 scale=1e-4,
             )
-            found.append(dataclasses.replace(late, unless="command_delay"))
+            found.append(dataclasses.replace(late, unless=("command_delay",)))
         if axis.kd and axis.law != "effort" and (self.effort or not unknown):
             at = axis.speed_late_s
             high = max(

@@ -66,7 +66,7 @@ TORQUE_FF = Free(
     start=0.0,
     low=-40.0,
     high=40.0,
-    unless="integral_action",
+    unless=("integral_action", "position_integral"),
 )
 """Bounds of the fitted T_ref [N·m], wider than the paper's ± 8: a stiff joint with an error of 10 mrad has 18. An integral,
 which begins in balance, takes up any constant torque: beside it nothing determines T_ref."""
@@ -76,8 +76,9 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
 ``gravity_mismatch``."""
-_NOT_ON_PIPER = ("presliding", "unbalance")
-"""Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
+_NOT_ON_PIPER = ("position_integral", "presliding", "unbalance")
+"""Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them. Its loop is no
+cascade, so that the first one is ``integral_action``."""
 WEIGHS = 3.0
 """Least motion due to weight [noise floors of the angle, rms] at which it determines the scale of the torques. A choice."""
 EFFORT_SCALE = Free(
@@ -85,7 +86,13 @@ EFFORT_SCALE = Free(
 )
 """Ratio of reported effort to torque, which differs between versions of PiPER firmware."""
 SPEED_DELAY = Free(
-    name="speed_delay_s", unit="s", start=0.0, low=0.0, high=TIMING_S, scale=1e-3
+    name="speed_delay_s",
+    unit="s",
+    start=0.0,
+    low=0.0,
+    high=TIMING_S,
+    scale=1e-3,
+    leaves=True,
 )
 """τ of the effect speed_delay: how late a sampled loop damps the speed. It is fitted if something besides the inertia
 determines the scale of the torques; otherwise a change of K_p is equivalent (``taccorl.diagnosis.search.identifiable``)."""
@@ -95,7 +102,13 @@ POSITION_AGE = Free(
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
 LOOP = Free(
-    name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4
+    name="loop_s",
+    unit="s",
+    start=0.0,
+    low=0.0,
+    high=2.0 * TIMING_S,
+    scale=1e-4,
+    leaves=True,
 )
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
@@ -386,8 +399,10 @@ class JointProblem(WithoutMaps):
         )
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
-        # lower bound is a little below that value, so that a fit to such a drive does not end at the bound.
-        delay = dataclasses.replace(SPEED_DELAY, low=-0.6 * joint.speed_delay_s)
+        # lower bound is a little below that value, so that a fit to such a drive does not end at the bound. A loop below 200 Hz
+        # would have a bound that no file may state.
+        newest = max(-0.6 * joint.speed_delay_s, -SPEED_DELAY.high)
+        delay = dataclasses.replace(SPEED_DELAY, low=newest)
         units = Scale(unit=joint.unit)
         scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (
             self.effort and not self._left_out

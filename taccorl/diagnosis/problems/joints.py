@@ -239,19 +239,13 @@ def _failed(part: str, outcome: Failed, workers: int) -> Exception:
         return TaccorlError(outcome.reason.partition(": ")[2])
     killed = f": mostly for lack of memory, of which --workers=1 needs less than --workers={workers}"
     return TaccorlError(
-        f"{part}: {outcome.reason}{killed * ('SIGKILL' in outcome.reason)}; nothing was written"
+        f"{part}: {outcome.reason}{killed * ('SIGKILL' in outcome.reason)}"
     )
 
 
-def set_numbers(
-    config: TwinConfig,
-    signal: str,
-    base: Mapping[str, float],
-    intervals: Mapping[str, Sequence[float]],
-) -> None:
-    """Change ``config`` in place: write fitted gains into one arm, and the delay of the speed unless its interval contains 0.
-    Payload positions and effort scales belong to recordings, not to the twin. ``base``: fitted number → value. ``intervals``:
-    fitted number → (low, high)."""
+def set_numbers(config: TwinConfig, signal: str, base: Mapping[str, float]) -> None:
+    """Change ``config`` in place: write fitted gains into one arm, and the delay of the speed. Payload positions and effort
+    scales belong to recordings, not to the twin. ``base``: fitted number → value, each written as it was fitted."""
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(
         arm, copy.deepcopy(config.controller_of(arm))
@@ -266,17 +260,9 @@ def set_numbers(
         if name in base:
             values[k] = float(base[name])
     if "speed_delay_s" in base:
-        sure = intervals["speed_delay_s"][0] > 0.0
-        delay = make_effect(
-            "speed_delay",
-            arm=arm,
-            joints=[joint],
-            delay_s=float(base["speed_delay_s"]) * sure,
-        )
+        delay_s = float(base["speed_delay_s"])
+        delay = make_effect("speed_delay", arm=arm, joints=[joint], delay_s=delay_s)
         add_effect(config, delay)
-        config.effects = [
-            e for e in config.effects if e is not delay or not e.is_absent
-        ]
 
 
 def add_effect(config: TwinConfig, effect: Effect) -> None:

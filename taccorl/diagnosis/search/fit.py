@@ -402,7 +402,7 @@ def fit(
     every = (*problem.base, *(f for c in candidates for f in c.frees))
     absent = [f.name for f in every if f.optional and start.get(f.name, f.start) <= 0.0]
     held = {
-        f.name: f.start for f in every if f.held or f.unless in names
+        f.name: f.start for f in every if f.held or {*f.unless} & {*names}
     } | dict.fromkeys(absent, 0.0)
     frees = tuple(f for f in every if f.name not in held)
     low = np.array([f.coordinate(f.low) for f in frees])

@@ -5,7 +5,7 @@ fully: the screening (``screen``) orders the effects and drops none that physics
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,10 +40,11 @@ from taccorl.diagnosis.search.problem import (
     Values,
     chosen,
     with_held,
+    without_numbers,
 )
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe, is_likely, probe
-from taccorl.diagnosis.search.settle import settled
+from taccorl.diagnosis.search.settle import is_as_good, settled
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
 
@@ -63,6 +64,8 @@ PAST_ROW = 0.02
 """Share of a row by which a fit of a delay begins beyond a whole row."""
 NEARLY = 0.1
 """An effect counts as a simpler one if its parameter, without unit, is this close to where both agree. A choice."""
+SPEED_DELAY = "speed_delay_s"
+"""Name of the delay of a drive's speed among the fitted numbers. Beside a fitted loop period it counts half a period, too."""
 FAINT = (0.3, 3.0)
 """Fits of an optional number begin at its typical value times these factors."""
 
@@ -462,7 +465,44 @@ class Fits:
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
         if not fine.frees:
             return fine
-        problem, fine = self._without_ended(fine)
+        return self._with_intervals(*self._without_ended(fine))
+
+    def as_stated(self, model: Fit, keep: Collection[str] = ()) -> Fit:
+        """``model`` without the numbers of a drive's loop (``Free.leaves``) whose 95 % interval holds what the file has: they
+        stay as they are there, and all others are refitted. With them where the error would rise, and those in ``keep``."""
+
+        def stated(
+            name: str, values: Values
+        ) -> float:  # a speed is half a fitted period older than its delay in the file
+            later_s = 0.5 * values.get("loop_s", 0.0)
+            return self.given[name] + later_s * (name == SPEED_DELAY)
+
+        ends = model.intervals()
+        same = [
+            f.name
+            for f in model.frees
+            if f.leaves
+            and f.name not in keep
+            and ends[f.name][0] <= stated(f.name, model.values) <= ends[f.name][1]
+        ]
+        fitted = {f.name for f in model.frees}
+        held = {f.name: model.values[f.name] for f in self.problem.base}
+        held = {name: value for name, value in held.items() if name not in fitted}
+        for names in dict.fromkeys([tuple(same), *((name,) for name in same)]):
+            if not names:
+                break
+            self.progress(f"last refit with {' and '.join(names)} of the file")
+            problem = with_held(without_numbers(self.problem, names), held)
+            other = self._with_intervals(problem, self._fine(model, problem))
+            if is_as_good(other.error, model.error) and is_as_good(
+                self.error(other), self.error(model)
+            ):
+                of_file = {name: stated(name, other.values) for name in names}
+                return dataclasses.replace(other, values=other.values | of_file)
+        return model
+
+    def _with_intervals(self, problem: Problem, fine: Fit) -> Fit:
+        """``fine``, fitted with fine derivatives, with all that its intervals need, and ``settled``."""
         fine, steps = over_own_scale(problem, fine, self.fit_to)
         if self.validation:
             moved = moved_by(problem, fine, self.fit_to, self.validation, steps)

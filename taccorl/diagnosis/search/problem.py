@@ -3,10 +3,11 @@
 Letters in shapes: T rows, C channels of a recording (position and effort of a joint; taxels of a pad).
 """
 
+import contextlib
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -44,19 +45,26 @@ class Free:
     optional: bool = False
     """True: the number may be absent while its effect is there (``Effect.optional``). It is fitted from starts above 0 only, and
     otherwise stays at 0."""
-    unless: str = ""
-    """Name of an effect with the same influence on the recordings: in a fit with that effect this number is held at ``start``."""
+    leaves: bool = False
+    """True: the machine's file need not state it. Where the recordings do not tell it from what the file has, the last refit
+    leaves it out (``Fits.as_stated``)."""
+    unless: tuple[str, ...] = ()
+    """Names of effects with the same influence on the recordings: in a fit with one of them this number is held at ``start``."""
+
+    def within(self, value: float) -> float:
+        """``value`` clipped to the bounds."""
+        return min(max(value, self.low), self.high)
 
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
         ``scale``, so that a relevant change is of order 1."""
-        value = min(max(value, self.low), self.high)
+        value = self.within(value)
         return math.log(value) if self.log else value / self.scale
 
     def value(self, coordinate: float) -> float:
         """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
         raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
-        return min(max(raw, self.low), self.high)
+        return self.within(raw)
 
 
 def free(p: Parameter, cls: type[Effect]) -> Free:
@@ -82,7 +90,7 @@ def free(p: Parameter, cls: type[Effect]) -> Free:
         scale=scale,
     )
     return dataclasses.replace(
-        found, optional=optional, unless=cls.optional.get(p.name, "")
+        found, optional=optional, unless=(cls.optional.get(p.name, ""),)
     )
 
 
@@ -142,13 +150,20 @@ def candidate(
 ) -> Candidate:
     """Candidate for an effect, from its class.
 
+    Start values are clipped to the bounds of their parameters: facts of recordings may lead beyond them, as a drive that the
+    fit finds softer than the file says leads to a softer gear.
+
     Args:
         seen: facts of the recordings from which start values follow (``Effect.starts``), such as ``duration_s``.
         selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
     """
     frees = tuple(free(p, cls) for p in cls.parameters() if p.name not in selectors)
     starts = [
-        {f"{cls.name}.{k}": v for k, v in start.items() if k not in selectors}
+        {
+            f"{cls.name}.{k}": cls.clipped(k, v)
+            for k, v in start.items()
+            if k not in selectors
+        }
         for start in cls.starts(seen)
     ]
     unlike = {tuple(start.items()): start for start in starts}.values()
@@ -340,6 +355,13 @@ def with_held(problem: Problem, stated: Mapping[str, float]) -> Problem:
     return with_frees(problem, held)
 
 
+def without_numbers(problem: Problem, names: Collection[str]) -> Problem:
+    """Copy of ``problem`` in which no always fitted number is one of ``names``: they are as the machine's file has them."""
+    copied = copy.copy(problem)
+    copied.base = tuple(f for f in problem.base if f.name not in names)
+    return copied
+
+
 EFFORT_SCALE = "effort_scale"
 """Name of the ratio of recorded efforts to the true ones, that of a torque constant to the true one. Held where the inertia is
 fitted: both change alike all that efforts show."""
@@ -370,6 +392,39 @@ Progress = Callable[[str], None]
 
 class Stopped(Exception):
     """Raised by a ``Progress``: no further fit is wanted."""
+
+
+class Found(str):
+    """Text with which a search reports what it has found so far: after each accepted effect, and at its end."""
+
+    effects: Sequence[Effect]
+    """Effects of the model so far, those of the machine's file included."""
+    present: Sequence[str]
+    """Names of those of the file."""
+    base: Values
+    """The always fitted numbers."""
+    errors: Mapping[str, Mapping[str, float]]
+    """``after`` → fit, validation → RMS error [floors]."""
+    intervals: Mapping[str, tuple[float, float]]
+    """Fitted number → 95 % interval; empty before the end."""
+    finished: bool
+    """True at the end of the search."""
+
+    def __new__(cls, text: str, **facts: Any) -> "Found":
+        """``facts``: values of all attributes."""
+        found = super().__new__(cls, text)
+        vars(found).update(facts)
+        return found
+
+
+def never_stopped(report: Progress) -> Progress:
+    """``report``, for steps in which a search that has found something must not end: ``Stopped`` is ignored."""
+
+    def going_on(text: str) -> None:
+        with contextlib.suppress(Stopped):
+            report(text)
+
+    return going_on
 
 
 def no_progress(*text: str) -> None:

@@ -48,10 +48,11 @@ class Probe:
         return float(np.sqrt(np.mean(np.square(self.signature))))
 
     def scaled(self, c: Candidate) -> Values:
-        """The start of the effect ``c`` with its strength multiplied as the score test suggests."""
+        """The start of the effect ``c`` with its strength multiplied as the score test suggests, within its bounds."""
         values = {f.name: f.start for f in c.frees} | self.start
         if can_fade(c) and c.frees[0].log and self.multiple > 0:
-            values[c.frees[0].name] *= min(max(self.multiple, 0.1), 10.0)
+            strength, by = c.frees[0], min(max(self.multiple, 0.1), 10.0)
+            values[strength.name] = strength.within(by * values[strength.name])
         return values
 
 

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.diagnosis.search.changed_numbers import (
+    OF_LOOP,
     better_than_present,
     changed_numbers,
     moved_gains,
@@ -44,11 +45,13 @@ from taccorl.diagnosis.search.fits import (
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import (
     EFFORT_SCALE,
+    Found,
     Problem,
     Progress,
     Recording,
     Stopped,
     Values,
+    never_stopped,
     no_progress,
     with_other_number,
 )
@@ -130,6 +133,11 @@ def diagnose(
     rivals = beam.rivals(answer, steps)
     rounds = beam.rounds(answer, steps, rivals)
     changed, model = changed_numbers(fits, answer.fit, beam.names)
+    model = fits.as_stated(model, _named(changed))
+    changed = tuple(
+        dataclasses.replace(c, after=float(model.values.get(c.name, c.after)))
+        for c in changed
+    )
     stages = {"before": fits.as_it_was, "fitted": fits.first, "after": model}
     errors = {
         stage: fits.errors(one.values, one.effects, test)
@@ -154,7 +162,7 @@ def diagnose(
         and refusal(answer, other.base, fits.config)
     )
     standing = fits.standing_out(answer) or fits.standing_out(answer, test)
-    return Diagnosis(
+    found = Diagnosis(
         status=_status(fits, answer, changed, bool(standing)),
         standing_out=standing,
         nearest=beam.nearest(answer, standing, (*fits.fit_to, *fits.validation)),
@@ -165,7 +173,7 @@ def diagnose(
         if other and tied
         else ("", 1.0),
         present=fits.present,
-        base=_base(model),
+        base=_base(fits, model),
         start=fits.given,
         intervals=model.intervals(),
         rounds=rounds,
@@ -196,6 +204,18 @@ def diagnose(
         before=fits.first,
         after=model,
     )
+    fits.report(
+        Found(
+            f"finished: {found.words}",
+            effects=found.effects,
+            present=found.present,
+            base=found.base,
+            errors=found.errors,
+            intervals=found.intervals,
+            finished=not beam.stopped,
+        )
+    )
+    return found
 
 
 Step = tuple[Model, Model, str]
@@ -208,6 +228,7 @@ class Beam:
     def __init__(self, fits: Fits, names: Sequence[str]) -> None:
         self.fits, self.config, self.names = fits, fits.config, list(names)
         self.remarks: list[str] = []
+        self.stopped = False
 
     def result(self) -> tuple[Model, list[str], list[str]]:
         """``search``, then ``pruned``. Where the last refit of all added effects is flawed (``Fits.flaw``), the search runs again
@@ -226,18 +247,20 @@ class Beam:
         fits = self.fits
         answer = fits.base
         try:
-            for answer in self._answers():  # noqa: B007
-                pass
+            for answer in self._answers():
+                if fits.added(answer):
+                    fits.report(_found(fits, answer))
         except Stopped:
             if not (names := fits.added(answer)):
                 raise
-            fits.report = no_progress
+            self.stopped = True
             self.config = fits.config = dataclasses.replace(
                 self.config, max_effects=len(names)
             )
             self.remarks.append(
                 f"Stopped after {' and '.join(names)}: what may be beside or in place of it was not tried."
             )
+        fits.report = never_stopped(fits.report)
         return answer
 
     def _answers(self) -> Iterator[Model]:
@@ -457,7 +480,9 @@ class Beam:
             ]  # both parts of one whose rows were split
             for name, m in self._beside(answer).items():
                 at = places(self.fits.problem, m.fit, own, self.config.little)
-                found[name] = max(p.error for p in at if p.words() == worst.words())
+                here = [p.error for p in at if p.words() == worst.words()]
+                if here:  # none where a test recording stands out
+                    found[name] = max(here)
         return tuple(sorted(found.items(), key=lambda item: item[1]))
 
     def ties(self, answer: Model) -> list[Model]:
@@ -600,12 +625,14 @@ def _offers(
         fits.progress(
             f"fitting {' and '.join(names)} without the others, for add-effect"
         )
-        own = fits.finished(fits.whole((*fits.present, *names), answer.fit.values).fit)
+        own = fits.as_stated(
+            fits.finished(fits.whole((*fits.present, *names), answer.fit.values).fit)
+        )
         found.append(
             Offer(
                 added=names,
                 effects=tuple(_described(fits, own, {}, {})),
-                base=_base(own),
+                base=_base(fits, own),
                 intervals=own.intervals(),
                 errors=fits.errors(own.values, own.effects, test),
                 at_bound=tuple(f.name for f in own.ended),
@@ -615,9 +642,31 @@ def _offers(
     return found
 
 
-def _base(model: Fit) -> Values:
-    """The always fitted numbers of ``model``."""
-    return {f.name: model.values[f.name] for f in model.frees if "." not in f.name}
+def _found(fits: Fits, answer: Model) -> Found:
+    """What was found so far, before the last refit."""
+    names = " and ".join(fits.added(answer))
+    return Found(
+        f"accepted: {names}, validation error {answer.error:.2f} noise floors",
+        effects=answer.fit.effects,
+        present=fits.present,
+        base=_base(fits, answer.fit),
+        errors={"after": {"fit": answer.fit.error, "validation": answer.error}},
+        intervals={},
+        finished=False,
+    )
+
+
+def _named(changed: Sequence[Changed]) -> set[str]:
+    """Names of the fitted numbers of which ``changed`` are; ``loop_hz`` is of all numbers of a loop."""
+    names = {c.name for c in changed}
+    return names | {*OF_LOOP} if "loop_hz" in names else names
+
+
+def _base(fits: Fits, model: Fit) -> Values:
+    """The always fitted numbers of ``model``, with those that its last refit left as the file has them."""
+    names = [f.name for f in model.frees if "." not in f.name]
+    names += [f.name for f in fits.problem.base if f.leaves and not f.held]
+    return {name: model.values[name] for name in names if name in model.values}
 
 
 def _status(

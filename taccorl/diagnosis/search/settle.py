@@ -60,12 +60,12 @@ def settled(
         rms(stacked(problem, m.values, m.effects, validation)) if validation else 0.0
         for m in (model, found)
     )
-    if not (_is_as_good(found.error, model.error) and _is_as_good(after, before)):
+    if not (is_as_good(found.error, model.error) and is_as_good(after, before)):
         return model
     return dataclasses.replace(found, trouble=model.trouble, moved=model.moved)
 
 
-def _is_as_good(error: float, before: float) -> bool:
+def is_as_good(error: float, before: float) -> bool:
     """Whether an RMS error [floors] has hardly risen."""
     return error**2 - before**2 <= MOST_MORE * max(before, 1.0) ** 2
 

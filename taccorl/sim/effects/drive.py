@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 import numpy as np
 
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import (
     ArmEffect,
@@ -121,6 +122,10 @@ class IntegralAction(JointEffect):
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name in self.acts_on():
             actuator = spec.actuator(name)
+            if actuator.gaintype == mujoco.mjtGain.mjGAIN_PID:
+                raise TaccorlError(
+                    f"effect {self.name}: {name} has an integral already, and the loop of a twin has one; remove one effect"
+                )
             kp, bias = actuator.gainprm[0], actuator.biasprm.copy()
             actuator.set_to_pid(
                 kp=kp, kv=-bias[2], ki=kp * self.rate_per_s, ctrlspec=_POSITION
@@ -131,6 +136,19 @@ class IntegralAction(JointEffect):
             actuator.gear[0] *= scale
             actuator.gainprm[0] /= scale
             actuator.biasprm[:3] = [bias[0] / scale, -kp / scale, bias[2] / scale**2]
+
+
+@effect("position_integral", slot="law", needs=("target", "position"))
+class PositionIntegral(IntegralAction):
+    """Integral part of the position loop of a cascade: τ = K_d (u + …), u = K_p / K_d (e + r ∫ e dt) − q̇ with e = q* − q, where
+    ``integral_action`` is the integral of u in the speed loop.
+
+    In a loop that is no cascade both effects are the same: laws impedance and pwm of axis and robot files have only
+    ``integral_action``, and a twin in MuJoCo has one of them at a joint."""
+
+    rate_per_s: float = number(
+        "r", "1/s", 0, 1.0, (0, 100), "a choice: position loops have up to 5"
+    )
 
 
 # MuJoCo reduces an inertia, when all other effects on it are there

@@ -77,6 +77,7 @@ def test_a_lane_does_not_depend_on_the_others() -> None:
         {"load_friction__share": 0.2, "gravity_cos": 1.0},
         {"torque_lag__time_constant_s": 0.01},
         {"integral_action__rate_per_s": 2.0},
+        {"position_integral__rate_per_s": 5.0},
         {"end_stop__stiffness_nm_per_rad": 200.0, "end_stop__angle_rad": 0.2},
     ]
     drives = [Drive(**(JOINT | effect)) for effect in effects]

@@ -234,6 +234,59 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
         assert held.effort == pytest.approx(np.full(50, given), abs=2e-3)
 
 
+@pytest.mark.parametrize("speed_rate", [0.0, 15.0])
+def test_an_integral_of_the_position_of_a_cascade_is_before_its_speed_loop(
+    speed_rate: float,
+):
+    """τ = kd (u + r_s ∫ u dt), u = kp (e + 3 ∫ e dt) − q̇, alone and beside an integral of u: both hold a spring at the target."""
+    axis = AxisConfig(
+        name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0
+    )
+    numbers = {
+        "position_integral": {"rate_per_s": 3.0},
+        "integral_action": {"rate_per_s": speed_rate},
+        "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0},
+    }
+    axis.effects = tuple(EffectEntry(*one) for one in numbers.items())
+    target, total = np.where(np.arange(400) < 10, 0.0, 0.3), np.zeros(2)
+
+    def torque(goal: float, q: float, v: float) -> float:
+        total[0] += DT_S * (goal - q)
+        u = 25.0 * (goal - q + 3.0 * total[0]) - v
+        total[1] += DT_S * u
+        return 4.0 * (u + speed_rate * total[1]) - 2.0 * q
+
+    found = answer(axis, recording(target))
+    assert np.abs(found.reported - integrated(target, torque, 0.08)).max() < 1e-4
+    plain = dataclasses.replace(axis, effects=axis.effects[1:])
+    assert np.abs(answer(plain, recording(target)).reported - found.reported).max() > (
+        1e-3
+    )
+    others = (SERVO, dataclasses.replace(axis, law="impedance", effects=()))
+    assert not any(law.allows_effect("position_integral") for law in others)
+
+
+def test_an_integral_of_the_position_adds_up_what_a_sampled_cascade_knows():
+    """A loop of 1 kHz: half a period of the newest error is 10 1/s · 0.5 ms = 0.5 % of the target, 1.5 mrad of 0.3 rad."""
+    time_s, hz, rate = np.arange(600) / RATE_HZ, 1000, 10.0
+    target = 0.3 * np.sin(2 * np.pi * (0.3 + 0.3 * time_s) * time_s)
+    q = v = total = torque = before = 0.0
+    truth = np.empty(len(target))
+    for step in range(len(target) * round(1 / (RATE_HZ * DT_S))):
+        row, within = divmod(step, round(1 / (RATE_HZ * DT_S)))
+        truth[row] = q if within == 0 else truth[row]
+        if step % round(1 / (hz * DT_S)) == 0:
+            speed, before = (q - before) * hz, q
+            total += (target[row] - q) / hz
+            torque = 8.0 * (20.0 * (target[row] - q + rate * total) - speed)
+        v += DT_S * torque / 0.08
+        q += DT_S * v
+    numbers = {"inertia": 0.08, "kp": 20.0, "kd": 8.0, "loop_hz": float(hz)}
+    axis = AxisConfig(name="servo", unit="rad", law="cascade", **numbers)
+    axis.effects = (EffectEntry("position_integral", {"rate_per_s": rate}),)
+    assert np.abs(answer(axis, recording(target)).reported - truth).max() < 1e-4
+
+
 @pytest.mark.parametrize("law", ["cascade", "velocity"])
 def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_the_rest(
     law,

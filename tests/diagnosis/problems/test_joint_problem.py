@@ -463,7 +463,7 @@ def test_a_sampled_loop_with_a_known_weight_is_no_effect_and_its_gains_are_found
     low, high = found.after.intervals()["kp"]
     assert low < case.values()["kp"] < high and high / low < 1.05
     new = TwinConfig()
-    set_numbers(new, case.signal, found.base, found.intervals)
+    set_numbers(new, case.signal, found.base)
     (effect,) = new.effects
     assert isinstance(effect, SpeedDelay) and effect.acts_on() == [case.signal]
     assert effect.delay_s == found.base["speed_delay_s"]
@@ -550,8 +550,8 @@ def test_an_effort_s_floor_is_at_least_what_no_smooth_curve_explains():
 def test_intervals_widen_by_what_the_other_recordings_would_move():
     """Torque of rest: θ from recordings that differ in it. Both have as many rows, so all together would fit half-way."""
     one, other = (TwinConfig() for _ in range(2))
-    set_numbers(one, SIGNAL, {"torque_ff": 1.0}, {})
-    set_numbers(other, SIGNAL, {"torque_ff": 1.2}, {})
+    set_numbers(one, SIGNAL, {"torque_ff": 1.0})
+    set_numbers(other, SIGNAL, {"torque_ff": 1.2})
     here, there = (recorded(twin, CHIRP, k) for k, twin in enumerate((one, other)))
     problem = JointProblem(
         NOMINAL, SIGNAL, Measurements((here,), validation=(there,)), effort=False
@@ -575,7 +575,7 @@ def test_with_commanded_gains_the_delay_is_found_from_a_start_of_zeros(delay_s: 
     late = make_effect("speed_delay", arm="left", joints=["joint5"], delay_s=delay_s)
     twin, robot = TwinConfig(), TwinConfig(effects=[late])
     for one in (twin, robot):  # soft gains leave room for a late speed
-        set_numbers(one, SIGNAL, {"kp": 6.0, "kd": 0.6, "torque_ff": 0.0}, {})
+        set_numbers(one, SIGNAL, {"kp": 6.0, "kd": 0.6, "torque_ff": 0.0})
     made = [
         recorded(robot, motion, k, effort=True)
         for k, motion in enumerate((CHIRP, CHIRP, VALIDATION[0], VALIDATION[1]))

@@ -295,7 +295,6 @@ def test_gains_go_to_one_arm_and_leave_the_other(tmp_path):
         twin,
         "left_joint3",
         {"kp": 500.0, "kd": 40.0, "torque_ff": -1.0, "effort_scale": 2.0},
-        {},
     )
     plain = TwinConfig().controller
     assert twin.controller == plain == twin.controller_of("right")
@@ -307,7 +306,7 @@ def test_gains_go_to_one_arm_and_leave_the_other(tmp_path):
     )
     for k in (0, 1, 3, 4, 5):
         assert left.kp_nm_per_rad[k] == plain.kp_nm_per_rad[k]
-    set_numbers(twin, "left_joint1", {"torque_ff": 0.25}, {})
+    set_numbers(twin, "left_joint1", {"torque_ff": 0.25})
     assert (left.torque_ff_nm[0], left.kp_nm_per_rad[2]) == (0.25, 500.0), (
         "the second joint keeps the first"
     )

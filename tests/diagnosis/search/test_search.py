@@ -18,7 +18,7 @@ from made_problem import (
 )
 
 from taccorl.diagnosis.search import fits
-from taccorl.diagnosis.search.problem import EFFORT_SCALE, Free, Stopped
+from taccorl.diagnosis.search.problem import EFFORT_SCALE, Found, Free, Stopped
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
@@ -114,6 +114,42 @@ def test_structure_that_no_effect_explains_or_one_recording_alone_shows_is_calle
     assert sorted(name for name, _ in nearest) == ["bump", "ripple", "square"], (
         "each once, though both parts stand out"
     )
+
+
+def test_what_only_a_test_recording_shows_is_said_and_ends_no_diagnosis():
+    """1.4 floors everywhere, √(1 + 0.098² / 0.1²), which the search may leave; and steps of 1 in the test recording."""
+    t, rng = np.arange(0.0, 10.0, 0.005), np.random.default_rng(0)
+    all_rows = {"all": (t >= 0.0, 1.0)}
+    fit, validation, test = (
+        [
+            dataclasses.replace(
+                record(k, extra=0.098 * rng.standard_normal(len(t)) + steps),
+                name=f"recording {k}",
+                regimes=all_rows,
+            )
+        ]
+        for k, steps in enumerate((0.0, 0.0, np.sign(np.sin(3.0 * t))))
+    )
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, validation, test)
+    assert found.names == () and found.status == "something_else"
+    assert [p.recording for p in found.standing_out] == ["recording 2"]
+    assert found.nearest == ()
+    told = verdict("it", found).finding
+    assert "recording 2" in told and "test recording" in told
+
+
+def test_a_search_reports_each_effect_that_it_accepts_and_its_end():
+    split, reports = made(Ripple(strength=1.0), Tone(strength=0.5)), list[Found]()
+
+    def progress(text: str) -> None:
+        if isinstance(text, Found):
+            reports.append(text)
+
+    found = diagnose(MadeProblem(Ripple, Tone, Square), *split, progress=progress)
+    named = [[e.name for e in r.effects] for r in reports]
+    assert ["ripple"] in named and named[-1] == ["ripple", "tone"]
+    assert [r.finished for r in reports] == [False] * (len(reports) - 1) + [True]
+    assert reports[-1].base == found.base and reports[-1].errors == found.errors
 
 
 def test_effects_that_the_twin_has_are_refitted_and_stay():
@@ -425,6 +461,8 @@ def test_a_stopped_search_keeps_the_effects_of_its_rounds():
     assert found.errors["after"]["test"] == pytest.approx(3.7, abs=0.1)
     assert found.remarks[0].startswith("Stopped after ripple")
     assert diagnosed("never").names == ("ripple", "tone")
+    late = diagnosed("last refit")
+    assert late.names == ("ripple", "tone"), "nothing more is sought then"
     with pytest.raises(Stopped):
         diagnosed("no effect added")
 
