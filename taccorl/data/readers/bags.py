@@ -30,7 +30,7 @@ from taccorl.data.recording import (
     TopicType,
     readers,
 )
-from taccorl.data.ros import Decoder, full_name, type_store, unpacked
+from taccorl.data.ros import Decoder, full_name, shipped_store, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
@@ -378,7 +378,7 @@ def _definition(
     named = [s for s in newest_first if s.value == f"ros2_{distro}"]
     known = [s for s in named or newest_first if kind in get_typestore(s).fielddefs]
     for candidate in known:
-        store = get_typestore(candidate)
+        store = shipped_store(candidate.value)
         with contextlib.suppress(Exception):
             if first is not None:
                 store.deserialize_cdr(first, kind)
