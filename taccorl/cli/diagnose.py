@@ -57,6 +57,7 @@ def run(config: DiagnoseConfig) -> int:
 
     check_folder(config.out, config.measurements)
     from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.report.compared import not_compared
     from taccorl.report.diagnosed import brief
     from taccorl.report.report import write_report
     from taccorl.report.terminal import show
@@ -96,7 +97,8 @@ def run(config: DiagnoseConfig) -> int:
                 *far_off(beside.comparison, machine.fitted_gains, beside.findings),
                 *refused,
             ]
-        )
+        ),
+        not_compared(beside.comparison),
     )
     if not parts:
         return 1

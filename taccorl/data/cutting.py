@@ -151,7 +151,25 @@ class Cutter(TimedRecording):
             self._cut_interval(
                 interval, f"episode {number}" if len(found) > 1 else "", result
             )
+        result.losses += self._lost_ends()
         return result
+
+    def _lost_ends(self) -> list[Loss]:
+        """The end of the recording that its container states and that is not there."""
+        topics = {channel.topic for channel in self.spec.channels.values()}
+        losses = []
+        for damage in self.recording.damage:
+            lacking = [topic for topic, _ in damage.missing if topic in topics]
+            if not lacking or damage.start_ns is None or damage.end_ns is None:
+                continue
+            start_ns, end_ns = map(self._common_ns, (damage.start_ns, damage.end_ns))
+            span_s = self.seconds(start_ns), self.seconds(end_ns)
+            reason = (
+                f"messages of {', '.join(lacking)} that the file counts are missing"
+            )
+            rows = (end_ns - start_ns) * self.fps // NS_PER_S
+            losses.append(Loss(*span_s, reason, rows=rows))
+        return losses[:1]
 
     def _whole(self, result: Cut) -> list[_Interval]:
         last = max(int(c.time_ns[-1]) for c in self.clocks.values())

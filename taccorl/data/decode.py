@@ -327,6 +327,13 @@ def pad_counts(found: Any, dtype: str) -> np.ndarray:
         )
     except (TypeError, ValueError) as error:
         raise RecordingError(f"not a list of counts: {error}") from error
+    if exact.dtype.kind != "b" and (exact < 0).any():
+        taxel = int(np.argmax(exact.reshape(-1) < 0))
+        text = f"counts that are not {wire.name}: {exact.reshape(-1)[taxel]:g} (taxel "
+        raise RecordingError(
+            f"{text}{taxel}) is below 0. Signed bytes (int8, `byte` of ROS 1), or counts "
+            f"above a baseline? Record raw counts, as {wire.name}"
+        )
     if not whole:
         raise RecordingError(
             f"counts that are not {wire.name} (normalised by the driver?): record raw counts"

@@ -45,7 +45,7 @@ from taccorl.lineage.store import Store
 Outcome = Literal["written", "split", "quarantined", "refused"]
 Progress = Callable[[str, int, int], None]
 """Function that is called with (recording, number of rows done, number of rows in all)."""
-RECORDING_STAGE_VERSION = 5
+RECORDING_STAGE_VERSION = 6
 DATASET_STAGE_VERSION = 5
 
 
@@ -124,7 +124,7 @@ def ingest(
     files = (
         file
         for job, entry in made
-        for file in zip(job.source.files, entry["source_digests"], strict=True)
+        for file in zip(job.source.inputs, entry["source_digests"], strict=True)
     )
     sources = [Artefact(path, digest) for path, digest in files]
     for entry in entries:
@@ -189,9 +189,9 @@ def _leave_out_twins(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> None
         if entry["outcome"] not in ("written", "split") or alike[size] == 1:
             continue
         if job.dry_run:
-            entry["source_digests"] = [digest_file(path) for path in job.source.files]
+            entry["source_digests"] = [digest_file(path) for path in job.source.inputs]
         content, digest = (
-            (tuple(entry["source_digests"]), entry["part"]),
+            (tuple(entry["source_digests"][: len(job.source.files)]), entry["part"]),
             entry["source_digests"][0][:12],
         )
         if first.setdefault(content, entry["recording"]) is not entry["recording"]:
@@ -294,7 +294,7 @@ def _stored(job: Job, progress: Progress | None, digests: list[str]) -> dict[str
         lambda config, inputs, folder: _build(job, folder, progress),
         RECORDING_STAGE_VERSION,
     )
-    inputs = [store.source(path) for path in job.source.files]
+    inputs = [store.source(path) for path in job.source.inputs]
     digests += [artefact.digest for artefact in inputs]
     artefact = store.run(
         stage, {"spec": job.spec.digest, "part": job.source.part} | job.stated, inputs

@@ -27,6 +27,7 @@ from mcap.records import (
     Metadata,
     MetadataIndex,
     Schema,
+    Statistics,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -73,6 +74,7 @@ _PARSERS: Mapping[Any, Callable[[ReadDataStream], Any]] = {
     Op.ATTACHMENT_INDEX: AttachmentIndex.read,
     Op.METADATA: Metadata.read,
     Op.METADATA_INDEX: MetadataIndex.read,
+    Op.STATISTICS: Statistics.read,
 }
 BEGINNINGS = {Op.CHUNK, Op.ATTACHMENT, Op.METADATA, Op.DATA_END}
 """Kinds of records at which reading goes on behind a damaged one in data of chunks."""
@@ -112,11 +114,17 @@ class Summary:
     proven: bool = False
     """True if the section has a CRC and agrees with it."""
     definitions: list[Schema | Channel] = field(default_factory=list)
-    has_chunks: bool = False
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    """Index records of the file's chunks, in the order of the section."""
+    statistics: Statistics | None = None
     starts: list[int] = field(default_factory=list)
     """Offsets of the file's chunks, attachments and metadata records, ascending."""
     end: int | None = None
     """Offset at which the data section ends; None without a sound footer: the file may have been cut."""
+
+    @property
+    def has_chunks(self) -> bool:
+        return bool(self.chunks)
 
     def next_start(self, offset: int) -> int | None:
         """Offset of the first indexed record at or after ``offset``; None without one."""
@@ -191,6 +199,11 @@ class McapFile:
         check_size(record.length)
         return parse(Op.CHUNK, self.body(record))
 
+    def num_indexed(self, record: Record) -> int:
+        """Number of messages that a message index lists: 16 bytes each, behind the
+        number of its channel (2) and their length (4)."""
+        return (record.length - 6) // 16
+
     def data_crc_matches(self, data_end: Record) -> bool:
         """True if the data section agrees with the CRC in its last record, or if there is none."""
         crc = int.from_bytes(self.body(data_end), "little")
@@ -257,8 +270,14 @@ class McapFile:
             crc, start = zlib.crc32(block, crc), start + len(block)
         return crc
 
-    def _read_summary(self) -> Summary:
-        """The summary, if the file has a footer and what it points to is sound."""
+    def summary_at(self, offset: int) -> Summary | None:
+        """The summary that begins at ``offset`` and not where the footer says, because
+        bytes before it are missing or too many; None if none is there."""
+        found = self._read_summary(offset)
+        return None if found.problem else found
+
+    def _read_summary(self, moved: int | None = None) -> Summary:
+        """The summary, if the file has a footer and what it points to is sound. ``moved``: offset at which it begins instead."""
         footer = self.record(self.size - _END_BYTES)
         self.file.seek(max(self.size - len(MAGIC), 0))
         if footer is None or footer.opcode != Op.FOOTER or self.file.read() != MAGIC:
@@ -266,6 +285,7 @@ class McapFile:
         start, _, crc = struct.unpack("<QQI", self.body(footer))
         if start == 0:
             return Summary(end=footer.offset)
+        start = start if moved is None else moved
         if not len(MAGIC) <= start <= footer.offset:
             return Summary("its footer points nowhere")
         if crc and self._crc(start, footer.end - 4) != crc:
@@ -291,13 +311,13 @@ class McapFile:
                 return Summary(f"unreadable at byte {offset:,}: {error}")
             if isinstance(found, Schema | Channel):
                 summary.definitions.append(found)
+            elif isinstance(found, Statistics):
+                summary.statistics = found
+            elif isinstance(found, ChunkIndex):
+                summary.chunks.append(found)
+                summary.starts.append(found.chunk_start_offset)
             elif found is not None:
-                summary.has_chunks |= record.opcode == Op.CHUNK_INDEX
-                summary.starts.append(
-                    found.chunk_start_offset
-                    if record.opcode == Op.CHUNK_INDEX
-                    else found.offset
-                )
+                summary.starts.append(found.offset)
             offset = record.end
         summary.definitions.sort(key=lambda d: isinstance(d, Channel))
         summary.starts.sort()

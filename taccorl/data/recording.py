@@ -63,9 +63,19 @@ class Damage:
     end_ns: int | None = None
     lost: bool = True
     """False if no message can be lost by it, as by a damaged index that only repeats what the data section holds."""
+    missing: tuple[tuple[str, int], ...] = ()
+    """(Topic, number of messages) that the file counts and does not hold; a topic without a name where only a sum is counted.
+    Nobody knows at which bytes they were: these are then 0 to 0."""
 
     def __str__(self) -> str:
-        return f"{Path(self.file).name} bytes {self.byte_start:,} to {self.byte_end:,}: {self.reason}"
+        name = Path(self.file).name
+        lacking = [
+            f"{n:,} of {topic}" if topic else f"{n:,}" for topic, n in self.missing
+        ]
+        more = f"; missing: {', '.join(lacking)}" if lacking else ""
+        if self.byte_end == 0:
+            return f"{name}: {self.reason}{more}"
+        return f"{name} bytes {self.byte_start:,} to {self.byte_end:,}: {self.reason}{more}"
 
 
 @dataclass(frozen=True)
@@ -75,6 +85,13 @@ class Source:
     path: Path
     files: tuple[Path, ...]
     part: str | None = None
+    beside: tuple[Path, ...] = ()
+    """Files that belong to ``files`` and are read along, such as a write-ahead log."""
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """All files that are read."""
+        return *self.files, *self.beside
 
     @property
     def name(self) -> str:
@@ -213,7 +230,7 @@ def find_sources(
     if (found := _sources_at(path, names, split_bag)) is not None:
         return found
     if path.is_dir():
-        found, left = [], []
+        found, left = [], dict[str, str]()
         for child in sorted(path.iterdir(), key=lambda p: decode.natural_key(p.name)):
             sources, why = None, ""
             try:
@@ -223,15 +240,17 @@ def find_sources(
                     raise
                 why = without_place(str(error), child)
             if sources is None and not child.name.startswith("."):
-                left.append(
-                    f"{child.name} ({why or _why_not(child, names, split_bag)})"
-                )
+                why = why or _why_not(child, names, split_bag)
+                left[child.name] = f"{child.name} ({why})"
             found += sources or []
         if found:
+            beside = {p.name for _, source in found for p in source.beside}
             if skipped is not None:
-                skipped += left
+                skipped += [text for name, text in left.items() if name not in beside]
             return found
-        raise RecordingError(f"{path}: {_why_nothing(path, names, split_bag, left)}")
+        raise RecordingError(
+            f"{path}: {_why_nothing(path, names, split_bag, [*left.values()])}"
+        )
     opens = kind.reader if (kind := sniff(path)) else None
     if opens in names or (
         reader is not None and _other_kind(path, names, split_bag) is None

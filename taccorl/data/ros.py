@@ -8,7 +8,7 @@ of frames are left out. SI units (REP 103).
 import functools
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import zstandard
@@ -119,6 +119,35 @@ def full_name(kind: str) -> str:
     return kind if kind.count("/") != 1 else kind.replace("/", "/msg/")
 
 
+def octets(types: Mapping[str, Any]) -> dict[str, Any]:
+    """rosbags' definitions of messages, with the ``byte`` of ROS 2 as what it is: an
+    octet, 0 … 255. rosbags reads it as int8, which it is in ROS 1 only."""
+
+    def as_octet(field: Any) -> Any:
+        node, content = field
+        if content[0] == "byte":
+            return node, ("uint8", *content[1:])
+        if isinstance(content[0], tuple):  # an array or a sequence of fields
+            return node, (as_octet(content[0]), *content[1:])
+        return field
+
+    return {
+        kind: (constants, [(name, as_octet(field)) for name, field in fields])
+        for kind, (constants, fields) in types.items()
+    }
+
+
+@functools.cache
+def shipped_store(distribution: str) -> Any:
+    """rosbags' type store of the messages of a ROS 2 distribution: ``ros2_humble``."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    known = get_typestore(Stores(distribution)).fielddefs
+    store.register({k: d for k, d in octets(known).items() if k not in store.fielddefs})
+    return store
+
+
 @functools.lru_cache(maxsize=256)
 def type_store(kind: str, encoding: str, definition: str, what: str = "") -> Any:
     """rosbags' type store that knows ``kind`` by a definition, named ``what``. Raises RecordingError: it does not parse."""
@@ -150,7 +179,7 @@ def type_store(kind: str, encoding: str, definition: str, what: str = "") -> Any
                 re.sub(r"(?m)^=+\s*$", "=" * 80, definition), kind
             )
         store = get_typestore(Stores.EMPTY)
-        store.register(types)
+        store.register(types if encoding == "ros1msg" else octets(types))
         store.get_msgdef(kind)
     except Exception as error:  # this topic only
         what = what or f"the bag's definition of {kind}"

@@ -234,7 +234,7 @@ def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Al
         [
             touch_motion(m, config, m.pressed)
             for m in side
-            if m.pressed is not None and pads.presses(m, arm)
+            if m.pressed is not None and pads.presses(m, arm, config)
         ]
         for side in (measurements.fit, measurements.validation)
     )

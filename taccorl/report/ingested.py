@@ -82,6 +82,8 @@ def contents(inventory: Inventory) -> Section:
         if len(inventory.source.files) > 1
         else ""
     )
+    if beside := [path.name for path in inventory.source.beside]:
+        files += f" with {', '.join(beside)}"
     known = inventory.times_known
     duration = f"{inventory.duration_s:.2f}" if known else "–"
     rows, lines = [], []

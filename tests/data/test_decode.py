@@ -285,6 +285,7 @@ def test_sixteen_bit_counts_come_little_endian_and_no_others_are_taken():
         ([0.0, float("nan"), 1.0, 0.2], "normalised by the driver"),
         ([0, 1, 2, 256], "counts that are not uint8"),
         ([0, 1, 2, -1], "counts that are not uint8"),
+        (np.array([0, -61, 2, -1], np.int8), "uint8: -61 .taxel 1. is below 0.*int8"),
         (
             [0, 1, 2],
             "3 taxels,.*sensor pad.*2×2; other layouts:.*file.*data_specs/sensors/",

@@ -23,7 +23,12 @@ import numpy as np
 
 from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.recorded import TACTILE, signal_names, signal_units
+from taccorl.alignment.measurements.recorded import (
+    pad_features,
+    pads_of,
+    signal_names,
+    signal_units,
+)
 from taccorl.alignment.measurements.tables import (
     TableSpec,
     measurement_of_columns,
@@ -34,7 +39,6 @@ from taccorl.data.episode import Episode
 from taccorl.data.origin import UNSTATED, Origin
 from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import RecordingError, TaccorlError, nearest
-from taccorl.robots import ROBOT
 
 TIME = (
     "timestamp"  # Column of a LeRobot dataset with the time of a row in its episode [s]
@@ -149,13 +153,19 @@ def from_episode(
         )
     time_s = np.arange(len(measured)) / episode.spec.fps
     touch = None
-    if TACTILE in episode.arrays:
-        counts = episode.arrays[TACTILE][first:].astype(np.int16)
-        baseline = np.asarray(episode.baselines.get(TACTILE, np.zeros(counts.shape[1])))
+    features = [key for key in pad_features(episode.spec) if key in episode.arrays]
+    if features:
+        pads = tuple(pad for key in features for pad in pads_of(episode.spec, key))
+        counts = [episode.arrays[key][first:].astype(np.int16) for key in features]
+        resting = [
+            np.asarray(episode.baselines.get(key, np.zeros(own.shape[1])))
+            for key, own in zip(features, counts, strict=True)
+        ]
         touch = Touch(
-            time_s=np.repeat(time_s[:, None], len(ROBOT.pads), axis=1),
-            counts=counts,
-            baseline=baseline,
+            time_s=np.repeat(time_s[:, None], len(pads), axis=1),
+            counts=np.concatenate(counts, axis=1),
+            baseline=np.concatenate(resting),
+            pads=pads,
         )
     ages = [
         t.age_max_s

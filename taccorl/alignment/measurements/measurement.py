@@ -8,6 +8,7 @@ Letters in shapes: T rows, J signals (of the robot: in the order of actions), N 
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -40,14 +41,64 @@ ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
 """Units of the PiPER's signals, in the order of actions."""
 
 
+@dataclass(frozen=True)
+class TouchPad:
+    """One pad of a recording."""
+
+    name: str
+    """Name in the dataset spec: the pads of an arm begin with its name, ``left_a``."""
+    shape: tuple[int, int]
+    """Numbers of rows and of columns of its taxels."""
+    gain_per_count: float = 1 / 75
+    """Normalised reading = counts above baseline × gain."""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.shape[0]}×{self.shape[1]})"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Touch:
-    """Frames of the pads at their own rate. Pads are scanned at different times, so that each has its own times."""
+    """Frames of P pads at their own rate. Pads are scanned at different times, so that each has its own times."""
 
     time_s: np.ndarray
-    """(N, 4) times [s] of the ends of each pad's scans, on the measurement's clock, in the order of ``ROBOT.pads``."""
-    counts: np.ndarray  # (N, K) int16 counts above baseline, unclipped
+    """(N, P) times [s] of the ends of each pad's scans, on the measurement's clock, in the order of ``pads``."""
+    counts: np.ndarray
+    """(N, K) int16 counts above baseline, unclipped: the taxels of one pad after
+    those of the other, row after row."""
     baseline: np.ndarray  # (K,) counts that were subtracted
+    pads: tuple[TouchPad, ...] = tuple(
+        TouchPad(name, ROBOT.pad.shape) for name in ROBOT.pads
+    )
+    """The P pads; the twin's if not given."""
+
+    def __post_init__(self) -> None:
+        num_taxels = sum(math.prod(pad.shape) for pad in self.pads)
+        shapes = self.time_s.shape[1], self.counts.shape[1], len(self.baseline)
+        if shapes != (len(self.pads), num_taxels, num_taxels):
+            pads = ", ".join(map(str, self.pads))
+            raise TaccorlError(
+                f"touch: times of {shapes[0]} pads, {shapes[1]} taxels and "
+                f"{shapes[2]} resting counts, but the pads are {pads}"
+            )
+
+    @property
+    def parts(self) -> dict[TouchPad, "Touch"]:
+        """Pad → its frames alone, in the order of ``pads``."""
+        found, first = {}, 0
+        for p, pad in enumerate(self.pads):
+            taxels = slice(first, first := first + math.prod(pad.shape))
+            found[pad] = Touch(
+                time_s=self.time_s[:, p : p + 1],
+                counts=self.counts[:, taxels],
+                baseline=self.baseline[taxels],
+                pads=(pad,),
+            )
+        return found
+
+    def without(self, known: Sequence[TouchPad]) -> list[TouchPad]:
+        """The pads that have another name or shape than each of ``known``."""
+        alike = {(pad.name, pad.shape) for pad in known}
+        return [pad for pad in self.pads if (pad.name, pad.shape) not in alike]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.measurements.measurement import UNITS, Measurement, Touch
+from taccorl.alignment.measurements.measurement import (
+    UNITS,
+    Measurement,
+    Touch,
+    TouchPad,
+)
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.data import decode
 from taccorl.data.cutting import Cutter, Unfit
@@ -33,7 +38,10 @@ from taccorl.data.spec import (
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
-TACTILE = "observation.tactile"  # key of the feature with the pads' readings
+TACTILE = "observation.tactile"  # Begin of the keys of touch
+NO_SENSOR = (
+    "no `sensor` in the dataset spec states its pads, so that it is not compared"
+)
 RATE_TOLERANCE = 0.02
 """Largest relative difference of a channel's median rate from the spec's at which the spec's rate is used; the clock drifts."""
 LONGEST_LINE = 3.0
@@ -54,7 +62,28 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
             for d in recording.damage
             if d.lost
         ]
+        found += [
+            Finding("touch_not_read", "note", key, f"{key}: {NO_SENSOR}")
+            for key in spec.features
+            if key.startswith(TACTILE) and key not in spec.target.sensors
+        ]
         return rows.measurement(_notes(recording, spec), (*found, *rows.cut_short()))
+
+
+def pad_features(spec: DatasetSpec) -> list[str]:
+    """Keys of the features with pads' newest frames, in the spec's order: those whose
+    sensor the spec states."""
+    features = spec.features
+    return [k for k in spec.sensors if k in features and features[k].history == 1]
+
+
+def pads_of(spec: DatasetSpec, key: str) -> list[TouchPad]:
+    """The pads of the feature ``key``, in its order."""
+    sensor = spec.sensors[key]
+    shape = sensor.rows, sensor.columns
+    return [
+        TouchPad(name, shape, sensor.gain_per_count) for name in spec.features[key].pads
+    ]
 
 
 def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
@@ -99,7 +128,8 @@ def _joint_channels(
     source: Source, spec: RecordingSpec
 ) -> tuple[RecordingSpec, dict[str, _Span]]:
     """The spec without pictures, with effort and velocity beside each state channel where the recording has them."""
-    wanted = [key for key in (STATE, ACTION, TACTILE) if key in spec.features]
+    keys = (STATE, ACTION, *pad_features(spec.target))
+    wanted = [key for key in keys if key in spec.features]
     names = signal_names(spec.target)
     channels = {
         c: spec.channels[c] for key in wanted for c in spec.features[key].channels
@@ -184,9 +214,10 @@ def _cutter(recording: Recording, found: list[Finding]) -> Cutter:
     try:
         return Cutter(recording)
     except Unfit as why:
-        features = {k: f for k, f in recording.spec.features.items() if k != TACTILE}
+        pads = pad_features(recording.spec.target)
+        features = {k: f for k, f in recording.spec.features.items() if k not in pads}
         text = f"touch is left out: {why}. Record a second without touch first"
-        found.append(Finding("no_baseline", "warning", TACTILE, text))
+        found.append(Finding("no_baseline", "warning", ", ".join(pads), text))
         return Cutter(
             dataclasses.replace(
                 recording, spec=dataclasses.replace(recording.spec, features=features)
@@ -340,7 +371,9 @@ class _Rows:
                 channel, held=False
             )
         raw = [self._values(c) for c in self.states]
-        touch = self._touch() if TACTILE in self.spec.features else None
+        features = pad_features(self.spec.target)
+        features = [key for key in features if key in self.spec.features]
+        touch = self._touch(features) if features else None
         source = self.cutter.recording.source
         no_clock = self.spec.reader == "hdf5"  # row k is k / rate, whenever it was
         return Measurement(
@@ -395,25 +428,33 @@ class _Rows:
             nominal_hz=self.cutter.nominal_hz(channel),
         )
 
-    def _touch(self) -> Touch:
+    def _touch(self, features: list[str]) -> Touch:
         """Frame n of the first pad, with each other pad's nearest frame; every pad keeps its own times.
         Specs take off a scan as latency, to say when a frame began; here a frame's time is the end of its scan."""
-        channels = self.spec.features[TACTILE].channels
-        scan_s = self.spec.target.sensors[TACTILE].scan_time_s
-        first = self._time_ns(channels[0])
+        sensors = self.spec.target.sensors
+        scan_s = {
+            channel: sensors[key].scan_time_s
+            for key in features
+            for channel in self.spec.features[key].channels
+        }
+        first = self._time_ns(next(iter(scan_s)))
         columns, times = [], []
-        for channel in channels:
+        for channel in scan_s:
             time_ns = self._time_ns(channel)
             after = np.clip(np.searchsorted(time_ns, first), 1, len(time_ns) - 1)
             nearer = np.where(
                 first - time_ns[after - 1] <= time_ns[after] - first, after - 1, after
             )
             columns.append(self._values(channel)[nearer])
-            times.append((time_ns[nearer] - self.grid_ns[0]) / NS_PER_S + scan_s)
-        baseline = self.cutter.baselines[TACTILE]
+            start_s = (time_ns[nearer] - self.grid_ns[0]) / NS_PER_S
+            times.append(start_s + scan_s[channel])
+        baseline = np.concatenate([self.cutter.baselines[key] for key in features])
         counts = np.concatenate(columns, axis=1) - baseline
         return Touch(
             time_s=np.stack(times, axis=1),
             counts=counts.astype(np.int16),
             baseline=baseline,
+            pads=tuple(
+                pad for key in features for pad in pads_of(self.spec.target, key)
+            ),
         )

@@ -21,9 +21,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.measurement import Measurement, TouchPad
 from taccorl.alignment.measurements.pressed import PressedObject
-from taccorl.data.sensor_spec import load_sensor_spec
+from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
 from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -173,30 +173,57 @@ def _moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
     return moved
 
 
+def twin_pads(config: TwinConfig) -> dict[str, TouchPad]:
+    """Name → pad of the twin."""
+    sensor = _sensor_spec(config)
+    shape = sensor.rows, sensor.columns
+    return {name: TouchPad(name, shape, sensor.gain_per_count) for name in ROBOT.pads}
+
+
+def lacking_pads(measurement: Measurement, config: TwinConfig, arm: str) -> str:
+    """Text: which pads of an arm the twin has and the recording has not, by name and
+    shape; empty if it has them."""
+    pads = twin_pads(config)
+    own = [pads[f"{arm}_{finger}"] for finger in ROBOT.fingers]
+    touch = measurement.touch
+    alike = [] if touch is None else [(p.name, p.shape) for p in touch.pads]
+    if touch is None or all((pad.name, pad.shape) in alike for pad in own):
+        return ""
+    recorded = ", ".join(map(str, touch.pads))
+    return f"it has {recorded}, the twin's {arm} arm has {', '.join(map(str, own))}"
+
+
+def _sensor_spec(config: TwinConfig) -> SensorSpec:
+    """Spec of the twin's pads."""
+    has_spec = hasattr(config.sensor, "spec")
+    name = config.sensor.spec if has_spec else "flexitac_v2"  # pyright: ignore[reportAttributeAccessIssue]
+    return load_sensor_spec(find_spec(name))
+
+
 def touch_motion(
     measurement: Measurement, config: TwinConfig, pressed: PressedObject
 ) -> TouchMotion:
     """Make the matched contact replay of a measurement, from its gripper openings and its pad frames. ``config``: configuration
-    of the twin, for the robot's mounts and the sensor's scan. Raises TaccorlError: there are no frames of the pads, openings or
-    joints were not measured, or the object never came near a pad."""
+    of the twin, for the robot's mounts and the sensor's scan. Raises TaccorlError: there are no frames of the pads, they are of
+    other pads than the twin's, openings or joints were not measured, or the object never came near a pad."""
     if measurement.touch is None:
         none = "the recording has no frames of the pads; record them, or remove this recording"
         raise TaccorlError(f"{measurement.name}: {none}")
-    spec = load_sensor_spec(
-        find_spec(
-            config.sensor.spec  # pyright: ignore[reportAttributeAccessIssue]
-            if hasattr(config.sensor, "spec")
-            else "flexitac_v2"
+    if lacking := lacking_pads(measurement, config, pressed.arm):
+        raise TaccorlError(
+            f"{measurement.name}: its pads are not the twin's: {lacking}; remove `pressed`"
         )
-    )
+    spec = _sensor_spec(config)
     instants_s, number = (
         scan_instants_s(spec),
         np.arange(spec.rows * spec.columns).reshape(spec.rows, spec.columns),
     )
-    slots = [ROBOT.pads.index(f"{pressed.arm}_{finger}") for finger in ROBOT.fingers]
-    stamps = measurement.touch.time_s
-    covered = (stamps[:, slots] + instants_s[0] >= measurement.time_s[0]) & (
-        stamps[:, slots] <= measurement.time_s[-1]
+    names = [f"{pressed.arm}_{finger}" for finger in ROBOT.fingers]
+    parts = {pad.name: part for pad, part in measurement.touch.parts.items()}
+    own = [parts[name] for name in names]
+    stamps = np.concatenate([part.time_s for part in own], axis=1)
+    covered = (stamps + instants_s[0] >= measurement.time_s[0]) & (
+        stamps <= measurement.time_s[-1]
     )
     frames = covered.all(axis=1)
     if frames.sum() < 10:
@@ -204,7 +231,7 @@ def touch_motion(
             f"{measurement.name}: {frames.sum()} of {len(frames)} frames of the pads lie between its first and its last row; "
             "check the clocks of pads and joints"
         )
-    stamps = stamps[frames][:, slots]
+    stamps = stamps[frames]
     moving = _Fingers(measurement, config.robot, pressed)
     times = stamps[:, :, None] + instants_s
     pose, later, earlier = (
@@ -212,13 +239,14 @@ def touch_motion(
     )
     shapes, corners_m = shapes_in_object(pressed.solids)
     layout = dataclasses.replace(ROBOT.pad, rows=spec.rows, columns=spec.columns)
-    whole = (-1, len(ROBOT.pads), *layout.shape)
+    counts = np.stack([part.counts for part in own], axis=1)
+    resting = np.stack([part.baseline for part in own])
     motion = TouchMotion(
         measurement=measurement,
-        pads=tuple(ROBOT.pads[s] for s in slots),
+        pads=tuple(names),
         time_s=stamps,
-        measured=measurement.touch.counts.reshape(whole)[frames][:, slots],
-        baseline=measurement.touch.baseline.reshape(whole)[0, slots],
+        measured=counts[frames].reshape(-1, len(own), *layout.shape),
+        baseline=resting.reshape(len(own), *layout.shape),
         object_from_pad=pose,
         velocity=(later - earlier) / (2 * _STEP_S),
         groups=as_wire(number, spec).copy(),

@@ -15,12 +15,13 @@ import shutil
 import sqlite3
 import struct
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from taccorl.data import decode
-from taccorl.data.readers.mcap import MOST_METADATA_BYTES, BagReader, bag_sources
+from taccorl.data.readers.mcap import BagReader, bag_sources
 from taccorl.data.recording import (
     Damage,
     Message,
@@ -30,14 +31,17 @@ from taccorl.data.recording import (
     TopicType,
     readers,
 )
-from taccorl.data.ros import Decoder, full_name, type_store, unpacked
+from taccorl.data.ros import Decoder, full_name, shipped_store, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
-from taccorl.data.strict_yaml import load_yaml
-from taccorl.errors import RecordingError, SpecError
+from taccorl.data.stated_counts import StatedCounts, lacking_files, metadata_of
+from taccorl.errors import RecordingError
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as BagFile
 
+WRITE_AHEAD_LOG = "-wal"  # Behind the name of an SQLite file
+WRITE_VERSION = 18  # Byte of an SQLite file that states how it is written
+WITH_LOG = 2  # … if with a write-ahead log
 FARTHEST_ID = 1 << 62
 MOST_FAULTS = 5  # Most reported results of SQLite's integrity check; a damaged page gives one for each of its cells
 EVERY_TIME = (
@@ -52,21 +56,13 @@ class Db3Reader(BagReader):
     """One SQLite bag: a file, or the files that a bag folder's metadata.yaml names."""
 
     suffixes = (".db3",)
+    logs = (WRITE_AHEAD_LOG, "-shm", "-journal")
 
     def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
         super().__init__(source, spec)
         self._topics: dict[str, TopicType] = {}
         self._decoders: dict[str, Decoder] = {}
-        self._distro: str | None = None
-        folder = source.path if source.path.is_dir() else source.path.parent
-        with contextlib.suppress(SpecError, KeyError, TypeError):
-            found = load_yaml(folder / "metadata.yaml", MOST_METADATA_BYTES)[
-                "rosbag2_bagfile_information"
-            ]
-            if {p.name for p in source.files} <= {
-                Path(n).name for n in found["relative_file_paths"]
-            }:
-                self._distro = found.get("ros_distro")
+        self._distro: str | None = metadata_of(source).get("ros_distro")
 
     def topics(self) -> dict[str, TopicType]:
         for path in self.source.files:
@@ -79,9 +75,13 @@ class Db3Reader(BagReader):
             x if x is not None else e
             for x, e in zip((query.start_ns, query.end_ns), EVERY_TIME, strict=True)
         )
+        counts: dict[Path, Counter[str]] = {}
+        last_ns, without_log = None, []
         for path in self.source.files:
             with _File(path, damage) as file:
                 names = self._learn(file)
+                counts[path] = Counter()
+                without_log += file.without_log
                 self.check_decodable(
                     {name: self._topics[name] for name in names.values()},
                     query,
@@ -90,6 +90,8 @@ class Db3Reader(BagReader):
                 asked, orphans = [i for i, name in names.items() if query.asks(name)], 0
                 for _, topic_id, log_ns, data in file.rows(asked, between):
                     orphans += topic_id not in names
+                    counts[path][names.get(topic_id, f"topic {topic_id}")] += 1
+                    last_ns = log_ns if last_ns is None else max(last_ns, log_ns)
                     if data is not None:
                         yield self._message(names[topic_id], log_ns, data, query)
                 if query.topics is not None and query.whole:
@@ -98,6 +100,15 @@ class Db3Reader(BagReader):
                     file.lost(
                         f"{orphans} messages of topics that the bag does not name"
                     )
+        log = ", ".join(without_log)
+        if query.whole:
+            way_out = f"Was {log} beside it on the robot? Copy it, too" if log else ""
+            self.compare_counts(counts, last_ns, damage, way_out)
+        if log and not metadata_of(self.source):
+            return (
+                f"SQLite {UNPROTECTED}, and nothing counts the messages: the newest "
+                f"may be in {log}, which is not here"
+            )
         return f"SQLite {UNPROTECTED}"
 
     def _message(self, topic: str, log_ns: int, data: bytes, query: Query) -> Message:
@@ -147,6 +158,8 @@ class _File:
 
     def __init__(self, path: Path, damage: list[Damage]) -> None:
         self.path, self.damage, self._sound = path, damage, len(damage)
+        self.without_log: list[str] = []
+        """Name of the write-ahead log, if the file was written with one that is not beside it."""
 
     def __enter__(self) -> "_File":
         with contextlib.ExitStack() as stack:
@@ -183,6 +196,9 @@ class _File:
             raise RecordingError(
                 f"{self.path}: is not an SQLite file: it begins with {header[:16]!r}"
             )
+        log = self.path.with_name(self.path.name + WRITE_AHEAD_LOG)
+        if header[WRITE_VERSION] == WITH_LOG and not log.is_file():
+            self.without_log = [log.name]
         page_bytes, pages = (
             struct.unpack_from(">H", header, 16)[0],
             struct.unpack_from(">I", header, 28)[0],
@@ -201,7 +217,7 @@ class _File:
         )  # immutable: no lock, no journal, no shared memory file
         unfinished = [
             p
-            for end in ("-wal", "-journal")
+            for end in (WRITE_AHEAD_LOG, "-journal")
             if (p := path.with_name(path.name + end)).is_file()
         ]
         in_writing = any(p.stat().st_size for p in unfinished)
@@ -378,7 +394,7 @@ def _definition(
     named = [s for s in newest_first if s.value == f"ros2_{distro}"]
     known = [s for s in named or newest_first if kind in get_typestore(s).fielddefs]
     for candidate in known:
-        store = get_typestore(candidate)
+        store = shipped_store(candidate.value)
         with contextlib.suppress(Exception):
             if first is not None:
                 store.deserialize_cdr(first, kind)
@@ -435,6 +451,8 @@ class Rosbag1Reader(Reader):
                         {connection.topic: _topic_type(connection)}, query, str(path)
                     )
                 # rosbags sorts by log time, which hides a clock that was set back
+                if query.whole:
+                    damage += _not_indexed(path, bag)
                 bag.indexes = {  # pyright: ignore[reportAttributeAccessIssue]
                     number: sorted(
                         _Entry._make(entry)
@@ -456,7 +474,27 @@ class Rosbag1Reader(Reader):
                     yield Message(
                         topic, log_ns, stamp_ns, value if query.reads(topic) else None
                     )
+        if query.whole:
+            damage += lacking_files(self.source)
         return f"ROS 1 {UNPROTECTED}"
+
+
+def _not_indexed(path: Path, bag: "BagFile") -> list[Damage]:
+    """Damage for messages that the infos of chunks count and that no index lists."""
+    counted: Counter[str] = Counter()
+    listed: Counter[str] = Counter()
+    times = [entry.time for entries in bag.indexes.values() for entry in entries]
+    for connection in bag.connections:
+        topic, number = connection.topic, connection.id
+        listed[topic] += len(bag.indexes[number])
+        counted[topic] += sum(
+            chunk.connection_counts.get(number, 0) for chunk in bag.chunk_infos
+        )
+    ends_ns = [chunk.end_time - 1 for chunk in bag.chunk_infos]
+    stated = StatedCounts(
+        "the list of chunks", counted, end_ns=max(ends_ns, default=None)
+    )
+    return stated.compared(path, listed, max(times, default=None))
 
 
 class _Entry(NamedTuple):

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import math
 import re
+from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +31,11 @@ from taccorl.data.recording import (
     readers,
 )
 from taccorl.data.spec import ACTION, RecordingSpec
+from taccorl.data.stated_counts import StatedCounts
 from taccorl.data.timing import NS_PER_S, check_stamps
 from taccorl.errors import RecordingError
 
+NUM_ROWS = "num_samples"  # Attribute of a demonstration of robomimic
 BLOCK_BYTES = 4 << 20  # Number of bytes that are read at once
 MOST_ROWS = 1_000_000  # Most rows of a dataset: 9 h at 30 Hz; a file of a few kB can hold any number
 FREE_ROWS = 200_000
@@ -236,7 +239,21 @@ class Hdf5Reader(Reader):
                             b"" if value is None else value
                         )  # a broken picture: who asked by its time must not wait
                     yield Message(topic, log_ns, stamp_ns, value)
+            if query.whole:
+                damage += self._lacking_rows(attributes, datasets)
             return _unprotected({topic: datasets[topic] for topic in asked})
+
+    def _lacking_rows(
+        self, attributes: dict[str, Any], datasets: dict[str, h5py.Dataset]
+    ) -> list[Damage]:
+        """Damage for rows that the attribute of robomimic's demonstrations counts and
+        that no dataset holds."""
+        number = attributes.get(NUM_ROWS)
+        if not isinstance(number, int | np.integer):
+            return []
+        longest = max(map(_length, datasets.values()), default=0)
+        stated = StatedCounts(f"its attribute {NUM_ROWS}", total=int(number))
+        return stated.compared(self.source.path, Counter(rows=longest), None)
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.Group]:

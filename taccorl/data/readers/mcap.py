@@ -8,12 +8,12 @@ file without a footer.)
 import json
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from mcap.opcode import Opcode as Op
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from taccorl.data import decode
@@ -37,12 +37,18 @@ from taccorl.data.recording import (
 )
 from taccorl.data.ros import Decoder, cdr_stamp, full_name, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
-from taccorl.data.strict_yaml import load_yaml
-from taccorl.errors import RecordingError, SpecError
+from taccorl.data.stated_counts import (
+    METADATA,
+    PACKED,
+    StatedCounts,
+    added,
+    bag_counts,
+    bag_metadata,
+    lacking_files,
+    metadata_of,
+)
+from taccorl.errors import RecordingError
 
-MOST_METADATA_BYTES = (
-    1 << 20
-)  # Largest metadata.yaml of a bag that is read; rosbag2 writes 1 to 2 kB for each topic
 MAX_TIME_NS = 2**63 - 1  # Latest time that an int64 can hold [ns]
 MAX_MISFITS = 10  # Most messages of a channel without CRC that may fail to decode as damage; more: its schema is wrong
 NO_SCHEMA = "no schema"  # Type of messages of a channel without a schema
@@ -146,19 +152,55 @@ class _Definitions:
 
 
 class BagReader(Reader):
-    """Base class of the readers of MCAP and ``.db3`` files. The files of a ROS 2 bag folder are read as one recording."""
+    """Base class of the readers of MCAP and ``.db3`` files. The files of a ROS 2 bag folder are read as one recording, and what
+    its metadata.yaml counts is compared with what they hold."""
+
+    logs: ClassVar[tuple[str, ...]] = ()
+    """Endings, behind a file's own, of files that belong to it."""
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         if path.is_dir():
-            return bag_sources(path, cls.suffixes[0], split_bag=split_bag)
-        return super().sources(path, split_bag=split_bag)
+            found = bag_sources(path, cls.suffixes[0], split_bag=split_bag)
+        else:
+            found = super().sources(path, split_bag=split_bag)
+        return found and [
+            replace(source, beside=cls._beside(source)) for source in found
+        ]
+
+    @classmethod
+    def _beside(cls, source: Source) -> tuple[Path, ...]:
+        named = [p.with_name(p.name + end) for p in source.files for end in cls.logs]
+        if metadata_of(source):
+            named.append(source.files[0].with_name(METADATA))
+        return tuple(path for path in named if path.is_file())
+
+    def compare_counts(
+        self,
+        found: dict[Path, Counter[str]],
+        last_ns: int | None,
+        damage: list[Damage],
+        way_out: str = "",
+    ) -> None:
+        """Add to ``damage`` what metadata.yaml counts and what is not there.
+
+        Args:
+            found: file → topic → number of messages that were read.
+            last_ns: greatest log time of all [ns]; None without messages.
+            way_out: text with the remedy.
+        """
+        counted = lacking_files(self.source)
+        for stated, files in bag_counts(self.source):
+            there: Counter[str] = sum((found[p] for p in files), Counter())
+            counted += stated.compared(files[0], there, last_ns, way_out)
+        added(counted, damage)
 
 
 def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
     """A rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers with ``split_bag``; None if
     ``path`` is no such folder. Raises RecordingError: a file is compressed, or metadata.yaml is damaged or differs."""
-    if packed := sorted(path.glob(f"*{suffix}.zstd")):
+    packed = sorted(path.glob(f"*{suffix}{PACKED}"))
+    if packed := [p for p in packed if not p.with_suffix("").is_file()]:
         raise RecordingError(
             f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`"
         )
@@ -166,18 +208,10 @@ def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | N
         (p for p in path.iterdir() if p.suffix == suffix),
         key=lambda p: decode.natural_key(p.name),
     )
-    index = path / "metadata.yaml"
+    index = path / METADATA
     if not files or not index.is_file():
         return [Source(path, tuple(files))] if files and split_bag else None
-    try:
-        names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"][
-            "relative_file_paths"
-        ]
-        named = [path / Path(n).name for n in names]
-    except (SpecError, KeyError, TypeError) as error:
-        raise RecordingError(
-            f"{index}: no metadata file of rosbag2 ({type(error).__name__}: {error})"
-        ) from error
+    named = [path / name for name in bag_metadata(path)["relative_file_paths"]]
     if absent := [p.name for p in named if not p.is_file()]:
         raise RecordingError(
             f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag"
@@ -213,6 +247,10 @@ class McapReader(BagReader):
         for file in files:
             yield from file.messages()
         self._whole |= query.whole
+        if query.whole:
+            found = {file.path: file.by_topic for file in files}
+            ends = [file.last_ns for file in files if file.last_ns is not None]
+            self.compare_counts(found, max(ends, default=None), damage)
         without = any(file.unprotected for file in files)
         return (
             "its recorder wrote messages without a CRC: changed bytes are read as values"
@@ -233,6 +271,20 @@ class _File:
         self.orphans = self.timeless = self.unchunked = self.unprotected = 0
         self.data_end: Record | None = None
         self.after_lost: int | None = None
+        self.counts: Counter[int] = Counter()  # Channel → number of messages read
+        self.last_ns: int | None = None  # Greatest log time of these [ns]
+        self.chunks: set[int] = set()  # Offsets of the chunks that were found
+        self.num_indexed = 0  # Number of messages that the indexes of chunks list
+        self.num_metadata = 0
+
+    @property
+    def by_topic(self) -> Counter[str]:
+        """Topic → number of messages that were read, whichever were asked for."""
+        found: Counter[str] = Counter()
+        for number, count in self.counts.items():
+            channel = self.known.channels.get(number)
+            found[channel.topic if channel else f"channel {number}"] += count
+        return found
 
     def messages(self) -> Iterator[Message]:
         already = len(self.damage)
@@ -253,11 +305,14 @@ class _File:
                         if (message := self._message(r, proven, record)) is not None:
                             yield message
                     elif isinstance(r, Metadata):
+                        self.num_metadata += 1
                         self.reader.metadata[r.name] = dict(r.metadata)
                     else:
                         self._learn(r, proven, record)
             if self.query.whole:
                 self._check_ends(mcap, sound=len(self.damage) == already)
+                if not any(damage.lost for damage in self.damage[already:]):
+                    self._check_counts(mcap)
                 self.unprotected += (
                     self.unchunked
                     if self.data_end is None or not any(mcap.body(self.data_end))
@@ -327,6 +382,10 @@ class _File:
                 self.data_end = record
                 return
             mcap.chunked = mcap.chunked or record.opcode == Op.CHUNK
+            if record.opcode == Op.MESSAGE_INDEX:
+                self.num_indexed += mcap.num_indexed(record)
+            if record.opcode == Op.CHUNK:
+                self.chunks.add(record.offset)
             if record.opcode in (
                 Op.SCHEMA,
                 Op.CHANNEL,
@@ -411,6 +470,40 @@ class _File:
         )
         return found, chunk.uncompressed_crc != 0
 
+    def _check_counts(self, mcap: McapFile) -> None:
+        """Compare what the file's index and statistics state with what was read."""
+        summary, moved = mcap.summary, None
+        if summary.problem and self.data_end is not None:
+            moved = mcap.summary_at(self.data_end.end)
+            summary = moved or summary
+        times_ns = {self.reader.chunk_times.get((self.path, c)) for c in self.chunks}
+        for index in summary.chunks:
+            own_ns = index.message_start_time, index.message_end_time
+            is_there = moved is not None or index.chunk_start_offset in self.chunks
+            other = summary.proven and any(own_ns) and own_ns not in times_ns
+            if other or not is_there:
+                end = index.chunk_start_offset + index.chunk_length
+                reason = "the index lists a chunk here, and there is none"
+                self._damaged(index.chunk_start_offset, end, reason, index)
+        found = self.by_topic
+        stated = [StatedCounts("its index", total=self.num_indexed)]
+        if (statistics := summary.statistics) is not None:
+            topics: Counter[str] = Counter()
+            for number, count in statistics.channel_message_counts.items():
+                channel = self.known.channels.get(number)
+                topics[channel.topic if channel else f"channel {number}"] += count
+            total, end_ns = statistics.message_count, statistics.message_end_time
+            own = StatedCounts("its statistics record", topics, total, end_ns)
+            stated.insert(0, own)
+            if (number := statistics.metadata_count) > self.num_metadata:
+                reason = f"its statistics record counts {number} metadata records, "
+                reason += f"{self.num_metadata} are there"
+                self._damaged(0, mcap.size, reason)
+        damage = [
+            d for part in stated for d in part.compared(self.path, found, self.last_ns)
+        ]
+        self.damage += damage[:1]  # they state the same thing
+
     def _check_ends(self, mcap: McapFile, *, sound: bool) -> None:
         if self.data_end is None:
             return
@@ -428,6 +521,9 @@ class _File:
 
     def _message(self, m: McapMessage, proven: bool, place: Record) -> Message | None:
         channel = self.known.channels.get(m.channel_id)
+        self.counts[m.channel_id] += 1
+        if m.log_time <= MAX_TIME_NS:
+            self.last_ns = max(m.log_time, self.last_ns or 0)
         if channel is not None and not self.query.asks(channel.topic):
             return None
         with_schema = channel is not None and (
@@ -519,7 +615,7 @@ class _File:
         start: int,
         end: int,
         reason: str,
-        chunk: Chunk | None = None,
+        chunk: Chunk | ChunkIndex | None = None,
         *,
         lost: bool = True,
     ) -> None:

@@ -32,6 +32,7 @@ from taccorl.alignment.measurements.noise_floor import (
 )
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.alignment.touch.model import TouchModel
+from taccorl.alignment.touch.motion import lacking_pads, twin_pads
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.replays import (
     BENCH_REST,
@@ -108,6 +109,7 @@ def compare(
     if any(m.touch is not None for m in every):
         touches, why_not = _touches(config, uses, pressed)
         left_out += why_not
+    left_out += _not_read(every)
     if not traces and not touches:
         why = "; ".join(left_out) or "no position was measured"
         raise TaccorlError(
@@ -221,8 +223,14 @@ def compare_joints(
         traces=tuple(traces),
         split=measurements.record(),
         clock=beside_onsets(clock),
-        left_out=tuple(
-            f"{s}: {file} does not name it under joints" for s in sorted(held)
+        left_out=(
+            *(f"{s}: {file} does not name it under joints" for s in sorted(held)),
+            *(
+                f"touch of {m.name}: {file} has no pads"
+                for m in every
+                if m.touch is not None
+            ),
+            *_not_read(every),
         ),
     )
 
@@ -326,17 +334,68 @@ def traces_of(
     return found
 
 
+def _not_read(measurements: Sequence[Measurement]) -> list[str]:
+    """Touch of recordings that was not read, with the reasons."""
+    return [
+        f"touch of {m.name}: {f.text}"
+        for m in measurements
+        for f in m.findings
+        if f.check == "touch_not_read"
+    ]
+
+
+def _other_pads(m: Measurement, config: TwinConfig) -> list[str]:
+    """Text: pads of a recording that the twin does not have; empty if there are none."""
+    pads = twin_pads(config).values()
+    others = [] if m.touch is None else m.touch.without(list(pads))
+    if not others:
+        return []
+    listed, twins = (", ".join(map(str, some)) for some in (others, pads))
+    return [f"the twin has no pads {listed}; it has {twins}"]
+
+
+def _arms_with_pads(m: Measurement, config: TwinConfig) -> list[str]:
+    """Arms of which the recording has the twin's pads."""
+    if m.touch is None:
+        return []
+    return [arm for arm in ROBOT.arms if not lacking_pads(m, config, arm)]
+
+
+def _pad_floors(
+    measurements: Sequence[Measurement], config: TwinConfig
+) -> dict[str, np.ndarray] | None:
+    """Name of a pad of the twin → (R, C) noise of its taxels [counts]; None if that of
+    a recorded pad is not known."""
+    floors = {}
+    for name, pad in twin_pads(config).items():
+        parts = [
+            dataclasses.replace(m, touch=part)
+            for m in measurements
+            if m.touch is not None
+            for own, part in m.touch.parts.items()
+            if (own.name, own.shape) == (pad.name, pad.shape)
+        ]
+        if not parts:
+            continue
+        if (floor := touch_floor(parts)) is None:
+            return None
+        floors[name] = floor.reshape(pad.shape)
+    return floors
+
+
 def _touches(
     config: TwinConfig,
     uses: Sequence[tuple[Use, Measurement]],
     pressed: PressedObject | None,
 ) -> tuple[list[TouchTrace], list[str]]:
     """Matched contact replays, and why there are none of some recordings."""
-    felt: list[tuple[Use, Measurement]] = [
-        (use, m) for use, m in uses if m.touch is not None
+    why_not = [
+        f"touch of {m.name}: {line}" for _, m in uses for line in _other_pads(m, config)
     ]
+    arms = {m.name: _arms_with_pads(m, config) for _, m in uses}
+    felt: list[tuple[Use, Measurement]] = [(use, m) for use, m in uses if arms[m.name]]
     unknown = [m.name for _, m in felt if m.pressed is None and pressed is None]
-    found, why_not = [], []
+    found = []
     if unknown:
         why_not.append(
             f"touch of {', '.join(unknown)}: what was pressed is not known; say it: `pressed` in measurements.yaml, or "
@@ -345,15 +404,16 @@ def _touches(
     if len(unknown) == len(felt):
         return found, why_not
     model, sensor = TouchModel(config), TouchModel(config).sensor
-    floor = touch_floor([m for _, m in felt])
-    if floor is None:
-        return [], [
-            f"touch of {', '.join(m.name for _, m in felt)}: too few frames for a noise floor"
-        ]
-    floor = floor.reshape(len(ROBOT.pads), model.spec.rows, model.spec.columns)
+    floors = _pad_floors([m for _, m in felt], config)
+    if floors is None:
+        names = ", ".join(m.name for _, m in felt)
+        return [], [*why_not, f"touch of {names}: too few frames for a noise floor"]
     for use, m in felt:
         solid = m.pressed or pressed
         if solid is None:
+            continue
+        if lacking := lacking_pads(m, config, solid.arm):
+            why_not.append(f"touch of {m.name}: {lacking}")
             continue
         try:
             motion = matched_contact(m, config, solid)
@@ -373,7 +433,7 @@ def _touches(
                 time_s=motion.time_s,
                 measured=motion.measured,
                 replayed=model.counts(motion, reading),
-                floor=floor[[ROBOT.pads.index(pad) for pad in motion.pads]],
+                floor=np.stack([floors[pad] for pad in motion.pads]),
                 origin=m.origin,
                 touched=np.asarray((motion.depth()[0] > 0).any(axis=(2, 3))),
             )

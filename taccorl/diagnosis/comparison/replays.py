@@ -26,8 +26,10 @@ from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
+CONTACT_READING = 0.4
+"""Normalised reading of a taxel above which it is in contact: λ_f (paper Table 3)."""
 CONTACT_COUNTS = 30.0
-"""Counts of a taxel above which it is in contact: λ_f = 0.4 (paper Table 3) at the data spec's 75 counts per reading of 1."""
+"""λ_f of the twin's pads, at the data spec's 75 counts per reading of 1."""
 DEEP_M, FELT_COUNTS = 2e-4, 1.0
 """Taxels at least this deep in an object [m] must read at least so many counts on average."""
 START_S = 0.1
@@ -129,22 +131,25 @@ def _start(m: Measurement) -> np.ndarray:
 
 
 def in_contact(m: Measurement) -> np.ndarray:
-    """(T, arms) bool: a pad of the arm is in contact at the time of each row; False without pads."""
+    """(T, arms) bool: a pad of the arm is in contact at the time of each row; False without pads. A pad whose name begins
+    with no arm's counts for each arm that was measured."""
+    found = np.zeros((m.num_rows, len(ROBOT.arms)), dtype=bool)
     if m.touch is None:
-        return np.zeros((m.num_rows, len(ROBOT.arms)), dtype=bool)
-    pads = len(ROBOT.pads)
-    beyond = np.asarray(
-        (m.touch.counts.reshape(len(m.touch.counts), pads, -1) > CONTACT_COUNTS).any(
-            axis=2
-        )
-    )
-    felt = [
-        np.interp(m.time_s, m.touch.time_s[:, p], beyond[:, p]) > 0.5
-        for p in range(pads)
-    ]
-    return np.asarray(
-        np.reshape(felt, (len(ROBOT.arms), len(ROBOT.fingers), -1)).any(axis=1)
-    ).T
+        return found
+    signals = zip(m.signals, m.measured.T, strict=True)
+    measured = {
+        signal.split("_", 1)[0]
+        for signal, values in signals
+        if any(np.isfinite(values))
+    }
+    for pad, frames in m.touch.parts.items():
+        gate_count = CONTACT_READING / pad.gain_per_count
+        beyond = (frames.counts > gate_count).any(axis=1)
+        at_rows = np.interp(m.time_s, frames.time_s[:, 0], beyond) > 0.5
+        named = {arm for arm in ROBOT.arms if pad.name.startswith(f"{arm}_")}
+        arms = [arm in (named or measured) for arm in ROBOT.arms]
+        found |= at_rows[:, None] & arms
+    return found
 
 
 def matched_contact(

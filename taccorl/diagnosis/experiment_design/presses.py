@@ -290,7 +290,7 @@ def _known(
     found = [
         matched_contact(m, config, m.pressed)
         for m in measurements.fit
-        if presses(m, arm) and m.pressed is not None
+        if presses(m, arm, config) and m.pressed is not None
     ]
     if not found:
         raise TaccorlError(

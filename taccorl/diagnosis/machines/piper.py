@@ -16,6 +16,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, unit_of
 from taccorl.alignment.measurements.motions import TORQUE_NM, joint_number
 from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.alignment.touch.motion import lacking_pads
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.comparison.result import Comparison
@@ -112,12 +113,19 @@ class PiperTwin(Machine):
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
         found = [
             *joints.swept_joints(measurements),
-            *map(pads.part_of, pads.pressed_arms(measurements)),
+            *map(pads.part_of, pads.pressed_arms(measurements, self.config)),
         ]
         if not found:
+            lacking = [
+                f"; {m.name} presses pads that the twin has not: {text}"
+                for m in measurements.fit
+                if m.pressed is not None
+                if (text := lacking_pads(m, self.config, m.pressed.arm))
+            ]
             raise TaccorlError(
                 "no fit recording moves a joint by 2 mrad or more, or states what pads pressed; record sweeps or presses "
                 "(taccorl excite plans both), and for presses state `pressed` in measurements.yaml"
+                + "".join(lacking[:1])
             )
         return tuple(found)
 

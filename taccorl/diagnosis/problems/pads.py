@@ -10,7 +10,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.touch.motion import TouchMotion
+from taccorl.alignment.touch.motion import TouchMotion, lacking_pads
 from taccorl.diagnosis.comparison.replays import matched_contact
 from taccorl.diagnosis.problems.touch_problem import (
     GainStatistics,
@@ -43,15 +43,19 @@ def part_of(arm: str) -> str:
     return f"{arm} pads"
 
 
-def presses(m: Measurement, arm: str) -> bool:
-    """True if the recording states which object the pads of this arm pressed (``pressed`` in measurements.yaml)."""
-    return m.pressed is not None and m.pressed.arm == arm
+def presses(m: Measurement, arm: str, config: TwinConfig) -> bool:
+    """True if the recording states which object the pads of this arm pressed (``pressed`` in measurements.yaml), and these are
+    pads that the twin has."""
+    stated = m.pressed is not None and m.pressed.arm == arm
+    return stated and not lacking_pads(m, config, arm)
 
 
-def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
+def pressed_arms(measurements: Measurements, config: TwinConfig) -> tuple[str, ...]:
     """Names of the arms for which at least one fit recording states which object their pads pressed."""
     return tuple(
-        arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit)
+        arm
+        for arm in ROBOT.arms
+        if any(presses(m, arm, config) for m in measurements.fit)
     )
 
 
@@ -74,7 +78,7 @@ def diagnose_arm(
         TaccorlError: no fit recording states it, or no matched contact replay of the same pads can be made.
     """
     uses: dict[str, tuple[Measurement, ...]] = {
-        use: tuple(m for m in getattr(measurements, use) if presses(m, arm))
+        use: tuple(m for m in getattr(measurements, use) if presses(m, arm, config))
         for use in ("fit", "validation", "test")
     }
     if not uses["fit"]:

@@ -132,7 +132,7 @@ def test_an_effect_that_the_twin_has_on_these_pads_is_refitted_and_replaced(
 def test_pads_of_both_arms_are_found_and_each_by_itself(measured: Measurements):
     alone = measured.fit[0]
     both = Measurements((alone, on_the_right(alone)))
-    assert pressed_arms(both) == ("left", "right")
+    assert pressed_arms(both, TwinConfig()) == ("left", "right")
     found = diagnose_parts(
         PiperTwin.nominal(),
         ("left pads", "right pads"),
