@@ -17,17 +17,14 @@ FROM_EFFORTS = (
 )
 """Checks of efforts, which say nothing where the sign is lost."""
 FROM_POSITIONS = (
-    *("not_finite", "unit", "reversed", "measured_before_command", "blocked"),
-    *("beyond_limits", "start_offset", "moving_start", "late_answer"),
+    *("not_finite", "unit", "reversed", "measured_before_command", "late_answer"),
+    *("blocked", "beyond_limits", "start_offset", "exchanged_target", "velocity_unit"),
 )
+"""Checks of positions, likewise."""
 
 
-@check(
-    "error",
-    "unsigned_register",
-    needs="rows",
-    explains=(*FROM_EFFORTS, *FROM_POSITIONS),
-)
+@check("error", "unsigned_effort", needs="rows", explains=FROM_EFFORTS)
+@check("error", "unsigned_position", explains=(*FROM_EFFORTS, *FROM_POSITIONS))
 def check_registers(t: Trial) -> Iterator[Finding]:
     """Find columns that jump by nearly a power of two of their own step at every change of sign."""
     for own in t.m.registers:
@@ -46,7 +43,8 @@ def unsigned_register(own: UnsignedColumn, why: str) -> Finding:
         f"{own.quantity} of {own.signal} is a register read without its sign ({own.register.words()}): {why}. Write "
         f"`{own.line}` into a columns file, which reads the numbers with their sign"
     )
-    return find("unsigned_register", own.signal, text)
+    name = "unsigned_effort" if own.quantity == "tau" else "unsigned_position"
+    return find(name, own.signal, text)
 
 
 def without_unsigned(

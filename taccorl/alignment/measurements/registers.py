@@ -110,8 +110,9 @@ def _steps(numbers: np.ndarray) -> set[float]:
 
 def _candidates(numbers: np.ndarray) -> Iterator[Register]:
     """Registers that can hold all ``numbers`` (T,), by the steps between them: those with an upper half in use."""
+    kinds: dict[Key, tuple[int, ...]] = {"sign_bit": SIGN_BITS, "wraps_at": WIDTHS}
     for step in sorted(_steps(numbers)):
-        for key, bits in (("sign_bit", SIGN_BITS), ("wraps_at", WIDTHS)):
+        for key, bits in kinds.items():
             for bit in bits:
                 register = Register(key, float(f"{step * 2.0**bit:.12g}"))
                 upper = numbers >= register.least_negative

@@ -168,10 +168,9 @@ class Column:
     @property
     def register(self) -> Register | None:
         """Register whose unsigned numbers the column holds; None: they are signed."""
-        for key, value in (("sign_bit", self.sign_bit), ("wraps_at", self.wraps_at)):
-            if value is not None:
-                return Register(key, value)
-        return None
+        if self.sign_bit is not None:
+            return Register("sign_bit", self.sign_bit)
+        return None if self.wraps_at is None else Register("wraps_at", self.wraps_at)
 
     def wrong_register(self) -> str:
         """What is wrong with ``sign_bit`` and ``wraps_at``; empty if nothing is."""

@@ -1,5 +1,6 @@
 """Registers that were logged without their sign: found in tables of every form, read by the line that is printed."""
 
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -7,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
 from taccorl.alignment.checks.telemetry import check_measurement, one_cause
+from taccorl.alignment.machines.robot_file import JointConfig
 from taccorl.alignment.measurements.registers import Register, find_registers
 from taccorl.alignment.measurements.tables import load_table_spec, read_table
 from taccorl.errors import RecordingError, SpecError
@@ -96,9 +99,7 @@ def test_the_printed_line_reads_the_effort(tmp_path, register, form, step, own_n
         file.write_text(columns_file({}))
         spec = load_table_spec(file)
     m = read_table(path, spec, UNITS)
-    found = {
-        f.feature: f for f in check_measurement(m) if f.check == "unsigned_register"
-    }
+    found = {f.feature: f for f in check_measurement(m) if f.check == "unsigned_effort"}
     assert found.keys() == signed.keys()
     lines = {name: re.findall("`(.*?)`", f.text)[0] for name, f in found.items()}
     if own_names:
@@ -111,7 +112,7 @@ def test_the_printed_line_reads_the_effort(tmp_path, register, form, step, own_n
         own = again.effort[:, again.column(name)]
         factor = 1.0 if own_names else 0.02
         assert own == pytest.approx(factor * step * counts, abs=1e-9)
-    assert "unsigned_register" not in [f.check for f in check_measurement(again)]
+    assert "unsigned_effort" not in [f.check for f in check_measurement(again)]
 
 
 def columns_file(lines: dict[str, str]) -> str:
@@ -138,7 +139,7 @@ def test_a_position_that_wraps_below_zero_is_named_with_its_line(tmp_path):
     file.write_text(text % ", ".join(lines))
     path = table(tmp_path, columns, "%d")
     found = check_measurement(read_table(path, load_table_spec(file)))
-    texts = [f.text for f in found if f.check == "unsigned_register"]
+    texts = [f.text for f in found if f.check == "unsigned_position"]
     lines = [re.findall("`(.*?)`", text)[0] for text in texts]
     assert [line.split(":")[0] for line in lines] == ["q", "q_target"]
     assert all("wraps_at: 65536" in line for line in lines)
@@ -156,7 +157,7 @@ def test_what_follows_from_the_lost_sign_is_not_said_beside_it(tmp_path):
     more = [find("reversed_effort", "elbow", "x"), find("effort_limit", "elbow", "x")]
     found = one_cause({m.name: [*check_measurement(m), *more]}, [m])[m.name]
     assert {f.check for f in found} & {"reversed_effort", "effort_limit"} == set()
-    assert "unsigned_register" in {f.check for f in found}
+    assert "unsigned_effort" in {f.check for f in found}
 
 
 @pytest.mark.parametrize(
@@ -200,3 +201,34 @@ def test_efforts_that_never_change_sign_are_left_to_the_machines_limits():
         "wraps_at",
     }
     assert math.isclose(found[-1][0].value, 65536)
+
+
+@pytest.mark.parametrize(
+    ("register", "numbers"), [(WRAP_16, 65527.0), (WRAP_32, 2.0**32 - 9)]
+)
+def test_minus_nine_beyond_the_limit_is_no_current(tmp_path, register, numbers):
+    counts = np.round(3 * effort(1) - 9)
+    assert counts.max() < 0 and logged(register, np.array([-9.0]))[0] == numbers
+    columns = {"elbow.q": motion(), "elbow.q_target": motion()}
+    columns["elbow.tau"] = logged(register, counts)
+    m = read_table(table(tmp_path, columns, "%d"), None, UNITS)
+    law = JointConfig(kp=20.0, kd=1.0, effort_limit=15.0)
+    (found,) = beyond_effort(law, m, "elbow", "robot.yaml")
+    assert found.check == "unsigned_effort"
+    assert f"wraps_at: {register.value:.12g}" in found.text and "mA" not in found.text
+    # 65 N·m of a large joint in mN·m, above no limit, are what they are.
+    assert beyond_effort(JointConfig(kp=20.0, kd=1.0), m, "elbow", "robot.yaml") == []
+
+
+def test_a_load_that_falls_where_its_law_asks_for_more_is_no_reversed_sign(tmp_path):
+    counts = np.round(
+        100 * effort(1) - 300
+    )  # always below 0: the column holds 1024 + …
+    columns = {"elbow.q": motion(), "elbow.q_target": motion()}
+    columns["elbow.tau"] = logged(SIGN_10, counts)
+    m = read_table(table(tmp_path, columns, "%d"), None, UNITS)
+    (found,) = reversed_effort(m, "elbow", left=0.05, fit=None)
+    assert found.check == "unsigned_effort" and "factor: -1" not in found.text
+    assert "`changes: {elbow.tau: {sign_bit: 1024}}`" in found.text
+    small = dataclasses.replace(m, registers=())
+    assert reversed_effort(small, "elbow", 0.05, None)[0].check == "reversed_effort"
