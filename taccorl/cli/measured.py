@@ -170,6 +170,7 @@ def checked(
         check_measurements,
         one_cause,
     )
+    from taccorl.alignment.checks.unsigned import without_unsigned
     from taccorl.cli.progress import LINE_EVERY_S, Steps
     from taccorl.report.terminal import show
 
@@ -200,7 +201,13 @@ def checked(
     timed = not uneven and all(
         m.period_s > 0 for m in measurements.all
     )  # else the checks above name the rows
-    own = machine.check(measurements) if timed else {}
+    signed = {
+        use: tuple(
+            without_unsigned(m, measurements.all) for m in getattr(measurements, use)
+        )
+        for use in ("fit", "validation", "test")
+    }
+    own = machine.check(dataclasses.replace(measurements, **signed)) if timed else {}
     of_sweeps = (
         "no_motion",
         "short",

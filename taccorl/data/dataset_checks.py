@@ -4,15 +4,16 @@ LeRobot finds a row's pictures by its ``timestamp``, its neighbours by ``index``
 normalises by ``meta/stats.json``. Each is compared with what it must be:
 
     timestamp = frame_index / fps       index = 0, 1, 2 … over all files       from, to = the episode's first row, last row + 1
-    statistics = those of the rows (LeRobot's quantiles are averages over episodes: only their order is checked)
+    statistics = those of the rows; quantiles may also be LeRobot's, which are averages over episodes (a note says so)
 """
 
 import itertools
 import json
 import math
+import re
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +32,13 @@ from taccorl.data.dataset import (
     numbers_of,
     write_info,
 )
-from taccorl.data.exact_statistics import known_rows, statistics_of_rows
+from taccorl.data.exact_statistics import (
+    QUANTILE_NAMES,
+    exact_stats,
+    known_rows,
+    quantile_bounds,
+    statistics_of_rows,
+)
 from taccorl.data.file_kinds import plainly
 from taccorl.data.finding import (
     Finding,
@@ -52,6 +59,9 @@ CHECKED = (
     "std",
 )  # Statistics that do not depend on how LeRobot adds them up
 STATISTICS_TOLERANCE = 1e-3  # Largest difference from the rows', as a share of the element's range: float32 sums
+NORMALISED = ("observation.state", "action")
+"""Features that policies normalise element by element."""
+QUANTILE = re.compile(r"q\d\d")  # Names of LeRobot's quantiles, q01 … q99
 
 
 class Rows(NamedTuple):
@@ -200,68 +210,111 @@ def check_statistics(dataset: Dataset) -> list[Finding]:
                 "statistics", "stats", f"meta/stats.json holds no object; {repaired}"
             )
         ]
-    findings = []
+    findings: list[Finding] = []
+    averaged: list[str] = []
+    without: dict[tuple[str, ...], list[str]] = {}
     for key, feature in dataset.info["features"].items():
         numbers, own = feature["dtype"] in STATED, key in BOOKKEEPING
         due = key not in (BOOKKEEPING if numbers else dataset.unstored) and (
             numbers or feature["dtype"] == "video"
         )
+        if key not in stats:
+            text = f"{key}: not in meta/stats.json; {_ways_out(dataset, key, numbers)}"
+            findings += [finding("statistics", key, text)] if due else []
+            continue
+        known = _known_values(dataset, key, feature) if numbers else None
+        wrong = _wrong_statistics(dataset, feature, stats[key], known)
+        if wrong is not None:
+            way_out = _ways_out(dataset, key, numbers and not wrong.rounded)
+            # LeRobot's own merge leaves its columns' stale
+            severity: Severity = "note" if own else "error"
+            text = f"{key}: {wrong.text}; {way_out}"
+            findings.append(finding("statistics", key, text, severity=severity))
+        elif known is not None and not own:
+            of_quantiles = _wrong_quantiles(dataset, stats[key], known)
+            if of_quantiles is not None and of_quantiles.rounded:
+                averaged.append(f"{key}: {of_quantiles.text}")
+            elif of_quantiles is not None:
+                text = f"{key}: {of_quantiles.text}; {_ways_out(dataset, key, True)}"
+                findings.append(finding("statistics", key, text))
+            absent = [name for name in QUANTILE_NAMES if name not in stats[key]]
+            if absent:
+                without.setdefault(tuple(absent), []).append(key)
+        if key in NORMALISED and known is not None:
+            findings += _without_spread(key, known)
+    if averaged:
         text = (
-            _wrong_statistics(dataset, key, feature, stats[key])
-            if key in stats
-            else "not in meta/stats.json" * due
+            f"{averaged[0]}: LeRobot averages the quantiles of {dataset.num_episodes} episodes, also of "
+            f"{len(averaged) - 1} other features; tactile_pi05 computes exact ones, and {repaired}"
         )
-        if text:
-            severity: Severity = (
-                "note" if own else "error"
-            )  # LeRobot's own merge leaves its columns' stale
-            computed = f"`{recompute_statistics(dataset.root.resolve())}` computes them, or {repaired}"
-            way_out = (
-                computed if numbers and not own else repaired
-            )  # of the rest LeRobot keeps what is there
-            findings.append(
-                finding(
-                    "statistics", key, f"{key}: {text}; {way_out}", severity=severity
-                )
-            )
+        findings.append(finding("averaged_quantiles", "stats", text))
+    for names, keys in without.items():
+        text = (
+            f"{listed(keys)}: meta/stats.json has no {listed(names, 5)} (datasets converted from v2.1 have none), by which "
+            f"LeRobot's π0.5 normalises: its training ends in a ValueError; {repaired}"
+        )
+        findings.append(finding("statistics", keys[0], text, severity="warning"))
     return findings
 
 
+def _ways_out(dataset: Dataset, key: str, recomputed: bool) -> str:
+    """The commands that mend statistics of ``key``; ``recomputed``: LeRobot's own command computes them, too."""
+    repaired = _repair(dataset)
+    if not recomputed or key in BOOKKEEPING:  # of the rest LeRobot keeps what is there
+        return repaired
+    computed = recompute_statistics(dataset.root.resolve())
+    return f"{repaired}; `{computed}` computes LeRobot's, in float32 and with quantiles averaged over episodes"
+
+
+class Wrong(NamedTuple):
+    """What is wrong with the statistics of one feature."""
+
+    text: str
+    rounded: bool = False
+    """True if LeRobot's own way of computing it explains it, so that LeRobot would write the same number again."""
+
+
+def _last_axis(shape: Sequence[int]) -> int:
+    """Number of elements of which LeRobot keeps statistics: of more axes the last."""
+    return shape[-1] if len(shape) > 1 else math.prod(shape)
+
+
+def _known_values(dataset: Dataset, key: str, feature: dict[str, Any]) -> np.ndarray:
+    """(N, size) values of the rows in which the feature is known."""
+    known = known_rows(feature_rows(dataset.root, key))
+    return known.reshape(-1, _last_axis(feature["shape"]))
+
+
+def _element(number: int, size: int) -> str:
+    return f" of element {number}" if size > 1 else ""
+
+
 def _wrong_statistics(
-    dataset: Dataset, key: str, feature: dict[str, Any], stats: Any
-) -> str:
-    """What is wrong with the statistics of one feature; empty if nothing is."""
+    dataset: Dataset, feature: dict[str, Any], stats: Any, known: np.ndarray | None
+) -> Wrong | None:
+    """What is wrong with the statistics of one feature besides its quantiles' values; None if nothing is. ``known``: (N, size)
+    values of all rows; None of pictures."""
     try:
         found = {name: np.asarray(stats[name], dtype=float).ravel() for name in CHECKED}
-        names = [
-            name for name in sorted(stats) if name[:1] == "q" and name[1:].isdecimal()
-        ]
+        names = [name for name in sorted(stats) if QUANTILE.fullmatch(name)]
         quantiles = [np.asarray(stats[name], dtype=float).ravel() for name in names]
     except (KeyError, TypeError, ValueError) as error:
-        return f"its statistics are not whole ({type(error).__name__}: {error})"
-    pictures, shape = feature["dtype"] in ("video", "image"), tuple(feature["shape"])
-    size = (
-        3 if pictures else shape[-1] if len(shape) > 1 else math.prod(shape)
-    )  # of more axes LeRobot keeps the last
-    numbers = not pictures and feature["dtype"] in STATED
-    known = (
-        known_rows(feature_rows(dataset.root, key)).reshape(-1, size)
-        if numbers
-        else None
-    )
+        return Wrong(f"its statistics are not whole ({type(error).__name__}: {error})")
+    pictures = feature["dtype"] in ("video", "image")
+    size = 3 if pictures else _last_axis(feature["shape"])
     if known is not None and not len(known):
-        return ""  # NaN in every row: nobody knows it
-    for name, values in found.items():
+        return None  # NaN in every row: nobody knows it
+    for name, values in (*found.items(), *zip(names, quantiles, strict=True)):
         if len(values) != size and not (
             pictures and len(values) == 1
         ):  # depth has one channel
-            return f"{name} has {len(values)} values for {size} elements"
+            return Wrong(f"{name} has {len(values)} values for {size} elements")
         if not np.isfinite(values).all():
             if known is not None and not np.isfinite(known).all():
-                return ""  # as its rows, which have a finding of their own
-            return f"{name} holds {values[~np.isfinite(values)][0]}"
+                return None  # as its rows, which have a finding of their own
+            return Wrong(f"{name} holds {values[~np.isfinite(values)][0]}")
     if (found["std"] < 0).any():
-        return f"std is negative ({found['std'].min():g})"
+        return Wrong(f"std is negative ({found['std'].min():g})")
     low, high, mean = found["min"], found["max"], found["mean"]
     tolerance = (
         STATISTICS_TOLERANCE * np.maximum(high - low, 0) + 1e-6 * np.abs(mean) + 1e-8
@@ -274,26 +327,129 @@ def _wrong_statistics(
             len(a) != len(b)
             or not (a <= b + tolerance + STATISTICS_TOLERANCE * np.abs(b)).all()
         ):
-            return "minimum, quantiles, mean and maximum are not in this order"
+            return Wrong("minimum, quantiles, mean and maximum are not in this order")
     if known is None:
-        return ""
+        return None
     count = np.asarray(stats.get("count", len(known))).ravel()
     if len(count) and int(count[0]) not in (
         len(known),
         sum(map(dataset.num_rows, range(dataset.num_episodes))),
     ):
-        return f"count is {int(count[0])}, but there are {len(known)} rows"
+        return Wrong(f"count is {int(count[0])}, but there are {len(known)} rows")
+    lengths = [*map(dataset.num_rows, range(dataset.num_episodes))]
+    per_row = len(known) // max(sum(lengths), 1)  # more than one: of more axes
+    return _wrong_moment(found, known, max(lengths) * max(per_row, 1))
+
+
+def _wrong_moment(
+    found: Mapping[str, np.ndarray], known: np.ndarray, summed: int
+) -> Wrong | None:
+    """The first of ``found`` (min, max, mean, std; (size,) each) that is not that of the rows ``known`` (N, size). Mean and
+    deviation of an element that never changes may be off by LeRobot's rounding, which is no fault.
+
+    LeRobot 0.6.1 adds up the rows of an episode in float32, ``summed`` numbers of magnitude x at most, and takes √(E[x²] − E[x]²)
+    for the deviation s. With ε = 2⁻²³: |mean error| ≤ summed ε x, |s² − σ²| ≤ 2 · summed ε x²."""
     exact = {"min": known.min(0), "max": known.max(0)}
     exact |= {"mean": known.mean(0, dtype=float), "std": known.std(0, dtype=float)}
     span = np.asarray(exact["max"], dtype=float) - exact["min"]
-    tolerance = STATISTICS_TOLERANCE * span + 1e-5 * np.abs(exact["mean"]) + 1e-7
+    largest = np.maximum(np.abs(known.max(0)), np.abs(known.min(0))).astype(float)
+    rounding = summed * float(np.finfo(np.float32).eps)
     for name, values in exact.items():
         off = np.abs(found[name] - values)
+        tolerance = _tolerance(span, exact["mean"])
+        rounded = np.zeros(len(off), dtype=bool)
+        if name == "mean":
+            rounded = off <= rounding * largest
+        if name == "std":
+            rounded = np.abs(found[name] ** 2 - values**2) <= 2 * rounding * largest**2
+        tolerance = np.where(rounded & (span == 0.0), np.inf, tolerance)
         if (off > tolerance).any():
             i = int(np.argmax(off - tolerance))
-            element = f" of element {i}" if size > 1 else ""
-            return f"{name}{element} is {found[name][i]:.6g}, of the rows {float(values[i]):.6g}"
-    return ""
+            text = f"{name}{_element(i, len(off))} is {found[name][i]:.6g}, of the rows {float(values[i]):.6g}"
+            if not rounded[off > tolerance].all():
+                return Wrong(text)
+            why = "LeRobot adds up in float32 and takes √(E[x²] − E[x]²), and its recompute_stats writes the same number again"
+            return Wrong(f"{text}: {why}", rounded=True)
+    return None
+
+
+def _tolerance(span: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Largest difference of a statistic from that of the rows, per element, (size,)."""
+    return STATISTICS_TOLERANCE * span + 1e-5 * np.abs(mean) + 1e-7
+
+
+def _wrong_quantiles(dataset: Dataset, stats: Any, known: np.ndarray) -> Wrong | None:
+    """A quantile that is not that of the rows ``known`` (N, size): first one that is not LeRobot's either, the mean of the
+    episodes' quantiles weighted by their rows."""
+    names = [name for name in sorted(stats) if QUANTILE.fullmatch(name)]
+    if not len(known) or not np.isfinite(known).all():
+        return None
+    span = known.max(0).astype(float) - known.min(0)
+    tolerance = _tolerance(span, known.mean(0, dtype=float))
+    averaged = None
+    for name in names:
+        values, share = (
+            np.asarray(stats[name], dtype=float).ravel(),
+            int(name[1:]) / 100,
+        )
+        low, high = quantile_bounds(known, share)
+        off = np.maximum(low - values, values - high) - tolerance
+        if (off <= 0.0).all():
+            continue
+        i = int(np.argmax(off))
+        exact = np.sort(known[:, i])[max(math.ceil(len(known) * share) - 1, 0)]
+        text = f"{name}{_element(i, len(off))} is {values[i]:.6g}, of the rows {float(exact):.6g}"
+        low, high = _averaged_bounds(dataset, known, share)
+        if not ((low - tolerance <= values) & (values <= high + tolerance)).all():
+            return Wrong(text)
+        averaged = averaged or Wrong(text, rounded=True)
+    return averaged
+
+
+def _averaged_bounds(
+    dataset: Dataset, known: np.ndarray, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds, (size,) each, of the mean of the episodes' quantiles, weighted by their rows; ``known`` (N, size): values of all
+    rows. Without an episode's own rows, some of which are unknown, all rows are one episode."""
+    lengths = [dataset.num_rows(k) for k in range(dataset.num_episodes)]
+    each = len(known) // max(sum(lengths), 1)  # more than one: of features of more axes
+    if each * sum(lengths) != len(known):
+        return quantile_bounds(known, share)
+    parts = np.split(known, np.cumsum(lengths)[:-1] * each)
+    bounds = [quantile_bounds(part, share) for part in parts if len(part)]
+    weights = [len(part) for part in parts if len(part)]
+    low, high = (
+        np.average(side, axis=0, weights=weights) for side in zip(*bounds, strict=True)
+    )
+    return low, high
+
+
+def _without_spread(key: str, known: np.ndarray) -> Iterator[Finding]:
+    """Elements of ``known`` (N, size) whose 1 % and 99 % quantiles are one number: a note where that is all they ever have, which
+    is no fault of the data; a warning where other numbers are rare."""
+    if len(known) < 2 or not np.isfinite(known).all():
+        return
+    stats = exact_stats(known)
+    still = stats["q01"] == stats["q99"]
+    moves = stats["max"] > stats["min"]
+    why = (
+        "and LeRobot's π0.5 divides what deviates from it by their difference, or 1e-8: the least deviation in use becomes huge. "
+        "tactile_pi05 gives such elements a finite range"
+    )
+    for name, elements in (
+        ("constant_element", still & ~moves),
+        ("rare_motion", still & moves),
+    ):
+        at = np.flatnonzero(elements)
+        if len(at):
+            share = (
+                "every row"
+                if name == "constant_element"
+                else "98 % of the rows or more"
+            )
+            each = listed([f"{i} ({stats['q01'][i]:g})" for i in at])
+            text = f"{key}: one number in {share} of element {each}: its quantiles q01 and q99 are equal, {why}"
+            yield finding(name, key, text)
 
 
 def repair(dataset: Dataset, copy: Path) -> None:
@@ -355,7 +511,8 @@ def repair(dataset: Dataset, copy: Path) -> None:
     bad = [
         k
         for k in pictures
-        if k not in stats or _wrong_statistics(dataset, k, features[k], stats[k])
+        if k not in stats
+        or _wrong_statistics(dataset, features[k], stats[k], None) is not None
     ]
     lerobot_format.restore_picture_statistics(copy, bad)
     lerobot_format.write_exact_statistics(copy)

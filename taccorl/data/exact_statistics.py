@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)  # Quantiles of LeRobot's statistics
+QUANTILE_NAMES = tuple(f"q{round(100 * q):02d}" for q in QUANTILES)
 
 
 def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
@@ -21,10 +22,28 @@ def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
             np.maximum((counts * (values - mean[:, None]) ** 2).sum(axis=1) / num, 0)
         ),
     }
-    for q in QUANTILES:  # the smallest value that a share q of them does not exceed
+    for name, q in zip(
+        QUANTILE_NAMES, QUANTILES, strict=True
+    ):  # the smallest value that a share q of them does not exceed
         reached = counts.cumsum(axis=1) >= np.ceil(np.round(q * num, 6))[:, None]
-        stats[f"q{round(100 * q):02d}"] = reached.argmax(axis=1).astype(float)
+        stats[name] = reached.argmax(axis=1).astype(float)
     return stats | {"count": num[:1]}
+
+
+def ranks(num: int, quantile: float) -> tuple[int, int]:
+    """First and last index in ``num`` sorted values that a share ``quantile`` of them may mean: LeRobot's own value, which a
+    share of them does not exceed, and its neighbours, between which others interpolate."""
+    middle = math.ceil(num * quantile) - 1
+    return max(middle - 1, 0), min(middle + 1, num - 1)
+
+
+def quantile_bounds(
+    values: np.ndarray, quantile: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest value, (size,) each, that count as this quantile of ``values`` (T, size), by ``ranks``."""
+    low, high = ranks(len(values), quantile)
+    sorted_ = np.partition(values, (low, high), axis=0)
+    return sorted_[low].astype(float), sorted_[high].astype(float)
 
 
 def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
@@ -44,13 +63,7 @@ def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
                 np.float64
             )
         )
-    names = [
-        "min",
-        "max",
-        "mean",
-        "std",
-        *(f"q{round(100 * q):02d}" for q in QUANTILES),
-    ]
+    names = ["min", "max", "mean", "std", *QUANTILE_NAMES]
     return dict(zip(names, np.concatenate(parts, axis=1), strict=True)) | {
         "count": np.array([num])
     }

@@ -97,7 +97,8 @@ CHECKS: dict[str, Severity] = {
         ),
         "note",
     ),
-    "skipped": "note",
+    **dict.fromkeys(("skipped", "constant_element", "averaged_quantiles"), "note"),
+    "rare_motion": "warning",
 }
 """Name of every check → its severity, unless the finding itself states another. Thresholds stand beside the functions."""
 

@@ -171,6 +171,8 @@ def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
             )
             cfg.num_workers = 0
         dataset, policy = make_dataset(cfg), cfg.trainable_config
+        if isinstance(policy, TactilePI05Config):
+            policy.resumed = bool(getattr(cfg, "resume", False))
         if isinstance(policy, TactilePI05Config) and policy.pretrained_path:
             policy.match_cameras(dataset.meta, cfg.rename_map or {})
         return dataset
@@ -350,6 +352,11 @@ class FastReader(DatasetReader):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         _warn_unverified(Path(self.root))
+        if self._meta.stats is None:
+            raise DatasetError(
+                f"{self.root}: meta/stats.json is absent: nothing can be normalised; `taccorl check {self.root} --repair=COPY` "
+                "writes a copy with it"
+            )
         self._cache = _requested
         self.cameras: list[str] = self._meta.video_keys if _reads_pictures else []
         """Cameras whose pictures are read."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -328,3 +329,43 @@ def test_a_recording_of_more_rows_than_a_diagnosis_replays_is_refused_with_its_n
         TaccorlError, match=r"long\.csv.*500001 rows, 500 s.*500000.*10 s"
     ):
         refuse_long(Measurements((at_rest(1000), at_rest(500_001))))
+
+
+@pytest.mark.slow
+def test_efforts_of_a_register_without_its_sign_are_read_by_the_printed_line(
+    tmp_path, said
+):
+    step = 0.02  # N·m a count; −9 counts are 1033
+    plain = sweeps(TwinConfig(), seconds=3.0)
+
+    def logged(m: Measurement) -> Measurement:
+        counts = np.round(m.effort / step)
+        assert np.nanmax(np.abs(counts)) < 1024
+        return dataclasses.replace(
+            m, effort=np.where(counts < 0, 1024 - counts, counts)
+        )
+
+    made = {
+        use: tuple(logged(m) for m in getattr(plain, use))
+        for use in ("fit", "validation", "test")
+    }
+    folder = write_folder(tmp_path / "sweeps", dataclasses.replace(plain, **made))
+    tau = f"tau: {{column: {SIGNAL}.tau, unit: Nm, factor: {step}}}"
+    both = ", ".join(
+        f"{key}: {{column: {SIGNAL}.{key}, unit: rad}}" for key in ("q", "q_target")
+    )
+    columns = tmp_path / "columns.yaml"
+    text = f"time: {{column: t, unit: s}}\nsignals: {{{SIGNAL}: {{{both}, %s}}}}\n"
+    columns.write_text(text % tau)
+    code, told = said(folder, f"--columns={columns}")
+    assert code == 1 and "factor: -1" not in told
+    line = re.search("unsigned_effort: .*?`(.*?)`", told)
+    assert line is not None
+    assert "sign_bit: 1024" in line[1]
+    columns.write_text(text % line[1])
+    code, told = said(folder, f"--columns={columns}")
+    assert code == 0 and "not compared" not in told
+    # The twin's own efforts, but for 0.05 N·m of noise and the rounding to counts: √(0.05² + 0.02² / 12).
+    words = row(told, f"{SIGNAL} effort", "fit")
+    assert words[5] == "N·m"
+    assert float(words[4]) == pytest.approx(0.0503, rel=0.1)

@@ -19,7 +19,8 @@ from small_arm import messages, write_mcap, write_spec
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
-from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
+from taccorl.data.dataset_checks import check_bookkeeping, check_statistics, repair
+from taccorl.data.exact_statistics import QUANTILE_NAMES
 from taccorl.data.finding import leave_out, recompute_statistics
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
 from taccorl.data.recording import Source, find_sources, readers
@@ -190,6 +191,12 @@ def swap_rows(root: Path) -> None:
     pq.write_table(table.take(order), path)
 
 
+def narrow_quantiles(told: dict[str, Any]) -> None:
+    action = told["action"]
+    for name in QUANTILE_NAMES:
+        action[name] = np.mean([action[name], action["mean"]], axis=0).tolist()
+
+
 TOTAL = 3 * ROWS + 3
 FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "stamps run on over the episodes": (
@@ -249,6 +256,25 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
         stats(lambda s: s["action"].update(max=[57.0, 57.0])),
         "statistics",
     ),
+    "quantiles absent": (
+        stats(lambda s: [s["action"].pop(q) for q in ("q01", "q99")]),
+        "statistics",
+    ),
+    "quantiles halfway to the mean": (stats(narrow_quantiles), "statistics"),
+    "all quantiles are the mean": (
+        stats(
+            lambda s: s["action"].update(
+                dict.fromkeys(QUANTILE_NAMES, s["action"]["mean"])
+            )
+        ),
+        "statistics",
+    ),
+    "one quantile of other rows": (
+        stats(
+            lambda s: s["observation.state"].update(q99=s["observation.state"]["q50"])
+        ),
+        "statistics",
+    ),
     "statistics of too few elements": (
         stats(lambda s: s["action"].update(mean=[0.1])),
         "statistics",
@@ -289,6 +315,41 @@ def test_a_planted_fault_is_named(faulty, name):
     assert set(found) <= {check, "statistics", "row_time", "row_index"}, (
         "nothing that is right is accused"
     )
+
+
+# By LeRobot's own writer; its deviation of 0.02 is about 2e-5, of counts near 30000 several of them, and of rows not 0 or 1.5.
+@pytest.mark.parametrize(
+    ("third", "expected"),
+    [
+        (lambda k, rng: 0.02, {"constant_element": "note"}),
+        (lambda k, rng: 1000.3, {"constant_element": "note"}),
+        (lambda k, rng: float(k == 7) / 50, {"rare_motion": "warning"}),
+        (lambda k, rng: 30000 + 1.5 * rng.normal(), {"statistics": "error"}),
+    ],
+)
+def test_what_hardly_moves_is_no_fault_but_for_lerobots_deviation(
+    tmp_path, third, expected
+):
+    rng = np.random.default_rng(3)
+
+    def state(k: int) -> np.ndarray:
+        return np.array([np.sin(k / 20), np.cos(k / 20), third(k, rng)], np.float32)
+
+    rows = [{"observation.state": state(k), "task": "put"} for k in range(200)]
+    names = {"observation.state": [*JOINTS, "third.pos"]}
+    root = write_with_lerobot(tmp_path / "d", [rows], names=names)
+    found = {f.check: f for f in check_statistics(Dataset(root))}
+    assert {f.check: f.severity for f in found.values()} == expected
+    if "statistics" in expected:  # a copy is the only way: LeRobot would write the same
+        commands = re.findall("`(.*?)`", found["statistics"].text)
+        assert [command.split()[0] for command in commands] == ["taccorl"]
+        repair(Dataset(root), tmp_path / "copy")
+        assert check_statistics(Dataset(tmp_path / "copy")) == []
+
+
+def test_lerobots_averages_of_quantiles_are_a_note(good):
+    found = [(f.check, f.severity) for f in check_statistics(Dataset(good))]
+    assert found == [("averaged_quantiles", "note")]
 
 
 def more_rows(root: Path) -> None:
@@ -423,12 +484,19 @@ def test_a_repaired_copy_is_the_good_dataset_again(good, faulty, name, tmp_path)
     assert of[0] == of[1]
 
 
-# The check prints three different repair commands; each is run on one fault.
+# The check prints a copy's command first, and for rows' numbers LeRobot's command in place; each is run.
 @pytest.mark.parametrize(
-    "name", ["statistics absent", "mean of older data", "pictures' statistics infinite"]
+    ("name", "commands"),
+    [
+        ("statistics absent", ["taccorl"]),
+        ("mean of older data", ["taccorl", "lerobot-edit-dataset"]),
+        ("quantiles halfway to the mean", ["taccorl", "lerobot-edit-dataset"]),
+        ("quantiles absent", ["taccorl"]),
+        ("pictures' statistics infinite", ["taccorl"]),
+    ],
 )
-def test_the_printed_command_mends_wrong_statistics(
-    good, name, tmp_path, monkeypatch, capsys
+def test_the_printed_commands_mend_wrong_statistics(
+    good, name, commands, tmp_path, monkeypatch, capsys
 ):
     root = shutil.copytree(good, tmp_path / "it's a set")
     FAULTS[name][0](root)
@@ -437,17 +505,13 @@ def test_the_printed_command_mends_wrong_statistics(
     line = next(
         line for line in capsys.readouterr().out.splitlines() if " statistics: " in line
     )
-    command = re.findall("`([^`]*)`", line)[0]
-    if command.startswith("taccorl "):
-        assert name in (
-            "statistics absent",
-            "pictures' statistics infinite",
-        )  # LeRobot's command leaves pictures' out
-        root = tmp_path / "copy"
-        assert main(shlex.split(command.replace("COPY", str(root)))[1:]) == 0
-    else:
+    printed = re.findall("`([^`]*)`", line)
+    assert [command.split()[0] for command in printed] == commands
+    copy = tmp_path / "copy"
+    assert main(shlex.split(printed[0].replace("COPY", str(copy)))[1:]) == 0
+    for command in printed[1:]:
         edit_dataset(command)
-    assert main(["check", str(root), "--pictures=false"]) == 0
+        assert main(["check", str(root), "--pictures=false"]) == 0
 
 
 def test_statistics_computed_anew_in_place_are_no_changed_file(

@@ -10,6 +10,7 @@ from scipy.signal import savgol_filter
 from taccorl.alignment.checks.effort_time import LawFit, law_fit
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
+from taccorl.alignment.checks.unsigned import unsigned_register
 from taccorl.alignment.checks.wiring import velocity_gain
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_model import JointModel
@@ -17,6 +18,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.alignment.measurements.registers import UnsignedColumn
 from taccorl.data.finding import Finding, listed
 
 BEYOND = (
@@ -165,6 +167,19 @@ def beyond_limits(
     return [find("beyond_limits", name, text, (row, row + 1))]
 
 
+def negative_efforts(m: Measurement, name: str) -> list[UnsignedColumn]:
+    """Registers by which all efforts of signal ``name`` are below 0 and nearer to 0 than the column's numbers; nearest first."""
+    effort = m.effort[:, m.column(name)]
+    size = float(np.nanmean(np.abs(effort))) if np.isfinite(effort).any() else 0.0
+    means = [
+        (float(np.nanmean(np.abs(own.decoded(effort)))), own)
+        for own in m.registers
+        if own.signal == name and own.quantity == "tau" and not own.changes
+    ]
+    near = [pair for pair in means if pair[0] < 0.5 * size]
+    return [own for _, own in sorted(near, key=lambda pair: pair[0])]
+
+
 @check("error", "beyond_effort")
 def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[Finding]:
     """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none. ``law``:
@@ -175,6 +190,11 @@ def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[F
     row = int(np.nanargmax(np.abs(m.effort[:, j])))
     if abs(m.effort[row, j]) <= EFFORT_BEYOND * limit:
         return []
+    for own in negative_efforts(m, name):
+        largest = float(np.nanmax(np.abs(own.decoded(m.effort[:, j]))))
+        if largest <= EFFORT_BEYOND * limit:
+            why = f"{m.effort[row, j]:.4g} {UNITS[m.units[j]][1]} are beyond its effort_limit of {limit:g}"
+            return [unsigned_register(own, why)]
     text = (
         f"{name} reports {m.effort[row, j]:.4g} {UNITS[m.units[j]][1]} at {m.time_s[row]:.3f} s, its effort_limit is {limit:g}. "
         f"Is it a current (mA), or the torque before the gear? Write the torque of one such unit at the joint as "
@@ -201,6 +221,9 @@ def reversed_effort(
     sign = 0 if fit is None else fit.sign
     if sign > 0 or (sign == 0 and left >= math.sqrt(1.0 - INERTIA_SURE**2)):
         return []
+    for own in negative_efforts(m, name):
+        if own.register.key == "sign_bit":  # the other kind keeps the sign of changes
+            return [unsigned_register(own, "it falls where its law asks for more")]
     if fit is not None and sign < 0:
         why = f"is {fit.kp:.2f} ± {fit.sd[0]:.2f} times what its law makes of target and position"
     else:

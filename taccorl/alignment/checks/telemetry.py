@@ -22,6 +22,7 @@ from taccorl.alignment.checks import (
     effort_time,
     robot,
     time_stamps,
+    unsigned,
     wiring,
 )
 from taccorl.alignment.checks.registry import (
@@ -51,7 +52,7 @@ __all__ = [
     "least_motion",
     "one_cause",
 ]
-LISTED = cells, clock, effort_time, robot, time_stamps, wiring
+LISTED = cells, clock, effort_time, robot, time_stamps, unsigned, wiring
 """Modules whose checks the list has once they are imported."""
 DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from taccorl.alignment.measurements.pressed import PressedObject
+from taccorl.alignment.measurements.registers import UnsignedColumn
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
 from taccorl.data.origin import UNSTATED, Origin
@@ -184,6 +185,8 @@ class Measurement(Stated):
     timing: tuple[
         ChannelTiming, ...
     ] = ()  # Timing of each channel's samples; empty for tables
+    registers: tuple[UnsignedColumn, ...] = ()
+    """Columns that may hold registers logged without their sign."""
     findings: tuple[Finding, ...] = ()  # Findings that were made while reading it
 
     def __post_init__(self) -> None:

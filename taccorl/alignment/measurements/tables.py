@@ -12,6 +12,7 @@ is off. Other names and units are written down in a columns file; no unit is eve
         q_target: {column: cmd_5, unit: deg}
         qd:       {column: speed_5, unit: rpm}
         tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
+        # sign_bit: 1024, of a register in sign and magnitude; wraps_at: 65536, of one in two's complement, read without its sign
         supply:   {column: volts_5, unit: V, factor: 0.1}            # of an axis or robot file with law pwm
         enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
 
@@ -26,7 +27,7 @@ file may state others: ``separator: semicolon``, ``decimal: comma``, ``encoding:
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,11 @@ import numpy as np
 from taccorl.alignment.measurements.even_rows import even_rows
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, unit_of
 from taccorl.alignment.measurements.quantisation import find_quantum
+from taccorl.alignment.measurements.registers import (
+    Register,
+    UnsignedColumn,
+    find_registers,
+)
 from taccorl.alignment.measurements.table_files import (
     SUFFIXES,
     FileForm,
@@ -119,6 +125,13 @@ _HINTS: dict[str, str] = {
     "A": _CURRENT,
     "mA": _CURRENT,
 }
+REGISTERS = ("q", "q_target", "tau")  # Columns that may be registers without their sign
+UNITS_OF_OWN = (
+    "rad",
+    "m",
+    "Nm",
+    "N",
+)  # Units of such columns in a table with own names
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
 _KINDS: dict[str, TargetKind] = {
@@ -130,7 +143,8 @@ _KINDS: dict[str, TargetKind] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column of the table, with its unit: quantity = (number − ``zero``) · ``factor`` [``unit``]."""
+    """One column of the table, with its unit: quantity = (number − ``zero``) · ``factor`` [``unit``], of the signed number where
+    a register was logged without its sign."""
 
     column: str
     unit: str  # Unit of the quantity, such as a key of ``TIME_S``, ``POSITION``, ``VELOCITY`` or ``EFFORT``
@@ -138,13 +152,35 @@ class Column:
     """Factor from the column's numbers to ``unit``: turns per tick, N·m per mA, or −1 to reverse the sign."""
     zero: float = 0.0
     """The column's number at 0 of its quantity, such as 512 counts or a pulse of 1500 µs; subtracted before ``factor``."""
+    sign_bit: float | None = None
+    """Number of the sign bit of a register in sign and magnitude, such as 1024 of bit 10: 1033 is −9."""
+    wraps_at: float | None = None
+    """Number of values of a register in two's complement, such as 65536 of 16 bits: 65527 is −9."""
     if_missing: float | None = (
         None  # Value for files without the column; if not given, such a file is rejected
     )
 
     def quantity(self, numbers: np.ndarray) -> np.ndarray:
         """(any shape) the quantity [``unit``] for the column's ``numbers``, of the same shape."""
-        return (numbers - self.zero) * self.factor
+        register = self.register
+        signed = numbers if register is None else register.decoded(numbers)
+        return (signed - self.zero) * self.factor
+
+    @property
+    def register(self) -> Register | None:
+        """Register whose unsigned numbers the column holds; None: they are signed."""
+        if self.sign_bit is not None:
+            return Register("sign_bit", self.sign_bit)
+        return None if self.wraps_at is None else Register("wraps_at", self.wraps_at)
+
+    def wrong_register(self) -> str:
+        """What is wrong with ``sign_bit`` and ``wraps_at``; empty if nothing is."""
+        if self.sign_bit is not None and self.wraps_at is not None:
+            return "sign_bit and wraps_at exclude each other: a register is in sign and magnitude or in two's complement"
+        value = self.register.value if self.register else 1.0
+        if not math.isfinite(value) or value <= 0.0:
+            return f"{value:g}; give the number of the sign bit, or of all values, such as 1024 or 65536"
+        return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +191,8 @@ class Change:
     unit: str | None = None
     factor: float | None = None
     zero: float | None = None
+    sign_bit: float | None = None
+    wraps_at: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,6 +291,12 @@ def _rules(spec: TableSpec) -> Rules:
                 where,
                 f"factor {column.factor:g}; give a finite number other than 0",
             )
+            wrong = column.wrong_register()
+            yield (
+                wrong,
+                f"{place}/{key}/{column.register.key if column.register else 'sign_bit'}",
+                wrong,
+            )
             if known[column.unit][0]:
                 kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
         mixed = "units of rotation and of translation are mixed; is the joint a hinge or a slide?"
@@ -311,6 +355,8 @@ def _resolved(
             _CONVERSIONS[key],
         )
         is_alike = new.unit in kinds and kinds[new.unit][0] == kinds[old.unit][0]
+        if wrong := new.wrong_register():
+            raise RecordingError(f"{path}: changes: {column}: {wrong}")
         if (
             not is_alike
             or not math.isfinite(new.zero)
@@ -435,9 +481,14 @@ def read_table(
     header, columns = read_columns(
         path, lambda own: wanted_columns(_resolved(path, own, spec, units), own), spec
     )
-    spec = _resolved(path, header, spec, units)
+    resolved = _resolved(path, header, spec, units)
     return measurement_of_columns(
-        path, columns, spec, name=path.name, origin=table_origin(path, spec)
+        path,
+        columns,
+        resolved,
+        name=path.name,
+        origin=table_origin(path, resolved),
+        own_names=spec is None or not spec.signals,
     )
 
 
@@ -448,10 +499,12 @@ def measurement_of_columns(
     *,
     name: str,
     origin: Origin,
+    own_names: bool = False,
 ) -> Measurement:
     """Make a ``Measurement`` of one table read from ``path``. Uneven rows are resampled to an even grid (``even_rows``).
-    ``columns``: name of each column of ``spec`` → its numbers (T,). Raises RecordingError: there are too few rows, or a motor is
-    neither on nor off."""
+
+    ``columns``: name of each column of ``spec`` → its numbers (T,). ``own_names``: the table has taccorl's own names. Raises
+    RecordingError: there are too few rows, a motor is neither on nor off, or a number is none of its register."""
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(
@@ -462,6 +515,7 @@ def measurement_of_columns(
     values = {key: np.full(shape, nothing.get(key, np.nan)) for key in _CONVERSIONS}
     units = []
     kinds: list[TargetKind] = []
+    registers: list[UnsignedColumn] = []
     for j, signal in enumerate(spec.signals.values()):
         units.append(POSITION[signal.q.unit][0])
         for key, column in _columns_of(signal):
@@ -472,6 +526,12 @@ def measurement_of_columns(
                 if column.column in columns
                 else np.full(len(time_s), column.if_missing)
             )
+            if column.register is not None:
+                _check_register(path, column, read)
+            elif key in REGISTERS and column.zero == 0.0:
+                registers += _unsigned(
+                    own_names, list(spec.signals)[j], key, column, read
+                )
             numbers = column.quantity(read) * _CONVERSIONS[key][column.unit][1]
             values["q_target" if key in TARGETS else key][:, j] = numbers
         if not any(
@@ -520,10 +580,49 @@ def measurement_of_columns(
         quantum=np.array([find_quantum(column) for column in values["q"].T]),
         source=path,
         origin=origin,
+        registers=tuple(
+            replace(own, row=max(own.row - rows.start, 0)) for own in registers
+        ),
         instruction=spec.instruction,
         start_ns=first_ns(path, time_s[rows]),
     )
     return even_rows(found)
+
+
+def _check_register(path: Path, column: Column, numbers: np.ndarray) -> None:
+    """Raises RecordingError: the column holds a number that its register cannot hold."""
+    register = column.register
+    assert register is not None, "the caller has asked"
+    bad = np.flatnonzero(~register.holds(numbers))
+    if len(bad):
+        raise RecordingError(
+            f"{path}: column {column.column!r}: {numbers[bad[0]]:.12g} in row {bad[0] + 1} after the header is no number of a "
+            f"register with {register.key}: {register.value:.12g}, which holds 0 … below {register.end:.12g}; correct "
+            f"{register.key}, or remove it where the column is signed"
+        )
+
+
+def _unsigned(
+    own_names: bool, signal: str, key: str, column: Column, numbers: np.ndarray
+) -> Iterator[UnsignedColumn]:
+    """Registers that may have been logged without their sign in this column, each with the line that reads it."""
+    for register, changes, row in find_registers(numbers):
+        if key != "tau" and (not changes or register.key == "sign_bit"):
+            continue  # a position may lie anywhere, and jumps where its sensor wraps
+        new = replace(column, **{register.key: register.value})
+        stated = [
+            f"{name}: {value:.12g}"
+            for name in ("factor", "sign_bit", "wraps_at")
+            if (value := getattr(new, name)) not in (None, 1.0)
+        ]
+        unit = [] if column.unit in UNITS_OF_OWN else [f"unit: {column.unit}"]
+        moved = [f"column: {column.column}"] * (column.column != f"{signal}.{key}")
+        line = f"changes: {{{signal}.{key}: {{{', '.join([*moved, *unit, *stated])}}}}}"
+        if not own_names:
+            both = f"column: {column.column}, unit: {column.unit}"
+            line = f"{key}: {{{', '.join([both, *stated])}}}"
+        step = register.value * column.factor * _CONVERSIONS[key][column.unit][1]
+        yield UnsignedColumn(signal, key, register, step, line, changes, row)
 
 
 def wanted_columns(spec: TableSpec, header: list[str]) -> list[str]:

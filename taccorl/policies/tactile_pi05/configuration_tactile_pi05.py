@@ -151,6 +151,9 @@ class TactilePI05Config(PI05Config):
     scheduler_decay_lr: float = 5e-6
     """η_min, reached at the last step of the training, whatever ``scheduler_decay_steps`` says."""
 
+    # True while a training is resumed, whose processors keep the checkpoint's statistics; no setting, and not stored.
+    resumed = False
+
     def __post_init__(self) -> None:
         """Raises TaccorlError: a setting is out of its range, or the backbone is unknown."""
         super().__post_init__()

@@ -45,6 +45,7 @@ from taccorl.policies.tactile_pi05.image_randomization import (
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
+from taccorl.policies.tactile_pi05.statistics import use_exact_statistics
 from taccorl.policies.tactile_pi05.weights import (
     base_of,
     find_weights,
@@ -81,6 +82,7 @@ class TactilePI05Policy(PI05Policy):
         PreTrainedPolicy.__init__(self, config)
         if dataset_meta is not None:
             config.match_dataset(dataset_meta)
+            use_exact_statistics(config, dataset_meta)
         self.mixture = Mixture.of_statistics(dataset_stats, config.sim_weight)
         if dataset_meta is not None and self.mixture is None:
             if IS_SIM in dataset_meta.features:
