@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
+import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, plain_name
@@ -73,6 +74,11 @@ class Element:
     def place(self) -> str:
         """File and line."""
         return f"{self.path}:{self.line}"
+
+    @property
+    def near(self) -> str:
+        """Name of the file, and line."""
+        return f"{self.path.name}:{self.line}"
 
 
 def read_model(path: Path) -> tuple[Element, bytes]:
@@ -254,6 +260,36 @@ def joints_of(root: Element) -> dict[str, Element]:
         ):
             found.setdefault(one.get("name"), one)
     return found
+
+
+class Places:
+    """Texts that name a joint or actuator with the line of the file in which it is."""
+
+    def __init__(self, root: Element) -> None:
+        self._joints = joints_of(root)
+        self._actuators = [e for all_ in root.all("actuator") for e in all_.children]
+
+    def joint(self, name: str) -> str:
+        """Text for a joint."""
+        element = self._joints.get(name)
+        return f"joint {name}" + (f" ({element.near})" if element else "")
+
+    def actuator(self, model: mujoco.MjModel, a: int) -> str:
+        """Text for an actuator of a joint in the compiled model; of those without a name the order tells which one it is."""
+        name, joint = model.actuator(a).name, model.actuator_trnid[a, 0]
+        same = [e for e in self._actuators if e.get("name") == name]
+        if not name:
+            on = (model.joint(joint).name,)
+            same = [e for e in same if e.get("joint", e.get("jointinparent")) in on]
+        before = [
+            b
+            for b in range(a)
+            if model.actuator(b).name == name and model.actuator_trnid[b, 0] == joint
+        ]
+        text = f"actuator {name or a}"
+        return text + (
+            f" ({same[len(before)].near})" if len(same) > len(before) else ""
+        )
 
 
 def _refuse_names(root: Element) -> None:
