@@ -45,8 +45,9 @@ def _uniform(seed: float, count: int) -> float:
 def arriving(
     p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float
 ) -> np.ndarray:
-    """(S hold, LANES) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each. Lag and
-    slew limit act once per target in MuJoCo's twin, and within the drive, at the middle of each step, with ``Drive.midpoint``."""
+    """(S hold, LANES) what the controller works on in each physics step, of targets (S,)
+    held for ``hold`` steps each. In MuJoCo's twin, lag and slew limit act once per target;
+    with ``Drive.midpoint`` they act within the drive: values at the middle of each step."""
     held_s, count = hold * step_s, sent.size * hold
     lag_s, likely, apart = (
         p.command_lag__time_constant_s,

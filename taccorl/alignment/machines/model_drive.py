@@ -125,7 +125,7 @@ class JointDraft:
         """Take a range of forces, times ``scale`` at the joint, as a limit of the effort,
         if it is the same to both sides."""
         low, high = source.pair(range_)
-        if not source.get(switch):
+        if not source.get(switch) or scale == 0.0:
             return
         if not (high > 0.0 and math.isclose(-low, high, rel_tol=_ALIKE)):
             source.explain("effort_limit clips both directions alike")

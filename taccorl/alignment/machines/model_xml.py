@@ -275,7 +275,8 @@ class Places:
         return f"joint {name}" + (f" ({element.near})" if element else "")
 
     def actuator(self, model: mujoco.MjModel, a: int) -> str:
-        """Text for an actuator of a joint in the compiled model; of those without a name the order tells which one it is."""
+        """Text for an actuator of a joint in the compiled model. Actuators without a name
+        are found by their order at the joint."""
         name, joint = model.actuator(a).name, model.actuator_trnid[a, 0]
         same = [e for e in self._actuators if e.get("name") == name]
         if not name:

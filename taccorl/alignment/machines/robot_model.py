@@ -69,7 +69,7 @@ _NOT_RIGID = (
     "actuator_armature",
     "actuator_damping",
 )
-"""Fields of a joint and its actuators that the rigid-body model lacks; the robot file has them."""
+"""Fields that the rigid-body model lacks, because the robot file has them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +85,8 @@ class JointFacts:
     """Inertia of all bodies that the joint moves, with other joints at the model's zero pose [kg·m² or kg]; without armature."""
     armature: float  # Rotor inertia at the joint, of joint and actuators [kg·m² or kg]
     drive: DriveFacts
-    """Drive by the actuators of the joint, or by all those that hold it through tendons, if it has none of its own and they do
-    not couple it with another joint."""
+    """Drive by the actuators of the joint, or, if it has none of its own, by those that
+    hold it through tendons and do not couple it with another joint."""
     effects: tuple[Effect, ...]  # Friction, springs and effects in the drive
 
 
@@ -204,7 +204,8 @@ def _spec(
 
 
 def _with_one_limit(spec: mujoco.MjSpec, root: Element) -> list[str]:
-    """Switch on limits of a URDF of which only ``lower`` or ``upper`` is stated, the other being 0: MuJoCo switches them off."""
+    """Switch on limits of a URDF with ``lower`` or ``upper`` alone, the other being 0:
+    MuJoCo switches them off. Returns remarks."""
     remarks = []
     for name, element in joints_of(root).items():
         limit = element.child("limit")
@@ -215,7 +216,8 @@ def _with_one_limit(spec: mujoco.MjSpec, root: Element) -> list[str]:
         if len(stated) == 1:
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             remarks.append(
-                f"joint {name} ({limit.near}): the limit states {stated[0]} alone; the other one is 0 by the rules of URDF"
+                f"joint {name} ({limit.near}): the limit states {stated[0]} alone; the "
+                "other one is 0 by the rules of URDF"
             )
     return remarks
 

@@ -1,5 +1,5 @@
-"""Drives of MJCF files: MuJoCo simulates each model, and the robot file that init-robot drafts from it must move alike, or the
-draft must name what it lacks, with the line."""
+"""Drives of MJCF files: MuJoCo simulates each model, and the robot file that init-robot
+drafts from it must move alike, or the draft must name what it lacks, with the line."""
 
 import re
 from collections.abc import Mapping
@@ -18,18 +18,22 @@ from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli import init_robot
 
-MODEL = """<mujoco><compiler angle="radian"/><option timestep="1e-4" integrator="implicitfast"/><worldbody><body>
+MODEL = """<mujoco><compiler angle="radian"/><option INTEGRATION/><worldbody><body>
 <joint name="j" axis="0 1 0" range="-2 2" {joint}/>
 <inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody><actuator>
 {actuators}
 </actuator></mujoco>
 """
+INTEGRATION = 'timestep="1e-4" integrator="implicitfast"'
 JOINT_LINE, ACTUATOR_LINE = 2, 4
 RATE_HZ, STEPS = 500, 20  # rows a second, and physics steps of a row
 FLOOR_RAD = 2e-4  # noise of a joint's encoder, as in other tests of simulated arms
 SERVO = '<position joint="j" kp="80" kv="6"/>'
 STIFF = 'solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"'
-ON_BOARD = '<dcmotor joint="j" motorconst="0.4" resistance="2" gear="2" input="pos" controller="20 {} 1.5 {} 0 {}" {}/>'
+MOTOR = '<dcmotor joint="j" motorconst="0.8" resistance="2"'
+GEARED = '<dcmotor joint="j" motorconst="0.4" resistance="2" gear="2"'
+ON_BOARD = GEARED + ' input="pos" controller="20 {} 1.5 {} 0 {}" {}/>'
+PASSIVE = '<dcmotor joint="j" input="none" motorconst="0" resistance="1"'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +45,8 @@ class Case:
     per_control: float = 1.0
     """Target of the joint per control of the model."""
     kind: str = "position"
-    """Target that is logged: position; velocity; speeds whose integral is the position that is logged; a torque or duty that
-    the test computes from the position at each step."""
+    """Control of the model: position; velocity; integral: speeds, of which the integral is
+    logged; torque or duty: the test computes them from the position at each step."""
     written: Mapping[str, str] = field(default_factory=dict)
     """Key of the draft → what the user writes for TODO."""
     remarks: tuple[str, ...] = ()
@@ -117,15 +121,18 @@ CASES = {
         remarks=at(ACTUATOR_LINE, "velocity_feedforward", "torque_ff", "ctrlrange"),
     ),
     "velocity beside a position": Case(
-        actuators='<position name="a" joint="j" kp="80" kv="2"/><velocity name="b" joint="j" kv="3"/>',
+        actuators='<position name="a" joint="j" kp="80" kv="2"/>'
+        '<velocity name="b" joint="j" kv="3"/>',
         remarks=at(ACTUATOR_LINE, "actuator b", "beside a"),
     ),
     "motor beside a position": Case(
-        actuators=f'<motor name="b" joint="j" gear="3"/>{SERVO.replace("/>", " name='a'/>")}',
+        actuators='<motor name="b" joint="j" gear="3"/>'
+        '<position name="a" joint="j" kp="80" kv="6"/>',
         remarks=at(ACTUATOR_LINE, "actuator b", "torque_ff"),
     ),
     "gain that is not kp, constant": Case(
-        actuators='<general joint="j" gainprm="40" biastype="affine" biasprm="1.5 -80 -6"/>',
+        actuators='<general joint="j" gainprm="40" biastype="affine" '
+        'biasprm="1.5 -80 -6"/>',
         per_control=0.5,
         remarks=at(ACTUATOR_LINE, "factor: 0.5"),
     ),
@@ -154,19 +161,19 @@ CASES = {
         written=gains(40, 4),
     ),
     "dcmotor": Case(
-        actuators='<dcmotor joint="j" motorconst="0.4" resistance="2" gear="2" ctrlrange="-12 12"/>',
+        actuators=f'{GEARED} ctrlrange="-12 12"/>',
         kind="duty",
         per_control=1 / 12,
         written=gains(8, 0.3),
     ),
     "dcmotor with inductance": Case(
-        actuators='<dcmotor joint="j" motorconst="0.8" resistance="2" inductance="0.01" ctrlrange="-12 12"/>',
+        actuators=f'{MOTOR} inductance="0.01" ctrlrange="-12 12"/>',
         kind="duty",
         per_control=1 / 12,
         written=gains(8, 0.3),
     ),
     "dcmotor with torque limit": Case(
-        actuators='<dcmotor joint="j" motorconst="0.8" resistance="2" saturation="2 0 0" ctrlrange="-12 12"/>',
+        actuators=f'{MOTOR} saturation="2 0 0" ctrlrange="-12 12"/>',
         kind="duty",
         per_control=1 / 12,
         written=gains(8, 0.3),
@@ -181,15 +188,12 @@ CASES = {
         per_control=0.5,
         remarks=at(ACTUATOR_LINE, "factor"),
     ),
-    "dcmotor that brakes": Case(
-        actuators=f'{SERVO}<dcmotor joint="j" motorconst="0.4" resistance="0.5" gear="2" input="none"/>'
-    ),
+    "dcmotor that brakes": Case(actuators=f'{SERVO}{GEARED} input="none"/>'),
     "dcmotor with cogging": Case(
-        actuators=f'{SERVO}<dcmotor joint="j" motorconst="0" resistance="1" gear="-2" input="none" cogging="0.3 6 0.3"/>'
+        actuators=f'{SERVO}{PASSIVE} gear="-2" cogging="0.3 6 0.3"/>'
     ),
     "dcmotor with LuGre friction": Case(
-        actuators=f'{SERVO}<dcmotor joint="j" motorconst="0" resistance="1" gear="2" input="none" '
-        'lugre="500 0.5 0.25 0.4 0.1"/>'
+        actuators=f'{SERVO}{PASSIVE} gear="2" lugre="500 0.5 0.25 0.4 0.1"/>'
     ),
     "forcerange": Case(
         actuators='<position joint="j" kp="20" kv="1.5" gear="2" forcerange="-2 2"/>',
@@ -202,7 +206,8 @@ CASES = {
         moves_alike=False,
     ),
     "forceranges of two": Case(
-        actuators='<position name="a" joint="j" kp="80" kv="2" forcerange="-1 1"/><velocity joint="j" kv="3"/>',
+        actuators='<position name="a" joint="j" kp="80" kv="2" forcerange="-1 1"/>'
+        '<velocity joint="j" kv="3"/>',
         remarks=at(ACTUATOR_LINE, "actuator_forcerange[1] 1", "not the sum"),
         moves_alike=False,
     ),
@@ -261,12 +266,14 @@ CASES = {
         remarks=at(ACTUATOR_LINE, "mjGAIN_AFFINE", "actuator_gainprm[2] -9"),
     ),
 }
-"""Rows with remarks and alike motion state something else besides, such as a control for speeds that stays 0."""
+"""Rows with remarks that move alike state something that the test does not use, such as a
+control for speeds, which stays 0, or that counts in how it logs, such as a gear."""
 
 
 def model_file(folder: Path, case: Case) -> Path:
     joint = case.joint
-    text = MODEL.format(joint=joint, actuators=case.actuators)
+    text = MODEL.replace("INTEGRATION", INTEGRATION)
+    text = text.format(joint=joint, actuators=case.actuators)
     if "axis" in joint:
         text = text.replace('axis="0 1 0" ', "")
     (folder / "arm.xml").write_text(text)
@@ -282,7 +289,8 @@ def commanded() -> np.ndarray:
 
 
 def simulated(path: Path, case: Case, target: np.ndarray) -> np.ndarray:
-    """(T,) position in MuJoCo at each row's time, before its command acts, after 3 s at the first target [rad]."""
+    """(T,) position in MuJoCo at each row's time, before its command acts, after 3 s at the
+    first target [rad]."""
     model = mujoco.MjModel.from_xml_path(str(path))
     data, seen = mujoco.MjData(model), np.empty(len(target))
     names = [model.actuator(a).name for a in range(model.nactuator)]
