@@ -267,7 +267,10 @@ class Places:
 
     def __init__(self, root: Element) -> None:
         self._joints = joints_of(root)
-        self._actuators = [e for all_ in root.all("actuator") for e in all_.children]
+        self._named: dict[str, list[Element]] = {}
+        for section in root.all("actuator"):
+            for element in section.children:
+                self._named.setdefault(element.get("name"), []).append(element)
 
     def joint(self, name: str) -> str:
         """Text for a joint."""
@@ -278,19 +281,14 @@ class Places:
         """Text for an actuator of a joint in the compiled model. Actuators without a name
         are found by their order at the joint."""
         name, joint = model.actuator(a).name, model.actuator_trnid[a, 0]
-        same = [e for e in self._actuators if e.get("name") == name]
+        same, before = self._named.get(name, []), 0
         if not name:
-            on = (model.joint(joint).name,)
-            same = [e for e in same if e.get("joint", e.get("jointinparent")) in on]
-        before = [
-            b
-            for b in range(a)
-            if model.actuator(b).name == name and model.actuator_trnid[b, 0] == joint
-        ]
-        text = f"actuator {name or a}"
-        return text + (
-            f" ({same[len(before)].near})" if len(same) > len(before) else ""
-        )
+            on = model.joint(joint).name
+            same = [e for e in same if e.get("joint", e.get("jointinparent")) == on]
+            beside = np.flatnonzero(model.actuator_trnid[:a, 0] == joint)
+            before = sum(not model.actuator(b).name for b in beside)
+        line = f" ({same[before].near})" if before < len(same) else ""
+        return f"actuator {name or a}{line}"
 
 
 def _refuse_names(root: Element) -> None:

@@ -66,7 +66,7 @@ class StatedFields:
     def __init__(self, model: mujoco.MjModel, kind: str, k: int, place: str) -> None:
         self.place = place
         self._numbers = dict(_numbers(model, kind, k))
-        default = dict(_numbers(_empty(), kind, 0))
+        default = _defaults(kind)
         self._left = {
             name: value
             for name, value in self._numbers.items()
@@ -120,20 +120,30 @@ def remarks_on_rest(every: Sequence[StatedFields]) -> list[str]:
 
 
 def _numbers(model: mujoco.MjModel, kind: str, k: int) -> Iterator[tuple[str, float]]:
-    for field in STRUCTS["mjModel"].fields:
-        if not isinstance(field, StructFieldDecl) or not field.array_extent:
-            continue
-        name = field.name
-        if not name.startswith(_PREFIXES[kind]) or name.endswith(_LABELS):
-            continue
-        if name in _KEPT or name in _DERIVED:
-            continue
-        rows = _ROWS[str(field.array_extent[0])](model, k)
+    for name, size in _fields(kind):
+        rows = _ROWS[size](model, k)
         values = np.ravel(getattr(model, name)[rows]).astype(float)
         if name == "actuator_gear":
             values = values[:1]  # of a hinge or slide the others have no meaning
         for i, value in enumerate(values):
             yield (name if len(values) == 1 else f"{name}[{i}]"), float(value)
+
+
+@cache
+def _fields(kind: str) -> tuple[tuple[str, str], ...]:
+    """Fields of joints or actuators that matter, each with the name of its first size."""
+    arrays = [
+        (field.name, str(field.array_extent[0]))
+        for field in STRUCTS["mjModel"].fields
+        if isinstance(field, StructFieldDecl) and field.array_extent
+    ]
+    return tuple(
+        (name, size)
+        for name, size in arrays
+        if name.startswith(_PREFIXES[kind])
+        and not name.endswith(_LABELS)
+        and name not in (*_KEPT, *_DERIVED)
+    )
 
 
 def _default(default: Mapping[str, float], name: str) -> float:
@@ -149,5 +159,5 @@ def _value(name: str, value: float) -> str:
 
 
 @cache
-def _empty() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(_EMPTY)
+def _defaults(kind: str) -> dict[str, float]:
+    return dict(_numbers(mujoco.MjModel.from_xml_string(_EMPTY), kind, 0))
