@@ -45,7 +45,9 @@ def _uniform(seed: float, count: int) -> float:
 def arriving(
     p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float
 ) -> np.ndarray:
-    """(S hold, LANES) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
+    """(S hold, LANES) what the controller works on in each physics step, of targets (S,)
+    held for ``hold`` steps each. In MuJoCo's twin, lag and slew limit act once per target;
+    with ``Drive.midpoint`` they act within the drive: values at the middle of each step."""
     held_s, count = hold * step_s, sent.size * hold
     lag_s, likely, apart = (
         p.command_lag__time_constant_s,
@@ -60,17 +62,30 @@ def arriving(
     share = where((share != 0.0) & (p.kp > 0.0), share * p.kd * apart, 0.0)
     lagging = goal = at = before = 0.0 * share + sent[0]
     commands, chance = np.empty((count, LANES)), np.ones((1, LANES))
+    in_drive = numbers[_MIDPOINT, 0] > 0.0 and (
+        holds(lag_s > 0.0) or holds(furthest < math.inf)
+    )
     for k in range(sent.size):
+        lag_from, goal_from, at_from = lagging, goal, at
         lagging += (sent[k] - lagging) * reached
         if holds(likely > 0.0):
             for lane in range(LANES):
                 chance[0, lane] = _uniform(numbers[_SEED, lane], k)
-        goal = where((likely <= 0.0) | (load(chance, 0) >= likely), lagging, goal)
+        comes = (likely <= 0.0) | (load(chance, 0) >= likely)
+        goal = where(comes, lagging, goal)
         at = min(max(goal, at - furthest), at + furthest)
-        now = at + share * (at - before) / held_s
+        lead = share * (at - before) / held_s
+        now = at + lead
         before = at
-        for n in range(k * hold, (k + 1) * hold):
-            store(commands, n, now)
+        for n in range(hold):
+            if in_drive:
+                since = (n + 0.5) / hold
+                left = decayed(since * held_s / max(lag_s, 1e-9))[0]
+                now = sent[k] + (lag_from - sent[k]) * left
+                now = where(comes, where(lag_s > 0.0, now, lagging), goal_from)
+                reach = since * furthest
+                now = min(max(now, at_from - reach), at_from + reach) + lead
+            store(commands, k * hold + n, now)
     for lane in range(LANES):
         if numbers[_DELAY, lane] > 0.0:
             # MuJoCo reads its delay buffer before it writes the new value: the shortest delay is one physics step.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
+import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, plain_name
@@ -79,6 +80,11 @@ class Element:
     def place(self) -> str:
         """File and line."""
         return f"{self.path}:{self.line}"
+
+    @property
+    def near(self) -> str:
+        """Name of the file, and line."""
+        return f"{self.path.name}:{self.line}"
 
 
 def read_model(path: Path) -> tuple[Element, bytes]:
@@ -274,6 +280,35 @@ def joints_of(root: Element) -> dict[str, Element]:
         ):
             found.setdefault(one.get("name"), one)
     return found
+
+
+class Places:
+    """Texts that name a joint or actuator with the line of the file in which it is."""
+
+    def __init__(self, root: Element) -> None:
+        self._joints = joints_of(root)
+        self._named: dict[str, list[Element]] = {}
+        for section in root.all("actuator"):
+            for element in section.children:
+                self._named.setdefault(element.get("name"), []).append(element)
+
+    def joint(self, name: str) -> str:
+        """Text for a joint."""
+        element = self._joints.get(name)
+        return f"joint {name}" + (f" ({element.near})" if element else "")
+
+    def actuator(self, model: mujoco.MjModel, a: int) -> str:
+        """Text for an actuator of a joint in the compiled model. Actuators without a name
+        are found by their order at the joint."""
+        name, joint = model.actuator(a).name, model.actuator_trnid[a, 0]
+        same, before = self._named.get(name, []), 0
+        if not name:
+            on = model.joint(joint).name
+            same = [e for e in same if e.get("joint", e.get("jointinparent")) == on]
+            beside = np.flatnonzero(model.actuator_trnid[:a, 0] == joint)
+            before = sum(not model.actuator(b).name for b in beside)
+        line = f" ({same[before].near})" if before < len(same) else ""
+        return f"actuator {name or a}{line}"
 
 
 def _refuse_names(root: Element) -> None:

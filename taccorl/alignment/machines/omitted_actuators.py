@@ -6,10 +6,12 @@ l_i = Σ_j c_ij q_j give the joints the stiffness K = Σ_i kp_i c_i c_iᵀ (and 
 its diagonal, as of a CoreXY gantry with equal motors, the diagonal is what a drive of that joint would have.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
@@ -23,6 +25,7 @@ _KIND = {
     _TRN.mjTRN_BODY: "body",
     _TRN.mjTRN_SLIDERCRANK: "slider-crank",
 }
+_STATED = ("forcerange", "ctrlrange", "delay", "damping", "armature")
 _NOTHING = 1e-9  # share of the diagonal below which an element beside it is rounding
 
 
@@ -36,7 +39,8 @@ class OmittedActuator:
     """Joint that it moves → change of its length per motion of the joint, gear included [rad/rad, m/rad, …]; None where this
     depends on the pose."""
     kp: float  # Position gain at its own length; 0 for a motor
-    kd: float  # Velocity gain at its own length
+    kd: float  # Velocity gain at its own length; NaN if it is stated as a ``dampratio``
+    more: str = ""  # What else it states, in MuJoCo's words
 
     @property
     def text(self) -> str:
@@ -50,7 +54,8 @@ class OmittedActuator:
             if moved
             else "moves no hinge or slide by itself"
         )
-        return f"actuator {self.name} is left out: it acts on {self.transmission}, which {where}"
+        more = f"; so is its {self.more}" if self.more else ""
+        return f"actuator {self.name} is left out: it acts on {self.transmission}, which {where}{more}"
 
 
 def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
@@ -101,8 +106,28 @@ def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
             )
         affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
         kp, kd = (-float(actuator.biasprm[p]) if affine else 0.0 for p in (1, 2))
-        omitted.append(OmittedActuator(name, transmission, levers, kp + 0.0, kd + 0.0))
+        if kd < 0.0:
+            kd = math.nan
+        numbers = (kp + 0.0, kd + 0.0)
+        omitted.append(
+            OmittedActuator(name, transmission, levers, *numbers, _more(actuator))
+        )
     return omitted
+
+
+def _more(actuator: mujoco.MjsActuator) -> str:
+    """Limits, delay, friction, inertia and dynamics of an actuator, in MuJoCo's words."""
+    stated = {name: np.ravel(getattr(actuator, name)) for name in _STATED}
+    texts = [
+        f"{name} {' '.join(f'{x:g}' for x in values)}"
+        for name, values in stated.items()
+        if values.any()
+    ]
+    if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
+        texts.append(f"dyntype {actuator.dyntype.name}")
+    if actuator.biasprm[2] > 0.0:
+        texts.append(f"dampratio {actuator.biasprm[2]:g}")
+    return ", ".join(texts)
 
 
 def joint_gains(
@@ -112,6 +137,8 @@ def joint_gains(
     couples it with that joint. None if no actuator holds it, or if the lever of one that does depends on the pose."""
     own = [a for a in omitted if joint in a.levers]
     if not own or any(lever is None for a in own for lever in a.levers.values()):
+        return None
+    if any(math.isnan(a.kd) for a in own):
         return None
     stiffness: dict[str, float] = {}
     damping = 0.0

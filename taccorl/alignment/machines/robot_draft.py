@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from taccorl.alignment.controller.drive_law import GAIN_UNITS
 from taccorl.alignment.machines.robot_file import TODO
 from taccorl.alignment.machines.robot_model import (
     JointFacts,
@@ -15,6 +16,7 @@ from taccorl.alignment.machines.robot_model import (
 )
 from taccorl.alignment.measurements.dataset_rows import TIME, dataset_columns
 from taccorl.data.dataset import Dataset
+from taccorl.data.finding import listed
 from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import TaccorlError
 
@@ -26,6 +28,12 @@ _LAWS = {
     "effort": "the measured torque, for logs without targets. Columns NAME.q and NAME.tau; no kp, no kd",
     "pwm": "k_t (V d − k_e q̇) / R, duty d = kp (q* − q) − kd q̇ within ± 1: supply_v, resistance_ohm, torque_nm_per_a",
 }
+_MEANING = {
+    "kp": "position gain of the drive; a guess where nobody knows it",
+    "kd": "damping gain",
+    "supply_v": "supply of the motor; the model states none",
+}
+_WINDING_UNITS = {"supply_v": "V", "resistance_ohm": "Ω", "torque_nm_per_a": "N·m/A"}
 _HEADER = """\
 # A robot, drafted from {model}. Write a value for each TODO; loading the file names those that are left.
 # taccorl compare sweeps/ --twin={name}      how far this model is from recordings, and where
@@ -69,30 +77,31 @@ def _joint(facts: JointFacts) -> list[str]:
         if facts.limits is None
         else f"{facts.limits[0]:.4g} … {facts.limits[1]:.4g} {turn}"
     )
-    servo = next((a for a in facts.actuators if a.kp > 0), None)
-    speed = next((a for a in facts.actuators if a.kd > 0), None)
+    drive = facts.drive
     lines = [
         f"  {facts.name}:   # {limits}; inertia {facts.inertia:.3g} {inertia} at the model's zero pose",
-        f"    law: {'velocity ' if speed and not servo else 'impedance'}             # or another one of those above",
+        f"    law: {drive.law:<9}             # or another one of those above",
     ]
-    if servo:
-        source = f"   # {torque}/{turn}, of actuator {servo.name}; is it what the drive runs?"
+    units = {"kp": f"{torque}/{turn}", "kd": f"{torque}·s/{turn}"}
+    if drive.law == "pwm":
+        units = dict(zip(units, GAIN_UNITS["pwm"], strict=True)) | _WINDING_UNITS
+    if drive.law == "velocity":
+        del units["kp"]
+    source = f", of actuator {listed(drive.actuators)}; is it what the drive runs?"
+    for key, unit in units.items():
+        if key in drive.numbers:
+            lines += [f"    {key}: {drive.numbers[key]:.6g}   # {unit}{source}"]
+            source = ""
+        else:
+            lines += [f"    {key}: {TODO}                   # {unit}: {_MEANING[key]}"]
+    if drive.law != "pwm":
         lines += [
-            f"    kp: {servo.kp:.6g}{source}",
-            f"    kd: {servo.kd:.6g}   # {torque}·s/{turn}",
+            f"    gains: {TODO}                # commanded: the drive runs kp and kd; fitted: nobody knows them"
         ]
-    elif speed:
+    if "torque_ff" in drive.numbers:
         lines += [
-            f"    kd: {speed.kd:.6g}   # {torque}·s/{turn}, of actuator {speed.name}; is it what the drive runs?"
+            f"    torque_ff: {drive.numbers['torque_ff']:.6g}   # {torque}: constant of the actuators"
         ]
-    else:
-        lines += [
-            f"    kp: {TODO}                   # {torque}/{turn}: position gain of the drive; a guess where nobody knows it",
-            f"    kd: {TODO}                   # {torque}·s/{turn}: damping gain",
-        ]
-    lines += [
-        f"    gains: {TODO}                # commanded: the drive runs kp and kd; fitted: nobody knows them"
-    ]
     if facts.armature > 0:
         lines += [
             f"    rotor_inertia: {facts.armature:.6g}   # {inertia}: the model's armature, already at the joint, so gear is 1"
@@ -103,12 +112,9 @@ def _joint(facts: JointFacts) -> list[str]:
             "    # rotor_inertia: 1.0e-5    # kg·m² of the motor; without it no effect in the gear is looked for",
             f"    # gear: 100.0              # {per_gear}",
         ]
-    limit = facts.effort_limit or next(
-        (a.effort_limit for a in facts.actuators if a.effort_limit), None
-    )
-    if limit:
+    if "effort_limit" in drive.numbers:
         lines += [
-            f"    effort_limit: {limit:.6g}   # {torque}; torques beyond are clipped"
+            f"    effort_limit: {drive.numbers['effort_limit']:.6g}   # {torque}; torques beyond are clipped"
         ]
     else:
         lines += [f"    # effort_limit: 10.0       # {torque}; the model names none"]
@@ -118,22 +124,15 @@ def _joint(facts: JointFacts) -> list[str]:
         "    # effort_after_target: true   # where the effort of a row answers the row's own target already",
         "    # known: [armature]        # numbers and effects that you know for certain: no diagnosis moves or adds them",
     ]
-    effects = []
-    if facts.damping > 0:
-        effects.append(
-            f"{{effect: viscous_friction, damping_nms_per_rad: {facts.damping:.6g}}}"
-        )
-    if facts.friction > 0:
-        effects.append(f"{{effect: coulomb_friction, torque_nm: {facts.friction:.6g}}}")
-    if facts.stiffness > 0:
-        effects.append(
-            f"{{effect: cable_spring, stiffness_nm_per_rad: {facts.stiffness:.6g}, rest_rad: {facts.spring_rest:.6g}}}"
-        )
-    if effects:
-        lines += [
-            "    effects:   # the model's damping, dry friction and springs",
-            *(f"    - {line}" for line in effects),
+    if facts.effects:
+        lines += ["    effects:   # friction, springs and drive as in the model"]
+    for effect in facts.effects:
+        numbers = [
+            f"{p.name}: {getattr(effect, p.name):.6g}"
+            for p in effect.parameters()
+            if getattr(effect, p.name) != p.absent
         ]
+        lines += [f"    - {{effect: {effect.name}, {', '.join(numbers)}}}"]
     return lines
 
 

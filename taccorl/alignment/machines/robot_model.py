@@ -13,6 +13,7 @@ removed.
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,15 +22,26 @@ import mujoco
 import numpy as np
 
 from taccorl.alignment.machines import omitted_actuators as actuators
+from taccorl.alignment.machines.model_drive import (
+    DriveFacts,
+    JointDraft,
+    actuator_of,
+    drive_of,
+    spring,
+)
 from taccorl.alignment.machines.model_xml import (
     Element,
+    Places,
     joints_of,
     read_model,
     unbalanced,
     without_shapes,
 )
+from taccorl.alignment.machines.stated_fields import StatedFields, remarks_on_rest
+from taccorl.alignment.machines.unmodelled import remarks_on_unmodelled
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects.effect import Effect
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 MOST_TURNS = (
@@ -49,16 +61,15 @@ _REMOVED = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ActuatorFacts:
-    """One actuator of a joint in MJCF: τ = gear · (gain · ctrl + bias0 + bias1 · gear q + bias2 · gear q̇)."""
-
-    name: str
-    kp: float  # Position gain at the joint [N·m/rad or N/m]; 0 for a motor
-    kd: float  # Velocity gain at the joint [N·m·s/rad or N·s/m]
-    effort_limit: (
-        float | None
-    )  # Largest torque or force at the joint [N·m or N]; None if unlimited
+_NOT_RIGID = (
+    "dof_damping",
+    "dof_frictionloss",
+    "dof_armature",
+    "jnt_stiffness",
+    "actuator_armature",
+    "actuator_damping",
+)
+"""Fields that the rigid-body model lacks, because the robot file has them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,17 +83,11 @@ class JointFacts:
     )  # Lowest and highest position [rad or m]; None if unlimited
     inertia: float
     """Inertia of all bodies that the joint moves, with other joints at the model's zero pose [kg·m² or kg]; without armature."""
-    armature: float  # Rotor inertia at the joint [kg·m² or kg]
-    effort_limit: float | None  # Largest torque or force [N·m or N]; None if unlimited
-    damping: float  # Damping coefficient [N·m·s/rad or N·s/m]
-    friction: float  # Dry friction [N·m or N]
-    stiffness: float  # Stiffness of a spring at the joint [N·m/rad or N/m]
-    spring_rest: (
-        float  # Position at which the spring of ``stiffness`` is relaxed [rad or m]
-    )
-    actuators: tuple[ActuatorFacts, ...]
-    """Actuators of the joint; one that stands for all those that hold it through tendons, if it has none of its own and they do
-    not couple it with another joint; empty if it has none."""
+    armature: float  # Rotor inertia at the joint, of joint and actuators [kg·m² or kg]
+    drive: DriveFacts
+    """Drive by the actuators of the joint, or, if it has none of its own, by those that
+    hold it through tendons and do not couple it with another joint."""
+    effects: tuple[Effect, ...]  # Friction, springs and effects in the drive
 
 
 @dataclass(frozen=True)
@@ -94,9 +99,8 @@ class RobotModel:
     joints: dict[
         str, JointFacts
     ]  # Name → facts of the hinge and slide joints, in the order of the tree
-    remarks: tuple[
-        str, ...
-    ]  # Parts of the file that were left out, and what that means for the robot file
+    remarks: tuple[str, ...]
+    """Parts of the file that were left out, and what that means for the robot file."""
 
 
 def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotModel:
@@ -113,6 +117,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
         raise TaccorlError(f"{path}: {error}") from error
     remarks += actuators.remarks_on(omitted)
     actuators.without(spec, omitted)
+    remarks += remarks_on_unmodelled(spec, root)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
     for body in spec.bodies:
@@ -125,10 +130,8 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
         raise TaccorlError(
             f"{path}: joint {k + 1} of {model.njnt}, of body {body}, has no name; give it one"
         )
-    inertias = _inertias(model)
-    joints = {
-        name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(names)
-    }
+    joints, of_joints = _joint_facts(model, names, root, omitted)
+    remarks += of_joints
     remarks += [
         remark for facts in joints.values() for remark in _of_limits(root, facts)
     ]
@@ -144,7 +147,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     model.opt.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
     )
-    for field in ("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness"):
+    for field in _NOT_RIGID:
         getattr(model, field)[:] = 0.0
     # MuJoCo stores the inertia of a body on one slide when it compiles, with the armature.
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -191,11 +194,32 @@ def _spec(
             for joint in root.all("joint")
             if (mimic := joint.child("mimic")) is not None
         }
-        return mujoco.MjSpec.from_string(text), root, remarks, mimics
+        spec = mujoco.MjSpec.from_string(text)
+        remarks += _with_one_limit(spec, root)
+        return spec, root, remarks, mimics
     except (ValueError, mujoco.FatalError) as error:
         raise TaccorlError(
             f"{_placed(path, error)}: MuJoCo cannot read it: {_one_line(error)}"
         ) from error
+
+
+def _with_one_limit(spec: mujoco.MjSpec, root: Element) -> list[str]:
+    """Switch on limits of a URDF with ``lower`` or ``upper`` alone, the other being 0:
+    MuJoCo switches them off. Returns remarks."""
+    remarks = []
+    for name, element in joints_of(root).items():
+        limit = element.child("limit")
+        joint = spec.joint(name)
+        if joint is None or limit is None or not joint.range[0] < joint.range[1]:
+            continue
+        stated = [key for key in ("lower", "upper") if limit.get(key)]
+        if len(stated) == 1:
+            joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+            remarks.append(
+                f"joint {name} ({limit.near}): the limit states {stated[0]} alone; the "
+                "other one is 0 by the rules of URDF"
+            )
+    return remarks
 
 
 def _placed(path: Path, error: Exception) -> str:
@@ -352,52 +376,45 @@ def _inertias(model: mujoco.MjModel) -> np.ndarray:
     return np.diag(mass)
 
 
-def _facts(
+def _joint_facts(
     model: mujoco.MjModel,
-    name: str,
-    k: int,
+    names: Sequence[str],
+    root: Element,
     omitted: list[actuators.OmittedActuator],
-    inertias: np.ndarray,
-) -> JointFacts:
-    dof = model.jnt_dofadr[k]
-    own = [
-        _actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k
-    ]
-    if not own and (held := actuators.held_by(omitted, name)):
-        own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None)]
-    effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
-    return JointFacts(
-        name=name,
-        unit="m" if model.jnt_type[k] == _SLIDE else "rad",
-        limits=(float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1]))
-        if model.jnt_limited[k]
-        else None,
-        inertia=float(inertias[dof] - model.dof_armature[dof]),
-        armature=float(model.dof_armature[dof]),
-        effort_limit=None if effort is None else float(np.abs(effort).max()),
-        damping=float(model.dof_damping[dof]),
-        friction=float(model.dof_frictionloss[dof]),
-        stiffness=float(np.ravel(model.jnt_stiffness[k])[0]),
-        spring_rest=float(model.qpos_spring[model.jnt_qposadr[k]]),
-        actuators=tuple(own),
-    )
-
-
-def _actuator(model: mujoco.MjModel, a: int) -> ActuatorFacts:
-    gear = float(model.actuator_gear[a, 0])
-    affine = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
-    kp, kd = (
-        -(gear**2) * float(model.actuator_biasprm[a, p]) if affine else 0.0
-        for p in (1, 2)
-    )
-    limit = (
-        abs(gear) * float(np.abs(model.actuator_forcerange[a]).max())
-        if model.actuator_forcelimited[a]
-        else None
-    )
-    if limit is None and not affine and model.actuator_ctrllimited[a]:
-        limit = abs(gear * float(model.actuator_gainprm[a, 0])) * float(
-            np.abs(model.actuator_ctrlrange[a]).max()
+) -> tuple[dict[str, JointFacts], list[str]]:
+    """Facts of each joint, and remarks on what the model states beyond them."""
+    places, inertias = Places(root), _inertias(model)
+    found: dict[str, JointFacts] = {}
+    remarks: list[str] = []
+    fields: list[StatedFields] = []
+    for k, name in enumerate(names):
+        own = StatedFields(model, "joint", k, places.joint(name))
+        draft = JointDraft(own)
+        limits = own.pair("jnt_range") if own.get("jnt_limited") else None
+        every = [
+            actuator_of(model, a, places.actuator(model, a), limits)
+            for a in range(model.nactuator)
+            if model.actuator_trnid[a, 0] == k
+        ]
+        drive = drive_of(draft, every)
+        if not every and (held := actuators.held_by(omitted, name)):
+            numbers = {"kp": held[1], "kd": held[2]} | drive.numbers
+            drive = DriveFacts(numbers=numbers, actuators=(held[0],))
+        rotors = [a.gear**2 * a.fields.get("actuator_armature") for a in every]
+        armature = own.get("dof_armature") + sum(rotors)
+        spring(draft, float(model.qpos_spring[model.jnt_qposadr[k]]))
+        own.take("jnt_limited", "jnt_range", "jnt_actgravcomp", "dof_armature")
+        for one in every:
+            one.fields.take("actuator_armature")
+        found[name] = JointFacts(
+            name=name,
+            unit="m" if model.jnt_type[k] == _SLIDE else "rad",
+            limits=limits,
+            inertia=float(inertias[model.jnt_dofadr[k]]) - armature,
+            armature=armature,
+            drive=drive,
+            effects=tuple(draft.effects.values()),
         )
-    name = model.actuator(a).name or str(a)
-    return ActuatorFacts(name=name, kp=kp + 0.0, kd=kd + 0.0, effort_limit=limit)
+        remarks += draft.remarks
+        fields += [own, *(one.fields for one in every)]
+    return found, [*remarks, *remarks_on_rest(fields)]

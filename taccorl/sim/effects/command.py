@@ -66,7 +66,7 @@ class CommandLag(_CommandEffect):
     """Low-pass of the commands: ṙ = (q* − r) / T, and the controller's target is r. Slow motions look delayed by T.
 
     The equation is solved exactly for targets that are constant between two commands. The controller gets the value of r at the
-    end of that interval."""
+    end of that interval; the drives of axis and robot files get it in each physics step."""
 
     possible: ClassVar = _WITH_GRIPPER
     time_constant_s: float = number("T", "s", 0, 0.05, (0, 0.5))
@@ -161,8 +161,9 @@ class SlewLimit(_CommandEffect):
     """Speed limit of the commands: |ṙ| ≤ v_max, and the controller's target is r, which moves towards q* by at most v_max Δt
     until the next command.
 
-    As in ``command_lag``, the controller gets the value of r at the end of that Δt: r_k = r_{k−1} + clip(q*_k − r_{k−1}, ± v_max
-    Δt). The effect acts after ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``."""
+    As in ``command_lag``, the controller gets the value of r at the end of that Δt, or in
+    each physics step: r_k = r_{k−1} + clip(q*_k − r_{k−1}, ± v_max Δt). The effect acts after
+    ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``."""
 
     speed_rad_per_s: float = number("v_max", "rad/s", math.inf, 0.5, (0.05, 20))
 

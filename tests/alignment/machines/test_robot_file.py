@@ -646,12 +646,10 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
     path.write_text(URDF.format(inertial=INERTIAL))
     facts = load_robot_model(path).joints["j1"]
     assert facts.inertia == pytest.approx(0.01 + 2 * 0.1**2)
-    assert (facts.limits, facts.effort_limit, facts.damping, facts.friction) == (
-        (-1.0, 1.0),
-        5.0,
-        0.3,
-        0.2,
-    )
+    viscous, dry = facts.effects
+    assert (facts.limits, facts.drive.numbers) == ((-1.0, 1.0), {"effort_limit": 5.0})
+    assert viscous == make_effect("viscous_friction", damping_nms_per_rad=0.3)
+    assert dry == make_effect("coulomb_friction", torque_nm=0.2)
     assert "effort_limit: 5" in robot_draft(path, tmp_path / "out.yaml")[0]
     path.write_text(URDF.format(inertial=""))
     with pytest.raises(
@@ -659,6 +657,34 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
         match=r'link a moves and has no mass.*write <inertial>.*<link name="a">',
     ):
         load_robot_model(path)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize(
+    ("stated", "limits", "word"),
+    [
+        ('upper="1.5"', (0.0, 1.5), "upper alone"),
+        ('lower="-1.5"', (-1.5, 0.0), "lower alone"),
+        ('lower="0" upper="1.5"', (0.0, 1.5), ""),
+        ("", None, ""),
+    ],
+)
+def test_a_limit_that_a_urdf_leaves_out_is_0(
+    stated: str,
+    limits: tuple[float, float] | None,
+    word: str,
+    kind: str,
+    tmp_path: Path,
+) -> None:
+    """The rules of URDF; MuJoCo takes such a joint for one without limits."""
+    path = tmp_path / "r.urdf"
+    text = URDF.format(inertial=INERTIAL).replace('lower="-1" upper="1"', stated)
+    path.write_text(text.replace("revolute", kind))
+    draft, robot = robot_draft(path, tmp_path / "out.yaml")
+    assert robot.joints["j1"].limits == limits
+    assert ("no limits" in draft) == (limits is None)
+    said = [remark for remark in robot.remarks if "r.urdf:4" in remark]
+    assert len(said) == bool(word) and all(word in remark for remark in said)
 
 
 @pytest.mark.parametrize(
