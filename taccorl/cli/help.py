@@ -21,7 +21,7 @@ SHOWN = {
     "post-train": "policy.path env.task env.twin anchor.dataset anchor.weight iterations resume rerun out",
     "init-robot": "out dataset",
     "compare": "twin against joints columns out rerun",
-    "align": "twin joints pads cameras fit_kp method out",
+    "align": "twin joints pads cameras fit_kp out",
     "diagnose": "twin joints pads until columns out",
     "add-effect": "twin joints pads values out",
     "effects": "for",
