@@ -1,9 +1,10 @@
 """``taccorl align sweeps/ --twin=twin.yaml``: fit the numbers that the PiPER's twin has anyway to measurements (paper App. B).
 
-Joints that move: K_d and T_ref, with --fit_kp=true also K_p. Pads for which measurements.yaml states the pressed object: k_n and
-k_d. Cameras that --cameras names: pose, latency and exposure, from the first episode. Each number has its 95 % interval; errors
-before and after are those of validation recordings (cameras: of frames that were not fitted). Writes a new twin. Then
-``taccorl diagnose`` searches for effects.
+Joints that move: K_d and T_ref, with --fit_kp=true also K_p; by least squares, or by the paper's SPSA (--method=spsa). Pads for
+which measurements.yaml states the pressed object: k_n and k_d, with the paper's five numbers of the match. Cameras that
+--cameras names: pose, latency and exposure, from the first episode. Each number has its 95 % interval; errors before and after
+are those of validation recordings (cameras: of frames that were not fitted). Writes a new twin. Then ``taccorl diagnose``
+searches for effects.
 """
 
 import dataclasses
@@ -14,7 +15,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.measured import PartsConfig, replayed
 from taccorl.cli.parse import parse
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 
 TWIN, REPORT = "twin.yaml", "report.json"
 """Names of the files in the output folder."""
+NO_JOINT = (
+    "--method=spsa: searches for gains of joints, and none is to be aligned; name some by "
+    "--joints=, or remove --method"
+)
 LATE_S = 0.01
 """Delay of a joint's measurement after the twin's replay [s] from which on its gains are not fitted: a tenth of K_d / K_p of the
 PiPER's joints (0.084 … 0.12 s), by which fitted gains would be wrong."""
@@ -44,9 +49,26 @@ class AlignConfig(PartsConfig):
     """These cameras: front, left_wrist, right_wrist, of one recording or dataset."""
     fit_kp: bool = False
     """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
-    what the recordings state, or the twin's."""
+    what the recordings state, or the twin's. SPSA fits K_p in any case, as in the paper, unless the recordings state it."""
+    method: Literal["least_squares", "spsa"] = "least_squares"
+    """Search for the gains of joints. spsa: the paper's, with its loss and constants, from the twin's gains; it ends near the
+    minimum, where least_squares ends at it."""
+    seed: int = 0
+    """Seed of the random signs of --method=spsa, at least 0."""
     out: Path = Path("alignment")
     """Folder of twin.yaml, report.json and, of each camera, a picture of outlines before and after; it must be new or empty."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seed < 0:
+            raise TaccorlError(f"--seed={self.seed}: at least 0")
+        if self.seed and self.method != "spsa":
+            raise TaccorlError(
+                f"--seed={self.seed}: only --method=spsa draws random signs; add that, "
+                "or remove --seed"
+            )
+        if self.method == "spsa" and (self.pads or self.cameras) and not self.joints:
+            raise TaccorlError(NO_JOINT)
 
 
 def main(argv: list[str]) -> int:
@@ -138,8 +160,13 @@ def _joints_and_pads(
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
+    from taccorl.diagnosis.problems.joints import SIGNALS
 
     measurements = config.read(machine)
+    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
+    spsa_seed = config.seed if config.method == "spsa" else None
+    if spsa_seed is not None and not set(selected) & set(SIGNALS):
+        raise TaccorlError(NO_JOINT)
 
     def replay() -> "Comparison":
         with Bars(len(measurements.all)) as bars:
@@ -156,7 +183,6 @@ def _joints_and_pads(
     if beside is None:
         return None
     before = beside.comparison
-    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     troubled = (
         {} if SHIFTED in config.accept else _come_late(before, beside.late, selected)
     )
@@ -167,7 +193,8 @@ def _joints_and_pads(
             parts,
             machine.config,
             measurements,
-            fit_kp=config.fit_kp,
+            fit_kp=config.fit_kp or spsa_seed is not None,
+            spsa_seed=spsa_seed,
             workers=config.workers,
             done=lambda part: bars.update(part, next(count), len(parts)),
         )
@@ -285,6 +312,11 @@ def _section(one: "Alignment") -> Section:
     for n in one.numbers:
         interval = "not fitted" if n.fixed else f"{n.low:.4g} … {n.high:.4g}"
         rows.append([n.name, f"{n.before:.4g}", f"{n.value:.4g}", interval, n.unit])
+    parts = []
+    if one.touch_matches:
+        from taccorl.report.touch_match import touch_match_section
+
+        parts.append(touch_match_section(("before", "fitted"), one.touch_matches))
     remarks = [
         f"{one.error_name}: {one.before:.3g} → {one.after:.3g}",
         *(f"Remark: {remark}" for remark in one.remarks),
@@ -298,7 +330,7 @@ def _section(one: "Alignment") -> Section:
         heads=("number", "before", "fitted", "95 % interval", "unit"),
         rows=rows,
         right=range(1, 4),
-        parts=[Section(text=remarks)],
+        parts=[*parts, Section(text=remarks)],
     )
 
 

@@ -69,7 +69,13 @@ def run(config: CompareConfig) -> int:
     from taccorl.diagnosis.comparison.result import origin_words
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.problems.joints import of_joints
-    from taccorl.report.compared import cell_numbers, how_far, not_compared, where
+    from taccorl.report.compared import (
+        cell_numbers,
+        how_far,
+        not_compared,
+        pad_matches,
+        where,
+    )
     from taccorl.report.terminal import show
 
     twins = [
@@ -108,7 +114,11 @@ def run(config: CompareConfig) -> int:
         return 1
     first, last = comparisons[0], comparisons[-1]
     show(
-        how_far(*comparisons), where(first, ()), cell_numbers(last), not_compared(first)
+        how_far(*comparisons),
+        *pad_matches(*comparisons),
+        where(first, ()),
+        cell_numbers(last),
+        not_compared(first),
     )
     off = far_off(last, twins[-1].fitted_gains, beside.findings)
     show(

@@ -31,6 +31,7 @@ from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.touch.calibration import calibrate_touch
+from taccorl.alignment.touch.match import TouchMatch
 from taccorl.alignment.touch.motion import touch_motion
 from taccorl.data.episode import Episode
 from taccorl.data.spec import find_spec, load_dataset_spec
@@ -87,6 +88,9 @@ class Alignment:
     effects: tuple[Effect, ...] = ()
     """Effects whose parameters were fitted with the numbers: latency and exposure of a camera. They replace the twin's effects
     of the same name; an absent one (without influence) only removes the twin's."""
+    touch_matches: tuple[TouchMatch, ...] = ()
+    """For pads: the paper's five numbers before and after the alignment, on the recordings
+    ``judged_by``; empty for others."""
     twin: TwinConfig | None = None
     """For a camera: the twin with its new pose."""
     overlays: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -103,21 +107,39 @@ class Alignment:
         values["effects"] = [
             effect.name for effect in self.effects if not effect.is_absent
         ]
+        if self.touch_matches:
+            values["touch_match"] = {
+                when: one.record()
+                for when, one in zip(
+                    ("before", "after"), self.touch_matches, strict=True
+                )
+            }
         return _plain(values)
 
 
-_NOT_STORED = ("numbers", "effects", "twin", "overlays")
+_NOT_STORED = ("numbers", "effects", "touch_matches", "twin", "overlays")
 
 
 def align_part(
-    part: str, config: TwinConfig, measurements: Measurements, *, fit_kp: bool = False
+    part: str,
+    config: TwinConfig,
+    measurements: Measurements,
+    *,
+    fit_kp: bool = False,
+    spsa_seed: int | None = None,
 ) -> Alignment:
     """Align one joint (``left_joint5``) or the pads of one arm (``left pads``); why it cannot be done is its ``trouble``.
-    ``fit_kp``: fit K_p, too. Positions determine K_d / K_p and T_ref / K_p, and K_p only through small terms that other errors of
-    the model change; without, K_p is what the recordings state, or the twin's."""
+
+    Args:
+        fit_kp: fit K_p, too. Positions determine K_d / K_p and T_ref / K_p, and K_p only
+            through small terms that other errors of the model change; without, K_p is what
+            the recordings state, or the twin's.
+        spsa_seed: seed of SPSA's random signs, the same for every joint; None: least
+            squares.
+    """
     try:
         if part in joints.SIGNALS:
-            return _align_joint(part, config, measurements, fit_kp)
+            return _align_joint(part, config, measurements, fit_kp, spsa_seed)
         return _align_pads(part, config, measurements)
     except TaccorlError as error:
         return Alignment(part=part, trouble=str(error))
@@ -129,18 +151,29 @@ def align_parts(
     measurements: Measurements,
     *,
     fit_kp: bool = False,
+    spsa_seed: int | None = None,
     workers: int = 1,
     done: Callable[[str], None] = lambda part: None,
 ) -> list[Alignment]:
     """Align ``parts``, ``workers`` of them at the same time; return one alignment for each, in their order. The number of workers
-    does not change the results. ``fit_kp``: as in ``align_part``. ``done``: function that is called with the name of each part
-    that was aligned."""
-    one = partial(align_part, config=config, measurements=measurements, fit_kp=fit_kp)
+    does not change the results. ``fit_kp``, ``spsa_seed``: as in ``align_part``. ``done``: function that is called with the name
+    of each part that was aligned."""
+    one = partial(
+        align_part,
+        config=config,
+        measurements=measurements,
+        fit_kp=fit_kp,
+        spsa_seed=spsa_seed,
+    )
     return joints.each(one, {part: part for part in parts}, workers, done)
 
 
 def _align_joint(
-    signal: str, config: TwinConfig, measurements: Measurements, fit_kp: bool
+    signal: str,
+    config: TwinConfig,
+    measurements: Measurements,
+    fit_kp: bool,
+    spsa_seed: int | None,
 ) -> Alignment:
     own = joints.of_joints(measurements, [signal])
     model = JointModel(config, signal)
@@ -153,6 +186,7 @@ def _align_joint(
         model,
         free=free,
         validation=[joint_motion(m, config, signal) for m in own.validation],
+        spsa_rng=None if spsa_seed is None else np.random.default_rng(spsa_seed),
     )
     judged = [e for e in fit.errors if e.use == "validation"] or list(fit.errors)
     before, after = (
@@ -240,7 +274,9 @@ def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Al
     )
     found = calibrate_touch(fit, validation, config)
     trouble = found.trouble
-    if not trouble and found.after.rms_count > found.before.rms_count:
+    before, after = found.before.rms_count, found.after.rms_count
+    assert before is not None and after is not None  # checked by calibrate_touch
+    if not trouble and after > before:
         trouble = f"the error on {', '.join(found.validation)} is larger with the fitted numbers"
     sensor = config.sensor
     return Alignment(
@@ -257,13 +293,14 @@ def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Al
             for name, n in (("k_n", found.stiffness), ("k_d", found.damping))
         ),
         error_name="RMS error of the counts of active taxels",
-        before=found.before.rms_count,
-        after=found.after.rms_count,
+        before=before,
+        after=after,
+        touch_matches=(found.before, found.after),
         judged_by=found.validation,
         fitted_to=found.fitted_to,
         remarks=(
-            f"λ_noise {found.noise.threshold_count:g} counts, noise {found.noise.pooled_std_count:.2f} counts; masks of active "
-            f"taxels: intersection over union {found.before.mask_iou:.3f} → {found.after.mask_iou:.3f}",
+            f"λ_noise {found.noise.threshold_count:g} counts, noise {found.noise.pooled_std_count:.2f} counts; a taxel above "
+            "λ_noise is active",
             _as_option(found.noise.threshold_count),
         ),
         trouble=trouble,

@@ -15,6 +15,7 @@ from taccorl.diagnosis.comparison.localise import (
 )
 from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
 from taccorl.diagnosis.comparison.result import (
+    FELT_FLOORS,
     Comparison,
     Kind,
     Score,
@@ -25,6 +26,7 @@ from taccorl.diagnosis.comparison.result import (
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.report.section import Cell as Styled
 from taccorl.report.section import Picture, Section, Value, change
+from taccorl.report.touch_match import touch_match_section
 
 USES: tuple[Use, ...] = ("validation", "test", "fit")
 """Uses in the order in which a recording is looked for as an example."""
@@ -100,6 +102,21 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
         right=range(2, len(heads)),
         notes=notes,
     )
+
+
+def pad_matches(*comparisons: Comparison) -> list[Section]:
+    """The paper's five numbers of each pad and use, a column for each twin; empty without
+    pads."""
+    every = {c.twin: c.pad_matches() for c in comparisons}
+    sections = []
+    for pad, use in comparisons[0].pad_matches():
+        own = {twin: m[pad, use] for twin, m in every.items() if (pad, use) in m}
+        title = f"{pad}, {use}"
+        sections.append(touch_match_section([*own], [*own.values()], title))
+    if not sections:
+        return []
+    note = f"A taxel above {FELT_FLOORS:g} of its noise floors is active."
+    return [Section(title="Touch match", notes=[note], parts=sections)]
 
 
 def _together(found: Mapping[tuple, Score], signal: str, use: Use) -> str:

@@ -206,6 +206,7 @@ class Report:
             *([compared.touch(self.without_effects, self.after)] if c.touches else []),
             compared.cell_numbers(self.last),
             compared.how_far(*twins),
+            *compared.pad_matches(*twins),
             *(
                 diagnosed(f, self.origins, regimes.get(f.part), self.options)
                 for f in self.found
@@ -307,6 +308,9 @@ def as_json(report: Report) -> dict[str, Any]:
         "scores": _scores(c),
         "scores_refitted": _scores(report.refitted),
         "scores_after": _scores(after),
+        "touch_match": _pad_matches(c),
+        "touch_match_refitted": _pad_matches(report.refitted),
+        "touch_match_after": _pad_matches(after),
         "where": {
             "note": WHERE_NOT_WHY,
             "twin": drawn.twin,
@@ -344,6 +348,15 @@ def _scores(c: Comparison | None) -> list[dict[str, Any]]:
         if c is None
         else [plain(s) | {"ratio": s.ratio} for s in (*c.scores(), *c.pad_scores())]
     )
+
+
+def _pad_matches(c: Comparison | None) -> list[dict[str, Any]]:
+    """The paper's five numbers of each pad and use."""
+    matches = {} if c is None else c.pad_matches()
+    return [
+        {"pad": pad, "use": use} | plain(one.record())
+        for (pad, use), one in matches.items()
+    ]
 
 
 def _diagnosis(d: Diagnosis) -> dict[str, Any]:

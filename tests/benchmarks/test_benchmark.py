@@ -290,6 +290,7 @@ TINY: dict[str, dict[str, Any]] = {  # module → its constants
     },
     "diagnosis": {"HIDDEN": ("coulomb_friction",), "HIDDEN_IN_PADS": ("taxel_saturation",), "ARMS": (410,)},
     "gpu": {"WORLDS": (2,), "WORLDS_ON_CPU": (2,), "NUM_ENVS": 2, "REPEATS": 1, "ACTIONS": 2},
+    "paper_search": {"SEEDS": 1},
     "policies": {"REPEATS": 1},
     "recordings": {"RECORDING_S": 4.0, "LONG_RECORDING_S": 5.0, "RIVAL_ROWS": 5, "REPEATS": 1},
     "rl": {"NUM_SIMS": 2, "REPEATS": 1, "_CHUNKS": (1,), "_CPUS": 2},

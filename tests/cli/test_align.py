@@ -15,6 +15,7 @@ from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.touch.match import MATCH_NUMBERS
 from taccorl.diagnosis.align import Alignment, align_part, aligned
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
@@ -76,6 +77,45 @@ def test_gains_are_found_and_the_error_falls_to_the_noise(
     )
     assert twin.controller_of("right") == TwinConfig().controller_of("right")
     assert "mrad" in said("compare", folder / "sweeps", "--twin=found/twin.yaml")[1]
+
+
+def test_the_paper_s_spsa_writes_a_twin(folder: Path, said: Any, tmp_path: Path):
+    words = ["--method=spsa", "--seed=1", "--out=found"]
+    code, text = said("align", folder / "sweeps", *words)
+    assert code == 0, text
+    report = json.loads((tmp_path / "found" / "report.json").read_text())
+    assert "--method=spsa --seed=1" in report["command"]
+    [part] = report["parts"]
+    assert part["trouble"] == "" and part["after"] < 0.5 * part["before"]
+    assert any(r.startswith("SPSA: loss (eq. 9)") for r in part["remarks"])
+    numbers = {n["name"]: n for n in part["numbers"]}
+    assert not numbers["kp"]["fixed"], "the paper fits all three"
+    truth = other_gains().controller_of("left")
+    ratio = truth.kd_nms_per_rad[J] / truth.kp_nm_per_rad[J]
+    assert numbers["kd/kp"]["value"] == pytest.approx(ratio, rel=0.05)
+    assert numbers["kd/kp"]["low"] < ratio < numbers["kd/kp"]["high"]
+    control = load_twin(tmp_path / "found" / "twin.yaml").controller_of("left")
+    assert control.kp_nm_per_rad[J] == numbers["kp"]["value"]
+    assert control.kd_nms_per_rad[J] == numbers["kd"]["value"]
+    assert control.torque_ff_nm[J] == numbers["torque_ff"]["value"]
+
+
+@pytest.mark.parametrize(
+    ("words", "stated"),
+    [
+        (["--method=anneal"], "anneal"),
+        (["--seed=3"], "--method=spsa"),
+        (["--method=spsa", "--seed=-1"], "--seed=-1"),
+        (["--method=spsa", "--pads=left"], "--joints="),
+        (["--method=spsa", "--cameras=[front]"], "--joints="),
+    ],
+)
+def test_a_search_that_cannot_be_or_has_no_effect_is_refused(
+    words: list[str], stated: str, folder: Path, said: Any, tmp_path: Path
+):
+    code, text = said("align", folder / "sweeps", *words, "--out=found")
+    assert code == 2 and stated in text
+    assert not (tmp_path / "found").exists()
 
 
 @pytest.mark.slow
@@ -180,6 +220,12 @@ def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
         "left pads", config, Measurements((presses[0],), (presses[1],), rule="by hand")
     )
     assert found.trouble == "" and found.after < found.before
+    match = found.record()["touch_match"]
+    for number in MATCH_NUMBERS:
+        assert match["before"][number.name] > 0 and match["after"][number.name] > 0
+    assert match["before"]["rms_count"] == found.before
+    assert match["after"]["histogram_count"] < 0.2 * match["before"]["histogram_count"]
+    assert match["before"]["undefined"] == match["after"]["undefined"] == {}
     (counts,) = re.findall(r"λ_noise (\S+) counts", found.remarks[0])
     (option,) = re.findall(r"--policy\.noise_threshold=(\S+)", found.remarks[1])
     assert (

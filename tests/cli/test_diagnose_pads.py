@@ -13,10 +13,11 @@ import pytest
 import yaml
 
 from taccorl.alignment.measurements.folder import INDEX
+from taccorl.alignment.touch.match import MATCH_NUMBERS
 from taccorl.cli.main import main
 from taccorl.sim.effects import effects
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
-from taccorl.sim.twin_file import load_twin
+from taccorl.sim.twin_file import load_twin, save_twin
 from taccorl.surrogate import touch
 
 VERB = ""
@@ -66,6 +67,37 @@ def robot(made: Path) -> Path:
         assert main(["diagnose", str(made / "presses"), *words]) == 0
     (made / "said.txt").write_text(said.getvalue())
     return made
+
+
+@pytest.mark.slow
+def test_the_paper_s_five_numbers_are_in_align_and_compare(
+    made: Path, said: Any, tmp_path: Path
+):
+    presses, twin = made / "presses", f"--twin={made / 'twin.yaml'}"
+    said("align", presses, twin, "--pads=left", "--out=aligned")
+    [part] = json.loads((tmp_path / "aligned" / "report.json").read_text())["parts"]
+    before, after = part["touch_match"]["before"], part["touch_match"]["after"]
+    names = [number.name for number in MATCH_NUMBERS]
+    assert len(names) == 5 and set(names) < set(before) == set(after)
+    assert all(before[name] > 0 and after[name] > 0 for name in names)
+    assert before["undefined"] == after["undefined"] == {}
+    # Of a twin whose pads are 30 % stiffer: another twin, other numbers.
+    config = load_twin(made / "twin.yaml")
+    config.sensor.normal_stiffness_per_m *= 1.3  # pyright: ignore
+    save_twin(config, tmp_path / "stiff.yaml")
+    words = [presses, twin, "--against=stiff.yaml", "--out=compared"]
+    code, text = said("compare", *words)
+    assert code == 0 and all(number.label in text for number in MATCH_NUMBERS)
+    report = json.loads((tmp_path / "compared" / "report.json").read_text())
+    one, other = report["touch_match"], report["touch_match_after"]
+    keys = [(m["pad"], m["use"]) for m in one]
+    assert keys == [(m["pad"], m["use"]) for m in other]
+    assert set(keys) >= {("left_a", "validation"), ("left_b", "fit")}
+    for soft, stiff in zip(one, other, strict=True):
+        assert 0 < soft["mask_iou"] < 1 and soft["centroid_m"] < 2e-3
+        assert soft["temporal_count"] < stiff["temporal_count"]
+    assert report["touch_match_refitted"] == []
+    assert "Touch match" in (tmp_path / "compared" / "report.html").read_text()
 
 
 @pytest.mark.slow

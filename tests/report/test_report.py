@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_traces import ORIGIN, comparison, swing, trace
+from made_traces import ORIGIN, comparison, swing, touch_trace, trace
 from simulated_sweeps import SIGNAL, friction, sweeps
 
 import taccorl
@@ -21,12 +21,20 @@ from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError, TaccorlError, plain_name
+from taccorl.report.compared import pad_matches
 from taccorl.report.diagnosed import brief, clean
 from taccorl.report.diagnosed import diagnosed as sections_of
 from taccorl.report.evidence_words import separable
 from taccorl.report.ingested import ingested
 from taccorl.report.page import html
-from taccorl.report.report import NUMBERS, PAGE, Report, check_folder, write_report
+from taccorl.report.report import (
+    NUMBERS,
+    PAGE,
+    Report,
+    as_json,
+    check_folder,
+    write_report,
+)
 from taccorl.report.section import Cell, Picture, Section, cell, change
 from taccorl.report.terminal import show
 from taccorl.sim.effects import effects
@@ -90,6 +98,39 @@ def test_page_needs_no_other_file_and_says_where_its_data_is_from(written: Path)
         "where the twin is off, not why" in tags.text
         and "taccorl compare sweeps" in tags.text
     )
+
+
+def test_the_paper_s_five_numbers_of_pads_stand_before_and_after(tmp_path: Path):
+    # Pad a of 2 × 3 taxels, active above 4 floors of 1 count: measured {00, 01}; the twin
+    # has {01} in all frames, the mended twin what was measured. Pad b reads nothing.
+    measured = np.zeros((200, 2, 2, 3))
+    measured[:, 0, 0] = [10.0, 30.0, 4.0]
+    replayed = measured.copy()
+    replayed[:, 0, 0] = [0.0, 40.0, 0.0]
+    before, after = (
+        comparison(touches=(touch_trace(measured, counts, 1.0, pitch_m=2e-3),), twin=n)
+        for n, counts in (("twin", replayed), ("mended twin", measured))
+    )
+    report = Report(title="pads", comparison=before, after=after)
+    found = as_json(report)
+    one, silent = found["touch_match"]
+    mended, _ = found["touch_match_after"]
+    assert (one["pad"], one["use"], one["frames"]) == ("left_a", "validation", 200)
+    assert one["mask_iou"] == pytest.approx(1 / 2)
+    assert one["active_taxels"] == pytest.approx(1.0)
+    # Column (10·0 + 30·1) / 40 = 0.75 against 1, of 2 mm
+    assert one["centroid_m"] == pytest.approx(0.25 * 2e-3)
+    # Half of 10, 30 moves from 10 to 40, the other half from 30 to 40.
+    assert one["histogram_count"] == pytest.approx((30 + 10) / 2)
+    assert one["temporal_count"] == 0.0
+    assert (mended["mask_iou"], mended["centroid_m"]) == (1.0, 0.0)
+    assert silent["pad"] == "left_b" and silent["centroid_m"] is None
+    assert "no frame" in silent["undefined"]["centroid_m"]
+    (section,) = pad_matches(before, after)
+    table, other = section.parts
+    assert list(table.heads) == ["number", "twin", "mended twin", "unit"]
+    assert list(table.rows[2]) == ["centroids", "0.5", "0", "mm"]
+    assert list(other.rows[2]) == ["centroids", "undefined", "undefined", "mm"]
 
 
 def test_numbers_are_those_of_the_comparison(tmp_path: Path):

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import OptimizeResult, least_squares
 
+from taccorl.alignment.controller import spsa
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -39,6 +40,7 @@ _STEPS = {
     "kd": 1e-4,
     "torque_ff": 1e-6,
 }  # of log K_p, log K_d / K_p and T_ref / K_p [rad], for derivatives
+_LOG_IN_PAPER = {"kp", "kd"}  # varied as logarithms
 _LATE_STEP_S, _MOST_LATE_S = 1e-4, 0.5
 _DIVERGED = 1e3
 
@@ -88,17 +90,19 @@ def identify_controller(
     *,
     free: Sequence[str] | None = None,
     validation: Sequence[JointMotion] = (),
+    spsa_rng: np.random.Generator | None = None,
 ) -> ControllerFit:
     """Fit the gains of ``model`` to recordings of its joint.
 
     Least squares of positions, and of torques if every recording has them: K_p and K_d are then as accurate as the driver's
-    scale of torques. (The paper searches by SPSA.)
+    scale of torques. Or SPSA with the paper's loss of positions, from the twin's gains, if ``spsa_rng`` is given.
 
     Args:
         motions_fit: recordings to which the gains are fitted.
         free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. The others
             have the commanded values, or the twin's.
         validation: recordings that are not used in the fit; their errors are reported.
+        spsa_rng: generator of SPSA's random signs; None: least squares.
 
     Raises TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a
     parameter is unknown."""
@@ -121,8 +125,15 @@ def identify_controller(
     search = _GainSearch(
         motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free)
     )
-    x, unfinished = _by_least_squares(search)
-    estimates, ridge = _estimates(search, x, search.covariance(x))
+    if spsa_rng is None:
+        x, unfinished = _by_least_squares(search)
+        spread, remarks = search.covariance(x), []
+    else:
+        x, remarks = _by_spsa(search, spsa_rng)
+        unfinished = []
+        to_minimum = search.step_to_minimum(x)
+        spread = search.covariance(x) + np.outer(to_minimum, to_minimum)
+    estimates, ridge = _estimates(search, x, spread)
     later = search.solve(
         np.append(x, 1e-6), most=30
     ).x  # with a delay of the rows as a further unknown
@@ -150,6 +161,7 @@ def identify_controller(
         converged=not unfinished,
         remarks=(
             *(f"not converged, because {why}" for why in unfinished),
+            *remarks,
             *_remarks(search, estimates, ridge),
         ),
     )
@@ -166,6 +178,40 @@ def _by_least_squares(search: "_GainSearch") -> tuple[np.ndarray, list[str]]:
     return found.x, [] if found.status > 0 else [
         f"{found.nfev} steps of the solver were not enough"
     ]
+
+
+def _by_spsa(
+    search: "_GainSearch", rng: np.random.Generator
+) -> tuple[np.ndarray, list[str]]:
+    """The best x, and remarks. The paper's search is over η = log K_p, log K_d, T_ref, of
+    which only free ones are varied."""
+
+    def gains(eta: np.ndarray) -> Gains:
+        found = dict(zip(search.free, eta, strict=True))
+        for name in _LOG_IN_PAPER & found.keys():
+            found[name] = math.exp(found[name])
+        return search.given._replace(**found)
+
+    def loss(eta: np.ndarray) -> float:
+        positions = (search.simulate(m, gains(eta))[0] for m in search.motions)
+        measured = (m.measured for m in search.motions)
+        return sum(map(spsa.paper_loss, positions, measured))
+
+    values = [(getattr(search.given, n), *PAPER_BOUNDS[n]) for n in search.free]
+    eta = [
+        np.log(own) if name in _LOG_IN_PAPER else np.array(own)
+        for name, own in zip(search.free, values, strict=True)
+    ]
+    start, low, high = np.transpose(eta)
+    found = spsa.minimise(loss, start, low, high, rng)
+    remarks = [
+        f"SPSA: loss (eq. 9) {found.start_loss:.4g} → {found.loss:.4g} rad in "
+        f"{found.iterations} iterations. It ends near the minimum, not at it: intervals "
+        "contain the distance as well as the noise"
+    ]
+    if not found.out_of_patience:
+        remarks.append("SPSA was cut off while it still improved, if slowly")
+    return search.at(gains(found.x)), remarks
 
 
 def _estimates(
@@ -459,6 +505,10 @@ class _GainSearch:
             * len(residual)
             / independent_rows([part[:, None] for part in parts])
         )
+
+    def step_to_minimum(self, x: np.ndarray) -> np.ndarray:
+        """(P,) step from ``x`` to the minimum of least squares, to first order: −J⁺ r."""
+        return np.linalg.lstsq(self.jacobian(x), -self.residual(x))[0]
 
     def weigh(self, x: np.ndarray) -> None:
         """Set the noise of both channels to the RMS residuals at ``x`` (P,)."""

@@ -1,8 +1,7 @@
 """Tactile calibration, paper App. B.2: λ_noise from readings without contact, then (k_n, k_d) on matched contact replays.
 
 The fit uses least squares on the counts of all taxels near the object. The match is measured, on recordings that were
-not used for the fit, by the quantities that the paper aligns: masks of active taxels, their number, centroids, histograms,
-temporal differences. The same threshold is applied to twin and measurement.
+not used for the fit, by the five quantities that the paper aligns (``touch.match``).
 
 k_n and the sensor's gain (counts for a reading of 1) cannot be separated by counts, so that the gain is not fitted.
 
@@ -18,6 +17,7 @@ from scipy.optimize import least_squares
 
 from taccorl.alignment.controller.identification import Estimate
 from taccorl.alignment.measurements.correlation import Rows, block_sums, rate_of
+from taccorl.alignment.touch.match import TouchMatch, touch_match
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.errors import TaccorlError
@@ -47,16 +47,6 @@ class NoiseLevel:
     def pooled_std_count(self) -> float:
         """RMS over all taxels of ``std_count`` [counts]."""
         return float(np.sqrt(np.mean(np.square(self.std_count))))
-
-
-@dataclass(frozen=True)
-class TouchMatch:
-    """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
-
-    rms_count: float  # RMS difference of counts [counts], over taxels that are ever active in either
-    mask_iou: (
-        float  # Masks of active taxels: intersection over union, all frames together
-    )
 
 
 @dataclass(frozen=True)
@@ -111,34 +101,6 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
         threshold_count=float(
             np.quantile(np.concatenate([f.ravel() for f in frames]), QUANTILE)
         ),
-    )
-
-
-def touch_match(
-    motions: Sequence[TouchMotion],
-    simulated: Sequence[np.ndarray],
-    threshold_count: float,
-) -> TouchMatch:
-    """Compare measured with simulated counts; a taxel is active above ``threshold_count`` (λ_noise).
-    ``simulated``: counts (T, P, R, C) for each of ``motions``."""
-    both = [
-        (m.measured.astype(np.float32), s.astype(np.float32))
-        for m, s in zip(motions, simulated, strict=True)
-    ]
-    masks = [(a > threshold_count, b > threshold_count) for a, b in both]
-    ever = [a.any(axis=0) | b.any(axis=0) for a, b in masks]
-    union = sum(int((a | b).sum()) for a, b in masks)
-    if union == 0:
-        raise TaccorlError(
-            f"touch: no taxel ever has a reading above λ_noise = {threshold_count:g} counts in {_names(motions)}"
-        )
-    differences = [(x - y)[:, of] for (x, y), of in zip(both, ever, strict=True)]
-    rms = math.sqrt(
-        sum(float(np.square(x).sum()) for x in differences)
-        / max(sum(x.size for x in differences), 1)
-    )
-    return TouchMatch(
-        rms_count=rms, mask_iou=sum(int((a & b).sum()) for a, b in masks) / union
     )
 
 
@@ -207,7 +169,14 @@ def calibrate_touch(
         [model.counts(m, model.simulate(m, *numbers)) for m in validation]
         for numbers in (start, value)
     ]
-    matches = [touch_match(validation, counts, threshold) for counts in simulated]
+    measured, pitch_m = [m.measured for m in validation], validation[0].layout.pitch_m
+    before, after = (
+        touch_match(measured, counts, threshold, pitch_m) for counts in simulated
+    )
+    if before.rms_count is None or after.rms_count is None:
+        raise TaccorlError(
+            f"touch: no taxel ever has a reading above λ_noise = {threshold:g} counts in {_names(validation)}"
+        )
     return TouchCalibration(
         noise=noise,
         stiffness=Estimate(
@@ -219,8 +188,8 @@ def calibrate_touch(
             high=float(high[1]),
             unit="s/m",
         ),
-        before=matches[0],
-        after=matches[1],
+        before=before,
+        after=after,
         fitted_to=tuple(m.name for m in fit),
         validation=tuple(m.name for m in validation),
         trouble=_trouble(solved.status, value, std),

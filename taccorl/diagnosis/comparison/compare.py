@@ -435,6 +435,7 @@ def _touches(
                 replayed=model.counts(motion, reading),
                 floor=np.stack([floors[pad] for pad in motion.pads]),
                 origin=m.origin,
+                pitch_m=motion.layout.pitch_m,
                 touched=np.asarray((motion.depth()[0] > 0).any(axis=(2, 3))),
             )
         )

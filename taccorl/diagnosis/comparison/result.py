@@ -16,6 +16,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.folder import Use
 from taccorl.alignment.measurements.noise_floor import SignalFloor
+from taccorl.alignment.touch.match import TouchMatch, touch_match
 from taccorl.data.finding import Finding
 from taccorl.data.origin import NOT_STATED, Origin
 from taccorl.errors import TaccorlError, nearest
@@ -126,6 +127,8 @@ class TouchTrace:
     """(N, P, R, C) load on each cell, in ``load_unit``; None if only the object's shape and pose are known."""
     load_unit: str = ""
     """Unit of ``load``; empty if that is None."""
+    pitch_m: float | None = None
+    """Distance between neighbouring taxels of a pad [m]; None for cells."""
     repeated: bool = False
     """True: ``floor`` includes the variation between repeats of a press. False: it is the noise of each cell, a lower bound."""
     cells: CellNumbers | None = None
@@ -257,21 +260,39 @@ class Comparison:
             ]
         return [s for s in found if s is not None]
 
+    @property
+    def pads(self) -> list[str]:
+        """Names of the pads, in the order of ``ROBOT.pads``; others follow."""
+        place = {pad: k for k, pad in enumerate(ROBOT.pads)}
+        known = dict.fromkeys(pad for t in self.touches for pad in t.pads)
+        return sorted(known, key=lambda pad: place.get(pad, len(place)))
+
     def pad_scores(self) -> list[Score]:
-        """Errors of every pad and use: pad by pad, in the order of ``ROBOT.pads``."""
-        there = dict.fromkeys(pad for t in self.touches for pad in t.pads)
-        pads = sorted(
-            there,
-            key=lambda pad: (
-                ROBOT.pads.index(pad) if pad in ROBOT.pads else len(ROBOT.pads)
-            ),
-        )
+        """Errors of every pad and use: pad by pad, in the order of ``pads``."""
         found = [
             _touch_score([t for t in self.touches if t.use == use], pad)
-            for pad in pads
+            for pad in self.pads
             for use in self.uses
         ]
         return [s for s in found if s is not None]
+
+    def pad_matches(self) -> dict[tuple[str, Use], TouchMatch]:
+        """(pad, use) → the paper's five numbers, for pads of known pitch, in the order of
+        ``pad_scores``. Taxels that read more than ``FELT_FLOORS`` of their noise floors are
+        active."""
+        found = {}
+        for pad in self.pads:
+            for use in self.uses:
+                traces = [t for t in self.touches if t.use == use and pad in t.pads]
+                if not traces or (pitch_m := traces[0].pitch_m) is None:
+                    continue
+                found[pad, use] = touch_match(
+                    [t.measured[:, [t.pads.index(pad)]] for t in traces],
+                    [t.replayed[:, [t.pads.index(pad)]] for t in traces],
+                    FELT_FLOORS * traces[0].floor[traces[0].pads.index(pad)],
+                    pitch_m,
+                )
+        return found
 
 
 # scores ----------------------------------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ from taccorl.alignment.touch.calibration import (
     TouchCalibration,
     calibrate_touch,
     noise_level,
-    touch_match,
 )
+from taccorl.alignment.touch.match import touch_match
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
@@ -60,7 +60,7 @@ def test_stiffness_and_damping_are_recovered_within_their_intervals(
         assert abs(number.value - truth) < 2 * half
 
 
-def test_the_validation_recording_is_matched_up_to_the_noise(
+def test_the_validation_recording_is_matched_in_all_that_the_paper_aligns(
     found: TouchCalibration,
 ) -> None:
     before, after = found.before, found.after
@@ -70,6 +70,12 @@ def test_the_validation_recording_is_matched_up_to_the_noise(
     assert after.rms_count == pytest.approx(1.33, rel=0.05), "what is left is noise"
     assert after.mask_iou >= before.mask_iou
     assert after.mask_iou > 0.97
+    assert after.active_taxels <= before.active_taxels
+    assert after.centroid_m < 1e-3
+    assert after.histogram_count < 0.2 * before.histogram_count
+    # Of noise alone: √2 · 1.33
+    assert after.temporal_count == pytest.approx(1.88, rel=0.05)
+    assert after.temporal_count <= before.temporal_count
 
 
 def test_the_twins_own_effects_act_in_the_fit(presses: list[TouchMotion]) -> None:
@@ -88,10 +94,13 @@ def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(
     clean = np.zeros(motion.measured.shape, np.int16)
     clean[motion.near(0.0).any(axis=(2, 3)), 10:14, 3:6] = 50
     made = dataclasses.replace(motion, measured=clean)
-    perfect = touch_match([made], [clean], 4.0)
+    pitch_m = motion.layout.pitch_m
+    perfect = touch_match([made.measured], [clean], 4.0, pitch_m)
     assert (perfect.rms_count, perfect.mask_iou) == (0.0, 1.0)
-    moved = touch_match([made], [np.roll(clean, 1, axis=3)], 4.0)
+    moved = touch_match([made.measured], [np.roll(clean, 1, axis=3)], 4.0, pitch_m)
     assert moved.mask_iou == pytest.approx(8 / 16)  # of 3 + 1 columns two are shared
+    assert moved.centroid_m == pytest.approx(2e-3)  # one column
+    assert (moved.active_taxels, moved.histogram_count) == (0.0, 0.0)
 
 
 def test_what_cannot_be_calibrated_is_said(presses: list[TouchMotion]) -> None:
@@ -109,6 +118,11 @@ def test_what_cannot_be_calibrated_is_said(presses: list[TouchMotion]) -> None:
     touched = dataclasses.replace(
         presses[0], **{name: getattr(presses[0], name)[210:240] for name in in_time}
     )
+    before = {name: getattr(presses[1], name)[:150] for name in in_time}
+    before["measured"] = np.zeros_like(before["measured"])
+    silent = dataclasses.replace(presses[1], **before)
+    with pytest.raises(TaccorlError, match=r"no taxel ever.*λ_noise.*press_1"):
+        calibrate_touch(presses[:1], [silent], CONFIG)
     with pytest.raises(
         TaccorlError, match=r"pad left_a has 0 frames without contact in press_0"
     ):
