@@ -81,7 +81,7 @@ def test_statements_classes_and_constants_are_counted(tmp_path: Path) -> None:
     assert concepts(tmp_path) == Concepts(statements=5, classes=1, constants=3)
 
 
-@pytest.mark.parametrize("folder", MOST.keys() - {"tests"})
+@pytest.mark.parametrize("folder", [name for name in MOST if name != "tests"])
 def test_no_file_is_too_long(folder: str) -> None:
     long = {}
     for path in (ROOT / folder).rglob("*.py"):
