@@ -21,7 +21,7 @@ class Concepts(NamedTuple):
 
 
 MOST = {
-    "taccorl/alignment": Concepts(10_964, 117, 556),
+    "taccorl/alignment": Concepts(10_967, 117, 556),
     "taccorl/cli": Concepts(3_494, 38, 38),
     "taccorl/data": Concepts(7_013, 77, 223),
     "taccorl/diagnosis": Concepts(7_211, 84, 217),
@@ -40,9 +40,9 @@ MOST = {
     "taccorl/training": Concepts(1_042, 15, 13),
     "taccorl/views": Concepts(1_535, 8, 73),
     "tests": Concepts(40_042, 139, 1101),
-    "pipelines": Concepts(4_119, 20, 182),
+    "pipelines": Concepts(4_116, 20, 182),
 }
-MOST_LINES_OF_A_FILE = 800  # at 88 columns
+MOST_LINES_OF_A_FILE = 850  # at 88 columns
 
 
 def is_constant(name: str) -> bool:

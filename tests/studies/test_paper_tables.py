@@ -140,7 +140,7 @@ def test_cells_are_what_was_counted():
         f"{puzzle} not run | 90.6 → 50 % of 128; of 9 | 0 % (0 … 4) of 96*, updates: 3 | {both}"
         in told
     )
-    assert "after PPO of policies of 8 demonstrations: not run" in told
+    assert "What PPO adds to it is not\nknown" in told
     beside = [*moved, moved[1] | {"twin": "", "real": 5, "sim_weight": 0.5}]
     assert len(transfer(beside)["late", 9]["nominal"]) == 1
     alone = "0 % (0 … 4) of 96* | 14 % (10 … 20) of 192* |"

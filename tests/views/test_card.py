@@ -92,7 +92,7 @@ def test_an_instruction_cannot_put_markup_or_links_into_the_card(copy: Path):
     card = card_text(Dataset(copy))
     line = next(x for x in card.splitlines() if x.startswith("- instruction"))
     assert line == (
-        r"- instruction: *\<img src=x onerror=alert(1)\> [x\](javascript:alert(1)) "
+        r"- instruction: *\<img src=x onerror=alert(1)\> [x\]\(javascript:alert(1)) "
         r"\*\*now\*\**"
     )
 

@@ -484,9 +484,10 @@ def _braking(one: Actuator) -> Part:
 def _of_device(draft: JointDraft, a: Actuator) -> None:
     """Cogging and LuGre friction of a DC motor, at the joint."""
     fields, g = a.fields, abs(a.gear)
-    amplitude, poles, phase, sliding, static, slow = (
-        fields.get(f"actuator_biasprm[{i}]") for i in range(6)
-    )
+    cogging = [fields.get(f"actuator_biasprm[{i}]") for i in range(3)]
+    amplitude, poles, phase = cogging
+    lugre = [fields.get(f"actuator_biasprm[{i}]") for i in range(3, 6)]
+    sliding, static, slow = lugre
     if amplitude > 0.0:
         names = [f"actuator_biasprm[{i}]" for i in range(3)]
         values: dict[str, Any] = {"torque_nm": g * amplitude, "periods": g * poles}
