@@ -9,8 +9,8 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder"
-"$folder/bin/pip" install --quiet --disable-pip-version-check \
-    mujoco==4.0.0 numpy==2.2.6
+"$folder/bin/pip" install --quiet --disable-pip-version-check --no-compile \
+    mujoco-core==4.0.0 numpy==2.2.6
 "$folder/bin/python" - <<'PYTHON'
 import sys
 
