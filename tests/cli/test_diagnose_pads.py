@@ -71,8 +71,9 @@ def robot(made: Path) -> Path:
 
 @pytest.mark.slow
 def test_the_paper_s_five_numbers_are_in_align_and_compare(
-    made: Path, said: Any, tmp_path: Path
+    made: Path, said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.chdir(tmp_path)
     presses, twin = made / "presses", f"--twin={made / 'twin.yaml'}"
     said("align", presses, twin, "--pads=left", "--out=aligned")
     [part] = json.loads((tmp_path / "aligned" / "report.json").read_text())["parts"]
