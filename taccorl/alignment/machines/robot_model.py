@@ -178,6 +178,8 @@ def _spec(
     try:
         if root.tag == "mujoco":
             spec = mujoco.MjSpec.from_file(str(path))
+            # MuJoCo moves the model for minutes to find the range of a muscle.
+            spec.compiler.LRopt.mode = int(mujoco.mjtLRMode.mjLRMODE_NONE)
             tied = (
                 e
                 for e in spec.equalities

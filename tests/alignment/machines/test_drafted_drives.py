@@ -470,6 +470,25 @@ def test_what_a_model_states_beside_its_joints_is_named_with_its_line(
     assert "kd: TODO" in text  # dampratio is no gain
 
 
+MUSCLE = """<mujoco><worldbody>
+<body><joint name="j" axis="0 1 0" range="-1 1" limited="true"/><geom size=".1"/>
+</body></worldbody>
+<actuator><position name="a" joint="j" kp="40" kv="2"/>
+<muscle name="m" joint="j"/></actuator></mujoco>"""
+
+
+def test_the_range_of_a_muscle_is_not_sought(tmp_path: Path) -> None:
+    """MuJoCo moves the model to find it, which may take minutes; no robot file uses it."""
+    path = tmp_path / "arm.xml"
+    path.write_text(MUSCLE)
+    by_mujoco = mujoco.MjModel.from_xml_path(str(path))
+    assert by_mujoco.actuator_lengthrange[1].any()
+    model = load_robot_model(path).model
+    assert not model.actuator_lengthrange.any()
+    _, robot = robot_draft(path, tmp_path / "robot.yaml")
+    assert any("actuator m (arm.xml:5)" in remark for remark in robot.remarks)
+
+
 def attributes(tag: str) -> list[str]:
     """Attributes of an element, by the schema of the MuJoCo that is installed."""
     schema = mujoco.mj_printSchema(False, False)
