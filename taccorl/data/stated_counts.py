@@ -137,23 +137,36 @@ def metadata_of(source: Source) -> dict[str, Any]:
 
 def bag_counts(source: Source) -> list[tuple[StatedCounts, tuple[Path, ...]]]:
     """What metadata.yaml counts, and in which files of the recording: in all of them
-    topic by topic, if they are the whole bag, and in each file, if it counts that."""
+    topic by topic, if they are the whole bag, and in each file, if it counts that.
+    Raises RecordingError: a count is no number of messages."""
     found, stated = metadata_of(source), []
     by_name = {path.name: path for path in source.files}
-    with contextlib.suppress(KeyError, TypeError, ValueError):
+    with contextlib.suppress(KeyError, TypeError):  # not stated
         for file in found.get("files") or ():
             name = Path(file["path"]).name.removesuffix(PACKED)
             if name in by_name and len(found["relative_file_paths"]) > 1:
-                number = int(file["message_count"])
+                number = _count(source, name, file["message_count"])
                 stated.append((StatedCounts(METADATA, total=number), (by_name[name],)))
     if {*by_name} != {*found.get("relative_file_paths", ())}:
         return stated
-    with contextlib.suppress(KeyError, TypeError, ValueError):
+    with contextlib.suppress(KeyError, TypeError):
         topics: Counter[str] = Counter()
         for topic in found["topics_with_message_count"]:
-            topics[topic["topic_metadata"]["name"]] += int(topic["message_count"])
-        start_ns = int(found["starting_time"]["nanoseconds_since_epoch"])
-        end_ns = start_ns + int(found["duration"]["nanoseconds"])
-        total = int(found["message_count"])
+            name = topic["topic_metadata"]["name"]
+            topics[name] += _count(source, name, topic["message_count"])
+        begin_ns = found["starting_time"]["nanoseconds_since_epoch"]
+        length_ns = found["duration"]["nanoseconds"]
+        end_ns = sum(_count(source, "its times", ns) for ns in (begin_ns, length_ns))
+        total = _count(source, "the bag", found["message_count"])
         stated.insert(0, (StatedCounts(METADATA, topics, total, end_ns), source.files))
+    return stated
+
+
+def _count(source: Source, what: str, stated: object) -> int:
+    """Raises RecordingError: ``stated`` is no whole number, or below 0."""
+    if not isinstance(stated, int) or isinstance(stated, bool) or stated < 0:
+        raise RecordingError(
+            f"{source.path}: {METADATA} states {stated!r} for {what}, which is no whole number "
+            "of 0 or more: what lacks cannot be told. Correct it, or remove that file"
+        )
     return stated

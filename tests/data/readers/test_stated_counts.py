@@ -124,6 +124,21 @@ def test_more_messages_than_metadata_counts_are_no_loss(tmp_path):
     assert damage_of(bag) == []
 
 
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("stated", ["many", -5, 2.5, True])
+def test_a_count_that_is_none_is_refused_and_not_ignored(stated, plugin, tmp_path):
+    bag = write_ros2(tmp_path / "bag", plugin)
+    path = bag / "metadata.yaml"
+    metadata = yaml.safe_load(path.read_text())
+    of_topic = metadata["rosbag2_bagfile_information"]["topics_with_message_count"][0]
+    of_topic["message_count"] = stated
+    path.write_text(yaml.safe_dump(metadata))
+    with pytest.raises(
+        RecordingError, match=rf"metadata.yaml states {stated!r} for /a"
+    ):
+        damage_of(bag)
+
+
 def split_bag(folder: Path) -> Path:
     """Three .db3 files of one bag, of 20, 20 and 10 messages of each topic."""
     bag = write_ros2(folder / "bag", "SQLITE3")
