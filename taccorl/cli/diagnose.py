@@ -106,6 +106,7 @@ def run(config: DiagnoseConfig) -> int:
     left = [part for part in parts if part not in {f.part for f in found}]
     refused += [f"{part}: stopped before an effect was found" for part in left]
     if not found and stopped_by == signal.SIGTERM:
+        show(Section(text=[*refused, "no report was written"]))
         return 128 + stopped_by
     if not found:
         raise KeyboardInterrupt
