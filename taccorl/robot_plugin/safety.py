@@ -70,6 +70,9 @@ PIPER_EFFORT = {"gripper.pos": 45.0, ".pos": 15.0}
 rad/s and 24 thousand counts of a pad."""
 
 _NUMBER = re.compile(r"(?<!\w)-?\d[\d.e+-]*")  # in a reason of a stop, not in a name
+_IMPOSSIBLE = (
+    10.0  # largest speeds: no collision or hand moves a joint so fast. A choice
+)
 _AT_TARGET = 0.2  # of what a joint moves in a period at its largest speed: 0.02 rad at 3 rad/s and 30 Hz
 
 
@@ -193,6 +196,8 @@ class Guard:
             seen, stamps_s = self._admitted(seen)
         except Unfit as error:
             return self.stop(str(error), is_lost=True)
+        if jump := self._jump(seen, stamps_s["state"]):
+            return self.stop(jump, is_lost=True)
         self.is_unfit = False
         passed_s = stamps_s["state"] - self._stamps_s.get("state", -math.inf)
         if self._observed is not None and 0 < passed_s < 1:
@@ -213,6 +218,23 @@ class Guard:
                 f"effort of {self.names[k]}: {seen.effort[k]:.1f}, at most {self._effort[k]:g}"
             )
         return self._beyond(seen.position, "is")
+
+    def _jump(self, seen: Observed, stamp_s: float) -> str:
+        """Text on a position that no robot of these speeds can have moved to since the
+        last one; empty if there is none."""
+        if self._observed is None or not math.isfinite(
+            before_s := self._stamps_s["state"]
+        ):
+            return ""
+        passed_s = max(stamp_s - before_s, self.period_s) + self.config.max_skew_s
+        moved = np.abs(seen.position - self._observed.position)
+        if not (beyond := moved > _IMPOSSIBLE * self._speed * passed_s).any():
+            return ""
+        k = int(np.argmax(beyond))
+        return (
+            f"position of {self.names[k]} moved by {moved[k]:.3g} in {passed_s:.3g} s, more than "
+            f"{_IMPOSSIBLE:g} times its largest speed {self._speed[k]:g}: the encoder or its reader is wrong"
+        )
 
     def _admitted(self, seen: Observed) -> tuple[Observed, dict[str, float]]:
         """The observation with every number checked, and the time of each channel's

@@ -120,6 +120,7 @@ FAULTS = {
     "state inf": Fault("stop", "position of gripper.pos is -inf", put("position", np.array([0, 0, -np.inf]))),
     "state shape": Fault("stop", r"position: of shape \(2,\)", put("position", np.zeros(2))),
     "state none": Fault("stop", "position: of type object", put("position", None)),
+    "state jump": Fault("stop", "position of .* moved by .* times its largest speed", put("position", np.array([1e4, 0, 0]))),
     "state text": Fault("stop", "position: of type <U", put("position", np.array(["0", "0", "0"]))),
     "state stamp nan": Fault("stop", "time of state is nan", stamped("state", math.nan)),
     "state stamp missing": Fault("stop", "state has no time", without_state),
