@@ -100,7 +100,7 @@ class Episode:
     provenance: dict[str, object] = field(default_factory=dict)
     """Facts about how the episode was made, as JSON values: recording, simulation …"""
     stored_rows: int = 0
-    """T of an episode of a dataset, for one of which no numbers are read."""
+    """Number of rows that the dataset states; used where no array of numbers was read."""
     findings: tuple[Finding, ...] = ()
     """Findings about the recording's samples, at the full rate of the channels (rows hold only some of the samples)."""
 

@@ -82,7 +82,7 @@ class TouchMatch:
 
     @property
     def undefined(self) -> dict[str, str]:
-        """Number that is None → what the readings lack."""
+        """Name of each number that is None → why these readings do not determine it."""
         return {n.name: n.needs for n in MATCH_NUMBERS if getattr(self, n.name) is None}
 
 

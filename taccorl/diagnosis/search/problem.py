@@ -408,7 +408,7 @@ class Found(str):
     intervals: Mapping[str, tuple[float, float]]
     """Fitted number → 95 % interval; empty before the end."""
     finished: bool
-    """True at the end of the search."""
+    """True if the search has ended; false while it still adds effects."""
 
     def __new__(cls, text: str, **facts: Any) -> "Found":
         """``facts``: values of all attributes."""
