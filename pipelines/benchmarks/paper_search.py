@@ -97,7 +97,7 @@ def align(sweeps: Path, twin: Path, signal: str, seed: int) -> Found:
 
 
 def runs() -> Iterator[Found]:
-    """All runs, joint by joint."""
+    """Run SPSA for every joint and seed; yield the results joint by joint."""
     controller = ControllerConfig(
         kp_nm_per_rad=[REFERENCE.kp] * ROBOT.num_joints,
         kd_nms_per_rad=[REFERENCE.kd] * ROBOT.num_joints,

@@ -503,7 +503,7 @@ def _checked_info(root: Path) -> dict[str, Any]:
 
 
 def _no_feature(feature: Any) -> str:
-    """Text on what makes an entry of ``features`` no description; empty if nothing does."""
+    """Error text for an entry of ``features`` in info.json that does not describe a feature; empty if the entry is valid."""
     if not isinstance(feature, dict):
         return f"expected dtype, shape and names, found {str(feature)[:80]!r}"
     dtype, shape = feature.get("dtype"), feature.get("shape")

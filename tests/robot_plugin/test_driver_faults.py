@@ -291,7 +291,8 @@ def test_without_a_finite_position_nothing_is_sent(
 
 
 def test_a_stop_repeats_the_last_finite_position(robot: DrivenRobot) -> None:
-    """Joints move by 0.01 a period, which is extrapolated for at most two periods."""
+    """The joints move by 0.01 in each period. While samples are missing, the guard
+    continues this motion for two periods at most."""
     robot.connect()
     robot.loop(5)
     measured, bench = robot.bench.position.copy(), robot.bench

@@ -410,7 +410,7 @@ def test_pings_of_a_stranger_cost_no_tick(patient_server: SurrogateServer) -> No
 
 
 def test_messages_that_are_none_of_a_surrogate_are_counted_by_the_link() -> None:
-    """A program that answers everything with the same message, on a port of its own."""
+    """A server on a free port that answers every request with the same message."""
     stamp, lead, state = '"stamps_s": [1.0]', [0.0] * 14, np.zeros((1, 3, 14)).tobytes()
     header = f'{{"kind": "state", {stamp}, "lead": {lead}}}'
     messages = {

@@ -47,9 +47,9 @@ class TouchPad:
     """One pad of a recording."""
 
     name: str
-    """Name in the dataset spec: the pads of an arm begin with its name, ``left_a``."""
+    """Name of the pad in the dataset spec. It begins with the name of the arm that carries it: ``left_a``."""
     shape: tuple[int, int]
-    """Numbers of rows and of columns of its taxels."""
+    """Number of rows and number of columns of the pad's taxels."""
     gain_per_count: float = 1 / 75
     """Normalised reading = counts above baseline × gain."""
 
