@@ -52,15 +52,15 @@ speed() { # BUILD NAME SECONDS OPTIONS: an iteration of PPO
   local out=/dev/shm/learn_speed/$2 path=/dev/shm/$1:$PYTHONPATH
   (cd "/dev/shm/$1" && PYTHONPATH=$path timeout "$3" python3 ${profile:+-m cProfile -o "$out.prof"} -m taccorl.cli.main post-train --config_path=configs/post_train/small.yaml \
     --policy.path="$start" --env.task="$task" --env.twin="$twin" --anchor.weight=0 --noise_check=false --rerun=false --env.start_share=0 --ppo.critic_warmup=0 \
-    --ppo.epochs=1 --ppo.batch_size=2048 --iterations=1 --save_freq=100 "${@:4}" --out="$out" >"$out.log" 2>&1)
+    --ppo.epochs=1 --ppo.batch_size=2048 --save_freq=100 "${@:4}" --out="$out" >"$out.log" 2>&1)
   since "$2 timed: $?"
 }
 one=(--env.shards=1 --env.threads="$threads")
-speed old old_2048 230 "${one[@]}" --env.physics=warp --env.num_envs=2048 --env.decisions=36
+speed old old_2048 230 "${one[@]}" --env.physics=warp --env.num_envs=2048 --env.decisions=36 --iterations=1
 speed repo new_8192_fast 150 "${one[@]}" --env.physics=warp:mode=resident,iterations=8,contacts=32,constraints=288 --env.num_envs=8192 --env.decisions=12 \
-  --policy.tf32=true --ppo.micro_batch=2048
+  --policy.tf32=true --ppo.micro_batch=2048 --iterations=1
+profile=yes speed repo compiled_8192 170 "${one[@]}" --env.physics=warp:mode=resident,iterations=8,contacts=32,constraints=288 --env.num_envs=8192 --env.decisions=12 \
+  --policy.tf32=true --policy.compile=true --ppo.micro_batch=2048 --iterations=2
 for build in old repo; do
-  speed $build c_of_$build 80 --env.physics=c --env.num_envs=128 --env.decisions=36 --env.shards="$threads" --env.threads=1
+  speed $build c_of_$build 80 --env.physics=c --env.num_envs=128 --env.decisions=36 --env.shards="$threads" --env.threads=1 --iterations=1
 done
-profile=yes speed repo profile_8192 150 "${one[@]}" --env.physics=warp:mode=resident,iterations=8,contacts=32,constraints=288 --env.num_envs=8192 --env.decisions=12 \
-  --policy.tf32=true --ppo.micro_batch=2048

@@ -240,7 +240,7 @@ class WarpBatch(Batch):
         def work(worlds: "_Worlds", run: np.ndarray) -> None:
             worlds.run(nstep, refresh=is_refreshed)
 
-        fields = dict.fromkeys(self._bound if is_refreshed else ())
+        fields = dict.fromkeys(self._bound) if is_refreshed else {}
         self._advance(ids, nstep, work, fields, with_state=is_refreshed)
 
     def step_targets(
