@@ -35,7 +35,7 @@ score() { # NAME POLICY OPTIONS
   since "$1 scored: $?"
 }
 by_c=(--workers="$((threads - 2))" --batch_size=14)
-score start_warp "$start" --physics=warp:mode=resident &
+score start_warp "$start" --physics=warp:mode=resident --batch_size=192 &
 score start_c "$start" "${by_c[@]}"
 wait
 options=()
@@ -44,7 +44,7 @@ timeout -s TERM $((end > $(now) ? end - $(now) : 1)) python3 -m taccorl.cli.main
   --env.twin="$twin" --env.threads="$threads" --rerun=false --keep_checkpoints=1 --save_freq=2 --seed="$seed" "${options[@]}" ${OPTIONS:-} --out="$out" >"$out.log" 2>&1
 since "post-trained: $?"
 result=$out/checkpoints/last/pretrained_model
-score result_warp "$result" --physics=warp:mode=resident &
+score result_warp "$result" --physics=warp:mode=resident --batch_size=192 &
 score result_c "$result" "${by_c[@]}"
 wait
 
