@@ -457,9 +457,7 @@ class JointProblem(WithoutMaps):
         found += [_within(name, value) for name, value in joint.winding.items()]
         if joint.exact_timing and joint.target_kind == "position":
             at = joint.target_late_s
-            found.append(
-                dataclasses.replace(TARGET_LATE, start=at, high=max(at, 0.0))
-            )
+            found.append(dataclasses.replace(TARGET_LATE, start=at, high=max(at, 0.0)))
         payloads: list[JointMotion] = [
             r.data
             for r in self.fit

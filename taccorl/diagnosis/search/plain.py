@@ -80,10 +80,11 @@ def plain_fit(
 
 
 def _without_timing(problem: Problem, start: Mapping[str, float]) -> list[Free]:
+    """Always fitted numbers; targets may also be early where a delay is fitted."""
     return [
         replace(f, start=start.get(f.name, f.start), held=True)
         if f.name in TIMING
-        else f
+        else replace(f, unless=())
         for f in problem.base
     ]
 

@@ -18,6 +18,7 @@ from taccorl.data.origin import Origin
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition, Machine
 from taccorl.diagnosis.search.fit import fit, rms, stacked
+from taccorl.diagnosis.search.plain import plain_fit
 
 J, KP, KD, STEP_S, RATE_HZ = 0.05, 20.0, 1.2, 2e-3, 100
 MODEL = f"""<mujoco><compiler angle="radian"/>
@@ -72,6 +73,10 @@ def test_timing_of_a_simulated_servo_with_commanded_gains_is_half_a_step(
     assert found.values["speed_delay_s"] == pytest.approx(-STEP_S / 2, abs=1e-4)
     left = rms(stacked(problem, found.values, (), problem.validation))
     assert left < 1.15
+    sides = problem.fit, problem.validation, problem.test
+    plain = plain_fit(problem, *sides, problem.start)
+    assert plain is not None
+    assert plain.errors["validation"] < 1.15
     base = {f.name: found.values[f.name] for f in found.frees}
     robot.with_additions([Addition("hinge", [], base, {})]).save(tmp_path / "new.yaml")
     (joint,) = yaml.safe_load((tmp_path / "new.yaml").read_text())["joints"].values()
