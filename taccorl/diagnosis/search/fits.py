@@ -30,8 +30,14 @@ from taccorl.diagnosis.search.fit import (
     over_own_scale,
     rms,
     stacked,
+    stacked_all,
 )
-from taccorl.diagnosis.search.identifiable import POSITION_AGE_S, not_told_from_none
+from taccorl.diagnosis.search.identifiable import (
+    LATE,
+    POSITION_AGE_S,
+    not_told_from_none,
+)
+from taccorl.diagnosis.search.lateness import lateness_s
 from taccorl.diagnosis.search.problem import (
     Candidate,
     Problem,
@@ -152,6 +158,11 @@ def best(models: Iterable[Model], config: SearchConfig) -> Model:
     return min(as_good, key=lambda m: (m.numbers, m.squares.mean))
 
 
+def simple_forms(cls: type[Effect]) -> tuple[str, ...]:
+    """Effects with fewer numbers that ``cls`` equals at the ends of one of its own."""
+    return (*cls.reduces_to, *cls.equals_when_wide)
+
+
 class Fits:
     """Fits of hypotheses to the same recordings, and their errors.
 
@@ -187,6 +198,8 @@ class Fits:
             for f in (*problem.base, *(f for x in there for f in x.frees))
         }
         """Value of every number of the problem as the machine's file has it, before any fit."""
+        self.late_s = max(lateness_s(problem, self.given, present, self.fit_to), 0.0)
+        """How much later than simulated with the machine's numbers it moves [s]."""
         self.state = ""
         """Text of how far the search is, before that of each step."""
         self.progress("fitting the numbers that are always fitted")
@@ -238,19 +251,35 @@ class Fits:
         return self.models[key]
 
     def without(self, model: Model, name: str, again: bool = False) -> Model:
-        """The model with one effect less, the others refitted; ``again``: from where ``model`` ended, so that both had the same
-        refits, even if it was fitted before."""
-        return self.whole(
-            tuple(n for n in model.names if n != name), model.fit.values, again
-        )
+        """The model with one effect less, the others refitted; ``again``: from where
+        ``model`` ended, so that both had the same refits, even if it was fitted before.
 
-    def whole(self, names: Sequence[str], start: Values, again: bool = False) -> Model:
-        """The model of exactly these effects, fitted fully from ``start`` unless it already is; ``again``: in any case."""
+        What makes the motion late gives its time to each other effect that does."""
+        others = tuple(n for n in model.names if n != name)
+        values = model.fit.values
+        late = [f.name for f in model.fit.frees if f.name.endswith(LATE)]
+        gone = sum(values[n] for n in late if n.startswith(f"{name}."))
+        shifted = [
+            values | {n: values[n] + gone}
+            for n in late
+            if gone > 0.0 and not n.startswith(f"{name}.")
+        ]
+        return self.whole(others, values, again, shifted)
+
+    def whole(
+        self,
+        names: Sequence[str],
+        start: Values,
+        again: bool = False,
+        further: Sequence[Values] = (),
+    ) -> Model:
+        """The model of exactly these effects, fitted fully from ``start`` and ``further``
+        ones unless it already is; ``again``: in any case."""
         there = self.models.get(frozenset(names))
         if there is not None and there.full and not again:
             return there
         self.progress(f"fitting {' and '.join(names) or 'no effect'}")
-        return self._keep(self.fitted(names, [start]), full=True)
+        return self._keep(self.fitted(names, [start, *further]), full=True)
 
     def children(
         self, parent: Model, names: Sequence[str], likely: bool = True
@@ -283,10 +312,15 @@ class Fits:
             seen.setdefault(p.name, []).append(p)
             self.probes.setdefault((key, p.name), p)
         order = list(seen)
+        simpler = {
+            form
+            for n in order[:SURELY_FULL]
+            for form in simple_forms(candidates[n].cls)
+        }
         names = [
             n
             for k, n in enumerate(order)
-            if k < PROBED or (likely and is_likely(candidates[n]))
+            if k < PROBED or n in simpler or (likely and is_likely(candidates[n]))
         ]
         starts = {
             n: [
@@ -320,7 +354,7 @@ class Fits:
             there = self.models.get(key | {n})
             if there is not None and there.full:
                 continue
-            sure = n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL])
+            sure = n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL], *simpler)
             if sure or short[n].error <= enough:
                 self.progress(f"refitting with {n}, {k} of at most {len(names)}")
                 began = [short[n].values, *starts[n][1:]]
@@ -329,10 +363,16 @@ class Fits:
                 self._keep(short[n], full=False)
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
-        """``parent`` with one effect more, after a few steps for each of its numbers."""
+        """``parent`` with one effect more, after a few steps for each of its numbers; one
+        that makes the motion late also from as late as the recordings are (``late_s``),
+        beside the numbers of the file: those of ``parent`` have made up for it."""
         own = self.problem.candidates[name].frees
         steps = FIRST_STEPS * max(sum(not f.optional for f in own), 1)
-        return self.fitted((*parent.names, name), [start], steps)
+        starts = [start]
+        late = [f.name for f in own if f.name.endswith(LATE)]
+        if late and self.late_s > 0.0:
+            starts.append(start | self.given | {late[0]: self.late_s})
+        return self.fitted((*parent.names, name), starts, steps)
 
     def _full(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
         """``parent`` with one effect more. Above the floor also from the numbers of the
@@ -464,6 +504,12 @@ class Fits:
             self.config.last_steps,
             FINE,
         )
+
+    def changed_by(self, a: Fit, b: Fit, recordings: Sequence[Recording]) -> float:
+        """RMS difference of what ``a`` and ``b`` simulate for ``recordings`` [floors]."""
+        ends = [(m.values, m.effects) for m in (a, b)]
+        one, other = stacked_all(self.problem, ends, recordings)
+        return rms(one - other)
 
     def error(self, model: Fit) -> float:
         """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""

@@ -291,14 +291,14 @@ def split_rows(
 
 
 def thinned(recordings: Sequence[Recording]) -> list[Recording]:
-    """Every second recording, at least two, and those without which a setting or a
-    regime of motion were lost. In their order."""
+    """Every second recording, at least two, and those without which a regime of motion or
+    a value of a setting were lost. In their order."""
     if len(recordings) <= 2:
         return list(recordings)
 
     def facts(r: Recording) -> set[Any]:
         seen = {n for n, (rows, _) in r.regimes.items() if rows.sum() >= LEAST_ROWS}
-        return {r.setting, *seen}
+        return seen | set(enumerate(r.setting))
 
     kept = list(recordings[::2])
     for r in recordings[1::2]:

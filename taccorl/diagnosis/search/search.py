@@ -21,6 +21,7 @@ test recordings, which no choice has seen, give the final figures.
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
 """
 
+import copy
 import dataclasses
 import itertools
 import time
@@ -37,7 +38,15 @@ from taccorl.diagnosis.search.changed_numbers import (
 )
 from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit
-from taccorl.diagnosis.search.fits import Fits, Model, best, better, refusal
+from taccorl.diagnosis.search.fits import (
+    Fits,
+    Model,
+    best,
+    better,
+    model_of,
+    refusal,
+    simple_forms,
+)
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import (
     EFFORT_SCALE,
@@ -303,20 +312,41 @@ class Beam:
         yield self._exchanged(answer)
 
     def _both(self, answer: Model) -> Model:
-        """The best of ``answer`` and of models with two effects in place of one that lies
-        between them, as friction over a power of the speed lies between Coulomb and
-        viscous friction; with more effects only if ``answer`` is above the floor."""
-        fits, most = self.fits, self.config.max_effects
-        room = 0 if fits.at_floor(answer) else most - len(fits.added(answer))
+        """``answer``, or the best model with two effects in place of one that lies between
+        them and leaves clearly less, as friction over a power of the speed lies between
+        dry and viscous friction. The dry one may be another with one number.
+
+        With more effects only if ``answer`` is above the floor, or for no more numbers.
+        """
+        fits, candidates = self.fits, self.fits.problem.candidates
+        room = self.config.max_effects - len(fits.added(answer))
+
+        def numbers(names: Sequence[str]) -> int:
+            return sum(not f.optional for n in names for f in candidates[n].frees)
+
+        pairs = []
         for name in fits.added(answer):
-            cls = fits.problem.candidates[name].cls
-            both = [*cls.reduces_to, *cls.equals_when_wide]
-            both = [n for n in both if n in self.names]
+            forms = [n for n in simple_forms(candidates[name].cls) if n in self.names]
+            if len(forms) < 2:
+                continue
             others = [n for n in answer.names if n != name]
-            names = tuple(dict.fromkeys([*others, *both]))
-            if len(both) > 1 and len(names) - len(answer.names) <= room:
-                fits.whole(names, answer.fit.values)
-        return best([answer, *self.sound(answer)], self.config)
+            key = frozenset(others)
+            twins = [
+                n
+                for n in candidates[forms[0]].cls.near_twins
+                if (key, n) in fits.probes and numbers([n]) == 1 and n not in forms
+            ]
+            twins.sort(key=lambda n: -fits.probes[key, n].explained)
+            for dry in (forms[0], *twins[:1]):
+                names = tuple(dict.fromkeys([*others, dry, *forms[1:]]))
+                more = len(names) - len(answer.names)
+                if more <= (0 if fits.at_floor(answer) else room) or (
+                    numbers([dry, *forms[1:]]) <= numbers([name])
+                ):
+                    pairs.append(fits.whole(names, answer.fit.values))
+        sound = [m for m in pairs if not fits.flaw(m)]
+        found = best(sound, self.config) if sound else answer
+        return found if refusal(answer, found, self.config) else answer
 
     def much(self, parent: Model) -> list[Model]:
         """Extensions of ``parent`` that remove much of the fit error, the best first."""
@@ -368,10 +398,34 @@ class Beam:
                 found.append(m)
         return found
 
+    def _repeated(self, answer: Model) -> tuple[Model, list[str]]:
+        """``answer`` without effects that gain nothing beside others on fit recordings that
+        the search has not used, though they change the simulation there by as much as
+        would be a gain; and their names."""
+        fits, removed = self.fits, list[str]()
+        unused = [r for r in self.whole.fit_to if r not in fits.fit_to]
+        while unused and len(fits.added(answer)) > 1:
+            own = model_of(fits.problem, answer.fit, unused)
+            gone = []
+            for name, part in self.parts(answer):
+                without = model_of(fits.problem, part.fit, unused)
+                changed = fits.changed_by(answer.fit, part.fit, unused)
+                needed = self.config.min_gain * max(without.squares.mean - 1.0, 1.0)
+                gain = gain_of(own.squares, without.squares)
+                if gain < self.config.min_gain and changed**2 >= needed:
+                    gone.append((gain, name, part))
+            if not gone:
+                break
+            _, name, answer = min(gone, key=lambda item: item[:2])
+            removed.append(name)
+        return answer, removed
+
     def pruned(self, answer: Model) -> tuple[Model, list[str], list[str]]:
-        """The model in its last refit, without effects and optional numbers that are superfluous there; names of the effects that
-        went; remarks on those that stay although their strength is open."""
-        fits, c, removed = self.whole, self.config, []
+        """The model in its last refit, to all fit recordings, without effects and optional
+        numbers that are superfluous there; names of the effects that went; remarks on
+        those that stay although their strength is open."""
+        fits, c = self.whole, self.config
+        answer, removed = self._repeated(answer)
         answer = fits.whole(answer.names, answer.fit.values)
         plain = {
             f"{x}.{n}": 0.0
@@ -680,7 +734,8 @@ def _described(
     how = (
         ", ".join(model.names) if fits.added(model) else "numbers of the file refitted"
     )
-    for effect in model.effects:
+    described = [copy.copy(effect) for effect in model.effects]
+    for effect in described:
         prefix = f"{effect.name}."
         effect.interval = {
             k.removeprefix(prefix): v
@@ -695,7 +750,7 @@ def _described(
             only = len(test_without) == 1
             without = errors[stage]["test"] if only else test_without[effect.name]
             effect.evidence += f"; test {'' if only else 'without it, '}{of_test(without, errors['after']['test'])}"
-    return list(model.effects)
+    return described
 
 
 def _undetermined(model: Fit) -> tuple[str, ...]:

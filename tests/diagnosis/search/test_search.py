@@ -341,7 +341,8 @@ def test_both_effects_between_which_the_first_one_lies_take_its_place_before_oth
         test,
         config=SearchConfig(max_effects=1),
     )
-    assert alone.names == ("between",)
+    # two numbers, as many as the one between them has, which leaves more
+    assert set(alone.names) == {"ripple", "bumps"}
 
 
 class Driven(MadeProblem):
@@ -730,3 +731,29 @@ def test_an_effect_that_only_undoes_what_the_refit_made_worse_is_not_added():
     assert row.gain > 0.2 and row.score > 2.0  # of the refitted twin
     assert found.names == () and all(r.added is None for r in found.rounds)
     assert f"{before:.2f}" in found.remarks[0] and f"{fitted:.2f}" in found.remarks[0]
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_an_effect_that_unused_recordings_contradict_is_not_added(everywhere: bool):
+    """The search uses recordings 0 and 2 of the fit; a tone of 0.5 is in these and in the
+    validation recording, and in 1 and 3 only if it is real."""
+    fit = [
+        record(k, Ripple(strength=1.0), Tone(strength=0.5 * (everywhere or k % 2 == 0)))
+        for k in range(4)
+    ]
+    validation = [record(4, Ripple(strength=1.0), Tone(strength=0.5))]
+    found = diagnose(MadeProblem(Ripple, Tone, Square), fit, validation)
+    assert set(found.names) == ({"ripple", "tone"} if everywhere else {"ripple"})
+    assert found.removed == (() if everywhere else ("tone",))
+
+
+def test_an_effect_that_unused_recordings_do_not_show_stays():
+    """Bumps are in the first second, of which recordings 1 and 3 were not measured."""
+    every = [record(k, Bump(strength=3.0)) for k in range(5)]
+    cut = [
+        dataclasses.replace(r, measured=np.where(r.time_s[:, None] < 1.2, np.nan, r.measured))
+        for r in every
+    ]
+    fit = [cut[k] if k % 2 else every[k] for k in range(4)]
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, every[4:])
+    assert found.names == ("bump",)
