@@ -31,6 +31,9 @@ WIDE, COARSE, FINE = 0.1, 1e-3, 1e-4
 kinks of dry friction and limits while hypotheses are compared, wide ones over jumps, as
 where a link bounces in its play; fine ones are needed to follow the ridge of K_p and K_d
 to its top."""
+TIGHT, LOOSE = 1e-5, 1e-3
+"""Relative fall of the squared residuals below which a fit ends; the loose one while
+hypotheses are compared."""
 LEFT_OVER = 1.5
 """RMS residual [floors] from which on the rest counts as an effect that the model lacks:
 below it, as noise."""
@@ -217,6 +220,7 @@ def minimise(
     at_once: int = 1,
     most: int = 40,
     step: float = COARSE,
+    tolerance: float = TIGHT,
     prior: Sequence[tuple[float, float]] = (),
 ) -> Solution:
     """Fit the numbers ``frees`` by least squares within their bounds.
@@ -229,6 +233,8 @@ def minimise(
         most: most steps of the solver. With 1 it stays at its start, of which it gives
             the residuals and derivatives.
         step: step of its finite differences.
+        tolerance: relative fall of the squared residuals below which it ends; a tenth of
+            it for the step.
         prior: mean and standard deviation of each coordinate, whose squared distance is
             added to the squared residuals; none: no prior. It is not part of the result's
             residuals and derivatives.
@@ -303,8 +309,8 @@ def minimise(
         jac=lambda u: slopes_with_prior(u + shift),  # pyright: ignore[reportArgumentType]
         bounds=(low - shift, high - shift),
         max_nfev=most,
-        ftol=1e-5,
-        xtol=1e-6,
+        ftol=tolerance,
+        xtol=0.1 * tolerance,
         gtol=1e-9,
     )
     ended = np.clip(found.x + shift, low, high)

@@ -569,6 +569,13 @@ def recording_of(
         channels=tuple(names[kind] for kind in kinds),
         data=motion,
         share=share,
+        setting=(
+            motion.payload_kg,
+            motion.moment_kgm,
+            motion.mounted_kgm2,
+            round(motion.kp_scale, 3),
+            round(motion.kd_scale, 3),
+        ),
     )
 
 

@@ -15,6 +15,7 @@ from taccorl.alignment.least_squares import (
     COARSE,
     FAR,
     FINE,
+    TIGHT,
     WIDE,
     Solution,
     inverse_of,
@@ -258,7 +259,7 @@ def fit(
     start: Mapping[str, float],
     most: int = 40,
     step: float = COARSE,
-    prior: Sequence[tuple[float, float]] = (),
+    tolerance: float = TIGHT,
 ) -> Fit:
     """Fit all numbers of a hypothesis together, but for those that are held.
 
@@ -267,8 +268,7 @@ def fit(
         start: start values; numbers that are left out start at their defaults.
         most: most steps of the solver.
         step: step of its finite differences.
-        prior: mean and standard deviation of each coordinate, whose squared distance is added to the squared residuals; none: no
-            prior. It is not part of the result's residuals and derivatives.
+        tolerance: relative fall of the squared residuals below which a fit ends.
     """
     candidates = chosen(problem, names)
     every = (*problem.base, *(f for c in candidates for f in c.frees))
@@ -292,7 +292,7 @@ def fit(
         at_once=problem.at_once,
         most=most,
         step=step,
-        prior=prior,
+        tolerance=tolerance,
     )
     values, effects = case(found.values)
     return Fit(
@@ -359,9 +359,11 @@ def best_fit(
     names: Sequence[str],
     starts: Sequence[Mapping[str, float]],
     most: int = 40,
+    tolerance: float = TIGHT,
 ) -> Fit:
     """The fit (``fit``) that leaves least, of one from each of ``starts``."""
-    return min(
-        (fit(problem, recordings, names, start, most) for start in starts),
-        key=lambda f: f.error,
+    fits = (
+        fit(problem, recordings, names, start, most, tolerance=tolerance)
+        for start in starts
     )
+    return min(fits, key=lambda f: f.error)

@@ -18,6 +18,8 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect, Parameter
 
+LEAST_ROWS = 10
+"""Fewer rows of a regime are not judged."""
 _SMALLEST = 1e-3
 """A strength that fades to 0 is searched, on a logarithmic scale, down to this share of its typical value."""
 
@@ -148,6 +150,8 @@ class Recording:
     short_noise: bool = False
     """True: noise does not last, so that what is left for longer than half a second is a misfit. False: as where joints or
     objects are not placed alike twice."""
+    setting: tuple[float, ...] = ()
+    """What others may have otherwise: load, gains."""
     share: np.ndarray | float = 1.0
     """(T, C) noise of an entry as a share of the floor of its channel."""
 
@@ -284,6 +288,23 @@ def split_rows(
         early.append(dataclasses.replace(r, measured=first))
         late.append(dataclasses.replace(r, measured=last))
     return early, late
+
+
+def thinned(recordings: Sequence[Recording]) -> list[Recording]:
+    """Every second recording, at least two, and those without which a regime of motion or
+    a value of a setting were lost. In their order."""
+    if len(recordings) <= 2:
+        return list(recordings)
+
+    def facts(r: Recording) -> set[Any]:
+        seen = {n for n, (rows, _) in r.regimes.items() if rows.sum() >= LEAST_ROWS}
+        return seen | set(enumerate(r.setting))
+
+    kept = list(recordings[::2])
+    for r in recordings[1::2]:
+        if facts(r) - set[Any]().union(*map(facts, kept)):
+            kept.append(r)
+    return [r for r in recordings if r in kept]
 
 
 def with_frees(problem: Problem, change: Callable[[Free], Free]) -> Problem:
