@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.fit import residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.search.identifiable import Known
@@ -86,6 +87,8 @@ class PartFinding:
     """Numbers that the recordings identify; None for parts for which they are not computed."""
     remark: str = ""
     """Text on what the search could not decide; empty if there is nothing."""
+    drifts: tuple[Drift, ...] = ()
+    """Numbers that changed from one recording of a motion to another one."""
 
 
 class Solved(NamedTuple):
