@@ -33,7 +33,7 @@ from taccorl.diagnosis.search.identifiable import (
 )
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import PartFinding, solved
+from taccorl.diagnosis.search.solve import PartFinding, solved, with_drifts
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import Done, Failed, run_in_processes
 from taccorl.robots import ROBOT
@@ -143,7 +143,9 @@ def diagnose_joint(
         "diagnosis": with_intervals(found.diagnosis, known),
         "drifts": tuple(drifted),
     }
-    return JointFinding(**told, floors=tuple(problem.floors))
+    joint = JointFinding(**told, floors=tuple(problem.floors))
+    # For other machines a finding of their checks says it.
+    return with_drifts(joint, drifted) if isinstance(machine, TwinConfig) else joint
 
 
 def drifts_of(

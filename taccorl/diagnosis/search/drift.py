@@ -9,20 +9,28 @@ Letters in shapes: M common rows, T rows.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from taccorl.diagnosis.search.fit import Fit, fit
-from taccorl.diagnosis.search.problem import Case, Free, Problem, Recording, chosen
+from taccorl.diagnosis.search.problem import (
+    Case,
+    Free,
+    Problem,
+    Recording,
+    chosen,
+    with_held,
+)
 
 EXPLAINED = 0.9
 """Least share of the squared difference that a changed number explains. A choice."""
 AS_GOOD = 2.0
 """Ratio of what two numbers leave below which both are named, and below which a shift of
 the clock leaves as little. A choice."""
+LEAST = 1.0  # Least RMS [noise floors] by which two recordings differ. A choice.
 STEPS = 6  # Gauss–Newton steps for one number
 NO_DRIFT = ("loop_s", "position_age_s", "speed_delay_s", "effort_age_s", "effort_scale")
 """Fitted numbers of the recording's timing and units, which no friction changes."""
@@ -91,6 +99,63 @@ def drifts(
     return [drift for drift in found if drift is not None]
 
 
+def changed(
+    problem: Problem,
+    first: Recording,
+    second: Recording,
+    over_s: float | None,
+    names: Sequence[str],
+    start: Mapping[str, float],
+) -> Drift | None:
+    """The number whose own value in each of two recordings does nearly as much as fits of all
+    numbers to each of them, if a fit to both together leaves ``LEAST`` floors more; for
+    channels that no motion aligns row by row. Arguments as of ``drifts``."""
+    pair = (first, second)
+    together = fit(problem, pair, names, start)
+    alone = [fit(problem, [one], names, together.values) for one in pair]
+    least = sum(float(np.sum(own.residuals**2)) for own in alone)
+    excess = float(np.sum(together.residuals**2)) - least
+    if excess < LEAST**2 * len(together.residuals):
+        return None
+    left: dict[str, float] = {}
+    ends: dict[str, list[Fit]] = {}
+    for name in (f.name for f in together.frees if f.name not in NO_DRIFT):
+        others = {k: v for k, v in together.values.items() if k != name}
+        rest = with_held(problem, others)
+        ends[name] = [fit(rest, [one], names, together.values) for one in pair]
+        squares = sum(float(np.sum(own.residuals**2)) for own in ends[name])
+        left[name] = (squares - least) / excess
+    name = min(left, key=lambda n: left[n])
+    if left[name] > 1.0 - EXPLAINED:
+        return None
+    return _named(name, ends[name], pair, over_s, left)
+
+
+def _named(
+    name: str,
+    ends: Sequence[Fit],
+    pair: tuple[Recording, Recording],
+    over_s: float | None,
+    left: Mapping[str, float],
+) -> Drift:
+    before, after = (own.values[name] for own in ends)
+    intervals = [own.intervals().get(name, (math.nan, math.nan)) for own in ends]
+    least = AS_GOOD * max(left[name], 1e-9)
+    return Drift(
+        number=name,
+        unit=next(f.unit for f in ends[0].frees if f.name == name),
+        before=before,
+        after=after,
+        before_interval=intervals[0],
+        after_interval=intervals[1],
+        first=pair[0].name,
+        second=pair[1].name,
+        over_s=over_s,
+        share=1.0 - left[name],
+        as_good=tuple(n for n in left if n != name and left[n] < least),
+    )
+
+
 def _drift(
     problem: Problem, repeat: Repeat, names: Sequence[str], start: dict[str, float]
 ) -> Drift | None:
@@ -114,23 +179,7 @@ def _drift(
         fit(problem, [recording], names, middle.values)
         for recording in (repeat.first, repeat.second)
     ]
-    before, after = (own.values[name] for own in alone)
-    intervals = [own.intervals().get(name, (math.nan, math.nan)) for own in alone]
-    return Drift(
-        number=name,
-        unit=next(f.unit for f in middle.frees if f.name == name),
-        before=before,
-        after=after,
-        before_interval=intervals[0],
-        after_interval=intervals[1],
-        first=repeat.first.name,
-        second=repeat.second.name,
-        over_s=repeat.over_s,
-        share=1.0 - left[name],
-        as_good=tuple(
-            n for n in left if n != name and left[n] < AS_GOOD * max(left[name], 1e-9)
-        ),
-    )
+    return _named(name, alone, (repeat.first, repeat.second), repeat.over_s, left)
 
 
 def _left_by_change(problem: Problem, middle: Fit, free: Free, repeat: Repeat) -> float:
@@ -141,7 +190,7 @@ def _left_by_change(problem: Problem, middle: Fit, free: Free, repeat: Repeat) -
     is_known = np.isfinite(repeat.difference)
     wanted = repeat.difference[is_known]
 
-    def changed(by: float) -> np.ndarray:
+    def effect_of(by: float) -> np.ndarray:
         ends = [_with(problem, middle, free.name, value + s * by) for s in (0.5, -0.5)]
         high, low = problem.simulate_all(ends, [repeat.first])[0]
         apart = high[:, 0] - low[:, 0]
@@ -150,14 +199,14 @@ def _left_by_change(problem: Problem, middle: Fit, free: Free, repeat: Repeat) -
     least = float(np.sum(wanted**2))
     if most <= 0.0:
         return least
-    by, here, there = 0.0, np.zeros_like(wanted), changed(tiny)
+    by, here, there = 0.0, np.zeros_like(wanted), effect_of(tiny)
     slope = there / tiny
     for _ in range(STEPS):
         power = float(slope @ slope)
         if not (power > 0.0 and math.isfinite(power)):
             break
         by = float(np.clip(by + slope @ (wanted - here) / power, -most, most))
-        here = changed(by)
+        here = effect_of(by)
         remains = float(np.sum((wanted - here) ** 2))
         if not remains < 0.999 * least:
             break

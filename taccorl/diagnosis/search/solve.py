@@ -202,6 +202,18 @@ def solved(
     return PartFinding(part=part, recordings=recordings, **stated, **judged)
 
 
+def with_drifts[FindingT: PartFinding](
+    found: FindingT, drifted: Sequence[Drift]
+) -> FindingT:
+    """The finding with numbers that changed between recordings, and a remark on each."""
+    remarks = (*(drift.words for drift in drifted), *found.diagnosis.remarks)
+    return dataclasses.replace(
+        found,
+        drifts=tuple(drifted),
+        diagnosis=dataclasses.replace(found.diagnosis, remarks=remarks),
+    )
+
+
 def _of_loop(
     problem: Problem, found: Diagnosis, recordings: Sequence[Recording]
 ) -> list[str]:
