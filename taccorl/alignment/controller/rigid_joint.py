@@ -43,6 +43,9 @@ class Rigid(NamedTuple):
     gravity_cos: float = 0.0  # C [N·m] in the same torque
     compensation_sin: float = 0.0  # S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity
     compensation_cos: float = 0.0  # C [N·m] in the same torque
+    free_inertia: float = 0.0
+    """1 / (M⁻¹)ⱼⱼ with the rotors of all joints, at the model's zero pose [kg·m²]: the inertia with the other joints free; 0: as
+    ``inertia``."""
     weight_n: float = 0.0
     """Force that holds the weight of masses besides the model's at a slide [N], which does not change as it slides."""
 

@@ -76,7 +76,7 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
 ``gravity_mismatch``."""
-_NOT_ON_PIPER = ("position_integral", "presliding", "unbalance")
+_NOT_ON_PIPER = ("position_integral", "presliding", "soft_friction", "unbalance")
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them. Its loop is no
 cascade, so that the first one is ``integral_action``."""
 WEIGHS = 3.0
