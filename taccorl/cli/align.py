@@ -24,6 +24,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Cell, Section
 
 if TYPE_CHECKING:
+    from taccorl.alignment.measurements.folder import Measurements
     from taccorl.diagnosis.align import Alignment
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.piper import PiperTwin
@@ -160,7 +161,7 @@ def _joints_and_pads(
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
-    from taccorl.diagnosis.problems.joints import SIGNALS
+    from taccorl.diagnosis.problems.joints import SIGNALS, of_joints
 
     measurements = config.read(machine)
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
@@ -168,9 +169,19 @@ def _joints_and_pads(
     if spsa_seed is not None and not set(selected) & set(SIGNALS):
         raise TaccorlError(NO_JOINT)
 
+    leads: list[str] = []
+
     def replay() -> "Comparison":
         with Bars(len(measurements.all)) as bars:
-            return machine.compare(measurements, progress=bars.update)
+            found = machine.compare(measurements, progress=bars.update)
+        if SHIFTED not in config.accept:
+            leads.extend(sorted(_leads(found) & set(selected)))
+        fitted = () if SHIFTED in config.accept else selected
+        clock = {
+            name: tuple(_of_gains(f) if f.feature in fitted else f for f in own)
+            for name, own in found.clock.items()
+        }
+        return dataclasses.replace(found, clock=clock)
 
     beside = replayed(
         machine,
@@ -198,6 +209,8 @@ def _joints_and_pads(
             workers=config.workers,
             done=lambda part: bars.update(part, next(count), len(parts)),
         )
+    if leads:
+        found = _beside_fitted(machine, found, of_joints(measurements, leads))
     floors = {
         (s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"
     }
@@ -207,6 +220,54 @@ def _joints_and_pads(
     ]
     found.sort(key=lambda one: selected.index(one.part))
     return [_beside_floor(one, floors.get((one.part, use))) for one in found]
+
+
+def _leads(comparison: "Comparison") -> set[str]:
+    """Signals that lead the replay in most of the recordings that move them."""
+    from taccorl.alignment.checks.clock import SHIFTED
+
+    found = [
+        f.feature
+        for own in comparison.clock.values()
+        for f in own
+        if f.check == SHIFTED and f.severity == "error"
+    ]
+    return {s for s in found if 2 * found.count(s) > len(comparison.of(s))}
+
+
+def _of_gains(f: Finding) -> Finding:
+    """A shift from the replay before gains are fitted, as a warning without a way out."""
+    from taccorl.alignment.checks.clock import SHIFTED
+
+    if f.check != SHIFTED:
+        return f
+    size, rows, _ = f.text.partition("rows)")
+    text = f"{size}{rows}: other gains look like this, too"
+    if f.severity == "error":
+        text += "; it is judged again beside the fitted ones"
+    return dataclasses.replace(f, severity="warning", text=text)
+
+
+def _beside_fitted(
+    machine: "PiperTwin", found: "list[Alignment]", measurements: "Measurements"
+) -> "list[Alignment]":
+    """``found``, in which joints whose recordings lead the replay with the fitted gains as
+    well are not aligned. ``measurements``: of the joints that led it before."""
+    from taccorl.diagnosis.align import aligned
+
+    twin, _ = aligned(machine.config, found)
+    again = dataclasses.replace(machine, config=twin).compare(measurements)
+    leads = _leads(again)
+    why = {
+        f.feature: f"{f.text}; --accept={f.check} aligns nevertheless"
+        for own in again.clock.values()
+        for f in own
+        if f.severity == "error" and f.feature in leads
+    }
+    return [
+        dataclasses.replace(one, trouble=one.trouble or why.get(one.part, ""))
+        for one in found
+    ]
 
 
 def _come_late(
@@ -303,9 +364,15 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
 
 def _section(one: "Alignment") -> Section:
     lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
-    lines += [
-        "the recordings agree with the twin's numbers, which stay as they are"
-    ] * bool(one.unchanged)
+    if one.unchanged and one.floors_left >= FAR_ABOVE_FLOOR:
+        lines.append(
+            "no other gains leave a smaller error: the twin's stay, although they leave "
+            f"{one.floors_left:.3g} noise floors"
+        )
+    elif one.unchanged:
+        lines.append(
+            "the recordings agree with the twin's numbers, which stay as they are"
+        )
     if not one.numbers:
         return Section(title=one.part, text=lines)
     rows = []
