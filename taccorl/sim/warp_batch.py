@@ -60,8 +60,8 @@ class WarpSettings:
     the mean is 1.8. A world that reaches the limit goes on with what it has, as in MuJoCo C."""
     mode: str = "copied"
     """What stays on the device. copied: states are copied back five times a control step, OpenGL draws. resident: a control step
-    is one launch, and MuJoCo Warp's ray tracer draws. Not to be trusted yet: a policy that completed 96 of 192 scenes by
-    MuJoCo C had completed one by step 716 of 900 in this mode, on an H200 (docs/training.md)."""
+    is one launch, and MuJoCo Warp's ray tracer draws; states and pictures were those of the copied mode on an H200, but of
+    192 scenes a weak policy completed fewer (docs/training.md)."""
 
     @classmethod
     def parse(cls, physics: str) -> "WarpSettings | None":
