@@ -179,6 +179,7 @@ def _joints_and_pads(
         config.accept,
         replay,
         "changes every gain",
+        only=config.asked(machine, measurements),
     )
     if beside is None:
         return None

@@ -109,7 +109,10 @@ def run(config: CompareConfig) -> int:
         comparisons.extend(_compared(config, twins, measurements))
         return comparisons[0]
 
-    beside = replayed(twins[0], measurements, "not compared", config.accept, replay)
+    only = config.joints
+    beside = replayed(
+        twins[0], measurements, "not compared", config.accept, replay, only=only
+    )
     if beside is None:
         return 1
     first, last = comparisons[0], comparisons[-1]
