@@ -29,7 +29,8 @@ from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.search.fit import fit, rms, stacked
-from taccorl.report.verdict import verdict
+from taccorl.report.account import account
+from taccorl.report.evidence import Seen
 
 STRENGTHS = {
     "coulomb_friction": 0.03,
@@ -133,7 +134,8 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
             )
         finding = machine.diagnose(part, measurements)
     d = finding.diagnosis
-    said = verdict(part, d, can_tell=finding.can_tell, known=finding.known)
+    seen = Seen(can_tell=finding.can_tell, known=finding.known)
+    said = account(part, d, seen)
     return {
         "seed": seed,
         "hidden": hidden,

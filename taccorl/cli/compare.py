@@ -109,13 +109,9 @@ def run(config: CompareConfig) -> int:
         comparisons.extend(_compared(config, twins, measurements))
         return comparisons[0]
 
+    only = config.joints
     beside = replayed(
-        twins[0],
-        measurements,
-        "not compared",
-        config.accept,
-        replay,
-        joints=config.joints,
+        twins[0], measurements, "not compared", config.accept, replay, only=only
     )
     if beside is None:
         return 1

@@ -8,7 +8,7 @@ import pytest
 from taccorl.alignment.checks.registry import find
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.cli.measured import _of_asked, checked
+from taccorl.cli.measured import checked, of_asked, recordings_with_errors
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.machines.load import load_machine
 
@@ -68,7 +68,8 @@ def gantry(folder: Path) -> tuple:
 def test_only_efforts_of_joints_that_are_not_asked_for_become_warnings(
     check: str, feature: str, severity: str
 ) -> None:
-    assert _of_asked(find(check, feature, "far off"), ["y"]).severity == severity
+    (found,) = of_asked([find(check, feature, "far off")], ["y"], ["x", "y"])
+    assert found.severity == severity
 
 
 @pytest.mark.slow
@@ -76,9 +77,9 @@ def test_an_inertia_that_is_far_off_stops_only_the_joint_that_has_it(
     tmp_path: Path,
 ) -> None:
     machine, own = gantry(tmp_path)
-    assert checked(machine, own, "not diagnosed") is None
-    assert checked(machine, own, "not diagnosed", joints=["x"]) is None
-    found = checked(machine, own, "not diagnosed", joints=["y"])
-    assert found is not None
+    assert recordings_with_errors(checked(machine, own))
+    assert recordings_with_errors(checked(machine, own, only=["x"]))
+    found = checked(machine, own, only=["y"])
+    assert not recordings_with_errors(found)
     of_x = [f for f in found["both.csv"] if f.check == "wrong_inertia"]
     assert [(f.feature, f.severity) for f in of_x] == [("x", "warning")]

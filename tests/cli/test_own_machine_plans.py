@@ -334,7 +334,7 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(
         "command": " ".join(words),
     }
     verdicts = {
-        part: {"finding": f"{part} lacks {name}"} for part, (name, _) in found.items()
+        part: {"title": f"{part} lacks {name}"} for part, (name, _) in found.items()
     }
     report = {"provenance": provenance, "diagnoses": diagnoses, "verdicts": verdicts}
     (tmp_path / "d" / "report.json").write_text(json.dumps(report))

@@ -64,6 +64,7 @@ from taccorl.diagnosis.problems.tilted_base import (
     change_between_poses,
     tilt_like,
 )
+from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.problem import candidate, split_rows
@@ -296,9 +297,11 @@ class RobotMachine(Machine):
                 return ()
         return others
 
-    def _tilt(self, found: JointFinding, measurements: Measurements) -> str:
-        """Text that states by how much the base would have to be tilted so that gravity gives the torque of the effect
-        ``unbalance``, in the poses of the fit recordings. Empty if ``unbalance`` was neither added nor tied with the added
+    def _tilt(
+        self, found: JointFinding, measurements: Measurements
+    ) -> Remark | None:
+        """By how much the base would have to be tilted so that gravity gives the torque of the effect
+        ``unbalance``, in the poses of the fit recordings. None if ``unbalance`` was neither added nor tied with the added
         effect, or if the error is at the floor in poses between which that torque would differ."""
         d = found.diagnosis
         values = (
@@ -314,26 +317,24 @@ class RobotMachine(Machine):
             if e.name == "unbalance"
         ]
         if not values:
-            return ""
+            return None
         own = [self._whole(m) for m in of_joints(measurements, [found.part]).fit]
         numbers = (
             values[0][f"unbalance.{name}"] for name in ("torque_nm", "hangs_at_rad")
         )
         down = tilt_like(self.robot, found.part, own, *numbers)
         if down is None:
-            return ""
+            return None
         if (
             d.status == "at_floor"
             and change_between_poses(self.robot, found.part, own, down) > MOST_LEFT
         ):
-            return ""  # an equal torque in poses in which a tilt has others
+            return None  # an equal torque in poses in which a tilt has others
         g = self.robot.rigid.model.opt.gravity
         leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
-        return (
-            f"{TILT}{leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
-            f"a level; if it leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into "
-            f"{self.robot.path.name} instead"
-        )
+        gravity = f"[{', '.join(f'{x:.4f}' for x in down + 0.0)}]"
+        values = {"degrees": float(leans), "part": found.part, "gravity": gravity}
+        return Remark(TILT, values | {"file": self.robot.path.name})
 
     def reconsidered(
         self,

@@ -50,7 +50,7 @@ from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
-from taccorl.report.verdict import verdict
+from taccorl.report.account import account
 from taccorl.sim.effects.scaled import scaled
 
 ROOT = Path(__file__).parents[3]
@@ -332,10 +332,10 @@ def test_a_wrong_torque_constant_is_told_from_a_wrong_mass_where_friction_is_kno
     assert [
         c.instead for c in found.changed if c.name in ("inertia", "effort_scale")
     ] == [instead]
-    words = verdict("drive", found).finding
-    assert ("one factor" in words) == (scale != 1.0) and (
-        "do not tell which" in words
-    ) == bool(instead)
+    told = account("drive", found)
+    efforts = {"tie_efforts", "scale_efforts"} & {*told.ids}
+    assert bool(efforts) == (scale != 1.0)
+    assert bool({"tie_effect", "tie_efforts"} & {*told.ids}) == bool(instead)
 
 
 def test_a_log_without_target_needs_a_law_that_takes_none(slide: Measurements):
@@ -396,7 +396,9 @@ def test_dry_friction_of_a_slide_is_found_in_newtons_beside_its_weight(
     )  # steps of 1 ms cost some
     assert best.base["inertia"] == pytest.approx(MASS_KG, rel=0.1)
     assert found.base["weight_cos"] == pytest.approx(weight_n, abs=0.5)
-    assert ("weight_cos 0 → " in verdict("drive", found).finding) == (weight_n > 0.0)
+    assert ("weight_cos" in account("drive", found).values("changed", "name")) == (
+        weight_n > 0.0
+    )
 
 
 WEIGHT_NM, LEVEL_RAD = 1.6, 0.5
