@@ -162,7 +162,7 @@ def moved_by(
 
     Root of the sum of squares of the Gauss–Newton step to the fit of all recordings, of
     the scatter of such steps if one of them, or one regime of motion, is left out (the
-    larger one, ``_scatter``), and of ``_moved_by_noise``.
+    larger one, ``_scatter``, beyond ``model.covariance``), and of ``_moved_by_noise``.
 
     Args:
         fitted_to, others: recordings of ``model``, and further ones.
@@ -181,8 +181,9 @@ def moved_by(
             scatter[inside] = np.maximum(
                 scatter[inside], _scatter(jacobian, left, groups)
             )
+    more = np.maximum(scatter**2 - np.diag(model.covariance()), 0.0)
     noise = _moved_by_noise(problem, model, fitted_to)
-    return np.sqrt(moved**2 + scatter**2 + noise**2)
+    return np.sqrt(moved**2 + more + noise**2)
 
 
 def _by_recording(recordings: Sequence[Recording]) -> list[np.ndarray]:
