@@ -5,7 +5,7 @@ import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -137,6 +137,7 @@ class RobotJoint(DriveJoint):
             self.position_age_s + law.position_age_s,
             law.position_age_s,
         )
+        self.target_late_s = law.target_late_s
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
 
@@ -177,7 +178,24 @@ class RobotJoint(DriveJoint):
             max(terms.inertia, LEAST_INERTIA * self.known.inertia)
             + self._config.armature
         )
-        return terms._replace(inertia=inertia, rotor_inertia=self._config.armature)
+        return terms._replace(
+            inertia=inertia,
+            rotor_inertia=self._config.armature,
+            free_inertia=self._free_inertia,
+        )
+
+    @cached_property
+    def _free_inertia(self) -> float:
+        """``Rigid.free_inertia``, without payloads."""
+        model, joints = self._robot.rigid.model, self._robot.config.joints
+        data, mass = mujoco.MjData(model), np.empty((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        for name, joint in joints.items():
+            dof = model.joint(name).dofadr[0]
+            mass[dof, dof] += joint.armature
+        own = model.joint(self.signal).dofadr[0]
+        return float(1.0 / np.linalg.inv(mass)[own, own])
 
     def inertia_kgm2(self, m: Measurement) -> float:
         """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""

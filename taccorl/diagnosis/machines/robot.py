@@ -11,6 +11,7 @@ import numpy as np
 
 from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_of_all
+from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -50,7 +51,9 @@ from taccorl.diagnosis.machines.machine import (
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import (
     JointFinding,
+    apart,
     diagnose_joint,
+    drifts_of,
     moves,
     of_joints,
 )
@@ -61,6 +64,7 @@ from taccorl.diagnosis.problems.tilted_base import (
     change_between_poses,
     tilt_like,
 )
+from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.problem import candidate, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
@@ -120,7 +124,8 @@ class RobotMachine(Machine):
 
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         config, joint = self.robot.config.joints[part], self.robot.joint(part)
-        own = {**config.numbers, "position_age_s": (config.position_age_s, "s")}
+        times = ("position_age_s", "target_late_s")
+        own = {**config.numbers, **{n: (getattr(config, n), "s") for n in times}}
         made = [
             joint.in_units(type(e))(
                 **{p.name: getattr(e, p.name) for p in e.parameters()}
@@ -167,7 +172,22 @@ class RobotMachine(Machine):
                 self.robot.path.name,
                 self.robot.joint(name).inertia_kgm2,
             )
+        for name, own_drifts in self._drifts(measurements).items():
+            for drift in own_drifts:
+                text = f"{name}: {drift.words}"
+                found[drift.second].append(find("drift", name, text))
         return found
+
+    def _drifts(self, measurements: Measurements) -> dict[str, list[Drift]]:
+        """Joint → its numbers that changed between recordings of one motion."""
+        moved = {
+            name: of_joints(measurements, [name]) for name in self.robot.config.joints
+        }
+        return {
+            name: drifts_of(self.robot, name, own)
+            for name, own in moved.items()
+            if own.fit
+        }
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
         for m in measurements.all:
@@ -188,6 +208,8 @@ class RobotMachine(Machine):
         self, measurements: Measurements, name: str, progress: Counted
     ) -> Comparison:
         laws = self.robot.config.joints
+        drifted = [d for own in self._drifts(measurements).values() for d in own]
+        measurements = apart(measurements, drifted)
         return compare_joints(
             self.robot,
             laws,
@@ -763,8 +785,9 @@ class RobotMachine(Machine):
                 for e in a.effects
             ]
             new = [make_effect(name, **own) for name, own in made]
-            if "position_age_s" in a.base:
-                numbers["position_age_s"] = float(a.base["position_age_s"])
+            for name in ("position_age_s", "target_late_s"):
+                if name in a.base:
+                    numbers[name] = float(a.base[name])
             half_s = 0.5 * float(a.base.get("loop_s", 0.0))
             if half_s > 0.0:
                 numbers["loop_hz"] = 0.5 / half_s
