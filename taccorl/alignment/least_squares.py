@@ -78,6 +78,11 @@ class Free:
     unless: tuple[str, ...] = ()
     """Names of effects with the same influence on the recordings: in a fit with one of them this number is held at ``start``."""
 
+    def is_at_end(self, value: float) -> bool:
+        """Whether ``value`` is at one of the bounds, or beyond it."""
+        here, low, high = map(self.coordinate, (value, self.low, self.high))
+        return bool(min(here - low, high - here) < _AT_BOUND * (high - low))
+
     def within(self, value: float) -> float:
         """``value`` clipped to the bounds."""
         return min(max(value, self.low), self.high)
@@ -92,6 +97,21 @@ class Free:
         """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
         raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
         return self.within(raw)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Estimate of one number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    """Unit of all three, such as ``N·m/rad``."""
+    fixed: bool = False
+    """True: not fitted, because it was commanded and known, or not requested."""
+    at_bound: bool = False
+    """True: the fit ended at one of the bounds of the search."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,6 +238,7 @@ def minimise(
     most: int = 40,
     step: float = COARSE,
     prior: Sequence[tuple[float, float]] = (),
+    ftol: float = 1e-5,
 ) -> Solution:
     """Fit the numbers ``frees`` by least squares within their bounds.
 
@@ -232,6 +253,8 @@ def minimise(
         prior: mean and standard deviation of each coordinate, whose squared distance is
             added to the squared residuals; none: no prior. It is not part of the result's
             residuals and derivatives.
+        ftol: the solver ends where a step changes the squared error by no larger share,
+            or the coordinates by ``ftol`` / 10.
     """
     low = np.array([f.coordinate(f.low) for f in frees])
     high = np.array([f.coordinate(f.high) for f in frees])
@@ -303,22 +326,19 @@ def minimise(
         jac=lambda u: slopes_with_prior(u + shift),  # pyright: ignore[reportArgumentType]
         bounds=(low - shift, high - shift),
         max_nfev=most,
-        ftol=1e-5,
-        xtol=1e-6,
+        ftol=ftol,
+        xtol=ftol / 10.0,
         gtol=1e-9,
     )
     ended = np.clip(found.x + shift, low, high)
-    near = np.minimum(ended - low, high - ended) < _AT_BOUND * (high - low)
-    rows = len(found.fun) - len(prior)
+    values, rows = at(ended), len(found.fun) - len(prior)
     return Solution(
-        values=at(ended),
+        values=values,
         residuals=found.fun[:rows],
         layout=tuple(layout),
         jacobian=found.jac[:rows],
         frees=tuple(frees),
-        at_bound=tuple(
-            f.name for f, is_near in zip(frees, near, strict=True) if is_near
-        ),
+        at_bound=tuple(f.name for f in frees if f.is_at_end(values[f.name])),
         trouble=""
         if found.status > 0
         else f"not converged: still improving after {most} steps",
