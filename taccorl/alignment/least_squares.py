@@ -95,7 +95,10 @@ class Free:
 
     def value(self, coordinate: float) -> float:
         """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
-        raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
+        if self.log:
+            raw = math.exp(min(coordinate, _MOST))
+        else:
+            raw = float(coordinate * self.scale)
         return self.within(raw)
 
 
