@@ -31,6 +31,9 @@ WIDE, COARSE, FINE = 0.1, 1e-3, 1e-4
 kinks of dry friction and limits while hypotheses are compared, wide ones over jumps, as
 where a link bounces in its play; fine ones are needed to follow the ridge of K_p and K_d
 to its top."""
+TIGHT, LOOSE = 1e-5, 1e-3
+"""Relative fall of the squared residuals below which a fit ends; the loose one while
+hypotheses are compared."""
 LEFT_OVER = 1.5
 """RMS residual [floors] from which on the rest counts as an effect that the model lacks:
 below it, as noise."""
@@ -176,17 +179,14 @@ class Solution:
         variances = np.diag(plain)
         pull = self.jacobian * self.residuals[:, None]
         pulls = block_sums(pull, self.layout)
-        if (count := len(pulls)) >= max(MANY_BLOCKS, 2 * p):
-            variances = np.maximum(
-                variances, np.square(pulls @ inverse).sum(axis=0) * count / (count - p)
-            )
+        if len(pulls) >= max(MANY_BLOCKS, 2 * p):
+            variances = np.maximum(variances, np.diag(sandwich(pulls, inverse, p)))
         if (count := len(self.layout)) >= MANY_RECORDINGS:
             ends = np.cumsum([int(rows.measured.sum()) for rows in self.layout])
             pulls = np.array([part.sum(axis=0) for part in np.split(pull, ends[:-1])])
             few = (student.ppf(0.975, count - 1) / student.ppf(0.975, np.inf)) ** 2
             variances = np.maximum(
-                variances,
-                few * np.square(pulls @ inverse).sum(axis=0) * count / (count - 1),
+                variances, few * np.diag(sandwich(pulls, inverse, 1))
             )
         if left_over:
             rest = max(self.error**2 - LEFT_OVER**2, 0.0) / min(
@@ -216,6 +216,19 @@ class Solution:
         return float(student.ppf(0.975, max(blocks - len(self.frees), 3)))
 
 
+def sandwich(pulls: np.ndarray, inverse: np.ndarray, used: int) -> np.ndarray:
+    """Covariance (p, p) by the scatter of B groups of residuals that hang together in any
+    way: (JᵀJ)⁻¹ Σ g gᵀ (JᵀJ)⁻¹ · B / (B − ``used``).
+
+    Args:
+        pulls: (B, p) gradients g = Jᵀ r of each group.
+        inverse: (p, p) (JᵀJ)⁻¹.
+        used: degrees of freedom that the groups have lost.
+    """
+    moved = pulls @ inverse
+    return moved.T @ moved * len(pulls) / max(len(pulls) - used, 1)
+
+
 def inverse_of(squares: np.ndarray) -> np.ndarray:
     """Inverse (p, p) of ``squares`` JᵀJ (p, p); directions that are open count as hardly seen."""
     strengths, ways = np.linalg.eigh(squares)
@@ -240,8 +253,8 @@ def minimise(
     at_once: int = 1,
     most: int = 40,
     step: float = COARSE,
+    tolerance: float = TIGHT,
     prior: Sequence[tuple[float, float]] = (),
-    ftol: float = 1e-5,
 ) -> Solution:
     """Fit the numbers ``frees`` by least squares within their bounds.
 
@@ -253,11 +266,11 @@ def minimise(
         most: most steps of the solver. With 1 it stays at its start, of which it gives
             the residuals and derivatives.
         step: step of its finite differences.
+        tolerance: relative fall of the squared residuals below which it ends; a tenth of
+            it for the step.
         prior: mean and standard deviation of each coordinate, whose squared distance is
             added to the squared residuals; none: no prior. It is not part of the result's
             residuals and derivatives.
-        ftol: the solver ends where a step changes the squared error by no larger share,
-            or the coordinates by ``ftol`` / 10.
     """
     low = np.array([f.coordinate(f.low) for f in frees])
     high = np.array([f.coordinate(f.high) for f in frees])
@@ -329,8 +342,8 @@ def minimise(
         jac=lambda u: slopes_with_prior(u + shift),  # pyright: ignore[reportArgumentType]
         bounds=(low - shift, high - shift),
         max_nfev=most,
-        ftol=ftol,
-        xtol=ftol / 10.0,
+        ftol=tolerance,
+        xtol=0.1 * tolerance,
         gtol=1e-9,
     )
     ended = np.clip(found.x + shift, low, high)

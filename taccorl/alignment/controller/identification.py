@@ -23,6 +23,7 @@ from taccorl.alignment.controller.lanes import LANES
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.least_squares import (
     FINE,
+    TIGHT,
     Estimate,
     Free,
     Solution,
@@ -398,7 +399,7 @@ class _GainFits:
             at_once=LANES,
             most=most,
             step=FINE,
-            ftol=1e-8 if late else 1e-5,
+            tolerance=1e-8 if late else TIGHT,
         )
 
     def best(self) -> Solution:
