@@ -367,6 +367,7 @@ class DriveJoint(RigidJoint):
     """A joint whose drive has the law of a file."""
 
     follows_line: ClassVar[bool] = True
+    keeps_times: ClassVar[bool] = True
 
     def __init__(
         self,

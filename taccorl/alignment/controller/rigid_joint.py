@@ -103,7 +103,9 @@ class RigidJoint(ABC):
     follows_line: ClassVar[bool] = False
     """Target between two rows. True: interpolated linearly. False: held at the value of the later row, as in a replay."""
     keeps_times: ClassVar[bool] = False
-    """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
+    """True: a recording may begin in motion, and targets of rows with jitter act at
+    their own arrival times. False: it begins at rest, and they act at the times of
+    their rows."""
     target_late_s: float = 0.0
     """Delay from a target's arrival (see ``keeps_times``) until it acts in the controller [s]."""
 
@@ -112,6 +114,8 @@ class RigidJoint(ABC):
         "kd",
     )  # Gains that a recording can state and a fit can determine
     holds_torque_ff: bool = False  # True: ``torque_ff`` stays as the file states it. False: it is always fitted.
+    wave: float = 1.0
+    """Position that counts as 1 rad in periodic forces: of a slide ``Scale.wave`` [m]."""
     known_names: tuple[
         str, ...
     ] = ()  # Numbers and effects that the file marks as known (``DriveLaw.known``)

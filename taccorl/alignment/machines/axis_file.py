@@ -343,8 +343,6 @@ def axis_digest(config: AxisConfig) -> str:
 class DrivenAxis(DriveJoint):
     """The axis of a file for the one-joint model."""
 
-    keeps_times: ClassVar[bool] = True
-
     def __init__(self, config: AxisConfig, stated: AxisConfig | None = None) -> None:
         """``stated``: axis as its file has it, if numbers of ``config`` are fitted; a fitted ``loop_hz`` does not change the
         physics step."""

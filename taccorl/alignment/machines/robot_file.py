@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -20,13 +21,18 @@ import yaml
 
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, PointMass
-from taccorl.alignment.machines.robot_joint import PAYLOAD_AT, RobotJoint, acts_on_joint
+from taccorl.alignment.machines.robot_joint import (
+    PAYLOAD_AT,
+    KeptMotions,
+    RobotJoint,
+    acts_on_joint,
+)
 from taccorl.alignment.machines.robot_model import RobotModel, load_robot_model
 from taccorl.data.strict_yaml import Rules
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
-from taccorl.sim.effects.scaled import OF_A_TURN
+from taccorl.sim.effects.scaled import OF_A_TURN, bounded
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -61,6 +67,11 @@ class JointConfig(DriveLaw):
     rate. Without it, a target holds until the next row."""
     position_age_s: float = 0.0
     """Age of the measured position when the torque acts, beyond that of the loop's timing [s]; ``diagnose`` fits it."""
+    force_unit_n: float | None = None
+    """Effort [N·m] of this joint that corresponds to 1 N·m at a joint of a small arm;
+    bounds of effects are multiplied by it (``RobotJoint.scale`` has the default)."""
+    length_unit_m: float | None = None
+    """Range of positions [rad] that corresponds to 1 rad at a joint of a small arm."""
     effects: list[Effect] = field(default_factory=list)
     """Effects beyond rigid bodies and control law; empty if there are none."""
     FITTED: ClassVar[tuple[str, ...]] = (
@@ -78,7 +89,7 @@ class JointConfig(DriveLaw):
             not_negative=("rotor_inertia",),
             finite=("position_age_s",),
         )
-        optional = ("loop_hz", "command_hz")
+        optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers(
             "joint",
             self,
@@ -148,6 +159,7 @@ class Robot:
     path: Path  # Path of the robot file
     assumed: Mapping[int, PointMass] = field(default_factory=dict)
     """Id of a body → payload of which a search assumes the place and fits the mass."""
+    motions: KeptMotions = field(default_factory=KeptMotions, repr=False, compare=False)
 
     @property
     def units(self) -> dict[str, str]:
@@ -391,7 +403,7 @@ def load_robot(path: Path) -> Robot:
     lacks; the message names file and line; TaccorlError: the model cannot be used (``load_robot_model``)."""
     path = Path(path)
     _refuse_todo(path)
-    document = EffectsDocument(RobotConfig, path)
+    document = _RobotDocument(RobotConfig, path)
     config = document.value
     model = path.parent / config.model
     if not model.is_file():
@@ -407,7 +419,34 @@ def load_robot(path: Path) -> Robot:
         )
     robot = Robot(config, rigid, path)
     document.refuse(_rules(robot, document))
-    return robot
+    return document.in_units(robot)
+
+
+class _RobotDocument(EffectsDocument[RobotConfig]):
+    """A robot file. Bounds of its effects follow from joints, which the model has:
+    ``in_units`` checks them."""
+
+    def _made(self, make: Any, values: dict[str, Any], key: str) -> Any:
+        is_effect = isinstance(make, type) and issubclass(make, Effect)
+        if is_effect and make is not Payload:
+            wide = [(p.name, -math.inf, math.inf) for p in make.parameters()]
+            make = bounded(make.name, tuple(wide))
+        return super()._made(make, values, key)
+
+    def in_units(self, robot: Robot) -> Robot:
+        """``robot`` with the effects of the file in the units of their joints."""
+        for name, config in robot.config.joints.items():
+            joint, made = robot.joint(name), []
+            for k, effect in enumerate(config.effects):
+                key = f"joints/{name}/effects/{k}"
+                stated = {
+                    field: getattr(effect, field)
+                    for field in effect.settings()
+                    if self.has(f"{key}/{field}")
+                }
+                made.append(self._made(partial(joint.made, effect.name), stated, key))
+            robot = robot.with_joint(name, dataclasses.replace(config, effects=made))
+        return robot
 
 
 def _rules(robot: Robot, document: EffectsDocument) -> Rules:

@@ -1,11 +1,12 @@
 """One joint of a robot file for the one-joint model: its drive, weight, payloads, and what the motion of other joints adds."""
 
+import copy
 import dataclasses
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import cache
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -37,10 +38,10 @@ from taccorl.alignment.controller.rigid_joint import (
 from taccorl.alignment.machines.robot_model import JointFacts
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.effects import make_effect
+from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
-from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, scaled
+from taccorl.sim.effects.scaled import OF_A_TURN, Scale, bounded, scaled
 
 if TYPE_CHECKING:
     from taccorl.alignment.machines.robot_file import Robot  # which makes the joints
@@ -61,8 +62,11 @@ of four joints, whose targets change every 10 ms, it leaves an error of 1.06 noi
 SWEEPS = 4
 """Gauss–Seidel sweeps over the joints in ``moved_together``. A choice: each sweep removes two thirds of the error."""
 MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
-"""Largest number of positions in ``_KEPT``, which serves all joints of a recording; and of entries of its mass matrices."""
+"""Largest number of positions in ``KeptMotions``, and of entries of mass matrices."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+FORCE_OF_MASS = 0.1
+"""Force unit of a slide without ``effort_limit`` over its mass [N/kg]. A choice: dry
+friction is searched up to 20 times this, a friction coefficient of 0.2."""
 LEAST_INERTIA = 0.01
 """Least inertia of a joint with a ``payload`` of negative mass, as a share of its inertia in the model. A choice: a search may
 try places of the mass that would make the inertia negative."""
@@ -71,22 +75,18 @@ PAYLOAD_AT = (
     "y_m",
     "z_m",
 )  # Parameters of ``payload`` for its place along the axes of its body
-_SLIDE_WAVES = Scale(
-    unit="m", length=1.0 / WAVE_SHARE
-)  # bounds of wave numbers are those of a file, in rad/m
 
 
-@contextmanager
-def under_gravity(
-    model: mujoco.MjModel, gravity_mps2: np.ndarray
-) -> Iterator[mujoco.MjModel]:
-    """Context manager: ``model`` with another gravity ``gravity_mps2`` (3,) [m/s²], in the frame of the world, for a while."""
-    own = model.opt.gravity.copy()
-    model.opt.gravity[:] = gravity_mps2
-    try:
-        yield model
-    finally:
-        model.opt.gravity[:] = own
+def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> mujoco.MjModel:
+    """Copy of ``model`` with gravity ``gravity_mps2`` (3,) [m/s²] in the world frame."""
+    return _copy_under_gravity(model, np.asarray(gravity_mps2, float).tobytes())
+
+
+@lru_cache(maxsize=64)  # a search asks for the same few thousands of times
+def _copy_under_gravity(model: mujoco.MjModel, gravity_mps2: bytes) -> mujoco.MjModel:
+    copied = copy.copy(model)
+    copied.opt.gravity[:] = np.frombuffer(gravity_mps2)
+    return copied
 
 
 @cache
@@ -137,6 +137,7 @@ class RobotJoint(DriveJoint):
             self.position_age_s + law.position_age_s,
             law.position_age_s,
         )
+        self.wave = self.scale.wave
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
 
@@ -189,15 +190,15 @@ class RobotJoint(DriveJoint):
     def _terms(self, pose: np.ndarray, masses: Sequence[PointMass] = ()) -> Rigid:
         """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor."""
         model = self._robot.rigid.model
-        if (key := pose.tobytes() + model.opt.gravity.tobytes()) not in self._unloaded:
+        if (key := pose.tobytes()) not in self._unloaded:
             self._unloaded[key] = rigid_terms(model, self.signal, pose)
         terms = with_masses(self._unloaded[key], model, self.signal, pose, masses)
         if not (more := self._robot.more_gravity).any():
             return terms
-        with under_gravity(model, more):  # the weight is linear in gravity
-            extra = with_masses(
-                rigid_terms(model, self.signal, pose), model, self.signal, pose, masses
-            )
+        leaned = under_gravity(model, more)  # the weight is linear in gravity
+        extra = with_masses(
+            rigid_terms(leaned, self.signal, pose), leaned, self.signal, pose, masses
+        )
         names = ("gravity_sin", "gravity_cos", "weight_n")
         return terms._replace(
             **{name: getattr(terms, name) + getattr(extra, name) for name in names}
@@ -351,10 +352,40 @@ class RobotJoint(DriveJoint):
             return bounded(
                 "payload", (mass, *((name, -far, far) for name in PAYLOAD_AT))
             )
-        if self.unit == "rad":
-            return cls
-        return scaled(
-            cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m")
+        return scaled(cls.name, self.scale)
+
+    def made(self, name: str, /, **values: Any) -> Effect:
+        """The effect of that name as a file may state it, in the units of the joint.
+        Raises TaccorlError: an effect or parameter is unknown, or out of bounds."""
+        cls = effects.get(name)
+        for key in values:
+            if key not in (known := cls.settings()):
+                raise TaccorlError(
+                    f"effect {name}: no parameter {key!r}; {nearest(key, known)}"
+                )
+        return (cls if cls is Payload else self.in_units(cls))(**values)
+
+    @property
+    def scale(self) -> Scale:
+        """Size of the joint's forces and motions relative to a joint of a small arm, by
+        which bounds of effects are multiplied: the file's ``force_unit_n`` and
+        ``length_unit_m``. Defaults: 1 of a hinge; of a slide a tenth of
+        ``effort_limit``, else ``FORCE_OF_MASS`` times its mass, and its stroke."""
+        c, known = self._config, self.known
+        force, length, drive = 1.0, 1.0, 0.0
+        if self.unit == "m":
+            force = max(1.0, FORCE_OF_MASS * known.inertia)
+            if c.effort_limit is not None:
+                force = 0.1 * c.effort_limit
+            if known.limits is not None:
+                length = known.limits[1] - known.limits[0]
+            if c.law != "effort" and c.loop_gains.kp > 0.0:
+                drive = 1.0 / c.loop_gains.kp
+        return Scale(
+            unit=self.unit,
+            force=c.force_unit_n or force,
+            length=c.length_unit_m or length,
+            drive=drive,
         )
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
@@ -454,8 +485,8 @@ def needed_along(
     """``torque_along`` of ``positions`` (T, nq) with the robot's own gravity: twice (T, nv), and (T, nv, nv)."""
     needed, carried, masses = torque_along(robot.rigid.model, positions, period_s)
     if (more := robot.more_gravity).any():
-        with under_gravity(robot.rigid.model, more) as model:
-            needed += torque_along(model, positions, period_s, still=True)[0]
+        leaned = under_gravity(robot.rigid.model, more)
+        needed += torque_along(leaned, positions, period_s, still=True)[0]
     return needed, carried, masses
 
 
@@ -473,11 +504,30 @@ def moved_together(robot: "Robot", m: Measurement) -> Along | None:
         getattr(m, name).tobytes() for name in ("target", "measured", *m.extra_columns)
     ]
     key = hashlib.sha1(b"".join([said, *arrays])).digest()
-    if key not in _KEPT:
-        while sum(len(one.positions) for one in _KEPT.values() if one) > MOST_KEPT:
-            del _KEPT[next(iter(_KEPT))]
-        _KEPT[key] = _moved_together(robot, m)
-    return _KEPT[key]
+    return robot.motions.of(key, lambda: _moved_together(robot, m))
+
+
+class KeptMotions:
+    """Motions of a robot's joints, which serve all joints of a recording. A copy that
+    another process gets is empty."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._found: dict[bytes, Along | None] = {}
+
+    def __reduce__(self) -> "tuple[type[KeptMotions], tuple[()]]":
+        return KeptMotions, ()
+
+    def of(self, key: bytes, make: Callable[[], Along | None]) -> Along | None:
+        """The motion of ``key``; ``make`` computes it if it is not there."""
+        with self._lock:
+            if key in self._found:
+                return self._found[key]
+        made = make()
+        with self._lock:
+            while sum(len(a.positions) for a in self._found.values() if a) > MOST_KEPT:
+                del self._found[next(iter(self._found))]
+            return self._found.setdefault(key, made)
 
 
 def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
@@ -524,6 +574,3 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         needed_along(robot, q, m.period_s / fine)[:2] if driven else (needed, carried)
     )
     return Along(frozenset(angles), q, needed, carried) if angles else None
-
-
-_KEPT: dict[bytes, Along | None] = {}

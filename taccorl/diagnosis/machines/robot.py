@@ -65,7 +65,7 @@ from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.problem import candidate, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import Scale
@@ -121,16 +121,10 @@ class RobotMachine(Machine):
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         config, joint = self.robot.config.joints[part], self.robot.joint(part)
         own = {**config.numbers, "position_age_s": (config.position_age_s, "s")}
-        made = [
-            joint.in_units(type(e))(
-                **{p.name: getattr(e, p.name) for p in e.parameters()}
-            )
-            for e in config.effects
-        ]
         return {
             n: (value, Scale(unit=joint.unit).unit_of(unit))
             for n, (value, unit) in own.items()
-        } | numbers_of(made)
+        } | numbers_of(config.effects)
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -747,8 +741,7 @@ class RobotMachine(Machine):
         own = {
             key: value for key, value in values.items() if key not in ("arm", "joints")
         }
-        make_effect(name, **own)  # which names what is wrong
-        return joint.in_units(effects.get(name))(**own)
+        return joint.made(name, **own)
 
     def with_additions(self, additions: Sequence[Addition]) -> "RobotMachine":
         robot = self.robot
@@ -757,12 +750,11 @@ class RobotMachine(Machine):
             numbers = {
                 key: float(value) for key, value in config.law_numbers(a.base).items()
             }
-            # The file has the registered classes, whose numbers are the same.
-            made = [
-                (e.name, {f.name: getattr(e, f.name) for f in dataclasses.fields(e)})
+            joint = robot.joint(a.part)  # bounds of a search may be narrower
+            new = [
+                joint.made(e.name, **{key: getattr(e, key) for key in e.settings()})
                 for e in a.effects
             ]
-            new = [make_effect(name, **own) for name, own in made]
             if "position_age_s" in a.base:
                 numbers["position_age_s"] = float(a.base["position_age_s"])
             half_s = 0.5 * float(a.base.get("loop_s", 0.0))
@@ -770,7 +762,7 @@ class RobotMachine(Machine):
                 numbers["loop_hz"] = 0.5 / half_s
             if "speed_delay_s" in a.base:  # in the file beyond a whole period
                 delay_s = float(a.base["speed_delay_s"]) - half_s
-                new.append(make_effect("speed_delay", delay_s=delay_s))
+                new.append(joint.made("speed_delay", delay_s=delay_s))
             kept = [e for e in config.effects if e.name not in {n.name for n in new}]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]
             robot = robot.with_joint(

@@ -65,6 +65,7 @@ from taccorl.diagnosis.search.problem import (
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.scaled import scaled
 
 GAINS_WITHIN = 1.25
 """Factor within which commanded gains are fitted, to both sides."""
@@ -371,16 +372,12 @@ class AxisProblem(WithoutMaps):
             if bare.loop_gains.kp > 0.0
             else {}
         )
-        # Of a slide the grid of ``Cogging.starts``, which counts turns, is of no use.
-        of_slide = (
-            {"length": self.axis.scale.wave, "least_span": 0.0}
-            if self.axis.unit == "m"
-            else {}
-        )
+        scale = self.axis.scale
+        cogging = scaled("cogging", scale)
         return (
             seen_in(motions, answers, asked)
             | drive
-            | position_waves(motions, inertias, **of_slide)
+            | position_waves(motions, inertias, cogging, length=scale.wave)
         )
 
 

@@ -50,6 +50,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.drive import SpeedDelay
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.load import Cogging
 from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.twin import TwinConfig
 
@@ -477,8 +478,14 @@ class JointProblem(WithoutMaps):
         return seen_in(motions, answers, asked) | {
             "peak_motor_nm": float(max(motor_nm)),
             "span_rad": float(np.ptp(np.concatenate(asked))),
-            **position_waves(motions, [self.model.inertia_kgm2(m) for m in motions]),
+            **self._position_waves(motions),
         }
+
+    def _position_waves(self, motions: Sequence[JointMotion]) -> dict[str, float]:
+        joint = self.model.joint
+        inertias = [self.model.inertia_kgm2(m) for m in motions]
+        cogging = joint.in_units(Cogging)
+        return position_waves(motions, inertias, cogging, length=joint.wave)
 
 
 def floor_words(floors: Sequence[SignalFloor]) -> str:

@@ -32,7 +32,10 @@ SOFT = 5.0
 """Compliance that a gear may have in multiples of the drive's; of series elastic actuators it is 0.1 to 3. A choice."""
 WAVE_SHARE = 0.25
 """Share w of a slide's length unit that stands for 1 rad in periodic forces (magnets, a screw): wave numbers 2π / pitch are
-6 / w … 200 / w, pitches 0.8 to 26 % of a stroke. A choice."""
+6 / w … 800 / w, pitches 0.2 to 26 % of a stroke. A choice."""
+FINER = 4.0
+"""Factor on the largest wave number of a slide's periodic forces: a screw's pitch of
+5 mm is 0.5 % of a stroke of 1 m. A choice."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +93,8 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
         }
         if p.unit == "rad/(N·m)":
             number["high"] = max(p.high * factors[p.name], SOFT * scale.drive)
+        if name == "cogging" and p.name == "periods" and scale.unit == "m":
+            number["high"] *= FINER
         changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
