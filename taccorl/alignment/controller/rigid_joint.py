@@ -1,6 +1,6 @@
 """Rigid-body properties of one joint for the one-joint model: inertia, weight, and torque from the motion of other joints. Each
-kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), any robot of an MJCF or URDF file
-(``robot_joint``), and an axis by itself (``machines.axis_file``).
+kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), and any robot or axis
+(``robot_joint``).
 
 Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 """
@@ -94,6 +94,8 @@ class RigidJoint(ABC):
     """Known fields of ``drive_numbers.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
+    loop_s: float = 0.0
+    """Period of the drive's loop that the machine's file states [s]; 0: none."""
     stated_age_s: float = 0.0  # Part of ``position_age_s`` that the machine's file states beyond half a loop period [s]
     speed_delay_s: float = 0.0  # Delay of the measured velocity in the controller [s]
     exact_timing: ClassVar[bool] = False
@@ -131,6 +133,10 @@ class RigidJoint(ABC):
         return self.gains._replace(
             **{name: values[name] for name in Gains._fields if name in values}
         ), {}
+
+    def with_values(self, values: Mapping[str, float]) -> "RigidJoint":
+        """The joint with fitted numbers, by name, that ``numbers`` does not convert."""
+        return self
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         """Ratios of a recording's gains to ``gains``: (for the position error, for the velocity); 1 if the recording states

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from taccorl.alignment.controller.drive_law import DriveJoint, with_gains
-from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel
 from taccorl.alignment.controller.joint_motion import (
     JointMotion,
     Surroundings,
@@ -43,8 +43,8 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import OF_A_TURN, Scale, bounded, scaled
 
-if TYPE_CHECKING:
-    from taccorl.alignment.machines.robot_file import Robot  # which makes the joints
+if TYPE_CHECKING:  # which makes the joints
+    from taccorl.alignment.machines.robot_file import JointConfig, Robot
 
 _GIVES = (
     "target",
@@ -122,10 +122,9 @@ class RobotJoint(DriveJoint):
         stated: "Robot | None" = None,
         along: "Along | None" = None,
     ) -> None:
-        self._robot, self._config = robot, (law := robot.config.joints[signal])
-        super().__init__(
-            law, signal, robot.rigid.joints[signal].unit, law.loop_hz, law.command_hz
-        )
+        self._robot, self.signal = robot, signal
+        self._use(law := robot.config.joints[signal])
+        self._stated_loop_hz = law.loop_hz
         self._stated, self._along = robot if stated is None else stated, along
         self._masses = robot.masses() if masses is None else masses
         own = [self._masses[signal].body] if signal in self._masses else []
@@ -133,13 +132,44 @@ class RobotJoint(DriveJoint):
         self._payload_in = [*own, robot.last_body(signal)][0]
         # At a slide the weight of an unknown mass is a constant force, too.
         self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
-        self.position_age_s, self.stated_age_s = (
-            self.position_age_s + law.position_age_s,
-            law.position_age_s,
-        )
+        self.scale = self._scale()
         self.wave = self.scale.wave
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
+
+    def _use(self, config: "JointConfig") -> None:
+        """Take the numbers of the drive from ``config``."""
+        signal, unit = self.signal, self._robot.rigid.joints[self.signal].unit
+        super().__init__(config, signal, unit, config.loop_hz, config.command_hz)
+        self._config = config
+        self.stated_age_s = config.position_age_s
+        self.position_age_s += config.position_age_s
+        self.target_late_s = config.target_late_s
+        if not self.has_model:
+            late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
+            self.facts = {
+                **self.facts,
+                "speed_age": self.speed_delay_s,
+                "speed_delay__delay_s": late_s,
+            }
+            self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
+
+    @property
+    def config(self) -> "JointConfig":
+        """Numbers of the drive: those of the file, or of ``with_values``."""
+        return self._config
+
+    @property
+    def has_model(self) -> bool:
+        """Whether a model has inertia and weight; else the file has, and fits them."""
+        return bool(self._robot.config.model)
+
+    def with_values(self, values: Mapping[str, float]) -> "RobotJoint":
+        if self.has_model:
+            return self
+        fitted = copy.copy(self)
+        fitted._use(self._config.with_numbers(values))
+        return fitted
 
     @property
     def known(self) -> JointFacts:
@@ -155,6 +185,8 @@ class RobotJoint(DriveJoint):
         )
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
+        if not self.has_model:  # ``with_values`` has them all
+            return self.gains, {}
         gains, facts = super().numbers(values)
         if "stall_nm" not in values:
             return gains, facts
@@ -167,11 +199,13 @@ class RobotJoint(DriveJoint):
 
     def timestep_s(self, motion: JointMotion) -> float:
         c = self._config
-        return c.timestep_s(
-            motion.rate_hz, self.known.inertia + c.armature, motion.kp_scale, c.loop_hz
-        )
+        inertia = c.inertia or self.known.inertia + c.armature
+        loop_hz = self._stated_loop_hz
+        return c.timestep_s(motion.rate_hz, inertia, motion.kp_scale, loop_hz)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        if self._config.inertia is not None:
+            return self._stated_rigid(motion, self._config.inertia)
         terms = self._terms(motion.pose, self._every_mass(bodies))
         # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
         inertia = (
@@ -180,8 +214,20 @@ class RobotJoint(DriveJoint):
         )
         return terms._replace(inertia=inertia, rotor_inertia=self._config.armature)
 
+    def _stated_rigid(self, motion: JointMotion, inertia: float) -> Rigid:
+        c = self._config
+        inertia += motion.mounted_kgm2
+        if self.unit == "m":
+            return Rigid(inertia, c.armature, weight_n=c.weight_cos)
+        weight = motion.moment_kgm * GRAVITY_M_PER_S2  # m l g sin(q − q₀)
+        sine = c.weight_sin + weight * math.cos(c.hangs_at_rad)
+        cosine = c.weight_cos - weight * math.sin(c.hangs_at_rad)
+        return Rigid(inertia, c.armature, sine, cosine)
+
     def inertia_kgm2(self, m: Measurement) -> float:
         """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""
+        if self._config.inertia is not None:
+            return self._config.inertia + self.surroundings(m).mounted_kgm2
         return (
             self._terms(self.pose(m), self._every_mass(self.effects(()))).inertia
             + self._config.armature
@@ -254,6 +300,10 @@ class RobotJoint(DriveJoint):
         return pose
 
     def surroundings(self, m: Measurement) -> Surroundings:
+        """Raises TaccorlError: a payload is stated at a joint of a model, or without its
+        lever at one without."""
+        if not self.has_model:
+            return self._mounted(m)
         if any(kg > 0 for kg in m.payload_kg.values()):
             raise TaccorlError(
                 f"{m.name}: payload_kg applies to the PiPER's hands only; write a second model file with the mass fixed to its "
@@ -273,10 +323,45 @@ class RobotJoint(DriveJoint):
             positions=positions,
         )
 
+    def _mounted(self, m: Measurement) -> Surroundings:
+        """With the masses that the file or the recording mounts on a joint without model:
+        the inertia m l² and the weight m g l sin(q − q₀), and those of the arm."""
+        c, name = self._config, self.signal
+        payload, lever, arm = (
+            getattr(m, key).get(name, getattr(c, key))
+            for key in ("payload_kg", "lever_m", "arm_kg")
+        )
+        if self.unit == "m" and (lever or arm):
+            raise TaccorlError(
+                f"{m.name}: lever_m or arm_kg of {name} is stated, but a slide has no lever; remove it"
+            )
+        if self.unit == "rad" and payload + arm > 0.0 and lever == 0.0:
+            raise TaccorlError(
+                f"{m.name}: payload_kg or arm_kg of {name} is stated, but the length of its lever is not; write `lever_m: …` "
+                f"in its file, or `lever_m: {{{name}: …}}` in measurements.yaml"
+            )
+        mounted = payload
+        if self.unit == "rad":
+            mounted = payload * lever**2 + arm * lever**2 / 3.0
+        return dataclasses.replace(
+            super().surroundings(m),
+            payload_kg=payload,
+            payload_at_known=True,
+            moment_kgm=payload * lever + 0.5 * arm * lever,
+            mounted_kgm2=mounted,
+        )
+
     def whole(self, m: Measurement) -> Measurement:
         """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording states
         none. Raises TaccorlError: the model lacks a signal, or has it in another unit."""
         names = tuple(self._robot.units)
+        if not self.has_model:
+            own = [name for name in names if name in m.signals]
+            if not own:
+                raise TaccorlError(
+                    f"{m.name} has no signal {names[0]!r}, which its file names; {nearest(names[0], m.signals)}"
+                )
+            m = m.only(own)
         for name, unit in zip(m.signals, m.units, strict=True):
             if name not in names:
                 model = self._robot.rigid.path.name
@@ -285,12 +370,12 @@ class RobotJoint(DriveJoint):
                 )
             if unit != self._robot.units[name]:
                 raise TaccorlError(
-                    f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}"
+                    f"{m.name}: {name} is in {unit}, its file states {self._robot.units[name]}"
                 )
             for key in ("lever_m", "arm_kg"):
-                if name in getattr(m, key):
+                if self.has_model and name in getattr(m, key):
                     raise TaccorlError(
-                        f"{m.name}: {key} of {name} is stated, which is supported for axis files only; remove it from "
+                        f"{m.name}: {key} of {name} is stated, which is for joints without a model; remove it from "
                         "measurements.yaml, and fix the mass to its link in the model"
                     )
             if (
@@ -365,20 +450,20 @@ class RobotJoint(DriveJoint):
                 )
         return (cls if cls is Payload else self.in_units(cls))(**values)
 
-    @property
-    def scale(self) -> Scale:
+    def _scale(self) -> Scale:
         """Size of the joint's forces and motions relative to a joint of a small arm, by
         which bounds of effects are multiplied: the file's ``force_unit_n`` and
-        ``length_unit_m``. Defaults: 1 of a hinge; of a slide a tenth of
-        ``effort_limit``, else ``FORCE_OF_MASS`` times its mass, and its stroke."""
+        ``length_unit_m``. Defaults: 1 of a hinge of a model; else a tenth of
+        ``effort_limit``, or of a slide ``FORCE_OF_MASS`` times its mass, and its stroke."""
         c, known = self._config, self.known
         force, length, drive = 1.0, 1.0, 0.0
         if self.unit == "m":
             force = max(1.0, FORCE_OF_MASS * known.inertia)
-            if c.effort_limit is not None:
-                force = 0.1 * c.effort_limit
             if known.limits is not None:
                 length = known.limits[1] - known.limits[0]
+        if self.unit == "m" or not self.has_model:
+            if c.effort_limit is not None:
+                force = 0.1 * c.effort_limit
             if c.law != "effort" and c.loop_gains.kp > 0.0:
                 drive = 1.0 / c.loop_gains.kp
         return Scale(
@@ -390,6 +475,8 @@ class RobotJoint(DriveJoint):
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         if self.unit == "m" and cls.name in OF_A_TURN:
+            return None
+        if cls is Payload and not self.has_model:
             return None
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,

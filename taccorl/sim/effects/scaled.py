@@ -87,7 +87,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     changed = {}
     for p in base.parameters():
         ends = {key: getattr(p, key) for key in ("absent", "low", "high", "typical")}
-        number = {
+        number: dict[str, Any] = {
             k: v if v is None or not math.isfinite(v) else v * factors[p.name]
             for k, v in ends.items()
         }
@@ -113,7 +113,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
             for start in base.starts(own)
         ]
 
-    by = "; in the file of an axis `force_unit_n` and `length_unit_m` set such bounds"
+    by = "; `force_unit_n` and `length_unit_m` of the joint set such bounds"
     return _changed(
         base, changed, (scaled, name, scale), starts=classmethod(starts), range_by=by
     )
