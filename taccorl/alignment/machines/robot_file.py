@@ -93,8 +93,8 @@ class JointConfig(DriveLaw):
     hangs_at_rad: float = 0.0
     """Position at which payload and arm hang straight down [rad]."""
     target_late_s: float = 0.0
-    """Delay from a target's row until it acts in the drive of a joint without a model [s];
-    ``diagnose`` fits up to 3 ms of it, a longer delay is an effect."""
+    """Delay from a target's row until it acts in the drive [s]. Of a joint without a model
+    ``diagnose`` fits up to 3 ms of it; a longer delay is an effect."""
     speed_late_s: float = 0.0
     """Delay of the speed in the loop of a joint without a model beyond that of a difference
     of two samples [s]; minus half a period if the drive measures the speed."""
@@ -115,7 +115,7 @@ class JointConfig(DriveLaw):
     )
     WITHOUT_MODEL: ClassVar[tuple[str, ...]] = (
         *("unit", "inertia", "limits", "weight_sin", "weight_cos", "payload_kg"),
-        *("lever_m", "arm_kg", "hangs_at_rad", "target_late_s", "speed_late_s"),
+        *("lever_m", "arm_kg", "hangs_at_rad", "speed_late_s"),
     )
     """Keys of a joint without a model, which has them for the others."""
     OF_HINGES: ClassVar[tuple[str, ...]] = (
