@@ -45,6 +45,7 @@ from taccorl.alignment.measurements.noise_floor import (
 from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.axis_numbers import (
     DRIVE_IS_STATED,
+    GAINS_WITHIN,
     OF_DRIVE,
     axis_numbers,
     no_candidates,
@@ -198,6 +199,7 @@ class JointProblem(WithoutMaps):
         """The joint, if it has no model: its body's numbers are fitted, too."""
         if isinstance(joint, RobotJoint) and not joint.has_model:
             self.axis = joint
+            self.commanded = joint.config.gains == "commanded"
             if gains == "fitted" != joint.config.gains:
                 raise TaccorlError(
                     f"--gains=fitted: write `gains: fitted` of {signal} into its file and "
@@ -305,7 +307,12 @@ class JointProblem(WithoutMaps):
                 f"fitted: {names}; gains and times of the drive stay: efforts are its "
                 f"law's, to {self.law_error:.2g} noise floors"
             )
-        return f"fitted: {names}; other numbers as the file states them"
+        near = ""
+        if self.commanded and any(f.name == "kp" for f in free):
+            near = (
+                f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)"
+            )
+        return f"fitted: {names}{near}; other numbers as the file states them"
 
     def _floor_of_loop(self) -> float:
         """Least floor of an axis's position. Without repeats an encoder's resolution is no
