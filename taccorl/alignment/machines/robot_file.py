@@ -93,8 +93,10 @@ class JointConfig(DriveLaw):
     hangs_at_rad: float = 0.0
     """Position at which payload and arm hang straight down [rad]."""
     target_late_s: float = 0.0
-    """Delay from a target's row until it acts in the drive [s]. Of a joint without a model
-    ``diagnose`` fits up to 3 ms of it; a longer delay is an effect."""
+    """Delay from a target's row until it acts in the drive [s]. Below 0: the position of a
+    row is read after the row's target was sent, or half a step later, as MuJoCo's
+    semi-implicit steps give it. ``diagnose`` fits −2 ms to 0, of a joint without a model 0
+    to 3 ms; a longer delay is an effect."""
     speed_late_s: float = 0.0
     """Delay of the speed in the loop of a joint without a model beyond that of a difference
     of two samples [s]; minus half a period if the drive measures the speed."""
@@ -133,10 +135,11 @@ class JointConfig(DriveLaw):
             "joint",
             self,
             positive=("gear", *positive),
-            not_negative=(
-                *("rotor_inertia", "payload_kg", "lever_m", "arm_kg", "target_late_s"),
+            not_negative=("rotor_inertia", "payload_kg", "lever_m", "arm_kg"),
+            finite=(
+                *("position_age_s", "target_late_s", "weight_sin", "weight_cos"),
+                "hangs_at_rad",
             ),
-            finite=("position_age_s", "weight_sin", "weight_cos", "hangs_at_rad"),
         )
         if has_model:
             self._check_beside_model()

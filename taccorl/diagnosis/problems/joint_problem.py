@@ -94,7 +94,7 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
 ``gravity_mismatch``."""
-_NOT_ON_PIPER = ("position_integral", "presliding", "unbalance")
+_NOT_ON_PIPER = ("position_integral", "presliding", "soft_friction", "unbalance")
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them. Its loop is no
 cascade, so that the first one is ``integral_action``."""
 WEIGHS = 3.0
@@ -119,6 +119,21 @@ POSITION_AGE = Free(
 )
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
+EARLY_S = 2e-3
+"""Most by which a target may act before its row's position was read [s]: MuJoCo's default step; half of it, or a position that
+is read right after its target was sent, are usual."""
+TARGET_LATE = Free(
+    name="target_late_s",
+    unit="s",
+    start=0.0,
+    low=-EARLY_S,
+    high=0.0,
+    scale=1e-4,
+    leaves=True,
+    unless=("command_delay", "sensor_delay"),
+)
+"""Delay from a target's row until it acts, below 0 as a rule of simulators: MuJoCo's semi-implicit steps answer to a force half a
+step early. An early target is no other K_d: of 1 ms 20 noise floors of 0.02 mrad stay. A late one is the effect command_delay."""
 LOOP = Free(
     name="loop_s",
     unit="s",
@@ -431,6 +446,9 @@ class JointProblem(WithoutMaps):
                     **self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s
                 ),
             ]
+        joint = self.model.joint
+        waits_s = base.get("loop_waits_s", 0.0) - joint.target_late_s
+        waits_s += base.get(TARGET_LATE.name, joint.target_late_s)
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
             self.model.joint.numbers(base),
@@ -485,8 +503,8 @@ class JointProblem(WithoutMaps):
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
         # lower bound is a little below that value, so that a fit to such a drive does not end at the bound. A loop below 200 Hz
-        # would have a bound that no file may state.
-        newest = max(-0.6 * joint.speed_delay_s, -SPEED_DELAY.high)
+        # would have a bound that no file may state. MuJoCo damps with the speed at the end of a step, half a step early.
+        newest = max(-0.6 * max(joint.speed_delay_s, EARLY_S), -SPEED_DELAY.high)
         delay = dataclasses.replace(SPEED_DELAY, low=newest)
         units = Scale(unit=joint.unit)
         if self.axis is not None:
@@ -531,6 +549,9 @@ class JointProblem(WithoutMaps):
             untimed = self.effort and not joint.position_age_s
             found += [LOOP if joint.exact_timing else EFFORT_AGE] * untimed
         found += [_within(name, value) for name, value in joint.winding.items()]
+        if joint.exact_timing and joint.target_kind == "position":
+            at = joint.target_late_s
+            found.append(dataclasses.replace(TARGET_LATE, start=at, high=max(at, 0.0)))
         payloads: list[JointMotion] = [
             r.data
             for r in self.fit
@@ -657,6 +678,13 @@ def recording_of(
         channels=tuple(names[kind] for kind in kinds),
         data=motion,
         share=share,
+        setting=(
+            motion.payload_kg,
+            motion.moment_kgm,
+            motion.mounted_kgm2,
+            round(motion.kp_scale, 3),
+            round(motion.kd_scale, 3),
+        ),
     )
 
 
