@@ -19,7 +19,6 @@ import numpy as np
 
 from pipelines.studies.foreign import ROBOTS, Case, Plant, recordings, unseen_sweep
 from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, cpu_words, share_row, study
-from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine
@@ -27,7 +26,6 @@ from taccorl.diagnosis.experiment_design.machine_surrogate import (
     recordings as slide_recordings,
 )
 from taccorl.diagnosis.experiment_design.motions import ground_of
-from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.search.fit import fit, rms, stacked
@@ -89,7 +87,7 @@ def made(
     """The user's machine, its joint, and recordings of the simulated one."""
     if seed >= FIRST_SLIDE_SEED:
         (folder / "slide.yaml").write_text(SLIDE, encoding="utf-8")
-        machine = Axis(load_axis(folder / "slide.yaml"), "slide")
+        machine = RobotMachine(load_robot(folder / "slide.yaml"), "slide")
         case = draw_machine(ground_of(machine, "slide", speed=0.3), seed, [one, other])
         return machine, "slide", slide_recordings(case)
     rng = np.random.default_rng([seed, 5])

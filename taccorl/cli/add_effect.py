@@ -35,7 +35,7 @@ class AddEffectConfig:
     Several with commas between them: what one diagnosis found, at one joint or at several. The numbers are those of a fit with
     exactly these."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """left_joint5; joint5 or J4 (the paper's name of it) for both arms. If not given: all joints for which the diagnosis found
     the effect."""

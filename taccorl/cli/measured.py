@@ -41,7 +41,7 @@ class MeasuredConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms; all that move if not given."""
     spec: str | None = None

@@ -383,21 +383,18 @@ def _rigid(robot: Robot, m: Measurement, state: np.ndarray) -> np.ndarray:
         for n in m.signals
     ]
     asked = np.array(rotors) * state[2]
-    with under_gravity(
+    model = under_gravity(
         robot.rigid.model, robot.rigid.model.opt.gravity + robot.more_gravity
-    ) as model:
-        data, joints = (
-            mujoco.MjData(model),
-            [model.joint(signal) for signal in m.signals],
-        )
-        q_at, v_at = (
-            [int(getattr(joint, key)[0]) for joint in joints]
-            for key in ("qposadr", "dofadr")
-        )
-        for t in range(len(asked)):
-            data.qpos[q_at], data.qvel[v_at], data.qacc[v_at] = state[:, t]
-            for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
-                step(model, data)
-            mujoco.mj_rne(model, data, 1, data.qfrc_inverse)
-            asked[t] += data.qfrc_inverse[v_at]
+    )
+    data, joints = mujoco.MjData(model), [model.joint(signal) for signal in m.signals]
+    q_at, v_at = (
+        [int(getattr(joint, key)[0]) for joint in joints]
+        for key in ("qposadr", "dofadr")
+    )
+    for t in range(len(asked)):
+        data.qpos[q_at], data.qvel[v_at], data.qacc[v_at] = state[:, t]
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            step(model, data)
+        mujoco.mj_rne(model, data, 1, data.qfrc_inverse)
+        asked[t] += data.qfrc_inverse[v_at]
     return asked

@@ -192,7 +192,7 @@ def remarks_on(omitted: list[OmittedActuator]) -> list[str]:
         said.append(
             f"an actuator moves several of {listed(shared, len(shared))}: its friction, play and inertia act on all that it "
             "moves, which a robot file cannot state, and what diagnose names at one of them may be in the motor. Record motions "
-            "in which one motor turns alone, and describe that motor by a file with kind: axis"
+            "in which one motor turns alone, and describe that motor by a robot file without a model"
         )
     return said
 

@@ -38,7 +38,6 @@ from taccorl.diagnosis.experiment_design.other_pose import (
     in_other_pose,
 )
 from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
-from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import GainsAre, Machine
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.machines.robot import RobotMachine
@@ -624,7 +623,7 @@ class JointPart(Part):
             and machine.robot.along_chain(self.name)
         ):
             found["other_pose"] = self._in_other_pose
-        if isinstance(machine, Axis):
+        if isinstance(machine, RobotMachine) and not machine.robot.config.model:
             found["mounted_mass"] = self._with_mass
         return found
 
@@ -655,15 +654,16 @@ class JointPart(Part):
 
     def _with_mass(self) -> "JointPart":
         ground, machine, name = self.ground, self.machine, self.name
-        assert isinstance(machine, Axis)
+        assert isinstance(machine, RobotMachine)
+        config = machine.robot.config.joints[name]
         stated = (
             [{}, {}]
             if ground.like is None
             else [ground.like.payload_kg, ground.like.lever_m]
         )
         now_kg, lever_m = (
-            stated[0].get(name, machine.config.payload_kg),
-            stated[1].get(name, machine.config.lever_m),
+            stated[0].get(name, config.payload_kg),
+            stated[1].get(name, config.lever_m),
         )
         if self.drive.unit == "rad" and not lever_m > 0.0:
             raise TaccorlError(
@@ -671,7 +671,7 @@ class JointPart(Part):
             )
         more_kg = (
             MOUNTED_SHARE
-            * machine.config.inertia
+            * (config.inertia or 0.0)
             / (1.0 if self.drive.unit == "m" else lever_m**2)
         )
         ground = dataclasses.replace(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axes import altered, axis_answer, axis_motion, axis_of
 from made_rows import of_signal, play
 from made_sweep import (
     ARMS_JOINTS,
@@ -41,12 +42,10 @@ from taccorl.alignment.checks.telemetry import (
 )
 from taccorl.alignment.checks.trial import Trial
 from taccorl.alignment.controller.drive_law import DriveLaw
-from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
-from taccorl.diagnosis.problems.axis_problem import axis_motion, simulated
 from taccorl.errors import TaccorlError
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
@@ -568,13 +567,13 @@ def test_friction_that_trails_the_twin_does_not_lead_it() -> None:
     time_s = np.arange(2500) / 250
     target = 0.24 / np.pi * np.arcsin(np.sin(2 * np.pi * time_s / 9))
     motion = dataclasses.replace(servo(time_s, 0.0 * time_s, target), units=("m",))
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo", unit="m", law="cascade", inertia=12.0, kp=30.0, kd=600.0
     )
 
     def slide(force_n: float = 0.0, **own: float) -> np.ndarray:
-        made = dataclasses.replace(axis, **own)
-        return simulated(
+        made = altered(axis, **own)
+        return axis_answer(
             made,
             axis_motion(made, motion),
             [make_effect("coulomb_friction", torque_nm=force_n)],
@@ -1043,8 +1042,8 @@ def test_a_step_from_rest_is_data_whether_its_target_jumps_in_the_first_row_or_l
     seen = check_measurement(m)
     assert not [f for f in seen if f.severity == "error"]
     assert not {"no_motion", "not_at_rest", "start_offset"} & {f.check for f in seen}
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, kp=10.0, kd=0.8)
-    answer_rad = simulated(axis, axis_motion(axis, m), []).reported
+    axis = axis_of(name="servo", unit="rad", inertia=0.02, kp=10.0, kd=0.8)
+    answer_rad = axis_answer(axis, axis_motion(axis, m), []).reported
     assert np.sqrt(np.mean((answer_rad - q) ** 2)) < 0.01 * abs(step_rad)
 
 

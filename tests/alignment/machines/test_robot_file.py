@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pickle
 from pathlib import Path
 
 import mujoco
@@ -19,6 +20,7 @@ from taccorl.alignment.machines.robot_joint import (
     RobotJoint,
     moved_together,
     needed_along,
+    under_gravity,
 )
 from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
@@ -874,3 +876,30 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(
         TaccorlError, match=r"arm\.xml.*joint 'elbo' .*elbow.*Rename.*columns"
     ):
         checks(renamed)
+
+
+def test_a_robot_under_another_gravity_leaves_its_model_as_it_is(
+    tmp_path: Path,
+) -> None:
+    """The model is shared by all joints, and by threads."""
+    model = robot(tmp_path, ROBOT_YAML, TWO_LINKS).rigid.model
+    own = model.opt.gravity.copy()
+    leaned = under_gravity(model, np.array([1.0, 2.0, 3.0]))
+    assert leaned.opt.gravity.tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(model.opt.gravity, own)
+
+
+def test_motions_that_a_robot_keeps_are_its_own_and_do_not_travel(
+    tmp_path: Path,
+) -> None:
+    one, other = (robot(tmp_path, ROBOT_YAML, TWO_LINKS) for _ in range(2))
+    assert one.motions.of(b"key", lambda: None) is None
+
+    def unexpected() -> None:
+        raise AssertionError("it was kept")
+
+    changed = one.with_joint("elbow", one.config.joints["elbow"])
+    assert changed.motions.of(b"key", unexpected) is None
+    for empty in (other, pickle.loads(pickle.dumps(one))):
+        with pytest.raises(AssertionError):
+            empty.motions.of(b"key", unexpected)

@@ -39,7 +39,7 @@ from taccorl.diagnosis.experiment_design.plan import (
     plan,
     scored,
 )
-from taccorl.diagnosis.machines.axis import Axis
+from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.errors import TaccorlError
 from taccorl.report.planned import planned as shown
 from taccorl.robots import ROBOT
@@ -308,7 +308,7 @@ def lift(
     patch.setattr(motions, "MOTIONS", [m for m in motions.MOTIONS if m.name == motion])
     (folder / "lift.yaml").write_text(text)
     return JointPart(
-        ground_of(Axis.load(folder / "lift.yaml"), "lift", speed=1.5), 1e-4
+        ground_of(RobotMachine.load(folder / "lift.yaml"), "lift", speed=1.5), 1e-4
     )
 
 
