@@ -47,7 +47,8 @@ REMOVABLE = 0.95
 _LEAST_REACH_M = 0.05
 _HINGE = mujoco.mjtJoint.mjJNT_HINGE
 MOST_EARLY_S = 0.01
-"""``position_age_s`` of a file must be above minus this value [s]. A choice: longer than the period of any drive's loop."""
+"""``position_age_s`` and ``target_late_s`` of a file must be above minus this value [s]. A
+choice: longer than the period of any drive's loop."""
 _ALONG = 0.9999  # least cosine between axes that count as parallel
 _HEADER = (
     "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
@@ -93,10 +94,10 @@ class JointConfig(DriveLaw):
     hangs_at_rad: float = 0.0
     """Position at which payload and arm hang straight down [rad]."""
     target_late_s: float = 0.0
-    """Delay from a target's row until it acts in the drive [s]. Below 0: the position of a
-    row is read after the row's target was sent, or half a step later, as MuJoCo's
-    semi-implicit steps give it. ``diagnose`` fits −2 ms to 0, of a joint without a model 0
-    to 3 ms; a longer delay is an effect."""
+    """Delay from a target's row until it acts in the drive [s]; ``diagnose`` fits it from
+    −2 ms to 0, of a joint without a model to 3 ms; a longer delay is an effect. Below 0: the
+    position of a row is read after its target was sent, or is half a step newer, as MuJoCo's
+    semi-implicit steps give it."""
     speed_late_s: float = 0.0
     """Delay of the speed in the loop of a joint without a model beyond that of a difference
     of two samples [s]; minus half a period if the drive measures the speed."""
@@ -137,18 +138,19 @@ class JointConfig(DriveLaw):
             positive=("gear", *positive),
             not_negative=("rotor_inertia", "payload_kg", "lever_m", "arm_kg"),
             finite=(
-                *("position_age_s", "target_late_s", "weight_sin", "weight_cos"),
-                "hangs_at_rad",
+                *("position_age_s", "target_late_s"),
+                *("weight_sin", "weight_cos", "hangs_at_rad"),
             ),
         )
         if has_model:
             self._check_beside_model()
         else:
             self._check_alone()
-        if not self.position_age_s > -MOST_EARLY_S:
-            raise TaccorlError(
-                f"joint.position_age_s: is {self.position_age_s:g} s; write a value above −{MOST_EARLY_S:g} s"
-            )
+        for name in ("position_age_s", "target_late_s"):
+            if not (value := getattr(self, name)) > -MOST_EARLY_S:
+                raise TaccorlError(
+                    f"joint.{name}: is {value:g} s; write a value above −{MOST_EARLY_S:g} s"
+                )
         self.check_law("joint")
         self.check_known(
             "joint", {e.name: [p.name for p in e.parameters()] for e in self.effects}

@@ -25,7 +25,7 @@ from taccorl.alignment.controller.drive_law import WINDING, WINDING_WITHIN
 from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2
 from taccorl.alignment.machines.robot_file import JointConfig
 from taccorl.alignment.machines.robot_joint import RobotJoint
-from taccorl.diagnosis.search.identifiable import TIMING_S
+from taccorl.diagnosis.search.identifiable import EARLY_S, TIMING_S
 from taccorl.diagnosis.search.problem import Free
 
 GAINS_WITHIN = 1.25
@@ -127,7 +127,7 @@ def _of_times(config: JointConfig, loop: Free, effort: bool) -> Iterator[Free]:
             name="target_late_s",
             unit="s",
             start=at,
-            low=0.0,
+            low=min(-EARLY_S, at),
             high=max(TIMING_S, at),
             scale=1e-4,
             unless=("command_delay",),

@@ -52,7 +52,7 @@ from taccorl.diagnosis.problems.axis_numbers import (
     of_motor,
 )
 from taccorl.diagnosis.problems.position_waves import position_waves
-from taccorl.diagnosis.search.identifiable import TIMING_S
+from taccorl.diagnosis.search.identifiable import EARLY_S, TIMING_S
 from taccorl.diagnosis.search.problem import (
     Candidate,
     Case,
@@ -119,9 +119,6 @@ POSITION_AGE = Free(
 )
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
-EARLY_S = 2e-3
-"""Most by which a target may act before its row's position was read [s]: MuJoCo's default step; half of it, or a position that
-is read right after its target was sent, are usual."""
 TARGET_LATE = Free(
     name="target_late_s",
     unit="s",
@@ -433,6 +430,10 @@ class JointProblem(WithoutMaps):
         self, base: Mapping[str, float], effects: Sequence[Effect], joint: RigidJoint
     ) -> Numbers:
         scale, waits_s = base.get(EFFORT_SCALE.name, 1.0), base.get("loop_waits_s", 0.0)
+        at = joint.target_late_s
+        waits_s += (
+            base.get(TARGET_LATE.name, at) - at
+        )  # 0 of an axis, whose joint has it
         if self.axis is not None:
             return Numbers(joint.gains, effects, waits_s=waits_s, effort_scale=scale)
         lever, half_s = (
@@ -446,9 +447,6 @@ class JointProblem(WithoutMaps):
                     **self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s
                 ),
             ]
-        joint = self.model.joint
-        waits_s = base.get("loop_waits_s", 0.0) - joint.target_late_s
-        waits_s += base.get(TARGET_LATE.name, joint.target_late_s)
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
             self.model.joint.numbers(base),
