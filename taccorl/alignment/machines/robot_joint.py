@@ -5,7 +5,7 @@ import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache, cached_property
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -183,7 +183,7 @@ class RobotJoint(DriveJoint):
             free_inertia=self._free_inertia,
         )
 
-    @cached_property
+    @property
     def _free_inertia(self) -> float:
         """``Rigid.free_inertia``, without payloads."""
         model, joints = self._robot.rigid.model, self._robot.config.joints
