@@ -312,7 +312,8 @@ def _side_by_side(
         )
         drive["gravity_sin"] += weight * case.lever.sin_m
         drive["gravity_cos"] += weight * case.lever.cos_m
-        drive["command_delay__delay_s"] += case.waits_s
+        # A target that acts before its row does so by a delay below 0, a later one by ``_sent``.
+        drive["command_delay__delay_s"] += case.waits_s + min(late_s, 0.0)
         drive["effort_age"] -= case.waits_s
         if any(drive[f"{name}__rate_per_s"] > 0.0 for name in INTEGRALS):
             drive["start_nm"] = motion.start_nm / case.effort_scale

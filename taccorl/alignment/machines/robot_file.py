@@ -61,6 +61,9 @@ class JointConfig(DriveLaw):
     rate. Without it, a target holds until the next row."""
     position_age_s: float = 0.0
     """Age of the measured position when the torque acts, beyond that of the loop's timing [s]; ``diagnose`` fits it."""
+    target_late_s: float = 0.0
+    """Delay from a target's row until it acts in the drive [s]; ``diagnose`` fits it from −2 ms to 0. Below 0: the position of a
+    row is read after the row's target was sent, or as it is half a step later, as MuJoCo's semi-implicit steps give it."""
     effects: list[Effect] = field(default_factory=list)
     """Effects beyond rigid bodies and control law; empty if there are none."""
     FITTED: ClassVar[tuple[str, ...]] = (
@@ -68,6 +71,7 @@ class JointConfig(DriveLaw):
         "effort_scale",
         "speed_delay_s",
         "position_age_s",
+        "target_late_s",
     )
 
     def __post_init__(self) -> None:
@@ -76,7 +80,7 @@ class JointConfig(DriveLaw):
             self,
             positive=("gear",),
             not_negative=("rotor_inertia",),
-            finite=("position_age_s",),
+            finite=("position_age_s", "target_late_s"),
         )
         optional = ("loop_hz", "command_hz")
         check_numbers(

@@ -137,6 +137,7 @@ class RobotJoint(DriveJoint):
             self.position_age_s + law.position_age_s,
             law.position_age_s,
         )
+        self.target_late_s = law.target_late_s
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
 

@@ -124,7 +124,8 @@ class RobotMachine(Machine):
 
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         config, joint = self.robot.config.joints[part], self.robot.joint(part)
-        own = {**config.numbers, "position_age_s": (config.position_age_s, "s")}
+        times = ("position_age_s", "target_late_s")
+        own = {**config.numbers, **{n: (getattr(config, n), "s") for n in times}}
         made = [
             joint.in_units(type(e))(
                 **{p.name: getattr(e, p.name) for p in e.parameters()}
@@ -784,8 +785,9 @@ class RobotMachine(Machine):
                 for e in a.effects
             ]
             new = [make_effect(name, **own) for name, own in made]
-            if "position_age_s" in a.base:
-                numbers["position_age_s"] = float(a.base["position_age_s"])
+            for name in ("position_age_s", "target_late_s"):
+                if name in a.base:
+                    numbers[name] = float(a.base[name])
             half_s = 0.5 * float(a.base.get("loop_s", 0.0))
             if half_s > 0.0:
                 numbers["loop_hz"] = 0.5 / half_s

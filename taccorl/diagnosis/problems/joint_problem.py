@@ -101,6 +101,21 @@ POSITION_AGE = Free(
 )
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
+EARLY_S = 2e-3
+"""Most by which a target may act before its row's position was read [s]: MuJoCo's default step; half of it, or a position that
+is read right after its target was sent, are usual."""
+TARGET_LATE = Free(
+    name="target_late_s",
+    unit="s",
+    start=0.0,
+    low=-EARLY_S,
+    high=0.0,
+    scale=1e-4,
+    leaves=True,
+    unless=("command_delay", "sensor_delay"),
+)
+"""Delay from a target's row until it acts, below 0 as a rule of simulators: MuJoCo's semi-implicit steps answer to a force half a
+step early. An early target is no other K_d: of 1 ms 20 noise floors of 0.02 mrad stay. A late one is the effect command_delay."""
 LOOP = Free(
     name="loop_s",
     unit="s",
@@ -348,6 +363,9 @@ class JointProblem(WithoutMaps):
                     **self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s
                 ),
             ]
+        joint = self.model.joint
+        waits_s = base.get("loop_waits_s", 0.0) - joint.target_late_s
+        waits_s += base.get(TARGET_LATE.name, joint.target_late_s)
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
             self.model.joint.numbers(base),
@@ -363,9 +381,7 @@ class JointProblem(WithoutMaps):
             )  # what the position's age takes from K_d is of no speed
             facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
         scale = base.get(EFFORT_SCALE.name, 1.0)
-        return Numbers(
-            gains, effects, lever, age_s, facts, base.get("loop_waits_s", 0.0), scale
-        )
+        return Numbers(gains, effects, lever, age_s, facts, waits_s, scale)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -400,8 +416,8 @@ class JointProblem(WithoutMaps):
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
         # lower bound is a little below that value, so that a fit to such a drive does not end at the bound. A loop below 200 Hz
-        # would have a bound that no file may state.
-        newest = max(-0.6 * joint.speed_delay_s, -SPEED_DELAY.high)
+        # would have a bound that no file may state. MuJoCo damps with the speed at the end of a step, half a step early.
+        newest = max(-0.6 * max(joint.speed_delay_s, EARLY_S), -SPEED_DELAY.high)
         delay = dataclasses.replace(SPEED_DELAY, low=newest)
         units = Scale(unit=joint.unit)
         scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (
@@ -439,6 +455,9 @@ class JointProblem(WithoutMaps):
             untimed = self.effort and not joint.position_age_s
             found += [LOOP if joint.exact_timing else EFFORT_AGE] * untimed
         found += [_within(name, value) for name, value in joint.winding.items()]
+        if joint.exact_timing and joint.target_kind == "position":
+            at = joint.target_late_s
+            found.append(dataclasses.replace(TARGET_LATE, start=at, high=max(at, 0.0)))
         payloads: list[JointMotion] = [
             r.data
             for r in self.fit
@@ -550,6 +569,13 @@ def recording_of(
         channels=tuple(names[kind] for kind in kinds),
         data=motion,
         share=share,
+        setting=(
+            motion.payload_kg,
+            motion.moment_kgm,
+            motion.mounted_kgm2,
+            round(motion.kp_scale, 3),
+            round(motion.kd_scale, 3),
+        ),
     )
 
 

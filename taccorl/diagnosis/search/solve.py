@@ -13,6 +13,7 @@ from taccorl.diagnosis.search.fit import residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.known_numbers import limits_of_known
+from taccorl.diagnosis.search.plain import plain_fit
 from taccorl.diagnosis.search.problem import (
     Problem,
     Progress,
@@ -28,6 +29,9 @@ from taccorl.errors import TaccorlError
 WAITS, SHARE = 0.5, 0.15
 """A remark names the wait of targets for the drive's loop if it can make at least the first share of the RMS error that is left,
 and, where the loop's rate was fitted, if one wait fitted to each half second explains the second share of its square. Choices."""
+
+CLEAR = ("nothing_missing", "numbers_off", "gains_moved")
+"""Statuses with which no plain fit is asked for, if no effect was added."""
 
 
 class Startable(Problem, Protocol):
@@ -150,6 +154,10 @@ def solve(
         found,
         remarks=(*_of_loop(problem, found, (*fit_to, *validation)), *found.remarks),
     )
+    if found.names != found.present or found.status not in CLEAR:
+        sides, file = (fit_to, validation, test), (problem.start, problem.present)
+        beside = plain_fit(problem, *sides, *file, held=problem.known)
+        found = dataclasses.replace(found, plain=beside)
     if problem.known:
         limits = limits_of_known(
             problem, problem.known, found, fit_to, validation, search or SearchConfig()
