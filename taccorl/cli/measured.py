@@ -262,6 +262,13 @@ def checked(
         for use in ("fit", "validation", "test")
     }
     own = machine.check(dataclasses.replace(measurements, **signed)) if timed else {}
+    drifting = {f.feature for some in own.values() for f in some if f.check == "drift"}
+    found = {
+        name: [
+            f for f in some if f.check != "does_not_repeat" or f.feature not in drifting
+        ]
+        for name, some in found.items()
+    }
     of_sweeps = (
         "no_motion",
         "short",
@@ -277,13 +284,6 @@ def checked(
         for m in measurements.all
     }
     found = one_cause(found, measurements.all, machine.command_rates)
-    drifting = {f.feature for own in found.values() for f in own if f.check == "drift"}
-    found = {
-        name: [
-            f for f in own if f.check != "does_not_repeat" or f.feature not in drifting
-        ]
-        for name, own in found.items()
-    }
     found = {name: of_asked(own, only, machine.units) for name, own in found.items()}
     show(
         *found_in_recordings(

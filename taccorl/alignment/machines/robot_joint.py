@@ -6,7 +6,7 @@ import hashlib
 import math
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -206,21 +206,19 @@ class RobotJoint(DriveJoint):
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         if self._config.inertia is not None:
             return self._stated_rigid(motion, self._config.inertia)
-        terms = self._terms(motion.pose, self._every_mass(bodies))
+        masses = self._every_mass(bodies)
+        terms = self._terms(motion.pose, masses)
         # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
-        inertia = (
-            max(terms.inertia, LEAST_INERTIA * self.known.inertia)
-            + self._config.armature
-        )
+        least = LEAST_INERTIA * self.known.inertia
+        inertia = max(terms.inertia, least) + self._config.armature
         return terms._replace(
             inertia=inertia,
             rotor_inertia=self._config.armature,
-            free_inertia=self._free_inertia,
+            free_inertia=max(self._free_inertia(masses), least),
         )
 
-    @cached_property
-    def _free_inertia(self) -> float:
-        """``Rigid.free_inertia``, without payloads."""
+    def _free_inertia(self, masses: Sequence[PointMass]) -> float:
+        """``Rigid.free_inertia`` with point masses."""
         model, joints = self._robot.rigid.model, self._robot.config.joints
         data, mass = mujoco.MjData(model), np.empty((model.nv, model.nv))
         mujoco.mj_forward(model, data)
@@ -228,6 +226,20 @@ class RobotJoint(DriveJoint):
         for name, joint in joints.items():
             dof = model.joint(name).dofadr[0]
             mass[dof, dof] += joint.armature
+
+        def lever(one: PointMass, by: np.ndarray) -> np.ndarray:
+            """(3, nv) Jacobian of a point beside the mass, by so much in its body's frame."""
+            jac = np.empty((3, model.nv))
+            turn = data.xmat[one.body].reshape(3, 3)
+            at = data.xpos[one.body] + turn @ (one.place_m + by)
+            mujoco.mj_jac(model, data, jac, None, at, one.body)
+            return jac
+
+        for one in masses:
+            there = lever(one, np.zeros(3))
+            beside = np.array([lever(one, axis) - there for axis in np.eye(3)])
+            spread = np.einsum("kl,kxi,lxj->ij", one.spread_m2, beside, beside)
+            mass += one.mass_kg * (there.T @ there + spread)
         own = model.joint(self.signal).dofadr[0]
         return float(1.0 / np.linalg.inv(mass)[own, own])
 

@@ -82,7 +82,7 @@ def compare(
     uses: list[tuple[Use, Measurement]] = [
         (use, m.on_robot(BENCH_REST))
         for use in USES
-        for m in getattr(measurements, use)
+        for m in in_time(getattr(measurements, use))
     ]
     every = [m for _, m in uses]
     floors: dict[Kind, Floors] = {
@@ -129,6 +129,12 @@ def compare(
     )
 
 
+def in_time(measurements: Sequence[Measurement]) -> list[Measurement]:
+    """The recordings in the order of their clock; those of one start, as of tables that
+    begin at 0, in their own order."""
+    return sorted(measurements, key=lambda m: m.start_ns)
+
+
 def compare_joints(
     machine: HasJoints,
     laws: Mapping[str, DriveLaw],
@@ -151,7 +157,7 @@ def compare_joints(
             is as the machine's own ``diagnose`` takes them.
     """
     uses: list[tuple[Use, Measurement]] = [
-        (use, whole(m)) for use in USES for m in getattr(measurements, use)
+        (use, whole(m)) for use in USES for m in in_time(getattr(measurements, use))
     ]
     every = [m for _, m in uses]
     traces, clock, held, replayed, left = [], {}, set(), [], []

@@ -11,6 +11,7 @@ from simulated_slide import robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.comparison.compare import in_time
 from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.problems.joints import apart, drifts_of
 from taccorl.diagnosis.search.drift import Drift
@@ -186,3 +187,10 @@ def test_the_noise_floor_is_not_taken_from_recordings_that_drift(
     drifted = drifts_of(machine.robot, "swing", own)
     after = JointProblem(machine.robot, "swing", apart(own, drifted))
     assert after.floors[0].value == pytest.approx(NOISE_RAD, rel=0.1)
+
+
+def test_errors_are_in_the_order_of_the_recordings_clock() -> None:
+    late, early = recorded("a", 1, minutes=5), recorded("b", 2, minutes=2)
+    assert in_time([late, early]) == [early, late]
+    tables = [recorded("b", 1), recorded("a", 2)]
+    assert in_time(tables) == tables

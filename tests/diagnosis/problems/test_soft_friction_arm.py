@@ -105,3 +105,17 @@ def test_the_usual_pair_is_found_beside_each_other(tmp_path: Path) -> None:
     assert values["soft_friction.torque_nm"] == pytest.approx(LOSS_NM, rel=0.02)
     damping = values["viscous_friction.damping_nms_per_rad"]
     assert damping == pytest.approx(DAMPING, rel=0.05)
+
+
+def test_the_inertia_with_the_other_joint_free_is_that_of_mujoco(
+    tmp_path: Path,
+) -> None:
+    machine = robot_machine(tmp_path, model(""), FILE)
+    made = mujoco.MjModel.from_xml_string(model(""))
+    own = Measurements((recorded(f'frictionloss="{LOSS_NM}"'),))
+    for joint in ("shoulder", "elbow"):
+        problem = JointProblem(machine.robot, joint, own)
+        terms = machine.robot.joint(joint).rigid(problem.fit[0].data, [])
+        expected = 1.0 / made.dof_invweight0[made.joint(joint).dofadr[0]]
+        assert terms.free_inertia == pytest.approx(expected, rel=1e-9)
+        assert terms.free_inertia < 0.9 * terms.inertia
