@@ -199,8 +199,9 @@ def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str]) -> Measurem
 def _disagreements(
     recordings: Sequence[Measurement], torques: Sequence[_Torques | None], name: str
 ) -> np.ndarray:
-    """(3,) RMS of the difference of each of ``PAIRS`` of joint ``name``, beside friction and a
-    constant, over the RMS of the torques; NaN where a torque is not known."""
+    """(3,) RMS of the difference of each of ``PAIRS`` of joint ``name``, beside friction, a
+    constant and, for links, a spring, over the RMS of the torques; NaN where a torque is not
+    known."""
     squares = np.zeros((len(PAIRS), 2))
     for m, own in zip(recordings, torques, strict=True):
         if own is None:
@@ -212,7 +213,8 @@ def _disagreements(
             if not np.isfinite([first, second]).all():
                 squares[k] += np.nan
                 continue
-            left = _beside(first - second, others)
+            spring = own.position[:, [j]] if "links" in (one, other) else others[:, :0]
+            left = _beside(first - second, np.hstack([others, spring]))
             size = _beside(first, others[:, 2:])
             squares[k] += [left @ left, size @ size]
     with np.errstate(divide="ignore", invalid="ignore"):
