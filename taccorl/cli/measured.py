@@ -33,6 +33,11 @@ MOST_ROWS = 500_000
 3400 replays for one effect of EMPS take six minutes then, and 70 000 replays to the noise floor two hours."""
 OTHER_GAINS = "other_gains"
 """Check by which efforts have other gains than the file's: no part with it is diagnosed unless it is accepted."""
+OF_EFFORTS = (
+    *("wrong_inertia", "reversed_effort", "beyond_effort", "effort_time"),
+    *("frozen_effort", "unsigned_effort"),
+)
+"""Checks of one joint's efforts and inertia, which do not hinder the diagnosis of others."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -130,20 +135,20 @@ def replayed(
     """Check measurements before and after their replay, and show the findings. ``verdict``: text with which the message begins
     if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
     with the measurements. ``why``: what an offset of one row does.
-    ``clocks``: whether to show which clocks nothing judged. ``only``: parts that are asked for; errors of others are
-    warnings. Returns None if there are errors, or most clocks are off."""
+    ``clocks``: whether to show which clocks nothing judged. ``only``: joints that are asked for; errors of the
+    efforts of others are warnings. Returns None if there are errors, or most clocks are off."""
     from taccorl.report.terminal import show
 
     findings = checked(machine, measurements, accept, only)
     if wrong := recordings_with_errors(findings):
         with contextlib.suppress(TaccorlError):  # what a replay would refuse as well
-            late = of_replays(replay(), findings, accept, only)
+            late = of_replays(replay(), findings, accept)
             findings |= {name: [*findings[name], *late[name]] for name in late}
         show(Section(text=[refusal(verdict, wrong, findings)]))
         return None
     comparison = replay()
     findings = without_explained(findings, comparison)
-    late = of_replays(comparison, findings, accept, only)
+    late = of_replays(comparison, findings, accept)
     checks = {
         f.check for found in (findings, late) for own in found.values() for f in own
     }
@@ -191,14 +196,11 @@ def refusal(
     )
 
 
-def of_asked(
-    findings: Sequence["Finding"], only: Collection[str], machine_parts: Collection[str]
-) -> list["Finding"]:
-    """``findings`` with errors of parts that are not asked for as warnings."""
-    others = {*machine_parts} - {*only} if only else set[str]()
+def of_asked(findings: Sequence["Finding"], only: Collection[str]) -> list["Finding"]:
+    """``findings`` with errors of the efforts of joints that are not asked for as warnings."""
     return [
         dataclasses.replace(f, severity="warning")
-        if f.severity == "error" and f.feature in others
+        if only and f.feature not in only and f.check in OF_EFFORTS
         else f
         for f in findings
     ]
@@ -271,7 +273,7 @@ def checked(
         for m in measurements.all
     }
     found = one_cause(found, measurements.all, machine.command_rates)
-    found = {name: of_asked(own, only, machine.units) for name, own in found.items()}
+    found = {name: of_asked(own, only) for name, own in found.items()}
     show(
         *found_in_recordings(
             {name: [f for f in own if not _waits(f)] for name, own in found.items()}
@@ -302,7 +304,6 @@ def of_replays(
     comparison: "Comparison",
     findings: dict[str, list["Finding"]],
     accept: Sequence[str],
-    only: Collection[str] = (),
 ) -> dict[str, list["Finding"]]:
     """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift
     is only a warning for an arm whose pose is unknown, and for a joint with other gains. ``findings``: of earlier checks; the
@@ -318,10 +319,9 @@ def of_replays(
             if f.check in ("pose_unknown", "other_gains", "other_scale")
         ]
         if clock:
-            every = {f.feature for f in clock}
             late[name] = [
                 _beside(f, found) if f.check == SHIFTED else f
-                for f in of_asked(accepted(clock, accept), only, every)
+                for f in accepted(clock, accept)
             ]
     return late
 

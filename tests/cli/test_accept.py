@@ -24,12 +24,14 @@ FOUND = [
     [
         ((), ["wrong_inertia", "frozen_channel", "uneven"]),
         (("elbow",), ["frozen_channel", "uneven"]),
-        (("shoulder",), ["wrong_inertia", "uneven"]),
+        (("shoulder",), ["wrong_inertia", "frozen_channel", "uneven"]),
         (PARTS, ["wrong_inertia", "frozen_channel", "uneven"]),
     ],
 )
-def test_errors_of_other_joints_than_those_asked_for_are_warnings(only, errors):
-    judged = of_asked(FOUND, only, PARTS)
+def test_errors_of_the_efforts_of_joints_that_are_not_asked_for_are_warnings(
+    only, errors
+):
+    judged = of_asked(FOUND, only)
     assert [f.check for f in judged if f.severity == "error"] == errors
     assert [f.check for f in judged] == [f.check for f in FOUND], "none is dropped"
 

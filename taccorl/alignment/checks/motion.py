@@ -377,7 +377,7 @@ def check_start(t: Trial) -> Iterator[Finding]:
         speed, sd = _speed_at_start(past, measured)
         # The second part: what the answer to a command that begins at once looks like in a parabola.
         allowed = START_SPEED[unit] + 0.25 * float(np.ptp(target)) / past[-1]
-        if speed > allowed + 5 * sd and not steps_at_row_0(measured, target):
+        if speed > allowed + 5 * sd:
             text = (
                 f"{name} moves at {speed:.3f} ± {sd:.3f} {unit}/s at row 0 (0.000 s), the twin starts at rest: "
                 "begin the recording a second before the motion"
@@ -396,14 +396,6 @@ def check_start(t: Trial) -> Iterator[Finding]:
                 "at 0 rad); record with the motor on"
             )
             yield find("start_offset", name, text, (0, rows))
-
-
-def steps_at_row_0(measured: np.ndarray, target: np.ndarray) -> bool:
-    """Whether the target of a signal stands elsewhere in row 0 and hardly moves while the signal goes there: a parabola takes
-    the answer to such a step for a speed at row 0, which it does not show. ``measured``, ``target``: (T,) from row 0 on."""
-    off, way = float(target[0] - measured[0]), float(measured[-1] - measured[0])
-    stays = float(np.ptp(target)) < 0.5 * abs(off)
-    return stays and way * off > 0.0 and abs(off) > 0.5 * float(np.ptp(measured))
 
 
 def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, float]:

@@ -33,7 +33,6 @@ from taccorl.alignment.checks.first_order import (
     onset_delay,
     pure_shift,
 )
-from taccorl.alignment.checks.motion import steps_at_row_0
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import (
     check_measurement,
@@ -1199,26 +1198,6 @@ def test_a_sweep_that_never_moves_the_joint():
 def test_too_short(clean):
     assert "of motion in 140 rows" in text_of(some(clean, slice(180, 320)), "too_short")
     assert found(sweep(0, seconds=2.0))["short"] == [""]
-
-
-@pytest.mark.parametrize("kp", [40.0, 150.0, 600.0])
-@pytest.mark.parametrize("rate_hz", [100, 200, 500])
-@pytest.mark.parametrize("steps", [True, False])
-def test_a_step_of_the_target_in_row_0_is_no_speed_at_row_0(kp, rate_hz, steps):
-    """A mass of 0.05 kg·m², well damped, at rest: its target steps by 0.2 rad in row 0. Or on its way with a target that
-    moves on at 0.6 rad/s. q by the exact solution of its equation."""
-    from scipy.linalg import expm
-
-    inertia, kd = 0.05, 1.4 * np.sqrt(kp * 0.05)
-    step = expm(np.array([[0.0, 1.0], [-kp / inertia, -kd / inertia]]) / rate_hz)
-    time_s = np.arange(30) / rate_hz
-    lag = 0.0 if steps else 0.6 * kd / kp  # of the mass behind a moving target
-    target = 0.2 + (0.0 if steps else 0.6) * time_s
-    state, rows = np.array([-0.2 if steps else 0.0, 0.0]), []
-    for goal in target:
-        rows.append(goal - lag + state[0])
-        state = step @ state
-    assert steps_at_row_0(np.array(rows), target) == steps
 
 
 def test_not_at_rest_at_the_start(clean):
