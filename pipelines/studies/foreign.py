@@ -117,7 +117,9 @@ _ARM6 = (
 )
 MOVE_TOGETHER = ("leg",)
 """Robots whose joints all move in each recording."""
-CARRIES_WEIGHT = ("arm of 7 joints", EXAMPLE)
+SHORT = "arm of 3 joints"
+"""The first three joints of the example."""
+CARRIES_WEIGHT = ("arm of 7 joints", EXAMPLE, SHORT)
 """Robots whose controllers compensate gravity."""
 
 
@@ -173,11 +175,13 @@ class Case:
     """True: efforts are logged."""
     beside: tuple[tuple[str, float], ...] = ()
     """Further effects that are hidden in the same joint, with their strengths."""
+    changes: tuple[tuple[str, str], ...] = ()
+    """(text, new text) in the MJCF of the robot that moves, not in that of its user."""
 
     @property
     def links(self) -> tuple[Link, ...]:
         """Links of the robot, from the base."""
-        return _ARM6 if self.robot == EXAMPLE else ROBOTS[self.robot]
+        return {EXAMPLE: _ARM6, SHORT: _ARM6[:3], **ROBOTS}[self.robot]
 
     @property
     def name(self) -> str:
@@ -417,7 +421,10 @@ def _simulate(
         gear[links[j].joint] = (
             f'stiffness="{1 / h["compliance"]}" damping="{0.003 / h["compliance"]}"'
         )
-    model = mujoco.MjModel.from_xml_string(_mjcf(links, gear))
+    text = _mjcf(links, gear)
+    for old, new in plant.case.changes:
+        text = text.replace(old, new, 1)
+    model = mujoco.MjModel.from_xml_string(text)
     model.opt.timestep, model.opt.integrator = (
         STEP_S,
         mujoco.mjtIntegrator.mjINT_IMPLICITFAST,

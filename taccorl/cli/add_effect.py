@@ -35,7 +35,7 @@ class AddEffectConfig:
     Several with commas between them: what one diagnosis found, at one joint or at several. The numbers are those of a fit with
     exactly these."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """left_joint5; joint5 or J4 (the paper's name of it) for both arms. If not given: all joints for which the diagnosis found
     the effect."""
@@ -141,6 +141,10 @@ def _diagnosed(
             f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
             for number in own
         ]
+        unknown = [n for n in names if n not in effects and n not in _numbers(machine)]
+        if unknown:
+            text = f"{unknown[0]}: no such effect; {nearest(unknown[0], effects)}"
+            raise TaccorlError(f"{text}; and {path} has no diagnosis")
         raise TaccorlError(
             f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(by_hand)}"
         )
@@ -213,6 +217,17 @@ def _diagnosed(
             f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}"
         )
     return additions, shlex.split(report["provenance"].get("command", "")), said
+
+
+def _numbers(machine: "Machine") -> set[str]:
+    """Names of all numbers of the machine's parts, such as kp."""
+    found: set[str] = set()
+    for part in machine.units:
+        try:
+            found |= machine.numbers(part).keys()
+        except (TaccorlError, ValueError, KeyError):  # no part of its own: a gripper
+            continue
+    return found
 
 
 def _found(diagnosis: dict[str, Any]) -> list[str]:

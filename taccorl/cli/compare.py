@@ -1,5 +1,5 @@
 """``taccorl compare --twin=twin.yaml --measurements=sweeps/``: the difference between the twin and measurements.
-``taccorl compare --twin=drive.yaml --measurements=bench/``: for another machine, whose file says ``kind: axis``.
+``taccorl compare --twin=drive.yaml --measurements=bench/``: for another machine, whose file says ``kind: robot``.
 
 MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may state which
 are for validation, which repeat one another, and which object the pads pressed: then touch is compared, pad by pad. The commands

@@ -31,13 +31,13 @@ MANY_ROWS = 1_000_000
 MOST_ROWS = 500_000
 """Rows of one recording beyond which a joint is not diagnosed. A choice: at 0.2 µs a row and replay (three physics steps a row),
 3400 replays for one effect of EMPS take six minutes then, and 70 000 replays to the noise floor two hours."""
-OTHER_GAINS = "other_gains"
-"""Check by which efforts have other gains than the file's: no part with it is diagnosed unless it is accepted."""
 OF_EFFORTS = (
     *("wrong_inertia", "reversed_effort", "beyond_effort", "effort_time"),
     *("frozen_effort", "unsigned_effort"),
 )
 """Checks of one joint's efforts and inertia, which do not hinder the diagnosis of others."""
+OTHER_GAINS = "other_gains"
+"""Check by which efforts have other gains than the file's: no part with it is diagnosed unless it is accepted."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -49,7 +49,7 @@ class MeasuredConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms; all that move if not given."""
     spec: str | None = None
@@ -135,20 +135,20 @@ def replayed(
     """Check measurements before and after their replay, and show the findings. ``verdict``: text with which the message begins
     if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
     with the measurements. ``why``: what an offset of one row does.
-    ``clocks``: whether to show which clocks nothing judged. ``only``: joints that are asked for; errors of the
-    efforts of others are warnings. Returns None if there are errors, or most clocks are off."""
+    ``clocks``: whether to show which clocks nothing judged. ``only``: parts that are asked for; errors of others are
+    warnings. Returns None if there are errors, or most clocks are off."""
     from taccorl.report.terminal import show
 
     findings = checked(machine, measurements, accept, only)
     if wrong := recordings_with_errors(findings):
         with contextlib.suppress(TaccorlError):  # what a replay would refuse as well
-            late = of_replays(replay(), findings, accept)
+            late = of_replays(replay(), findings, accept, only)
             findings |= {name: [*findings[name], *late[name]] for name in late}
         show(Section(text=[refusal(verdict, wrong, findings)]))
         return None
     comparison = replay()
     findings = without_explained(findings, comparison)
-    late = of_replays(comparison, findings, accept)
+    late = of_replays(comparison, findings, accept, only)
     checks = {
         f.check for found in (findings, late) for own in found.values() for f in own
     }
@@ -196,11 +196,15 @@ def refusal(
     )
 
 
-def of_asked(findings: Sequence["Finding"], only: Collection[str]) -> list["Finding"]:
-    """``findings`` with errors of the efforts of joints that are not asked for as warnings."""
+def of_asked(
+    findings: Sequence["Finding"], only: Collection[str], machine_parts: Collection[str]
+) -> list["Finding"]:
+    """``findings`` with errors as warnings where they are of the efforts of parts that are not asked for. Positions of other
+    joints move those that are."""
+    others = {*machine_parts} - {*only} if only else set[str]()
     return [
         dataclasses.replace(f, severity="warning")
-        if only and f.feature not in only and f.check in OF_EFFORTS
+        if f.severity == "error" and f.check in OF_EFFORTS and f.feature in others
         else f
         for f in findings
     ]
@@ -273,7 +277,14 @@ def checked(
         for m in measurements.all
     }
     found = one_cause(found, measurements.all, machine.command_rates)
-    found = {name: of_asked(own, only) for name, own in found.items()}
+    drifting = {f.feature for own in found.values() for f in own if f.check == "drift"}
+    found = {
+        name: [
+            f for f in own if f.check != "does_not_repeat" or f.feature not in drifting
+        ]
+        for name, own in found.items()
+    }
+    found = {name: of_asked(own, only, machine.units) for name, own in found.items()}
     show(
         *found_in_recordings(
             {name: [f for f in own if not _waits(f)] for name, own in found.items()}
@@ -304,6 +315,7 @@ def of_replays(
     comparison: "Comparison",
     findings: dict[str, list["Finding"]],
     accept: Sequence[str],
+    only: Collection[str] = (),
 ) -> dict[str, list["Finding"]]:
     """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift
     is only a warning for an arm whose pose is unknown, and for a joint with other gains. ``findings``: of earlier checks; the
@@ -319,9 +331,10 @@ def of_replays(
             if f.check in ("pose_unknown", "other_gains", "other_scale")
         ]
         if clock:
+            every = {f.feature for f in clock}
             late[name] = [
                 _beside(f, found) if f.check == SHIFTED else f
-                for f in accepted(clock, accept)
+                for f in of_asked(accepted(clock, accept), only, every)
             ]
     return late
 

@@ -31,7 +31,7 @@ FOUND = [
 def test_errors_of_the_efforts_of_joints_that_are_not_asked_for_are_warnings(
     only, errors
 ):
-    judged = of_asked(FOUND, only)
+    judged = of_asked(FOUND, only, PARTS)
     assert [f.check for f in judged if f.severity == "error"] == errors
     assert [f.check for f in judged] == [f.check for f in FOUND], "none is dropped"
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from axes import config_of
 
-from taccorl.alignment.machines.axis_file import load_axis
+from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.sim.effects import effects
 from tests.cli.printed import commands, facts
 
@@ -182,13 +183,13 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(
         f"--diagnosis={tmp_path / 'found'}",
     )
     assert code == 0
-    mended = load_axis(bench / "drive+coulomb_friction.yaml")
-    (effect,) = mended.effects
+    mended = load_robot(bench / "drive+coulomb_friction.yaml")
+    (effect,) = config_of(mended).effects
     assert effect.name == "coulomb_friction"
     # The model takes steps of 0.2 ms.
-    assert effect.values["torque_nm"] == pytest.approx(FRICTION_N, rel=0.15)
-    low, high = effect.values["interval"]["torque_nm"]
-    assert low < effect.values["torque_nm"] < high
+    assert effect.torque_nm == pytest.approx(FRICTION_N, rel=0.15)
+    low, high = effect.interval["torque_nm"]
+    assert low < effect.torque_nm < high
     new = tmp_path / "after"
     assert (
         said(
@@ -366,7 +367,8 @@ def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_wa
             f"--out={out}",
         )
         assert code == 0, text
-        assert sorted(e.name for e in load_axis(Path(out)).effects) == sorted(names)
+        written = config_of(load_robot(Path(out))).effects
+        assert sorted(e.name for e in written) == sorted(names)
         code, text = said(
             "compare",
             "bench",
@@ -387,13 +389,13 @@ def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_wa
         Path(f"{'+'.join(both)}.yaml").read_bytes()
         == Path("found/drive.yaml").read_bytes()
     )
-    friction = {n: load_axis(Path(f"{n}.yaml")).effects[0].values for n in both}
-    alone, together = (
-        friction["coulomb_friction"]["torque_nm"],
-        load_axis(Path("found/drive.yaml")),
-    )
-    beside = next(
-        e.values["torque_nm"] for e in together.effects if e.name == "coulomb_friction"
+    alone, beside = (
+        next(
+            e.torque_nm
+            for e in config_of(load_robot(Path(path))).effects
+            if e.name == "coulomb_friction"
+        )
+        for path in ("coulomb_friction.yaml", "found/drive.yaml")
     )
     assert beside == pytest.approx(12.0, rel=0.05) and abs(alone / beside - 1) > 0.2
     code, text = said(
@@ -403,7 +405,7 @@ def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_wa
         "--diagnosis=found",
         "--out=x.yaml",
     )
-    assert code == 0 and len(load_axis(Path("x.yaml")).effects) == 1
+    assert code == 0 and len(config_of(load_robot(Path("x.yaml"))).effects) == 1
     code, text = said(
         "add-effect",
         f"{both[0]},slew_limit",
@@ -460,11 +462,9 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench, said, tmp_path)
         "--values={torque_nm: 3.0}",
     ]
     assert said("add-effect", *words, f"--out={tmp_path / 'x.yaml'}")[0] == 0
-    assert load_axis(tmp_path / "x.yaml").effects[0].values == {
-        "torque_nm": 3.0,
-        "presliding_rad": 0.0,
-        "evidence": "by hand",
-    }
+    (effect,) = config_of(load_robot(tmp_path / "x.yaml")).effects
+    assert (effect.torque_nm, effect.presliding_rad) == (3.0, 0.0)
+    assert effect.evidence == "by hand"
     code, text = said(
         "add-effect", *words, "--pads=left", f"--out={tmp_path / 'y.yaml'}"
     )
@@ -472,7 +472,7 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench, said, tmp_path)
     code, text = said(
         "add-effect", *words, "--joints=[slde]", f"--out={tmp_path / 'y.yaml'}"
     )
-    assert code == 2 and "--joints=slde: no such axis; did you mean 'slide'" in text
+    assert code == 2 and "--joints=slde: no such joint; did you mean 'slide'" in text
 
 
 @pytest.mark.parametrize(

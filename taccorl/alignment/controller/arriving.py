@@ -87,17 +87,17 @@ def arriving(
                 now = min(max(now, at_from - reach), at_from + reach) + lead
             store(commands, k * hold + n, now)
     for lane in range(LANES):
-        if numbers[_DELAY, lane] > 0.0:
+        late = numbers[_DELAY, lane] / step_s
+        if late > 0.0 and numbers[_MIDPOINT, lane] <= 0.0:
             # MuJoCo reads its delay buffer before it writes the new value: the shortest delay is one physics step.
-            late = max(
-                numbers[_DELAY, lane] / step_s,
-                0.0 if numbers[_MIDPOINT, lane] > 0.0 else 1.0,
-            )
+            late = max(late, 1.0)
+        if late != 0.0:  # below 0: early
             whole = math.floor(late)
             own = commands[:, lane].copy()
             for n in range(count):
-                newer = own[n - whole] if n >= whole else sent[0]
-                older = own[n - whole - 1] if n > whole else sent[0]
+                at = min(n - whole, count - 1)
+                newer = own[at] if at >= 0 else sent[0]
+                older = own[at - 1] if at > 0 else sent[0]
                 commands[n, lane] = newer + (older - newer) * (late - whole)
     return commands
 

@@ -240,7 +240,7 @@ class JointModel:
             self.joint.command_hz if self.joint.command_hz < math.inf else 1.0 / step_s
         )
         parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
-        late_s = self.joint.target_late_s if self.joint.follows_line else 0.0
+        late_s = max(self.joint.target_late_s, 0.0) * self.joint.follows_line
         own_times = late_s > 0.0 or motion.command_s is not None
         if self.joint.follows_line:
             parts = round(steps) if own_times else min(parts, round(steps))
@@ -312,7 +312,8 @@ def _side_by_side(
         )
         drive["gravity_sin"] += weight * case.lever.sin_m
         drive["gravity_cos"] += weight * case.lever.cos_m
-        drive["command_delay__delay_s"] += case.waits_s
+        # A target that acts before its row does so by a delay below 0, a later one by ``_sent``.
+        drive["command_delay__delay_s"] += case.waits_s + min(late_s, 0.0)
         drive["effort_age"] -= case.waits_s
         if any(drive[f"{name}__rate_per_s"] > 0.0 for name in INTEGRALS):
             drive["start_nm"] = motion.start_nm / case.effort_scale

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from taccorl.diagnosis.search.fit import Fit
+from taccorl.diagnosis.search.plain import PlainFit
 from taccorl.diagnosis.search.problem import Values
 from taccorl.diagnosis.search.standing_out import Place
 from taccorl.sim.effects.effect import Effect
@@ -218,6 +219,9 @@ class Diagnosis:
     errors: dict[str, dict[str, float]]
     """RMS errors [floors]: ``before`` (with the given start values), ``fitted`` (numbers fitted, no effect) and ``after`` → fit,
     validation, test. No choice depends on test recordings."""
+    plain: PlainFit | None = None
+    """One fit of the usual numbers of a drive, beside which ``errors["after"]`` shows what the
+    added effects are worth; None for sensors, and where nothing is missing."""
     test_without: dict[str, float]
     """Added effect → test error [floors] if all others are refitted without it; empty without test recordings."""
     steps: tuple[tuple[str, float], ...]

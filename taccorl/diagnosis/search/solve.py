@@ -8,10 +8,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from taccorl.diagnosis.search.fit import residuals
+from taccorl.diagnosis.search.drift import Drift
+from taccorl.diagnosis.search.fit import fit, residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.known_numbers import limits_of_known
+from taccorl.diagnosis.search.plain import plain_fit
 from taccorl.diagnosis.search.problem import (
     Problem,
     Progress,
@@ -27,6 +29,9 @@ from taccorl.errors import TaccorlError
 WAITS, SHARE = 0.5, 0.15
 """A remark names the wait of targets for the drive's loop if it can make at least the first share of the RMS error that is left,
 and, where the loop's rate was fitted, if one wait fitted to each half second explains the second share of its square. Choices."""
+
+CLEAR = ("nothing_missing", "numbers_off", "gains_moved")
+"""Statuses with which no plain fit is asked for, if no effect was added."""
 
 
 class Startable(Problem, Protocol):
@@ -86,6 +91,8 @@ class PartFinding:
     """Numbers that the recordings identify; None for parts for which they are not computed."""
     remark: str = ""
     """Text on what the search could not decide; empty if there is nothing."""
+    drifts: tuple[Drift, ...] = ()
+    """Numbers that changed from one recording of a motion to another one."""
 
 
 class Solved(NamedTuple):
@@ -126,7 +133,8 @@ def solve(
             "can be evaluated; record a motion that is measured to its end, or mark another one with use: validation"
         )
     progress("which effects the recordings can show")
-    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    first = fit(problem, fit_to, problem.present, problem.start)
+    can_tell = identifiability(problem, fit_to, first)
     absent = [
         name
         for name in problem.known
@@ -138,6 +146,7 @@ def solve(
         validation,
         test,
         start=problem.start,
+        begin=first.values,
         present=problem.present,
         without=[*without, *absent],
         config=search,
@@ -147,6 +156,10 @@ def solve(
         found,
         remarks=(*_of_loop(problem, found, (*fit_to, *validation)), *found.remarks),
     )
+    if found.names != found.present or found.status not in CLEAR:
+        sides, file = (fit_to, validation, test), (problem.start, problem.present)
+        beside = plain_fit(problem, *sides, *file, held=problem.known)
+        found = dataclasses.replace(found, plain=beside)
     if problem.known:
         limits = limits_of_known(
             problem, problem.known, found, fit_to, validation, search or SearchConfig()
@@ -197,6 +210,18 @@ def solved(
         "rows_split": found.rows_split,
     }
     return PartFinding(part=part, recordings=recordings, **stated, **judged)
+
+
+def with_drifts[FindingT: PartFinding](
+    found: FindingT, drifted: Sequence[Drift]
+) -> FindingT:
+    """The finding with numbers that changed between recordings, and a remark on each."""
+    remarks = (*(drift.words for drift in drifted), *found.diagnosis.remarks)
+    return dataclasses.replace(
+        found,
+        drifts=tuple(drifted),
+        diagnosis=dataclasses.replace(found.diagnosis, remarks=remarks),
+    )
 
 
 def _of_loop(
