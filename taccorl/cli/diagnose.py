@@ -63,7 +63,7 @@ def run(config: DiagnoseConfig) -> int:
     ended the search, and what it had found was written."""
     from taccorl.report.report import check_folder
 
-    check_folder(config.out, config.measurements)
+    before = check_folder(config.out, config.measurements)
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.account import is_explained
     from taccorl.report.compared import not_compared
@@ -141,7 +141,7 @@ def run(config: DiagnoseConfig) -> int:
         for f in found
         if f.part in beside.unjudged and _of_time(f)
     ]
-    written = write_report(report, config.out)
+    written = write_report(report, config.out, before)
     lines = [disagree] if disagree else []
     if config.until == "noise_floor":
         mended.save(path := config.out / mended.file_name)

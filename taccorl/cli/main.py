@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import sys
+import warnings
 
 from taccorl.cli.output_lock import released_at_the_end
 from taccorl.errors import TaccorlError, nearest, printable
@@ -66,6 +67,9 @@ def main(argv: list[str] | None = None) -> int:
             signal.SIGTERM, _ended
         )  # what is unfinished is removed, as after Ctrl-C
         argv = sys.argv[1:]
+        if not sys.warnoptions:  # NumPy's notes on empty means and the like
+            os.environ["PYTHONWARNINGS"] = "ignore::RuntimeWarning"  # of workers
+            warnings.simplefilter("ignore", RuntimeWarning)
         for library in (
             ("OMP", "OPENBLAS", "MKL") if argv and argv[0] in ONE_THREAD else ()
         ):  # before NumPy is imported

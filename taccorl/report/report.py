@@ -240,10 +240,12 @@ MOST_REMARKS = 3
 _PAIRS: tuple[tuple[Use, Use], ...] = (("fit", "validation"), ("validation", "fit"))
 
 
-def write_report(report: Report, folder: Path) -> Section:
-    """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary; the line that says so. Raises
+def write_report(report: Report, folder: Path, before: str | None = None) -> Section:
+    """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary; the line that says so.
+    ``before``: date of the report that was there before the verb began, or empty; None: of the one that is there. Raises
     TaccorlError: as ``check_folder``, or the folder cannot be written to."""
-    replaced = check_folder(folder)
+    there = check_folder(folder)
+    replaced = there if before is None else before
     numbers = json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n"
     page.write(
         {

@@ -356,3 +356,18 @@ def test_errors_reports_and_lists_of_what_is_not_read_have_none_either(
         and r"b\x1b[31m.txt" in captured.out
         and r"c\x1b[31m" in captured.err
     )
+
+
+@pytest.mark.parametrize(("options", "shown"), [((), False), (("-W", "always"), True)])
+def test_notes_of_numpy_do_not_reach_the_terminal_unless_python_is_asked_for_them(
+    options: tuple[str, ...], shown: bool
+):
+    """Of the program and of a worker that it starts; Python's own -W shows them."""
+    note = "import warnings; warnings.warn('empty mean', RuntimeWarning)"
+    code = (
+        "import subprocess, sys; from taccorl.cli.main import main; "
+        f"sys.argv = ['taccorl', '--version']; main(); {note}; "
+        f"subprocess.run([sys.executable, '-c', {note!r}])"
+    )
+    done = fresh_python(*options, "-c", code)
+    assert done.returncode == 0 and ("empty mean" in done.stderr) == shown

@@ -63,6 +63,7 @@ def test_each_printed_command_does_what_it_says(
     code, text = said("diagnose", "bench", "--twin=robot.yaml", FEW, *words)
     own = facts(Path("diagnosis"), "swing")
     assert (code, next(iter(own))) == (0, kind), text
+    assert "replaced" not in text, "its own report of what was found so far"
     printed = commands(text)
     assert {*of_page(Path("diagnosis/report.html"))} == {*printed}
     assert [c.split()[1] for c in printed if c.split()[1] != "excite"] == verbs
