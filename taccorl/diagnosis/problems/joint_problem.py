@@ -441,12 +441,9 @@ class JointProblem(WithoutMaps):
             0.5 * base.get(LOOP.name, 0.0),
         )
         if SPEED_DELAY.name in base:
-            effects = [
-                *effects,
-                SpeedDelay(
-                    **self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s
-                ),
-            ]
+            # The earliest speed of a loop of the longest period is beyond the effect's range.
+            delay_s = SpeedDelay.clipped("delay_s", base[SPEED_DELAY.name] - half_s)
+            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
             self.model.joint.numbers(base),

@@ -630,3 +630,15 @@ def test_dry_friction_and_a_late_command_are_found_together():
     assert (
         found.errors["after"]["validation"] < 1.3 < found.errors["fitted"]["validation"]
     )
+
+
+def test_a_speed_earlier_than_its_effect_allows_is_simulated_at_the_end_of_its_range(
+    chirps,
+):
+    """−4.2 ms, as −1.2 ms less half of a loop of 6 ms; the effect goes to −3 ms."""
+    problem = JointProblem(NOMINAL, SIGNAL, Measurements(chirps))
+    early, end = (
+        problem.simulate(problem.start | {"speed_delay_s": s}, [], problem.fit[0])
+        for s in (-4.2e-3, -3e-3)
+    )
+    np.testing.assert_array_equal(early, end)
