@@ -1,14 +1,15 @@
-"""``python -m pipelines.judge --rows=FILE [--workers=14] [--cases=robots,pairs]``: the same 120 diagnoses with any build.
+"""``python -m pipelines.judge --rows=FILE``: the same 120 diagnoses with any build.
 
-``python -m pipelines.judge compare OLD.jsonl NEW.jsonl`` prints two builds side by side,
-study by study, with every answer that changed. Rows are appended as they are finished, and
-cases that have one are not run again. Another build in the folder OLD runs the same cases
-by the same command there, after ``cp pipelines/judge.py OLD/pipelines/`` and
-``cp pipelines/studies/foreign.py OLD/pipelines/studies/``.
+Options: ``--workers=14``, ``--cases=robots,*pack``. Rows are appended as they are
+finished; cases that have one are not run again. ``python -m pipelines.judge compare
+OLD.jsonl NEW.jsonl`` prints two builds side by side, with every answer that changed.
+Another build in the folder OLD runs the same cases by the same command there, after
+``cp pipelines/judge.py OLD/pipelines/`` and ``cp pipelines/studies/foreign.py
+OLD/pipelines/studies/``.
 
-The cases are a fixed sample of the stored ones: of the main study over all its CPU times,
-of the others all kinds and the slowest. Ten are new: one payload or one tilted base that
-several joints share. Every recording is simulated.
+The cases are a fixed sample of the stored ones: of the main study over all its CPU
+times, of the others all kinds and the slowest. Ten are new: one payload or one tilted
+base that several joints share. Every recording is simulated.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-# Before NumPy is imported, here and in every worker: CPU-seconds are those of one thread.
+# Before NumPy is imported, here and in every worker: CPU-seconds of one thread.
 for _name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR"):
     os.environ[f"{_name}_NUM_THREADS"] = "1"
 
@@ -48,10 +49,11 @@ from taccorl.surrogate.cells import draw_cells, simulated  # noqa: E402
 
 SAMPLE = {
     "single pack": """sensor_delay 770001, quadratic_drag 770004, cogging 770000,
-        torque_speed_limit 770004, slew_limit 770002, position_dependent_friction 770001,
-        armature 770003, asymmetric_friction 770003, load_friction 770001,
-        joint_compliance 770000, error_deadband 770002, coulomb_friction 770000,
-        end_stop 770002, stribeck_friction 770004""",
+        torque_speed_limit 770004, slew_limit 770002,
+        position_dependent_friction 770001, armature 770003,
+        asymmetric_friction 770003, load_friction 770001, joint_compliance 770000,
+        error_deadband 770002, coulomb_friction 770000, end_stop 770002,
+        stribeck_friction 770004""",
     "single chirp": """encoder_eccentricity 770001, coulomb_friction 770001,
         load_friction 770004, command_lag 770000, cable_spring 770001,
         joint_compliance 770003, torque_fade 770001, velocity_feedforward 770001,
@@ -75,18 +77,20 @@ SAMPLE = {
     "touch press": """taxel_saturation 770000, taxel_crosstalk 770001,
         taxel_ghosting 770000""",
     "removed press": "rate_softening 772000",
-    "robots": """coulomb_friction 60000, viscous_friction 60001, stribeck_friction 60002,
-        load_friction 60003, torque_scale 60006, torque_saturation 60007,
-        command_delay 60008, cable_spring 60024, command_lag 60028, backlash 60035,
-        armature 60042, none 70000, none 70002, none 70020""",
-    "robot_pairs": """coulomb_friction+viscous_friction 90000, coulomb_friction+armature 90001,
-        coulomb_friction+gravity_mismatch 90002, coulomb_friction+cable_spring
-        90003, coulomb_friction+command_delay 90004, coulomb_friction+torque_scale
-        90005, coulomb_friction+cogging 90007, coulomb_friction+joint_compliance
-        90008, armature+cogging 90022, cable_spring+torque_scale 90031,
-        command_delay+cogging 90037, torque_scale+cogging 90040,
-        coulomb_friction+cable_spring 91000, coulomb_friction+command_delay 91001,
-        coulomb_friction+backlash 91002, coulomb_friction+joint_compliance 91004""",
+    "robots": """coulomb_friction 60000, viscous_friction 60001,
+        stribeck_friction 60002, load_friction 60003, torque_scale 60006,
+        torque_saturation 60007, command_delay 60008, cable_spring 60024,
+        command_lag 60028, backlash 60035, armature 60042, none 70000, none 70002,
+        none 70020""",
+    "robot_pairs": """coulomb_friction+viscous_friction 90000,
+        coulomb_friction+armature 90001, coulomb_friction+gravity_mismatch 90002,
+        coulomb_friction+cable_spring 90003, coulomb_friction+command_delay 90004,
+        coulomb_friction+torque_scale 90005, coulomb_friction+cogging 90007,
+        coulomb_friction+joint_compliance 90008, armature+cogging 90022,
+        cable_spring+torque_scale 90031, command_delay+cogging 90037,
+        torque_scale+cogging 90040, coulomb_friction+cable_spring 91000,
+        coulomb_friction+command_delay 91001, coulomb_friction+backlash 91002,
+        coulomb_friction+joint_compliance 91004""",
     "servos": """load_friction 81000, load_friction 81026, load_friction 81031,
         coulomb_friction 81001, coulomb_friction 81028, stribeck_friction 81002,
         stribeck_friction 81013, backlash 81003, backlash 81014, motor 81015,
@@ -94,8 +98,8 @@ SAMPLE = {
     "cells": """taxel_saturation 50000, taxel_power_law 50009, taxel_play 50021,
         taxel_creep 50026, touch_delay 50039, taxel_log_creep 50045,
         taxel_crosstalk 50055, none 50065""",
-    "shared": """payload 95000, payload 95001, payload 95002, payload 95003, payload 95004,
-        tilt 95010, tilt 95011, tilt 95012, tilt 95013, tilt 95014""",
+    "shared": """payload 95000, payload 95001, payload 95002, payload 95003,
+        payload 95004, tilt 95010, tilt 95011, tilt 95012, tilt 95013, tilt 95014""",
 }
 """Study → cases, each a hidden effect (none; two joined by +) and a seed."""
 Row = dict[str, Any]
@@ -130,13 +134,13 @@ def sample(patterns: str = "*") -> list[Case]:
     return list(dict.fromkeys(wanted))
 
 
-# one case -------------------------------------------------------------------------------
+# one case
 
 
 @cache
 def simulations() -> list[int]:
-    """[0]: simulations since the first call in this process, parameter sets × recordings,
-    which any computer needs alike. Wraps the problems that this build has."""
+    """[0]: simulations since the first call in this process, which any computer needs alike:
+    parameter sets × recordings. Wraps the problems that this build has."""
     count, inside = [0], [False]
 
     def counted(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -250,7 +254,7 @@ class Recorded:
 
 
 def _errors(scores: Sequence[Any], part: str) -> dict[str, list[float]]:
-    """Use → error of the corrected file [floors], of positions alone and with efforts."""
+    """Use → errors of the corrected file [floors]: of positions alone, with efforts."""
     own = [s for s in scores if part in (s.signal, "") or s.kind == "touch"]
     return {
         use: [
@@ -393,7 +397,7 @@ def _waves(seed: Sequence[int], joints: int) -> np.ndarray:
 
 
 def _shared_answer(row: Row, hidden: str, true: float, down: np.ndarray) -> Row:
-    """By the corrected file: the number within a tenth or half a degree, and no effect."""
+    """By the corrected file: the number within 10 % or half a degree, and no effect."""
     file = row.get("file", {"joints": {}})
     joints = file["joints"].values()
     written = [e for joint in joints for e in joint.get("effects") or []]
@@ -422,7 +426,7 @@ RUNS: dict[str, Callable[[Case, Path], Row]] = {
 """Study → how a case of it is run; the others are the main study's."""
 
 
-# two builds side by side ----------------------------------------------------------------
+# two builds side by side
 
 GOOD = ("exact", "named", "silent", "said")
 AS_STATED = 0.05
@@ -444,7 +448,8 @@ def _cpu(rows: Sequence[Row]) -> str:
 def _held(rows: Sequence[Row]) -> str:
     """Numbers whose interval holds the truth, of those with a known truth."""
     numbers = [n for r in rows for n in r.get("numbers", {}).values() if len(n) == 4]
-    return f"{sum(low <= true <= high for _, low, high, true in numbers)} of {len(numbers)}"
+    held = sum(low <= true <= high for _, low, high, true in numbers)
+    return f"{held} of {len(numbers)}"
 
 
 def _as_stated(rows: Sequence[Row]) -> str:
@@ -551,15 +556,11 @@ def main(words: Sequence[str]) -> None:
         else:
             row["failed"] = outcome.trace or outcome.reason
         with options.rows.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row, ensure_ascii=False, default=_plain) + "\n")
+            file.write(json.dumps(row, ensure_ascii=False, default=float) + "\n")
         print(f"{case.key}: {row.get('answer', 'failed')}, {_cpu([row])}", flush=True)
 
     care = Care(limit_s=options.limit_s)
     run_in_processes(run, cases, options.workers, str, take, care)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 if __name__ == "__main__":

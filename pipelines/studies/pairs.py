@@ -21,15 +21,14 @@ from pipelines.studies.foreign import ROBOTS, Case, Plant, recordings, unseen_sw
 from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, cpu_words, share_row, study
 from pipelines.studies.slides import draw_slide
 from pipelines.studies.slides import recordings as slide_recordings
-from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design.motions import ground_of
-from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.search.fit import fit, rms, stacked
-from taccorl.report.verdict import verdict
+from taccorl.report.account import account
+from taccorl.report.evidence import Seen
 
 STRENGTHS = {
     "coulomb_friction": 0.03,
@@ -87,7 +86,7 @@ def made(
     """The user's machine, its joint, and recordings of the simulated one."""
     if seed >= FIRST_SLIDE_SEED:
         (folder / "slide.yaml").write_text(SLIDE, encoding="utf-8")
-        machine = Axis(load_axis(folder / "slide.yaml"), "slide")
+        machine = RobotMachine(load_robot(folder / "slide.yaml"), "slide")
         case = draw_slide(ground_of(machine, "slide", speed=0.3), seed, [one, other])
         return machine, "slide", slide_recordings(case)
     rng = np.random.default_rng([seed, 5])
@@ -133,7 +132,8 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
             )
         finding = machine.diagnose(part, measurements)
     d = finding.diagnosis
-    said = verdict(part, d, can_tell=finding.can_tell, known=finding.known)
+    seen = Seen(can_tell=finding.can_tell, known=finding.known)
+    said = account(part, d, seen)
     return {
         "seed": seed,
         "hidden": hidden,

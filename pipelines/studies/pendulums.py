@@ -23,9 +23,9 @@ from pipelines.studies.robots import (
     table,
 )
 from pipelines.studies.servo import Servo, write
-from taccorl.alignment.machines.axis_file import load_axis
+from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import read_measurements
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
+from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import effects
@@ -58,10 +58,10 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
     servo = Servo(seed=seed, hidden=hidden)
     with tempfile.TemporaryDirectory() as name:
         write(servo, Path(name))
-        axis = load_axis(Path(name) / "servo.yaml")
+        robot = load_robot(Path(name) / "servo.yaml")
         measurements = read_measurements(Path(name) / "swings", units={"servo": "rad"})
     began = time.process_time()
-    problem = AxisProblem(axis, measurements)
+    problem = JointProblem(robot, "servo", measurements)
     sides, config = (
         (problem.fit, problem.validation, problem.test),
         SearchConfig(max_effects=1),
@@ -73,7 +73,7 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
     beside = (
         {*d.rivals.get(added, ()), *effects.get(added).near_twins} if added else set()
     )
-    mended = axis.with_numbers(d.base)
+    mended = robot.config.joints["servo"].with_numbers(d.base)
     truth = {
         "stall_nm": 7.4 * servo.torque_nm_per_a / servo.resistance_ohm,
         "inertia": servo.inertia,

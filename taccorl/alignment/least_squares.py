@@ -81,6 +81,11 @@ class Free:
     unless: tuple[str, ...] = ()
     """Names of effects with the same influence on the recordings: in a fit with one of them this number is held at ``start``."""
 
+    def is_at_end(self, value: float) -> bool:
+        """Whether ``value`` is at one of the bounds, or beyond it."""
+        here, low, high = map(self.coordinate, (value, self.low, self.high))
+        return bool(min(here - low, high - here) < _AT_BOUND * (high - low))
+
     def within(self, value: float) -> float:
         """``value`` clipped to the bounds."""
         return min(max(value, self.low), self.high)
@@ -93,8 +98,26 @@ class Free:
 
     def value(self, coordinate: float) -> float:
         """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
-        raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
+        if self.log:
+            raw = math.exp(min(coordinate, _MOST))
+        else:
+            raw = float(coordinate * self.scale)
         return self.within(raw)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """Estimate of one number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    """Unit of all three, such as ``N·m/rad``."""
+    fixed: bool = False
+    """True: not fitted, because it was commanded and known, or not requested."""
+    at_bound: bool = False
+    """True: the fit ended at one of the bounds of the search."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,17 +179,14 @@ class Solution:
         variances = np.diag(plain)
         pull = self.jacobian * self.residuals[:, None]
         pulls = block_sums(pull, self.layout)
-        if (count := len(pulls)) >= max(MANY_BLOCKS, 2 * p):
-            variances = np.maximum(
-                variances, np.square(pulls @ inverse).sum(axis=0) * count / (count - p)
-            )
+        if len(pulls) >= max(MANY_BLOCKS, 2 * p):
+            variances = np.maximum(variances, np.diag(sandwich(pulls, inverse, p)))
         if (count := len(self.layout)) >= MANY_RECORDINGS:
             ends = np.cumsum([int(rows.measured.sum()) for rows in self.layout])
             pulls = np.array([part.sum(axis=0) for part in np.split(pull, ends[:-1])])
             few = (student.ppf(0.975, count - 1) / student.ppf(0.975, np.inf)) ** 2
             variances = np.maximum(
-                variances,
-                few * np.square(pulls @ inverse).sum(axis=0) * count / (count - 1),
+                variances, few * np.diag(sandwich(pulls, inverse, 1))
             )
         if left_over:
             rest = max(self.error**2 - LEFT_OVER**2, 0.0) / min(
@@ -194,6 +214,19 @@ class Solution:
         numbers as degrees of freedom."""
         blocks = len(block_sums(self.residuals, self.layout))
         return float(student.ppf(0.975, max(blocks - len(self.frees), 3)))
+
+
+def sandwich(pulls: np.ndarray, inverse: np.ndarray, used: int) -> np.ndarray:
+    """Covariance (p, p) by the scatter of B groups of residuals that hang together in any
+    way: (JᵀJ)⁻¹ Σ g gᵀ (JᵀJ)⁻¹ · B / (B − ``used``).
+
+    Args:
+        pulls: (B, p) gradients g = Jᵀ r of each group.
+        inverse: (p, p) (JᵀJ)⁻¹.
+        used: degrees of freedom that the groups have lost.
+    """
+    moved = pulls @ inverse
+    return moved.T @ moved * len(pulls) / max(len(pulls) - used, 1)
 
 
 def inverse_of(squares: np.ndarray) -> np.ndarray:
@@ -314,17 +347,14 @@ def minimise(
         gtol=1e-9,
     )
     ended = np.clip(found.x + shift, low, high)
-    near = np.minimum(ended - low, high - ended) < _AT_BOUND * (high - low)
-    rows = len(found.fun) - len(prior)
+    values, rows = at(ended), len(found.fun) - len(prior)
     return Solution(
-        values=at(ended),
+        values=values,
         residuals=found.fun[:rows],
         layout=tuple(layout),
         jacobian=found.jac[:rows],
         frees=tuple(frees),
-        at_bound=tuple(
-            f.name for f, is_near in zip(frees, near, strict=True) if is_near
-        ),
+        at_bound=tuple(f.name for f in frees if f.is_at_end(values[f.name])),
         trouble=""
         if found.status > 0
         else f"not converged: still improving after {most} steps",

@@ -35,7 +35,7 @@ class AddEffectConfig:
     Several with commas between them: what one diagnosis found, at one joint or at several. The numbers are those of a fit with
     exactly these."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """left_joint5; joint5 or J4 (the paper's name of it) for both arms. If not given: all joints for which the diagnosis found
     the effect."""
@@ -169,13 +169,8 @@ def _diagnosed(
         if any(
             name in {*diagnoses[part]["base"], *machine.numbers(part)} for part in parts
         ):
-            gains = name in ("kp", "kd") and {*parts} & {*machine.fitted_gains}
-            way = (
-                "; fitted gains are written by `taccorl diagnose` with --until=noise_floor"
-                * bool(gains)
-            )
             raise TaccorlError(
-                f"{path}: {name} is not off in that diagnosis; what it found: {', '.join(sorted(found)) or 'nothing'}{way}"
+                f"{path}: {name} is not off in that diagnosis; what it found: {', '.join(sorted(found)) or 'nothing'}"
             )
         effects.get(name)
     additions, refused, left_out, written, said = [], [], [], set(), {}
@@ -197,7 +192,7 @@ def _diagnosed(
         additions.append(_addition(machine, part, fit))
         written |= {*(e["effect"] for e in fit["effects"]), *_off(diagnoses[part])}
         said[part] = (
-            report["verdicts"][part]["finding"]
+            report["verdicts"][part]["title"]
             if fit is diagnoses[part]
             else fit["effects"][-1]["evidence"]
         )
@@ -249,11 +244,9 @@ def _off(diagnosis: dict[str, Any]) -> list[str]:
     efforts, which no file has."""
     from taccorl.diagnosis.search.problem import EFFORT_SCALE
 
-    return [
-        c["name"]
-        for c in diagnosis.get("changed", ())
-        if "." not in c["name"] and c["name"] != EFFORT_SCALE
-    ]
+    changed = [c["name"] for c in diagnosis.get("changed", ())]
+    own = [name for name in changed if "." not in name and name != EFFORT_SCALE]
+    return [*own, *diagnosis.get("moved", ())]
 
 
 def _changed(diagnosis: dict[str, Any]) -> set[str]:
@@ -284,11 +277,7 @@ def _fit_of(
     own, new = {*_found(diagnosis)}, wanted - {*diagnosis["present"], *_off(diagnosis)}
     if new == own:
         for name in wanted if not new else ():
-            if name not in {
-                n
-                for c in diagnosis.get("changed", [])
-                for n in (c["name"], c["name"].rpartition(".")[0])
-            }:
+            if name not in _changed(diagnosis):
                 raise TaccorlError(
                     f"{part}: the numbers of {name} in the file explain the recordings as well as refitted ones; give "
                     "--values={…} to change them nevertheless"
@@ -341,7 +330,7 @@ def _addition(machine: "Machine", part: str, fit: dict[str, Any]) -> "Addition":
 def _changes(part: str, old: "Numbers", new: "Numbers") -> Section:
     """The numbers of one part that change, old and new, and those that stay."""
     from taccorl.diagnosis.comparison.cell_numbers import summarised
-    from taccorl.report.evidence_words import unit_words
+    from taccorl.report.fact import unit_words
 
     def value(number: tuple[float, str] | None) -> str:
         return "–" if number is None else f"{number[0]:.5g}"

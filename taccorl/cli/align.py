@@ -189,6 +189,7 @@ def _joints_and_pads(
         config.accept,
         replay,
         "changes every gain",
+        only=config.asked(machine, measurements),
     )
     if beside is None:
         return None
@@ -347,7 +348,9 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
 
 
 def _section(one: "Alignment") -> Section:
-    lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
+    lines: list[Cell | str] = []
+    if one.trouble:
+        lines.append(Cell(f"not aligned: {one.trouble}", "error"))
     if one.unchanged and one.floors_left >= FAR_ABOVE_FLOOR:
         lines.append(
             "no other gains leave a smaller error: the twin's stay, although they leave "

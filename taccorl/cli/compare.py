@@ -1,5 +1,5 @@
 """``taccorl compare --twin=twin.yaml --measurements=sweeps/``: the difference between the twin and measurements.
-``taccorl compare --twin=drive.yaml --measurements=bench/``: for another machine, whose file says ``kind: axis``.
+``taccorl compare --twin=drive.yaml --measurements=bench/``: for another machine, whose file says ``kind: robot``.
 
 MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may state which
 are for validation, which repeat one another, and which object the pads pressed: then touch is compared, pad by pad. The commands
@@ -109,7 +109,10 @@ def run(config: CompareConfig) -> int:
         comparisons.extend(_compared(config, twins, measurements))
         return comparisons[0]
 
-    beside = replayed(twins[0], measurements, "not compared", config.accept, replay)
+    only = config.joints
+    beside = replayed(
+        twins[0], measurements, "not compared", config.accept, replay, only=only
+    )
     if beside is None:
         return 1
     first, last = comparisons[0], comparisons[-1]

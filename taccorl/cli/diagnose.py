@@ -13,14 +13,20 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.add_effect import compare_words
-from taccorl.cli.measured import PartsConfig, far_off, refuse_long, replayed
+from taccorl.cli.measured import (
+    OTHER_GAINS,
+    PartsConfig,
+    far_off,
+    refuse_long,
+    replayed,
+)
 from taccorl.cli.parse import command, verb
 from taccorl.report.section import Section
 
@@ -28,6 +34,7 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.cli.measured import Replayed
     from taccorl.diagnosis.machines.machine import Finding, Machine
+    from taccorl.report.fact import Fact
     from taccorl.report.report import Report
 
 
@@ -50,15 +57,17 @@ class DiagnoseConfig(PartsConfig):
 
 @verb(DiagnoseConfig, positional="measurements")
 def run(config: DiagnoseConfig) -> int:
-    """Diagnose, and print and write the result. Returns the exit status, 0: the remaining error is at the noise floor, 1:
-    something else remains, or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM ended the
-    search, and what it had found was written."""
+    """Diagnose, and print and write the result. Returns the exit status, 0: nothing is
+    missing, or at least half of the squared error is gone in each part; 1: little of it is,
+    or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM
+    ended the search, and what it had found was written."""
     from taccorl.report.report import check_folder
 
     check_folder(config.out, config.measurements)
     from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.report.account import is_explained
     from taccorl.report.compared import not_compared
-    from taccorl.report.diagnosed import brief
+    from taccorl.report.diagnosed import account_section, next_section
     from taccorl.report.report import write_report
     from taccorl.report.terminal import show
     from taccorl.sim.effects import effects
@@ -70,22 +79,28 @@ def run(config: DiagnoseConfig) -> int:
     if machine.of_joints:
         refuse_long(measurements)
     compare = partial(machine.compare, measurements)
+    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     beside = replayed(
-        machine, measurements, "not diagnosed", config.accept, compare, clocks=False
+        machine,
+        measurements,
+        "not diagnosed",
+        config.accept,
+        compare,
+        clocks=False,
+        only=config.asked(machine, measurements),
     )
     if beside is None:
         return 1
-    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     off = {
         f.feature: f.text
         for own in beside.findings.values()
         for f in own
-        if f.check == "other_gains"
+        if f.check == OTHER_GAINS
     }
     parts = [
-        part for part in selected if part not in off or "other_gains" in config.accept
+        part for part in selected if part not in off or OTHER_GAINS in config.accept
     ]  # else an effect stands in
-    way = "--accept=other_gains diagnoses it with the stated ones"
+    way = f"--accept={OTHER_GAINS} diagnoses it with the stated ones"
     refused = [
         f"{part}: not diagnosed: {off[part]}. {way}"
         for part in selected
@@ -115,29 +130,31 @@ def run(config: DiagnoseConfig) -> int:
     if stopped_by:
         words = "This diagnosis is not finished: it was stopped."
         report = dataclasses.replace(report, stopped=" ".join([words, *refused]))
-    verdicts = report.verdicts()
-    show(*(brief(f, verdicts[f.part], report.options) for f in found))
+    step = _next(config, report, machine)
+    report = dataclasses.replace(report, next=step)
+    accounts = report.accounts()
+    show(*map(account_section, accounts.values()))
+    if step and len(accounts) > 1:
+        show(next_section(step))
     clocks = [
         f"{f.part}: {beside.unjudged[f.part]}"
         for f in found
         if f.part in beside.unjudged and _of_time(f)
     ]
-    held = [part for part, v in verdicts.items() if v.kind == "data_first"]
-    written = write_report(
-        report, config.out
-    )  # makes the folder of the corrected twin, too
-    text = [
-        *_next(config, held, found, machine, mended),
-        *([disagree] if disagree else []),
-    ]
-    show(Section(text=[*refused, *clocks]), written, Section(text=text))
-    done = all(
-        f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor")
-        for f in found
-    )
+    written = write_report(report, config.out)
+    lines = [disagree] if disagree else []
+    if config.until == "noise_floor":
+        mended.save(path := config.out / mended.file_name)
+        whole = ", ".join([*machine.changes_as_a_whole(found), mended.saved_words])
+        lines = [f"wrote {path}: {whole}", *lines]
+    show(Section(text=[*refused, *clocks]), written, Section(text=lines))
     if stopped_by == signal.SIGTERM:
         return 128 + stopped_by
-    return int(not done or bool(disagree or refused))
+    explained = all(
+        is_explained(f.diagnosis) and accounts[f.part].kind != "data_first"
+        for f in found
+    )
+    return int(not explained or bool(disagree or refused))
 
 
 def _diagnosed(
@@ -163,7 +180,7 @@ def _diagnosed(
         steps.interim = Interim(
             folder=config.out,
             kept=Path(kept),
-            title=f"What {machine.name} lacks, from {config.measurements.name}",
+            title=_title(config, machine),
             provenance=_provenance(config, machine),
         )
         try:
@@ -191,6 +208,12 @@ def _diagnosed(
             raise
 
 
+def _title(config: DiagnoseConfig, machine: "Machine") -> str:
+    """The machine and the folder, with as much of their paths as tells them apart."""
+    twin = Path(*config.twin.parts[-2:]) if config.twin else machine.name
+    return f"{twin}: what it lacks, by {Path(*config.measurements.parts[-2:])}"
+
+
 def _provenance(config: DiagnoseConfig, machine: "Machine") -> dict[str, str]:
     return {
         "command": shlex.join(command("diagnose", config, "measurements")),
@@ -208,14 +231,14 @@ def _report(
     mended: "Machine",
 ) -> "Report":
     """With the comparisons that show what refitted numbers removed, and what effects did."""
+    from taccorl.report.evidence import added
     from taccorl.report.report import Report
-    from taccorl.report.verdict import added
 
     some = any(
         added(f.diagnosis) for f in found
     )  # else the twin as it was is the reference
     return Report(
-        title=f"What {beside.comparison.twin} lacks, from {config.measurements.name}",
+        title=_title(config, machine),
         comparison=beside.comparison,
         refitted=machine.refitted(found).compare(measurements, name="refitted twin")
         if some
@@ -247,94 +270,39 @@ def _given(config: DiagnoseConfig) -> list[str]:
     return [f"--twin={config.twin}"] * (config.twin is not None) + out
 
 
-def _next(
-    config: DiagnoseConfig,
-    held: Sequence[str],
-    found: "Sequence[Finding]",
-    machine: "Machine",
-    mended: "Machine",
-) -> Iterator[str]:
-    """Write the corrected machine if it was asked for; what was written, or what to do next. ``held``: parts whose recordings
-    are to be corrected first."""
+def _next(config: DiagnoseConfig, report: "Report", machine: "Machine") -> "list[Fact]":
+    """The next command, with all parts together; nothing that this run has done."""
     from taccorl.diagnosis.search.problem import EFFORT_SCALE
-    from taccorl.report.evidence_words import may_stand_in, unit_words, untested_words
-    from taccorl.report.verdict import added
+    from taccorl.report.account import moved
+    from taccorl.report.evidence import added
+    from taccorl.report.fact import fact
 
-    found = sorted(
-        found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"]
-    )  # the largest first
-    names = list(dict.fromkeys(name for f in found for name in added(f.diagnosis)))
-    off = [
-        (f.part, c)
-        for f in found
-        for c in f.diagnosis.changed
-        if c.name != EFFORT_SCALE
-    ]  # which no file has
-    refitted = [
-        c
-        for f in found
-        if f.diagnosis.status == "numbers_off" or not names
-        for c in f.diagnosis.changed
-    ]
-    of_file = [c.effect or c.name for c in refitted if c.name != EFFORT_SCALE]
-    undecided = any(c.instead for c in refitted)
-    whole = machine.changes_as_a_whole(found)
-    further = shlex.join(
-        command(
-            "diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"
-        )
-    )
+    accounts, found = report.accounts(), report.found
+    own = command("diagnose", config, "measurements")
+    if any(a.kind == "data_first" for a in accounts.values()):
+        return [fact("next_data")]
     if config.until == "noise_floor":
-        mended.save(path := config.out / mended.file_name)
-        done = [name for name in names if name in mended.effects]
-        done += [
-            f"{c.name} of {part} {c.was} → {c.after:.4g}{unit_words(c.unit)}"
-            for part, c in off
-        ]
-        yield f"wrote {path}: {', '.join([*done, *whole]) or 'refitted numbers, no effect'}; {mended.saved_words}"
-        yield f"next: {compare_words(command('diagnose', config, 'measurements'), [f.part for f in found], config.twin, path)}"
-        for f in found:
-            yield from (
-                f"{f.part}: {doubt}"
-                for doubt in (may_stand_in(f.diagnosis), untested_words(f.diagnosis))
-                if doubt
-            )
-    elif held:
-        yield f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
-    elif any(f.diagnosis.status == "too_many" for f in found) or whole:
-        yield f"next: {further}"
-    elif names := list(dict.fromkeys([*names, *of_file])):
-        alone = [
-            n
-            for n in names
-            if not any(
-                machine.option_of(f.part) for f in found if n in f.diagnosis.names
-            )
-        ]
-        words = [
-            "taccorl",
-            "add-effect",
-            ",".join(alone) if names[0] in alone else names[0],
-        ]
-        words += [
-            w
-            for f in found
-            if names[0] in f.diagnosis.names
-            for w in machine.option_of(f.part)
-        ]
-        tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
-        tied += [
-            f"payload in {body}"
-            for f in found
-            for body in f.diagnosis.or_in
-            if names[0] == "payload"
-        ]
-        yield from ["next: record what decides, see Record next"] * undecided
-        yield f"{'to write what was refitted' if undecided else 'next'}: {shlex.join([*words, *_given(config)])}"
-        yield from [
-            f"{' or '.join(tied)} does as well as {names[0]}: see Record next"
-        ] * bool(tied)
-    elif any(
-        f.part in machine.fitted_gains or machine.option_of(f.part) for f in found
+        path = config.out / machine.file_name
+        parts = [f.part for f in found]
+        return [fact("next", command=compare_words(own, parts, config.twin, path))]
+    whole = dataclasses.replace(config, until="noise_floor")
+    if machine.changes_as_a_whole(found) or any(
+        f.diagnosis.status == "too_many" for f in found
     ):
-        yield f"a twin with the refitted numbers: {further}"
+        words = command("diagnose", whole, "measurements")
+        return [fact("next", command=shlex.join(words))]
+    names: dict[str, list[str]] = {}
+    largest_first = sorted(
+        found, key=lambda f: -f.diagnosis.errors["fitted"]["validation"]
+    )
+    for f in largest_first:
+        changed = [c for c in f.diagnosis.changed if c.name != EFFORT_SCALE]
+        of_file = [*moved(f.diagnosis), *(c.effect or c.name for c in changed)]
+        for name in added(f.diagnosis) or of_file:
+            names.setdefault(name, machine.option_of(f.part))
+    if not names:
+        return []
+    first = next(iter(names.values()))
+    together = [name for name, options in names.items() if options == first]
+    words = ["taccorl", "add-effect", ",".join(together), *first, *_given(config)]
+    return [fact("next", command=shlex.join(words))]

@@ -1,5 +1,6 @@
 """Code shared by the verbs that read measurements: loading of the twin, and the checks before any conclusion."""
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -30,6 +31,13 @@ MANY_ROWS = 1_000_000
 MOST_ROWS = 500_000
 """Rows of one recording beyond which a joint is not diagnosed. A choice: at 0.2 µs a row and replay (three physics steps a row),
 3400 replays for one effect of EMPS take six minutes then, and 70 000 replays to the noise floor two hours."""
+OF_EFFORTS = (
+    *("wrong_inertia", "reversed_effort", "beyond_effort", "effort_time"),
+    *("frozen_effort", "unsigned_effort"),
+)
+"""Checks of one joint's efforts and inertia, which do not hinder the diagnosis of others."""
+OTHER_GAINS = "other_gains"
+"""Check by which efforts have other gains than the file's: no part with it is diagnosed unless it is accepted."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -41,7 +49,7 @@ class MeasuredConfig:
     measurements: Path
     """A recording, table or dataset, or a folder of those."""
     twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
     """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms; all that move if not given."""
     spec: str | None = None
@@ -81,6 +89,14 @@ class PartsConfig(MeasuredConfig):
         if self.workers < 1:
             raise TaccorlError(f"--workers={self.workers}: at least 1")
 
+    def asked(
+        self, machine: "Machine", measurements: "Measurements"
+    ) -> tuple[str, ...]:
+        """Names of the joints that --joints names; none: all, and pads, which depend on all."""
+        if self.pads or not self.joints:
+            return ()
+        return machine.select(machine.parts(measurements), self.joints, [])
+
     def read(self, machine: "Machine", **how: bool) -> "Measurements":
         """The measurements of the named joints: recordings of others, and what is wrong with them, hold nothing up."""
         from taccorl.diagnosis.problems.joints import of_joints
@@ -114,19 +130,25 @@ def replayed(
     replay: "Callable[[], Comparison]",
     why: str = "looks like missing physics",
     clocks: bool = True,
+    only: Collection[str] = (),
 ) -> Replayed | None:
     """Check measurements before and after their replay, and show the findings. ``verdict``: text with which the message begins
     if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
     with the measurements. ``why``: what an offset of one row does.
-    ``clocks``: whether to show which clocks nothing judged. Returns None if there are errors, or most clocks are off."""
+    ``clocks``: whether to show which clocks nothing judged. ``only``: parts that are asked for; errors of others are
+    warnings. Returns None if there are errors, or most clocks are off."""
     from taccorl.report.terminal import show
 
-    findings = checked(machine, measurements, verdict, accept)
-    if findings is None:
+    findings = checked(machine, measurements, accept, only)
+    if wrong := recordings_with_errors(findings):
+        with contextlib.suppress(TaccorlError):  # what a replay would refuse as well
+            late = of_replays(replay(), findings, accept, only)
+            findings |= {name: [*findings[name], *late[name]] for name in late}
+        show(Section(text=[refusal(verdict, wrong, findings)]))
         return None
     comparison = replay()
     findings = without_explained(findings, comparison)
-    late = of_replays(comparison, findings, accept)
+    late = of_replays(comparison, findings, accept, only)
     checks = {
         f.check for found in (findings, late) for own in found.values() for f in own
     }
@@ -144,7 +166,7 @@ def replayed(
     show(Section(text=unused), *found_in_recordings(shown))
     if clock_is_off(late, len(measurements.all)):
         text = f"{verdict}: time stamps of most recordings are off, see above; an offset of one row {why}"
-        show(Section(text=[text]))
+        show(Section(text=[text, refusal(verdict, recordings_with_errors(late), late)]))
         return None
     every = {
         name: [*findings.get(name, []), *late.get(name, [])]
@@ -155,15 +177,47 @@ def replayed(
     )
 
 
+def recordings_with_errors(findings: Mapping[str, Sequence["Finding"]]) -> list[str]:
+    """Names of the recordings in which a check found an error."""
+    every = findings.items()
+    return sorted(n for n, own in every if any(f.severity == "error" for f in own))
+
+
+def refusal(
+    verdict: str, wrong: Sequence[str], findings: Mapping[str, Sequence["Finding"]]
+) -> str:
+    """Line on recordings with errors, with the one option that accepts all that stops the verb."""
+    every = [f for own in findings.values() for f in own]
+    stops = [f.check for f in every if f.severity == "error" or f.check == OTHER_GAINS]
+    option = f"--accept={','.join(dict.fromkeys(stops))}"
+    return (
+        f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; if none of "
+        f"them is an error here: {option}"
+    )
+
+
+def of_asked(
+    findings: Sequence["Finding"], only: Collection[str], machine_parts: Collection[str]
+) -> list["Finding"]:
+    """``findings`` with errors as warnings where they are of the efforts of parts that are not asked for. Positions of other
+    joints move those that are."""
+    others = {*machine_parts} - {*only} if only else set[str]()
+    return [
+        dataclasses.replace(f, severity="warning")
+        if f.severity == "error" and f.check in OF_EFFORTS and f.feature in others
+        else f
+        for f in findings
+    ]
+
+
 def checked(
     machine: "Machine",
     measurements: "Measurements",
-    verdict: str,
     accept: Sequence[str] = (),
-) -> dict[str, list["Finding"]] | None:
-    """Run the checks of telemetry and of the machine, and print their findings. ``verdict``: text with which the message
-    begins if there are errors. ``accept``: checks whose errors become warnings. Returns: name of a recording → its findings;
-    None if there are errors."""
+    only: Collection[str] = (),
+) -> dict[str, list["Finding"]]:
+    """Run the checks of telemetry and of the machine, and print their findings. ``accept``: checks whose errors become
+    warnings. ``only``: as of ``replayed``. Returns: name of a recording → its findings."""
     from taccorl.alignment.checks.telemetry import (
         accepted,
         check_copies,
@@ -208,13 +262,6 @@ def checked(
         for use in ("fit", "validation", "test")
     }
     own = machine.check(dataclasses.replace(measurements, **signed)) if timed else {}
-    drifting = {f.feature for some in own.values() for f in some if f.check == "drift"}
-    found = {
-        name: [
-            f for f in some if f.check != "does_not_repeat" or f.feature not in drifting
-        ]
-        for name, some in found.items()
-    }
     of_sweeps = (
         "no_motion",
         "short",
@@ -230,9 +277,14 @@ def checked(
         for m in measurements.all
     }
     found = one_cause(found, measurements.all, machine.command_rates)
-    wrong = sorted(
-        {name for name, own in found.items() if any(f.severity == "error" for f in own)}
-    )
+    drifting = {f.feature for own in found.values() for f in own if f.check == "drift"}
+    found = {
+        name: [
+            f for f in own if f.check != "does_not_repeat" or f.feature not in drifting
+        ]
+        for name, own in found.items()
+    }
+    found = {name: of_asked(own, only, machine.units) for name, own in found.items()}
     show(
         *found_in_recordings(
             {name: [f for f in own if not _waits(f)] for name, own in found.items()}
@@ -243,13 +295,8 @@ def checked(
         lines.append(
             f"not listed in measurements.yaml, taken as use: fit: {', '.join(measurements.unlisted)}"
         )
-    if wrong:
-        lines.append(
-            f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "
-            "that is none here is accepted by --accept=CHECK"
-        )
     show(Section(text=lines))
-    return None if wrong else found
+    return found
 
 
 def refuse_long(measurements: "Measurements") -> None:
@@ -268,6 +315,7 @@ def of_replays(
     comparison: "Comparison",
     findings: dict[str, list["Finding"]],
     accept: Sequence[str],
+    only: Collection[str] = (),
 ) -> dict[str, list["Finding"]]:
     """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift
     is only a warning for an arm whose pose is unknown, and for a joint with other gains. ``findings``: of earlier checks; the
@@ -283,9 +331,10 @@ def of_replays(
             if f.check in ("pose_unknown", "other_gains", "other_scale")
         ]
         if clock:
+            every = {f.feature for f in clock}
             late[name] = [
                 _beside(f, found) if f.check == SHIFTED else f
-                for f in accepted(clock, accept)
+                for f in of_asked(accepted(clock, accept), only, every)
             ]
     return late
 

@@ -1,5 +1,5 @@
-"""Sections of a diagnosed part: verdict, errors, numbers, effects, evidence, and what its recordings cannot tell; and the few
-lines of a terminal."""
+"""Sections of a diagnosed part: its facts, errors, numbers, effects, evidence, and what its
+recordings cannot tell."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,127 +12,63 @@ from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
-from taccorl.report.evidence_words import (
-    effect_class,
-    evidence_words,
-    last_refit_words,
-    unit_words,
-)
+from taccorl.report.evidence import added, effect_class, grade
+from taccorl.report.fact import Account, Fact, Quantity, clean, unit_words
 from taccorl.report.section import Cell, Picture, Section, Value, change
-from taccorl.report.verdict import NEAR, Verdict, added, clean, refitted_words
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
-REMARKS = 3
-"""Most remarks in a terminal; a page has all."""
+
+def account_section(a: Account) -> Section:
+    """The facts of one part: title and confidence, and a row for each."""
+    rows = [
+        (label, Cell(text, "code") if label in COMMANDS else text)
+        for label, text in a.rows
+    ]
+    heading = Cell(f"{a.title}  [confidence: {a.level}]", "bold")
+    return Section(text=[heading], rows=rows, style=a.level)
 
 
-def verdict_section(v: Verdict) -> Section:
-    """Verdict, confidence, and the next recording with its command."""
-    command = [Cell(v.command, "code")] if v.command else []
-    remarks = [f"Remark: {remark}" for remark in v.remarks]
-    text = [
-        Cell(v.finding, "bold"),
-        v.confidence,
-        f"Record next: {v.record_next}",
-        *command,
-        *remarks,
-    ]
-    return Section(text=text, style=v.level)
+def next_section(found: Sequence[Fact]) -> Section:
+    """What to do next with all parts together."""
+    rows = [(f.label, Cell(f.text, "code")) for f in found]
+    return Section(text=[Cell("all parts", "bold")], rows=rows, style="data")
 
 
-def brief(f: Finding, v: Verdict, options: Sequence[str] = ()) -> Section:
-    """What a terminal shows of one part: the verdict, numbers and command of what was added, the confidence, and what to record
-    next. report.html has more. ``options``: as in ``verdict``."""
-    d, names = f.diagnosis, added(f.diagnosis)
-    text: list[Value] = [Cell(v.finding, "bold")]
-    text += [
-        f"{f'{e.name} ' * (len(names) > 1)}{_in_twin(d)}: {_values(e)}"
-        for e in d.effects
-        if e.name in names
-    ]
-    text += [Cell(f"to add it: {_to_add(f.part, names, options)}", "bold")] * (
-        v.kind in ("effects", "ties")
-    )
-    text += [Cell(v.confidence, v.level)]
-    text += [
-        f"Record next: {v.record_next}",
-        *[Cell(v.command, "bold")] * bool(v.command),
-    ]
-    text += [f"Remark: {remark}" for remark in v.remarks[:REMARKS]]
-    text += [f"and {len(v.remarks) - REMARKS} more remarks: see the page"] * (
-        len(v.remarks) > REMARKS
-    )
-    text += [
-        f"{_judged(f)}; errors of {f.measured}; noise floor {f.noise}",
-        *[f.remark] * bool(f.remark),
-    ]
-    return Section(title=_title(f), parts=[Section(text=text)])
+COMMANDS = ("plan", "next")
+"""Labels of lines that are command lines."""
 
 
 def diagnosed(
-    f: Finding,
-    origins: Sequence[Origin],
-    regimes: RegimeErrors | None = None,
-    options: Sequence[str] = (),
+    f: Finding, origins: Sequence[Origin], regimes: RegimeErrors | None = None
 ) -> Section:
-    """What was found at one part, on a page, which has its verdict in another place. ``origins``: of the recordings, for the
-    titles of figures. ``regimes``: errors by recording and regime; None: left out. ``options``: as in ``verdict``."""
+    """What was found at one part, on a page, which has its facts in another place.
+    ``origins``: of the recordings, for the titles of figures. ``regimes``: errors by
+    recording and regime; None: left out."""
     d = f.diagnosis
     parts = [
-        _errors(f, regimes),
+        _errors(f),
         Section(figures=[_waterfall(f.part, d, origins)]),
         *([] if f.known is None else [_identified(f.known)]),
-        *(_effect(f.part, d, e, options) for e in d.effects if e.name in added(d)),
+        *(_effect(d, e) for e in d.effects if e.name in added(d)),
         _numbers(d, f.known),
         *([] if regimes is None else [_regimes(regimes)]),
         *(_evidence(k, r) for k, r in enumerate(d.rounds, start=1)),
         *([Section(notes=[LEGEND])] if d.rounds else []),
         _can_tell(f),
     ]
-    return Section(title=_title(f), parts=parts)
-
-
-def _title(f: Finding) -> str:
-    return f"{f.part}: {', '.join(added(f.diagnosis)) or 'nothing was added'}"
-
-
-def _judged(f: Finding) -> str:
-    judged = (
-        "the last rows of each"
-        if f.rows_split
-        else ", ".join(f.recordings.get("validation", ()))
-    )
-    return f"{f.numbers}; chosen by the error on {judged} (validation)"
-
-
-def _in_twin(d: Diagnosis) -> str:
-    # a law's own kp may be another one, as of a cascade
-    times = d.base["kp"] / d.start["kp"] if "kp" in d.base else 1.0
-    return (
-        "in the twin"
-        if times == 1.0
-        else f"in the twin, with kp {times:.4g} times the stated one"
-    )
+    title = f"{f.part}: {', '.join(added(d)) or 'nothing was added'}"
+    return Section(title=title, parts=parts)
 
 
 def _values(e: Effect) -> str:
-    width = {name: high - low for name, (low, high) in e.interval.items()}
-    return ", ".join(
-        f"{p.name} {p.symbol} = {clean(getattr(e, p.name), width.get(p.name, 0.0))}{unit_words(p.unit)} "
-        f"({_interval(e.interval, p.name)})"
-        for p in e.parameters()
-    ) + f": {e.reads_as}" * bool(e.reads_as)
-
-
-def _to_add(part: str, names: Sequence[str], options: Sequence[str]) -> str:
-    pads = [f"--pads={part.removesuffix(' pads')}"] * part.endswith(" pads")
-    own = [
-        option
-        for option in options
-        if not option.lstrip("'").startswith("--measurements=")
-    ]  # quoted for a shell
-    return " ".join(["taccorl add-effect", ",".join(names), *pads, *own])
+    """All numbers of an effect, with its symbols."""
+    found = []
+    for p in e.parameters():
+        low, high = e.interval.get(p.name, (math.nan, math.nan))
+        own = Quantity(value=getattr(e, p.name), unit=p.unit, low=low, high=high)
+        found.append(f"{p.name} {p.symbol} = {own}")
+    return ", ".join(found)
 
 
 LEGEND = (
@@ -143,49 +79,26 @@ LEGEND = (
 )
 
 
-def _errors(f: Finding, regimes: RegimeErrors | None) -> Section:
+def _errors(f: Finding) -> Section:
+    """Errors of each use before and after, and how they were judged."""
     d = f.diagnosis
     rows = []
     for use in ("validation", "test"):
         if use in d.errors["after"]:
-            before, fitted, after = (
-                d.errors[stage][use] for stage in ("before", "fitted", "after")
-            )
-            rows.append(
-                [use, *map(_floors, (before, fitted, after)), change(fitted, after)]
-            )
-    text = [d.words, f"noise floor {f.noise}", _judged(f)]
-    notes = [
-        f.remark,
-        last_refit_words(d),
-        *(f"{name}: {words}" for name, words in summarised(d.base)[1].items()),
-    ]
-    if d.status == "something_else" and d.rounds and not d.standing_out:
-        best = [e for e in d.rounds[-1].evidence[:1] if e.gain >= NEAR]
-        near = [
-            f"nearest: {', '.join(filter(None, (e.name, e.verdict)))}" for e in best
-        ]
-        notes.append(
-            f"the figures show where the residual is; {(near or ['no effect comes near to it'])[0]}"
-        )
-    notes.append(d.trouble and f"the last fit: {d.trouble}")
-    for names, what in (
-        (
-            d.undetermined,
-            "not determined by these recordings, one of many values that fit",
-        ),
-        (
-            d.at_bound,
-            "at the end of its range, a symptom of missing physics or wrong units",
-        ),
-    ):
-        notes.append(f"{what}: {', '.join(names)}" if names else "")
+            stages = ("before", "fitted", "after")
+            before, fitted, after = (d.errors[stage][use] for stage in stages)
+            floors = map(_floors, (before, fitted, after))
+            rows.append([use, *floors, change(fitted, after)])
+    judged = ", ".join(f.recordings.get("validation", ()))
+    if f.rows_split:
+        judged = "the last rows of each"
+    chosen = f"{f.numbers}; chosen by the error on {judged} (validation)"
+    families = summarised(d.base)[1].items()
+    notes = [f.remark] * bool(f.remark)
+    notes += [f"{name}: {words}" for name, words in families]
     notes += [f"{name} was superfluous after the last refit" for name in d.removed]
-    if regimes is not None and (w := regimes.worst) is not None:
-        place = f"{w.recording} ({w.use}), {w.regime}"
-        notes.append(
-            f"worst after the fit: {place}: {w.error:.2f} noise floors, n {w.n}"
-        )
+    if d.undetermined:
+        notes.append(f"not determined by these recordings: {', '.join(d.undetermined)}")
     heads = (
         f"error of {f.measured} [noise floors]",
         "as it was",
@@ -194,11 +107,11 @@ def _errors(f: Finding, regimes: RegimeErrors | None) -> Section:
         "by the effects",
     )
     return Section(
-        text=text,
+        text=[d.words, f"noise floor {f.noise}", chosen],
         heads=heads,
         rows=rows,
         right=range(1, 5),
-        notes=[note for note in notes if note],
+        notes=notes,
     )
 
 
@@ -211,8 +124,8 @@ def _waterfall(part: str, d: Diagnosis, origins: Sequence[Origin]) -> Picture:
         from taccorl.report.figures import Step, waterfall
 
         steps = [Step("as given", d.errors["before"]["validation"])]
-        steps += [Step(name or refitted_words(d), error) for name, error in d.steps]
-        if last_refit_words(d):
+        steps += [Step(name or "numbers refitted", error) for name, error in d.steps]
+        if d.steps[-1][0]:
             steps.append(Step("last refit", d.errors["after"]["validation"]))
         return waterfall(steps, origins, f"{part}: validation error, effect by effect")
 
@@ -297,29 +210,17 @@ def _numbers(d: Diagnosis, known: Known | None) -> Section:
     )
 
 
-def _effect(part: str, d: Diagnosis, e: Effect, options: Sequence[str]) -> Section:
-    """What it is, on a robot and for a policy, who looks like it, and what to do next."""
+def _effect(d: Diagnosis, e: Effect) -> Section:
+    """What it is, on a robot and for a policy, and who looks like it."""
     rows: list[tuple[str, Value]] = [
         ("equation", Cell(e.equation, "code")),
-        (_in_twin(d), _values(e)),
+        ("in the twin", _values(e)),
         ("what this is", e.in_words),
         ("what it does to a policy", e.at_a_policy),
         ("what shows it best", e.to_record),
     ]
-    if rivals := d.rivals.get(e.name, ()):
-        rows.append(
-            (
-                "does as well",
-                Cell(
-                    f"{', '.join(rivals)}: these recordings do not tell which it is",
-                    "bold",
-                ),
-            )
-        )
-    rows += [
-        (f"near-twin {other}", why) for other, why in d.twins.get(e.name, {}).items()
-    ]
-    rows.append(("to add it", Cell(_to_add(part, [e.name], options), "code")))
+    twins = d.twins.get(e.name, {})
+    rows += [(f"near-twin {other}", why) for other, why in twins.items()]
     return Section(title=f"→ {e.name}", rows=rows)
 
 
@@ -439,7 +340,7 @@ def _evidence_row(e: Evidence, mark: str) -> list[Value]:
         mark,
         Cell(e.name, more=about),
         *numbers,
-        Cell(evidence_words(e), hint=f"ΔBIC {e.bic:.0f}"),
+        Cell(grade(e), hint=f"ΔBIC {e.bic:.0f}"),
         words,
     ]
 

@@ -13,6 +13,8 @@ from typing import Any
 import taccorl
 from taccorl.diagnosis.search.problem import Found
 from taccorl.report import page
+from taccorl.report.diagnosed import account_section
+from taccorl.report.fact import Account, fact
 from taccorl.report.report import GENERATOR, NUMBERS, PAGE, effects_as_json, plain
 from taccorl.report.section import Section
 
@@ -58,35 +60,34 @@ class Interim:
 
     def write(self) -> None:
         """Write the report of all parts. Raises TaccorlError: it cannot be written."""
-        diagnoses = {
-            part: json.loads(
-                (self.kept / f"{urllib.parse.quote(part, safe='')}.json").read_text()
-            )
-            for part in self.parts
-        }
-        findings = {part: _words(part, d) for part, d in diagnoses.items()}
+        diagnoses, accounts = {}, {}
+        for part in self.parts:
+            path = self.kept / f"{urllib.parse.quote(part, safe='')}.json"
+            d = diagnoses[part] = json.loads(path.read_text())
+            accounts[part] = _account(part, d)
         numbers = {
             "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
             "title": self.title,
             "finished": False,
             "provenance": dict(self.provenance),
-            "verdicts": {part: {"finding": text} for part, text in findings.items()},
+            "verdicts": {part: a.as_json() for part, a in accounts.items()},
             "diagnoses": diagnoses,
         }
-        text = Section(text=["This diagnosis is not finished.", *findings.values()])
-        page.write(
-            {
-                self.folder / NUMBERS: json.dumps(
-                    numbers, indent=1, ensure_ascii=False
-                ),
-                self.folder / PAGE: page.html(self.title, [text], GENERATOR),
-            }
-        )
+        sections = [
+            Section(text=["This diagnosis is not finished."]),
+            *map(account_section, accounts.values()),
+        ]
+        text = json.dumps(plain(numbers), indent=1, ensure_ascii=False)
+        html = page.html(self.title, sections, GENERATOR)
+        page.write({self.folder / NUMBERS: text, self.folder / PAGE: html})
 
 
-def _words(part: str, d: Mapping[str, Any]) -> str:
-    """Sentence on what was found in one part."""
+def _account(part: str, d: Mapping[str, Any]) -> Account:
+    """What was found in one part so far."""
     names = [e["effect"] for e in d["effects"] if e["effect"] not in d["present"]]
-    error = d["errors"]["after"]["validation"]
-    state = "" if d["finished"] else f"; {NOT_FINISHED}"
-    return f"{part}: {' and '.join(names) or 'no effect'}, validation error {error:.2f} noise floors{state}."
+    kind = (
+        ("effects" if names else "nothing_missing") if d["finished"] else "unfinished"
+    )
+    found = [fact(kind, part=part, missing=names)]
+    found.append(fact("error_so_far", error=d["errors"]["after"]["validation"]))
+    return Account.of_facts(part, found)

@@ -27,9 +27,11 @@ from taccorl.diagnosis.search.result import Diagnosis, may_go_on
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import check_writable
 from taccorl.report import compared, page
-from taccorl.report.diagnosed import diagnosed, verdict_section
+from taccorl.report.account import account, moved
+from taccorl.report.diagnosed import account_section, diagnosed, next_section
+from taccorl.report.evidence import Seen, added
+from taccorl.report.fact import Account, Fact
 from taccorl.report.section import Section
-from taccorl.report.verdict import Verdict, added, verdict
 from taccorl.sim.effects.effect import Effect
 
 PAGE, NUMBERS = "report.html", "report.json"
@@ -54,6 +56,8 @@ class Report:
     """Diagnosed parts."""
     options: Sequence[str] = ()
     """Options in suggested commands, such as ``--twin=twin.yaml``."""
+    next: Sequence[Fact] = ()
+    """What to do next, with all parts together."""
     findings: Mapping[str, Sequence[Checked]] = field(default_factory=dict)
     """Recording → findings of the checks before the comparison."""
     provenance: Mapping[str, str] = field(default_factory=dict)
@@ -89,60 +93,56 @@ class Report:
             if (traces := self.last.of(f.part))
         }
 
-    def verdicts(self) -> dict[str, Verdict]:
-        """Diagnosed part → sentences of its verdict."""
+    def accounts(self) -> dict[str, Account]:
+        """Diagnosed part → facts about it."""
         regimes, found = self.regimes(), {}
         for f in self.found:
             own = regimes.get(f.part)
-            found[f.part] = verdict(
-                f.part,
-                f.diagnosis,
+            traces = self.comparison.of(f.part)
+            unknown = [t.floor.words() for t in traces if t.floor.is_unknown]
+            seen = Seen(
                 can_tell=f.can_tell,
                 known=f.known,
-                data=self.unsettled(f.part),
-                doubts=[
-                    *self._clock_or_effect(f.part, f.diagnosis),
-                    *(own.remarks if own else ()),
-                ],
-                options=self.options,
+                errors=self.unsettled(f.part),
+                drifts=getattr(f, "drifts", ()),
+                led=self._led(f.part, f.diagnosis),
+                remarks=own.remarks[:MOST_REMARKS] if own else (),
                 repeated=self._repeated(f.part),
-                floor=next(
-                    (
-                        t.floor.words()
-                        for t in self.comparison.of(f.part)
-                        if t.floor.is_unknown
-                    ),
-                    "",
-                ),
+                floor=f.noise,
+                numbers=f.numbers,
+                judged_by=["the last rows of each"]
+                if f.rows_split
+                else f.recordings.get("validation", ()),
+                floor_unknown=next(iter(unknown), ""),
                 short={use: own.short(use, other) for use, other in _PAIRS}
                 if own
                 else None,
                 worst=own.worst if own else None,
+                plans=not self._is_input(f.part),
+                options=self.options,
             )
-            if self._is_input(f.part):  # excite plans motions by targets
-                found[f.part] = dataclasses.replace(found[f.part], command="")
+            found[f.part] = account(f.part, f.diagnosis, seen)
+        if len(found) == 1:
+            found = {
+                part: Account.of_facts(part, (*a.facts, *self.next))
+                for part, a in found.items()
+            }
         return found
 
     def _is_input(self, part: str) -> bool:
         """Whether the part's position is its input (law effort), so that only its effort is compared."""
         return not self.comparison.of(part) and bool(self.comparison.of(part, "effort"))
 
-    def _clock_or_effect(self, part: str, d: Diagnosis) -> list[str]:
-        """Text: most recordings of the part show a lead that the added effect and an offset of the clock explain alike."""
+    def _led(self, part: str, d: Diagnosis) -> tuple[int, int]:
+        """Number of recordings of the part whose clock may lead in place of an added
+        effect, and of all; 0 of them if most do not leave it open."""
         moved = {t.recording for t in self.comparison.of(part)}
-        clock = self.comparison.clock
-        led = [
-            n
-            for n in moved
-            if any((f.check, f.feature) == (UNDECIDED, part) for f in clock.get(n, ()))
-        ]
-        names = [name for name in added(d) if name in LOOK_LIKE_LEADS]
-        if not names or 2 * len(led) <= len(moved):
-            return []
-        return [
-            f"the measurement leads the twin's replay in {len(led)} of {len(moved)} recordings; an offset of the clock explains "
-            f"that as well as {' and '.join(names)}: compare the clocks, or record steps and fast motion"
-        ]
+        led = 0
+        for name in moved:
+            own = self.comparison.clock.get(name, ())
+            led += any((f.check, f.feature) == (UNDECIDED, part) for f in own)
+        looks_like_it = any(name in LOOK_LIKE_LEADS for name in added(d))
+        return led if looks_like_it and 2 * led > len(moved) else 0, len(moved)
 
     def _repeated(self, part: str) -> bool:
         """Whether noise floors of the part include the variation between repeats."""
@@ -188,16 +188,17 @@ class Report:
 
     def sections(self) -> list[Section]:
         """The page."""
-        c, verdicts, regimes = self.comparison, self.verdicts(), self.regimes()
+        c, accounts, regimes = self.comparison, self.accounts(), self.regimes()
         twins = [one for one in (c, self.refitted, self.after) if one is not None]
         return [
             Section(text=[origin_words(self.origins)], style="data"),
             *([Section(text=[self.stopped])] if self.stopped else []),
             *(
-                map(verdict_section, verdicts.values())
-                if verdicts
+                map(account_section, accounts.values())
+                if accounts
                 else [compared.verdict(c, self.after)]
             ),
+            *([next_section(self.next)] if len(accounts) > 1 else []),
             *(
                 [compared.signals(self.without_effects, self.after)]
                 if c.signals
@@ -207,10 +208,7 @@ class Report:
             compared.cell_numbers(self.last),
             compared.how_far(*twins),
             *compared.pad_matches(*twins),
-            *(
-                diagnosed(f, self.origins, regimes.get(f.part), self.options)
-                for f in self.found
-            ),
+            *(diagnosed(f, self.origins, regimes.get(f.part)) for f in self.found),
             compared.where(
                 self.without_effects,
                 self.origins,
@@ -237,6 +235,8 @@ class Report:
         return Section(title="How this report was made", rows=rows, folded=True)
 
 
+MOST_REMARKS = 3
+"""Remarks about the recordings in an account; the page has all."""
 _PAIRS: tuple[tuple[Use, Use], ...] = (("fit", "validation"), ("validation", "fit"))
 
 
@@ -301,7 +301,8 @@ def as_json(report: Report) -> dict[str, Any]:
         else {"name": after.twin, "effects": list(after.effects)},
         "recordings": c.split,
         "findings": plain(report.findings),
-        "verdicts": plain(report.verdicts()),
+        "verdicts": {part: plain(a.as_json()) for part, a in report.accounts().items()},
+        "next": plain([f.as_json() for f in report.next]),
         "identified": {
             f.part: plain(f.known) for f in report.found if f.known is not None
         },
@@ -369,6 +370,7 @@ def _diagnosis(d: Diagnosis) -> dict[str, Any]:
     offers = [plain(o) | {"effects": effects_as_json(o.effects)} for o in d.offers]
     return plain(kept) | {
         "words": d.words,
+        "moved": [*moved(d)],
         "effects": effects_as_json(d.effects),
         "offers": offers,
     }

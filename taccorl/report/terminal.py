@@ -57,10 +57,12 @@ def show(*sections: Section, indent: str = "") -> None:
         if s.rows and (any(s.heads) or len(s.rows[0]) != 2):
             out.print(_table(s, indent))
         elif s.rows:  # names and values
+            within = indent if not s.style else f"{indent}  "
+            width = max(len(cell(name).text) for name, _ in s.rows)
             for name, value in s.rows:
-                out.print(
-                    _line(name, indent) + Text(": ") + _line(value, ""), soft_wrap=True
-                )
+                label = _line(name, within)
+                label.append(" " * (width + 2 - len(cell(name).text)))
+                out.print(label + _line(value, ""), soft_wrap=True)
         for value in s.notes:
             out.print(_line(value, indent, "note"), soft_wrap=True)
         if s.command:

@@ -119,7 +119,10 @@ def save_twin(config: TwinConfig, path: Path) -> None:
 def effect_entry(effect: Effect) -> dict[str, Any]:
     """Return an effect as an entry of a file's ``effects``: ``effect``, its name, and the parameters that differ from its class's
     defaults."""
-    return _plugin_differences("effect", effects, effect)
+    registered = effects.get(effect.name)
+    if not isinstance(effect, registered):
+        return _plugin_differences("effect", effects, effect)
+    return {"effect": effect.name} | _differences(effect, type(effect)())
 
 
 def write_whole(path: Path, text: str) -> None:

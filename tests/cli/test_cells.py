@@ -12,6 +12,7 @@ import yaml
 
 from taccorl.alignment.machines.cells_file import cells_text, load_cells
 from taccorl.surrogate.cells import draw_cells, write_cells
+from tests.cli.printed import facts
 
 SENSOR = """\
 kind: cells
@@ -70,13 +71,17 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping, said):
     assert code == 0 and "fingertip touch" in shown and "loading" in shown
     assert "simulated force cells" in shown
     code, shown = said("diagnose", presses, f"--twin={sensor}", f"--out={out}")
-    assert code == 0 and "fingertip lacks taxel_creep" in shown
-    assert "Confidence high" in shown and "taccorl excite" not in shown, (
-        "no effect does as well"
-    )
-    assert "gain and offset of each cell fitted" in shown
+    assert code == 0 and [*facts(out, "fingertip")][0] == "effects"
+    assert "fingertip lacks taxel_creep  [confidence: high]" in shown
+    assert "taccorl excite" not in shown, "no effect does as well"
     page = (out / "report.html").read_text()
-    for words in ("simulated force cells", "reading over load", "taxel_creep", "phase"):
+    for words in (
+        "gain and offset of each cell fitted",
+        "simulated force cells",
+        "reading over load",
+        "taxel_creep",
+        "phase",
+    ):
         assert words in page
     code, shown = said(
         "add-effect", "taxel_creep", f"--twin={sensor}", f"--diagnosis={out}"

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from axes import altered
 
 from taccorl.alignment.checks.telemetry import check_measurement
 from taccorl.alignment.measurements.folder import Measurements
@@ -21,10 +22,9 @@ from taccorl.diagnosis.experiment_design.motions import (
     Ground,
     ground_of,
 )
-from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
-from taccorl.sim.effects import make_effect
+from taccorl.diagnosis.machines.robot import RobotMachine
 
 VERB, ONE_LINE = "", True
 SLIDE = """kind: axis
@@ -47,10 +47,10 @@ def drive(tmp_path: Path) -> Path:
 def ground(
     drive: Path, speed: float | None = 0.4, span: Sequence[float] = ()
 ) -> Ground:
-    return ground_of(Axis.load(drive), "slide", speed=speed, span=span)
+    return ground_of(RobotMachine.load(drive), "slide", speed=speed, span=span)
 
 
-def swept(drive: Path, hidden: Axis, rows_early: int = 0) -> Measurement:
+def swept(drive: Path, hidden: RobotMachine, rows_early: int = 0) -> Measurement:
     g = ground(drive)
     m, _ = dataclasses.replace(g, machine=hidden).answered(
         g.commanded("sweep", g.positions(MOTIONS[0], 0.5))
@@ -109,12 +109,8 @@ def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
 ):
     """20 % more damping lags by 0.2 · 2000 / 40000 = 10 ms, two rows, and no clock is off; a row early is an error. Both at
     once are a lag of one row, which speeds that are sent along would leave as well."""
-    axis = Axis.load(drive)
-    m = swept(
-        drive,
-        dataclasses.replace(axis, config=dataclasses.replace(axis.config, kd=kd)),
-        rows_early,
-    )
+    axis = RobotMachine.load(drive)
+    m = swept(drive, RobotMachine(altered(axis.robot, kd=kd), axis.name), rows_early)
     found = axis.compare(Measurements((m,))).clock["sweep"]
     assert [(f.check, f.severity) for f in found] == said, found
 
@@ -134,10 +130,8 @@ def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
 def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(
     drive, name, values, warns
 ):
-    axis = Axis.load(drive)
-    hidden = dataclasses.replace(
-        axis, config=axis.config.with_effects([make_effect(name, **values)])
-    )
+    axis = RobotMachine.load(drive)
+    hidden = RobotMachine(altered(axis.robot, effects=[(name, values)]), axis.name)
     m = swept(drive, hidden)
     found = [
         f
@@ -334,7 +328,7 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(
         "command": " ".join(words),
     }
     verdicts = {
-        part: {"finding": f"{part} lacks {name}"} for part, (name, _) in found.items()
+        part: {"title": f"{part} lacks {name}"} for part, (name, _) in found.items()
     }
     report = {"provenance": provenance, "diagnoses": diagnoses, "verdicts": verdicts}
     (tmp_path / "d" / "report.json").write_text(json.dumps(report))

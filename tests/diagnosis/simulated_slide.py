@@ -5,21 +5,21 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from axes import axis_of, problem_of
 
-from taccorl.alignment.machines.axis_file import AxisConfig
+from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.robot import RobotMachine
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import effects
 
 MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 4e4, 2800.0
 NOISE_M, NOISE_N = 2e-5, 2.0
-AXIS = AxisConfig(
+AXIS = axis_of(
     name="drive",
     unit="m",
     inertia=80.0,
@@ -31,10 +31,10 @@ AXIS = AxisConfig(
 
 
 def one_round(
-    axis: AxisConfig, measurements: Measurements, considered: Collection[str] = effects
+    axis: Robot, measurements: Measurements, considered: Collection[str] = effects
 ) -> Diagnosis:
     """Search for one effect, of ``considered``."""
-    problem, one = AxisProblem(axis, measurements), SearchConfig(max_effects=1)
+    problem, one = problem_of(axis, measurements), SearchConfig(max_effects=1)
     without = [name for name in problem.candidates if name not in considered]
     way = {"start": problem.start, "present": problem.present, "without": without}
     return diagnose(

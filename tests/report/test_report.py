@@ -21,10 +21,11 @@ from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError, TaccorlError, plain_name
+from taccorl.report.account import account
 from taccorl.report.compared import pad_matches
-from taccorl.report.diagnosed import brief, clean
-from taccorl.report.diagnosed import diagnosed as sections_of
-from taccorl.report.evidence_words import separable
+from taccorl.report.diagnosed import account_section
+from taccorl.report.evidence import separable
+from taccorl.report.fact import clean, fact
 from taccorl.report.ingested import ingested
 from taccorl.report.page import html
 from taccorl.report.report import (
@@ -269,80 +270,83 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, P
 
 
 def facts(finding: JointFinding) -> list[str]:
-    """Numbers with their units and intervals, names, and commands of a finding."""
+    """Names, texts and numbers of a finding that its part of the page has."""
     d, known = finding.diagnosis, finding.known
     (effect,), cls = d.effects, effects.get("coulomb_friction")
-    low, high = effect.interval["torque_nm"]
-    rivals = d.rivals.get(effect.name, ())
-    found = [
-        SIGNAL,
-        effect.name,
-        d.words,
-        finding.noise,
-        finding.numbers,
-        finding.measured,
-    ]
-    found += [
-        f"{of[use]:.2f}"
-        for of in map(d.errors.get, ("before", "fitted"))
-        for use in of
-        if use != "fit"
-    ]
-    found += [
-        f"{d.errors['after']['validation'] / d.errors['fitted']['validation'] - 1:+.0%}"
-    ]
-    found += [clean(x, high - low) for x in (effect.torque_nm, low, high)]  # pyright: ignore[reportAttributeAccessIssue]
-    found += [cls.equation, cls.in_words, cls.at_a_policy, cls.to_record]
-    found += [
-        text
-        for name, why in cls.near_twins.items()
-        for text in (f"near-twin {name}", why)
-    ]
-    found += [
-        text
-        for n in known.identifiable
-        for text in (n.name, clean(n.value, n.high - n.low))
-    ]
-    found += [
-        " … ".join(clean(end, n.high - n.low) for end in (n.low, n.high))
-        for n in known.identifiable
-    ]
-    found += [
-        word
-        for r in d.rounds
-        for e in r.evidence[:6]
-        for word in (e.name, f"{e.score:.1f}")
-    ]
-    found += [
-        f"taccorl add-effect {effect.name}",
-        *finding.recordings["validation"],
-        *known.pinned_by,
-        *rivals,
-    ]
-    apart = separable(d, effect.name, rivals)
-    return found + [
-        f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *apart])}"
-    ] * bool(apart)
+    found = [SIGNAL, effect.name, d.words, finding.noise, finding.numbers]
+    found += [finding.measured, *finding.recordings["validation"], *known.pinned_by]
+    gone = d.errors["after"]["validation"] / d.errors["fitted"]["validation"] - 1
+    found += [f"{gone:+.0%}", cls.equation, cls.in_words, cls.at_a_policy]
+    found += [cls.to_record, *cls.near_twins, *cls.near_twins.values()]
+    for stage in ("before", "fitted"):
+        found += [f"{x:.2f}" for use, x in d.errors[stage].items() if use != "fit"]
+    for n in known.identifiable:
+        ends = [clean(x, n.high - n.low) for x in (n.value, n.low, n.high)]
+        found += [n.name, ends[0], " … ".join(ends[1:])]
+    for e in d.rounds[0].evidence:
+        found += [e.name, f"{e.score:.1f}", e.verdict, effects.get(e.name).equation]
+    return found
 
 
-def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(diagnosed, capsys):
+def test_each_fact_of_a_diagnosis_is_on_the_page_in_the_terminal_and_in_json(
+    diagnosed, capsys
+):
     finding, path = diagnosed
-    verdict = Report(
-        title="", comparison=small().comparison, found=[finding]
-    ).verdicts()[SIGNAL]
-    show(brief(finding, verdict), sections_of(finding, ()))
+    report = json.loads((path.parent / NUMBERS).read_text())
+    own = report["verdicts"][SIGNAL]
+    d = finding.diagnosis
+    a = account(SIGNAL, d)
+    show(account_section(a))
     page, terminal = (
         " ".join(text.split())
         for text in (Tags(path.read_text()).text, capsys.readouterr().out)
     )
-    for fact in facts(finding):
-        assert fact in page and fact in terminal, fact
-    for row in finding.diagnosis.rounds[0].evidence:
-        assert effects.get(row.name).equation in page and row.verdict in page
-    name, d = finding.diagnosis.names[0], finding.diagnosis
-    assert page.count("--twin=a.yaml") == 1 + bool(
-        separable(d, name, d.rivals.get(name, ()))
-    ), "add-effect, excite"
+    for text in facts(finding):
+        assert " ".join(text.split()) in page, text
+    for f in a.facts[1:]:
+        assert f.text in terminal and f.text in page, f.id
+    assert {f["id"] for f in own["facts"]} >= {*a.ids} - {"plan", "record_repeat"}
+    assert (own["kind"], own["title"]) == (a.kind, a.title)
+    (missing,) = (f for f in own["facts"] if f["id"] == "missing")
+    assert missing["values"]["effect"] == d.names[0] and missing["text"] in page
+    apart = separable(d, d.names[0], d.rivals.get(d.names[0], ()))
+    assert page.count("--twin=a.yaml") == bool(apart), "excite"
+
+
+def test_a_number_of_json_has_its_unit_and_its_interval(diagnosed):
+    """The file of a diagnosis without an effect has the number that moved as an object."""
+    finding, _ = diagnosed
+    d = finding.diagnosis
+    frees = [dataclasses.replace(d.before.frees[0], name="kp", unit="N·m/rad")]
+    off = dataclasses.replace(
+        d,
+        effects=(),
+        status="nothing_missing",
+        base={"kp": 241.0},
+        start={"kp": 394.0},
+        intervals={"kp": (240.0, 242.0)},
+        after=dataclasses.replace(d.after, frees=frees),
+        errors=d.errors | {"before": {"fit": 9.0, "validation": 99.0, "test": 99.0}},
+    )
+    report = small(found=[dataclasses.replace(finding, diagnosis=off)])
+    own = as_json(report)["verdicts"][SIGNAL]
+    (kp,) = (f for f in own["facts"] if f["id"] == "changed")
+    assert own["kind"] == "numbers_off" and kp["values"]["before"] == 394.0
+    after = {"value": 241.0, "unit": "N·m/rad", "low": 240.0, "high": 242.0}
+    assert kp["values"]["after"] == after
+    assert as_json(report)["diagnoses"][SIGNAL]["moved"] == ["kp"]
+
+
+def test_the_next_command_stands_once_for_one_part_and_for_several(diagnosed):
+    finding, _ = diagnosed
+    step = (fact("next", command="taccorl add-effect x"),)
+    other = dataclasses.replace(finding, part="left_joint6")
+    for found in ([finding], [finding, other]):
+        report = small(found=found, next=step)
+        text = html("x", report.sections(), "x")
+        assert text.count("taccorl add-effect x") == 1
+        own = [a.ids.count("next") for a in report.accounts().values()]
+        assert own == ([1] if len(found) == 1 else [0, 0])
 
 
 def test_a_lead_that_only_one_effect_of_several_left_behind_holds_nothing_up(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axes import problem_of
 
 from pipelines.studies.pendulums import CASES, jobs, removed
 from pipelines.studies.robots import run_missing
@@ -19,9 +20,8 @@ from pipelines.studies.servo import (
     _swing,  # pyright: ignore[reportPrivateUsage]
     write,
 )
-from taccorl.alignment.machines.axis_file import load_axis
+from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
@@ -141,7 +141,7 @@ def test_with_the_hidden_effect_its_own_numbers_reach_the_noise_and_without_they
 ):
     """Simulated truth: what the generator ran with, in 3 % or three floors; the search's model shares no code with it."""
     made, folder = servo
-    problem = AxisProblem(load_axis(folder / "servo.yaml"), swings)
+    problem = problem_of(load_robot(folder / "servo.yaml"), swings)
     stall = SUPPLY_V * made.torque_nm_per_a / made.resistance_ohm
     start = problem.start | {
         "inertia": made.inertia,
@@ -165,7 +165,7 @@ def test_with_the_hidden_effect_its_own_numbers_reach_the_noise_and_without_they
 
 @pytest.mark.slow
 def test_friction_that_grows_with_the_load_is_found_from_the_tables(servo, swings):
-    problem = AxisProblem(load_axis(servo[1] / "servo.yaml"), swings)
+    problem = problem_of(load_robot(servo[1] / "servo.yaml"), swings)
     begun = {
         "start": problem.start,
         "present": problem.present,

@@ -109,11 +109,8 @@ def test_what_was_pressed_is_read_back(case, read):
 
 
 def test_nothing_is_wrong_with_the_recordings(read):
-    found = checked(PiperTwin.nominal(), read, "")
-    assert (
-        found is not None
-        and [f for own in found.values() for f in own if f.severity != "note"] == []
-    )
+    found = checked(PiperTwin.nominal(), read)
+    assert [f for own in found.values() for f in own if f.severity != "note"] == []
 
 
 def test_the_truth_is_sealed_and_the_twin_is_the_one_to_start_from(case, written):

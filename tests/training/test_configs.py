@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from lerobot.configs.train import TrainPipelineConfig
 
-from taccorl.alignment.machines.axis_file import load_axis
+from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.cli.parse import parse
 from taccorl.cli.post_train import PostTrainConfig
 from taccorl.sim.twin_file import load_twin
@@ -69,7 +69,7 @@ def test_every_file_is_loaded_by_what_reads_it(
 ) -> None:
     readers = {
         "twin.yaml": load_twin,
-        "diagnose": load_axis,
+        "diagnose": load_robot,
         **dict.fromkeys(("surrogates", "randomised"), load_twin),
         "cotrain": lambda path: lerobot_train(path, monkeypatch),
         "post_train": lambda path: parse(PostTrainConfig, [f"--config_path={path}"]),

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
@@ -37,6 +36,7 @@ _SAME = np.r_[
     np.full(3, np.deg2rad(0.4)), np.full(3, 0.004)
 ]  # poses closer than this will end in one
 _FAR_PX = 6.0  # a point further from its edge counts no more
+_STEPS = 2  # of least squares between two matchings
 _SOFT_PX = 1.0  # residuals beyond it count less (soft L1)
 
 
@@ -277,20 +277,16 @@ def weights(apart: np.ndarray) -> np.ndarray:
 
 
 def _step(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """(6,) that brings the matched points closest to their edges, soft L1."""
+    """(6,) that brings the matched points closest to their edges: least squares with
+    soft L1, by Gauss-Newton steps that are reweighted. A direction that the edges do not
+    determine hardly moves: a step is expected within ``_AROUND``."""
+    step = np.zeros(6)
     if matches.found.sum() < 50:
-        return np.zeros(6)
-
-    def there(step: np.ndarray) -> np.ndarray:
-        return Rotation.from_rotvec(-step[:3]).apply(seen - step[3:])
-
-    found = least_squares(
-        lambda step: distances(there(step), matches, at),
-        np.zeros(6),
-        jac=lambda step: slopes(there(step), matches, at),  # pyright: ignore[reportArgumentType]
-        loss="soft_l1",
-        f_scale=_SOFT_PX,
-        x_scale=[0.02, 0.02, 0.02, 0.01, 0.01, 0.01],
-        max_nfev=8,
-    )
-    return found.x
+        return step
+    for _ in range(_STEPS):
+        there = Rotation.from_rotvec(-step[:3]).apply(seen - step[3:])
+        apart, jacobian = distances(there, matches, at), slopes(there, matches, at)
+        weighted = weights(apart)[:, None] * jacobian
+        information = weighted.T @ jacobian + np.diag(_AROUND**-2.0)
+        step -= np.linalg.solve(information, weighted.T @ apart)
+    return step

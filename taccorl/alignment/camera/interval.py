@@ -26,6 +26,7 @@ from taccorl.alignment.camera.fit import (
     weights,
 )
 from taccorl.alignment.camera.view import TwinView
+from taccorl.alignment.least_squares import sandwich
 from taccorl.robots import ROBOT
 
 AXES = (
@@ -106,26 +107,14 @@ def covariance(
     np.add.at(scores, groups, weighted * apart[:, None])
     by_point = space_slopes(seen, solution.matches, level.intrinsics)
     shifts = _shifts(view, joints, solution.offset, seen[found], frames, bodies)
-    twin = np.stack(
-        [weighted.T @ (by_point * shift).sum(1) for shift in shifts]
-    )  # (sources, 6)
-    few = len(scores) / max(len(scores) - 6, 1)
+    twin = np.stack([weighted.T @ (by_point * shift).sum(1) for shift in shifts])
     # From a step in the camera's own frame to the pose's numbers.
-    bend = (
-        np.stack(
-            [
-                moved(solution.offset, step) - solution.offset
-                for step in 1e-6 * np.eye(6)
-            ],
-            axis=1,
-        )
-        / 1e-6
-    )
-    spread = bend @ np.linalg.inv(information)
-    return Covariance(
-        noise=few * spread @ scores.T @ scores @ spread.T,
-        twin=spread @ twin.T @ twin @ spread.T,
-    )
+    steps = 1e-6 * np.eye(6)
+    bent = [moved(solution.offset, step) - solution.offset for step in steps]
+    bend, inverse = np.stack(bent, axis=1) / 1e-6, np.linalg.inv(information)
+    noise = sandwich(scores, inverse, 6)
+    shape = inverse @ twin.T @ twin @ inverse
+    return Covariance(noise=bend @ noise @ bend.T, twin=bend @ shape @ bend.T)
 
 
 def _shifts(

@@ -1,9 +1,16 @@
-"""Columns of a joint against the model of a robot file: another joint's columns, and a sign that is turned in all of them. Target
-and position agree there, so that only the model shows it; no effect is needed once the columns are right.
+"""Columns of a joint against the model of a robot file: another joint's columns, and a sign
+that is turned in all of them. Target and position agree there, so that only the model shows
+it; no effect is needed once the columns are right.
 
-Letters in shapes: T rows, J signals.
+Three torques of a joint must agree: the recorded effort, that of its stated drive at target
+and position, and that which links and rotor ask. Columns of two joints are exchanged if two
+of the three agree far better with the columns of both exchanged; a joint is turned if its
+effort is that of the links with its sign reversed.
+
+Letters in shapes: T rows, R of every few rows, J signals.
 """
 
+import copy
 import dataclasses
 import itertools
 import math
@@ -14,210 +21,173 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.checks.effort_time import law_left
 from taccorl.alignment.checks.registry import find
-from taccorl.alignment.checks.robot import beyond_limits
-from taccorl.alignment.checks.trial import noise_of_rows, write
+from taccorl.alignment.checks.trial import write
 from taccorl.alignment.checks.wiring import velocity_gain
-from taccorl.alignment.controller.joint_model import JointModel
-from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
-from taccorl.alignment.machines.robot_joint import under_gravity
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.data.finding import Finding
 
-FAR, NEAR = 10.0, 3.0
-"""A replay is far off above the first multiple of the noise, and right below the second one. Choices."""
-INEXACT = 0.01  # Share of the tracking error that counts as noise: equations and times are no better. A choice.
+OFF = 0.05
+"""Torques of a joint disagree above this share of their RMS. A choice."""
 BETTER = 1 / 3
-"""Columns are exchanged, beside another fault that ``NEAR`` would not forgive, if the exchange leaves less than this share of the
-error, by the geometric mean of both joints. A choice."""
-LAW_OFF, LAW_NEAR = 0.1, 0.45
-"""Shares of the RMS effort. If the law of its own joint leaves more of an effort than the first, laws of other joints are fitted
-to it; one of them is accepted if it leaves at most the second. Choices."""
+"""Columns are exchanged if the exchange leaves less than this share of the disagreement, by
+the geometric mean of both joints, and less at each. A choice."""
 TURNED = 0.5
-"""What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
+"""What a turned sign leaves of the effort is at most this share of what the sign as it is
+leaves. A choice."""
 SURELY = 0.2
-"""A reversed sign is an error if reversing it leaves less than this share of the residual, else a warning: another centre of mass
-can look like it. A choice."""
+"""A reversed sign is an error if reversing it leaves less than this share of the residual,
+else a warning: another centre of mass can look like it. A choice."""
 AS_GOOD = 1.2
-"""Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
-SMOOTH_S = (
-    0.1  # Window of the quadratics whose slopes are velocity and acceleration [s]
-)
-MOST_ROWS = 400  # Rows of one recording at which the model is evaluated
-FREE = (
-    "a weight or spring"  # key of what is left beside the free numbers of such effects
-)
-COLUMNS = ("measured", "target", "velocity", "effort")  # Arrays (T, J) of a measurement
-_Moved = Mapping[
-    str, Sequence[Measurement]
-]  # Joint → recordings that move it, with all signals
+"""Turning a sign fits no number: it may leave this many times what a fit with a free weight
+and spring leaves. A choice."""
+SMOOTH_S = 0.1
+"""Window of the quadratics whose slopes are velocity and acceleration [s]."""
+MOST_ROWS = 200
+"""Rows of one recording at which the model is evaluated."""
+COLUMNS = ("measured", "target", "velocity", "effort")
+"""Arrays (T, J) of a measurement that hold a joint's columns."""
+EXCHANGES = (COLUMNS, COLUMNS[:-1], ("effort",))
+"""Columns that may be exchanged together."""
+PAIRS = (("effort", "drive"), ("effort", "links"), ("drive", "links"))
+"""Torques that are compared."""
+_Moved = Mapping[str, Sequence[Measurement]]
+"""Joint → recordings that move it, with all signals."""
+
+
+class _Torques(NamedTuple):
+    """Torques [N·m, N] and motion of all signals in one recording, (R, J) each; NaN where a
+    torque is not known."""
+
+    effort: np.ndarray
+    drive: np.ndarray
+    links: np.ndarray
+    position: np.ndarray
+    speed: np.ndarray
+
+
+class _Exchange(NamedTuple):
+    """Two joints whose torques agree far better with columns exchanged."""
+
+    pair: tuple[str, str]
+    recordings: Sequence[Measurement]
+    columns: Sequence[str]
+    torques: tuple[str, str]
+    """Those that agree."""
+    ratio: float
+    """Their disagreement with columns exchanged over that without; mean of both joints."""
 
 
 def check_columns(
     robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]
 ) -> None:
     """Add errors to ``found`` (recording → findings)."""
-    for pair in itertools.combinations(recordings, 2):
-        if robot.units[pair[0]] == robot.units[pair[1]]:
-            _exchanged(robot, pair, recordings, found)
-    _turned(robot, recordings, found)
+    every = list({m.name: m for own in recordings.values() for m in own}.values())
+    as_is = {
+        m.name: torques for m in every if (torques := _torques(robot, m)) is not None
+    }
+    known = [m for m in every if m.name in as_is]
+    off = [
+        name
+        for name in recordings
+        if (_disagreements(known, list(as_is.values()), name) > OFF).any()
+    ]
+    pairs = [
+        one
+        for pair in itertools.combinations(off, 2)
+        if robot.units[pair[0]] == robot.units[pair[1]]
+        and (one := _exchanged(robot, pair, recordings, known, as_is, found))
+    ]
+    named: set[str] = set()
+    for one in sorted(pairs, key=lambda one: one.ratio):
+        if not named & {*one.pair}:
+            named |= {*one.pair}
+            _tell(one, found)
+    if off:
+        _turned(robot, recordings, known, as_is, found)
 
 
 def _exchanged(
     robot: Robot,
     pair: tuple[str, str],
     recordings: _Moved,
-    found: dict[str, list[Finding]],
-) -> None:
-    """With the columns of the two exchanged the replay, far off as it is, is right in all that decide it, or far better at both
-    joints; or the efforts of both follow the law of the other. Of one joint that moved alone both must hold."""
-    other, rows = dict(zip(pair, reversed(pair), strict=True)), []
-    for name in pair:
-        for m in recordings[name]:
-            laws = {
-                kind
-                for n in pair
-                for kind in (m.target_kind(n), robot.config.joints[n].target_kind)
-            }
-            if (
-                laws != {"position"}
-                or not np.isfinite(m.measured[:, [m.column(n) for n in pair]])
-                .any(axis=0)
-                .all()
-            ):
-                return
-            swapped = _swapped(m, *pair)
-            limits = {n: robot.rigid.joints[n].limits for n in pair}
-            if any(
-                beyond_limits(swapped, n, limits[n], "") for n in pair
-            ):  # it is their unit that is wrong
-                return
-            old, new = (
-                _replay_error(robot, m, name),
-                _replay_error(robot, swapped, other[name]),
-            )
-            rows.append((name, m.name, _noise(m, name), old, new))
-    deciding = [
-        row for row in rows if row[3] >= FAR * row[2]
-    ]  # a slow motion may not: any joint follows its target
-    near = [
-        max(0.0 if old >= FAR * noise else old, NEAR * noise) >= new
-        for _, _, noise, old, new in rows
-    ]
-    right = bool(deciding) and all(
-        any(row[0] == n for row in deciding) or not recordings[n] for n in pair
-    )
-    right = right and all(near)
-    # Also a motion that only the exchange leaves far off decides: against it.
-    far = [
-        (row[0], *np.maximum(row[3:], row[2]))
-        for row in rows
-        if max(row[3:]) >= FAR * row[2]
-    ]
-    logs = [[math.log(new / old) for name, old, new in far if name == n] for n in pair]
-    replay = np.array(
-        [math.exp(sum(own) / len(own)) if own else math.nan for own in logs]
-    )
-    by_law, law, has_effort = _law_ratios(robot, pair, recordings)
-    sides = [k for k, n in enumerate(pair) if recordings[n]]
-    both = (
-        (replay, by_law)
-        if len(sides) == 2
-        else [np.array([replay[k], by_law[k]]) for k in sides]
-    )
-    if not (right or any(map(_far_better, both))):
-        return
-    told = deciding if right or _far_better(replay) else rows
-    old, new = np.sqrt(np.mean([np.square(row[3:]) for row in told], axis=0))
+    known: Sequence[Measurement],
+    as_is: Mapping[str, _Torques],
+    found: Mapping[str, Sequence[Finding]],
+) -> _Exchange | None:
+    """None: their columns are not exchanged, or these recordings do not show it."""
+    names = {m.name for joint in pair for m in recordings[joint]}
+    if any(  # it is their unit that is wrong
+        f.check == "beyond_limits" and f.feature in pair
+        for name in names
+        for f in found[name]
+    ):
+        return None
+    own = [m for m in known if m.name in names]
+    old = np.array([_disagreements(own, [as_is[m.name] for m in own], n) for n in pair])
+    best: _Exchange | None = None
+    for columns in EXCHANGES:
+        swapped = [_swapped(m, *pair, columns) for m in own]
+        torques = [_torques(robot, m) for m in swapped]
+        new = np.array([_disagreements(swapped, torques, n) for n in pair])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = new / old
+        for compared, (first, second) in zip(PAIRS, ratios.T, strict=True):
+            mean = math.sqrt(first * second)
+            least = BETTER if best is None else best.ratio
+            if mean < least and max(first, second) < 1.0:
+                best = _Exchange(pair, own, columns, compared, mean)
+    return best
+
+
+def _tell(one: _Exchange, found: dict[str, list[Finding]]) -> None:
+    """Add an error to ``found`` of each recording."""
+    which = "efforts" if len(one.columns) == 1 else "columns"
     text = (
-        f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {old:.2g} "
-        f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {new:.2g}"
-        f"{', as no effect leaves it' if right else ''}{law}. "
-        f"{_exchange([m for n in pair for m in recordings[n]], pair, has_effort)}, or exchange their names in the model"
-        f"{', or kp and kd where those are' if law else ''}{'' if right else '; another cause is there besides'}"
+        f"{' and '.join(one.pair)}: their {which} are exchanged: the torques of "
+        f"{' and '.join(one.torques)} agree {1 / max(one.ratio, 1e-3):.2g} times as well with "
+        f"the {which} of the two exchanged. {_exchange(one.recordings, one.pair, one.columns)}"
+        ", or exchange their names in the model"
     )
-    topic = " ↔ ".join(sorted(pair))
-    for name, feature in itertools.product(sorted({row[1] for row in told}), pair):
+    topic = " ↔ ".join(sorted(one.pair))
+    names = sorted(m.name for m in one.recordings)
+    for name, feature in itertools.product(names, one.pair):
         found[name].append(
             find("swapped_joints", feature, text, severity="error", topic=topic)
         )
 
 
 def _exchange(
-    moved: Sequence[Measurement], pair: tuple[str, str], has_effort: bool
+    moved: Sequence[Measurement], pair: tuple[str, str], columns: Sequence[str]
 ) -> str:
-    """Text: the columns file that exchanges the two, with velocities if they follow their own positions, and efforts if asked."""
+    """Text: the columns file that exchanges the ``columns`` of the two, velocities if they
+    follow their own positions."""
     j, k = at = [moved[0].column(name) for name in pair]
-    own, other = (
-        sum(velocity_gain(m, *p) is not None for m in moved for p in ps)
-        for ps in (((j, j), (k, k)), ((j, k), (k, j)))
+    own = sum(velocity_gain(m, i, i) is not None for m in moved for i in (j, k))
+    other = sum(
+        velocity_gain(m, *p) is not None for m in moved for p in ((j, k), (k, j))
     )
-    extra = {"qd": ("velocity", own >= other), "tau": ("effort", has_effort)}
-    keys = [
-        n
-        for n, (of, use) in extra.items()
-        if use and all(np.isfinite(getattr(m, of)[:, at]).all() for m in moved)
-    ]
-    sides = [
-        (a, b, key) for key in ("q", "q_target", *keys) for a, b in (pair, pair[::-1])
-    ]
-    changes = ", ".join(f"{a}.{key}: {{column: {b}.{key}}}" for a, b, key in sides)
-    file = f"Write `changes: {{{changes}}}` into a columns file; in one with signals: exchange the same columns there"
-    return write(
-        moved[0], file, "Exchange the channels of the two in the recording spec"
-    )
-
-
-def _far_better(ratios: np.ndarray) -> bool:
-    """Whether errors with the columns exchanged over those as they are leave no doubt: (2,) of both joints, or of replay and law
-    of the only one that moved. False where one is unknown, NaN."""
-    return bool(np.sqrt(np.prod(ratios)) < BETTER and ratios.max() < 1.0)
-
-
-def _law_ratios(
-    robot: Robot, pair: tuple[str, str], recordings: _Moved
-) -> tuple[np.ndarray, str, bool]:
-    """(2,) what the law of the other joint leaves of each one's efforts over what its own leaves, whatever friction or load there
-    is; NaN where they are not known, or near their own law. A text on both, and whether efforts are exchanged, too."""
-    joints = robot.config.joints
-    gains = [(k, p) for p in pair for k in joints[p].gain_names]
+    keys = {"measured": "q", "target": "q_target", "velocity": "qd", "effort": "tau"}
+    if own < other:
+        del keys["velocity"]
     used = [
-        [m for m in recordings[n] if all(p in getattr(m, k) for k, p in gains)]
-        for n in pair
+        key
+        for column, key in keys.items()
+        if column in columns
+        and all(np.isfinite(getattr(m, column)[:, at]).all() for m in moved)
     ]
-
-    def shares(names: tuple[str, ...], columns: Sequence[str]) -> np.ndarray:
-        """(2,) shares of the efforts that the laws of ``names`` leave; NaN if they are not known."""
-        found = []
-        for name, own in zip(names, used, strict=True):
-            left = [
-                law_left(joints[name], _swapped(m, *pair, columns), name) for m in own
-            ]
-            error, effort = np.square([x for x in left if x] or [(math.nan, 1.0)]).sum(
-                axis=0
-            )
-            found.append(math.sqrt(error / max(effort, 1e-300)))
-        return np.array(found)
-
-    as_is = shares(pair, ())
-    as_is[as_is <= LAW_OFF] = math.nan
-    if np.isnan(as_is).all():
-        return as_is, "", True
-    both = [shares(pair[::-1], columns) for columns in (COLUMNS, COLUMNS[:-1])]
-    has_effort = bool(np.nanmax(both[0]) <= np.nanmax(both[1]))
-    new = both[not has_effort]
-    new[new > LAW_NEAR] = math.nan
-    if np.isnan(new / as_is).all():
-        return as_is * math.nan, "", has_effort
-    words = f"; their laws leave {np.nanmean(as_is):.0%} of their efforts, those of each other {np.nanmean(new):.0%}"
-    return new / as_is, words, has_effort
+    sides = [(a, b, key) for key in used for a, b in (pair, pair[::-1])]
+    changes = ", ".join(f"{a}.{key}: {{column: {b}.{key}}}" for a, b, key in sides)
+    file = (
+        f"Write `changes: {{{changes}}}` into a columns file; in one with signals: exchange "
+        "the same columns there"
+    )
+    spec = "Exchange the channels of the two in the recording spec"
+    return write(moved[0], file, spec)
 
 
-def _swapped(
-    m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS
-) -> Measurement:
+def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str]) -> Measurement:
     order = list(range(len(m.signals)))
     j, k = m.column(a), m.column(b)
     order[j], order[k] = k, j
@@ -226,178 +196,199 @@ def _swapped(
     )
 
 
-def _replay_error(robot: Robot, m: Measurement, name: str) -> float:
-    """RMS [rad, m]."""
-    model = JointModel(robot, name)
-    left = (
-        m.measured[:, m.column(name)]
-        - model.simulate(motion_of(m, name, model.joint), model.gains).reported
-    )
-    return float(np.sqrt(np.nanmean(left**2)))
+def _disagreements(
+    recordings: Sequence[Measurement], torques: Sequence[_Torques | None], name: str
+) -> np.ndarray:
+    """(3,) RMS of the difference of each of ``PAIRS`` of joint ``name``, beside friction and a
+    constant, over the RMS of the torques; NaN where a torque is not known."""
+    squares = np.zeros((len(PAIRS), 2))
+    for m, own in zip(recordings, torques, strict=True):
+        if own is None:
+            return np.full(len(PAIRS), np.nan)
+        j = m.column(name)
+        others = _friction(own, j)
+        for k, (one, other) in enumerate(PAIRS):
+            first, second = getattr(own, one)[:, j], getattr(own, other)[:, j]
+            if not np.isfinite([first, second]).all():
+                squares[k] += np.nan
+                continue
+            left = _beside(first - second, others)
+            size = _beside(first, others[:, 2:])
+            squares[k] += [left @ left, size @ size]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.sqrt(squares[:, 0] / squares[:, 1])
 
 
-def _noise(m: Measurement, name: str) -> float:
-    j = m.column(name)
-    q = m.measured[np.isfinite(m.measured[:, j]), j]
-    return max(
-        noise_of_rows(q),
-        float(m.quantum[j]),
-        INEXACT * float(np.nanstd(m.measured[:, j] - m.target[:, j])),
-    )
+def _friction(own: _Torques, j: int) -> np.ndarray:
+    """(R, 3) speed of signal ``j``, its sign, and 1."""
+    speed = own.speed[:, j]
+    return np.column_stack([speed, np.sign(speed), np.ones_like(speed)])
 
 
-def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
-    """Report a joint whose efforts are explained far better if its sign is reversed. Efforts are fitted by the rigid-body torque
-    times a factor, damping, dry friction and a constant: as recorded, with one joint reversed, with a free weight and spring."""
-    parts: dict[str, list[_Torques]] = {name: [] for name in recordings}
-    for m in {m.name: m for own in recordings.values() for m in own}.values():
-        for name, part in _torques(robot, m).items():
-            if any(m.name == one.name for one in recordings[name]):
-                parts[name].append(part)
-    left: dict[str, dict[str, float]] = {}
-    for name, own in parts.items():
-        if own:
-            keys = [k for k in own[0].asked if all(k in p.asked for p in own)]
-            effort, others = (
-                np.concatenate([p.effort for p in own]),
-                np.concatenate([p.others for p in own]),
-            )
-            asked = {k: np.concatenate([p.asked[k] for p in own]) for k in keys}
-            left[name] = {
-                k: _left(effort, torque, others) for k, torque in asked.items()
-            }
-            free = np.column_stack([others, np.concatenate([p.place for p in own])])
-            left[name][FREE] = _left(effort, asked[""], free)
-
-    def explains(k: str) -> bool:
-        with_it = [
-            (errors[k], errors[""], errors[FREE])
-            for errors in left.values()
-            if k in errors
-        ]
-        clear = any(
-            other < TURNED * as_it_is and other < AS_GOOD * free
-            for other, as_it_is, free in with_it
-        )
-        return clear and all(
-            other < AS_GOOD * as_it_is for other, as_it_is, _ in with_it
-        )
-
-    better = [k for k in robot.config.joints if explains(k)]
-    total = {
-        k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e)
-        for k in better
-    }
-    k = min(total, key=lambda k: total[k], default="")
-    if k:
-        turned = [
-            k,
-            *(
-                other
-                for other in total
-                if other != k and total[other] < AS_GOOD * total[k]
-            ),
-        ]
-        name = min(
-            (n for n in left if k in left[n]),
-            key=lambda n: left[n][k] / max(left[n][""], 1e-300),
-        )
-        errors, unit = left[name], UNITS[robot.units[name]][1]
-        sure = errors[k] < SURELY * errors[""]
-        text = (
-            f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model leaves {errors['']:.3g} {unit} "
-            f"(RMS) of the effort of {name}, {errors[k]:.3g} with it turned, and {errors[FREE]:.3g} with any weight or spring "
-            f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and {k}.qd) in a columns file; if the "
-            "robot hangs or leans, state its `gravity` first"
-            f"{'' if sure else '. Another centre of mass of a link or another payload may look like this'}"
-            f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
-        )
-        severity = "error" if sure else "warning"
-        for m in recordings[name]:
-            found[m.name].append(
-                find("wrong_sign", name, text, severity=severity, topic=f"sign of {k}")
-            )
+def _beside(x: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(R,) ``x`` without what the columns ``others`` (R, N) explain."""
+    return x - others @ np.linalg.lstsq(others, x, rcond=None)[0]
 
 
-def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:
-    """RMS of ``effort`` (T,) without a positive multiple of ``torque`` (T,) and the columns of ``others`` (T, N)."""
-    columns = np.column_stack([torque, others])
-    solution = np.linalg.lstsq(columns, effort, rcond=None)[0]
-    if solution[0] <= 0.0:
-        columns = others
-        solution = np.linalg.lstsq(columns, effort, rcond=None)[0]
-    return float(np.sqrt(np.mean((effort - columns @ solution) ** 2)))
-
-
-class _Torques(NamedTuple):
-    """One joint in one recording, at every few rows."""
-
-    effort: np.ndarray  # (T,)
-    asked: dict[
-        str, np.ndarray
-    ]  # Turned joint, "" for none → (T,) torque that the rigid model asks of this one
-    others: np.ndarray  # (T, 3) speed, its sign, 1
-    place: np.ndarray  # (T, 3) position, its sine and cosine
-
-
-def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
-    """Joint with measured effort → its torques; empty if positions were not measured throughout."""
+def _torques(robot: Robot, m: Measurement) -> _Torques | None:
+    """None if positions were not measured throughout."""
     window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     known = [bool(np.isfinite(column).any()) for column in m.measured.T]
     q = np.where(known, m.measured, m.target)
-    names = [
-        n for n in robot.config.joints if np.isfinite(m.effort[:, m.column(n)]).all()
-    ]
-    if m.num_rows < 4 * window or not np.isfinite(q).all() or not names:
-        return {}
+    if m.num_rows < 4 * window or not np.isfinite(q).all():
+        return None
     rows = slice(window, -window, max(1, m.num_rows // MOST_ROWS))
-    state = np.array(
-        [
-            savgol_filter(q, window, 2, deriv=d, delta=m.period_s, axis=0)[rows]
-            for d in range(3)
-        ]
-    )
-    turned = [k for k in robot.config.joints if known[m.column(k)]]
-    signs = {
-        k: np.array([1.0 - 2.0 * (signal == k) for signal in m.signals])
-        for k in ("", *turned)
-    }
-    asked = {k: sign * _rigid(robot, m, state * sign) for k, sign in signs.items()}
-    found = {}
-    for name in names:
+
+    def smooth(values: np.ndarray, slope: int = 0) -> np.ndarray:
+        own = {"deriv": slope, "delta": m.period_s, "axis": 0, "mode": "nearest"}
+        return savgol_filter(values, window, 2, **own)[rows]
+
+    state = np.array([smooth(q, slope) for slope in range(3)])
+    links, weight = _links(robot, m, state)
+    drive, target = np.full_like(links, np.nan), smooth(m.target)
+    for name, law in robot.config.joints.items():
         j = m.column(name)
-        at, speed = state[0, :, j], state[1, :, j]
-        others = np.column_stack([speed, np.sign(speed), np.ones_like(speed)])
-        effort = savgol_filter(m.effort[:, j], window, 2)[rows]
-        place = np.column_stack([at, np.sin(at), np.cos(at)])
-        found[name] = _Torques(
-            effort, {k: torques[:, j] for k, torques in asked.items()}, others, place
-        )
-    return found
+        usual = law.law in ("impedance", "cascade") and law.target_kind == "position"
+        if not usual or m.target_kind(name) != "position" or not known[j]:
+            continue
+        kp, kd, torque_ff = law.loop_gains
+        kp_scale, kd_scale = law.gain_scales(name, m)
+        error = target[:, j] - state[0, :, j]
+        drive[:, j] = kp * kp_scale * error - kd * kd_scale * state[1, :, j]
+        drive[:, j] += torque_ff + robot.config.gravity_compensation * weight[:, j]
+        if law.effort_limit is not None:
+            drive[:, j] = np.clip(drive[:, j], -law.effort_limit, law.effort_limit)
+    return _Torques(smooth(m.effort), drive, links, state[0], state[1])
 
 
-def _rigid(robot: Robot, m: Measurement, state: np.ndarray) -> np.ndarray:
-    """(T, J) torques [N·m, N] that positions, speeds and accelerations, ``state`` (3, T, J), ask: links and rotors."""
+def _links(
+    robot: Robot, m: Measurement, state: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two (R, J) torques [N·m, N]: that which positions, speeds and accelerations, ``state``
+    (3, R, J), ask of links and rotors, and the weight that a controller knows."""
     rotors = [
         robot.config.joints[n].armature if n in robot.config.joints else 0.0
         for n in m.signals
     ]
-    asked = np.array(rotors) * state[2]
-    with under_gravity(
-        robot.rigid.model, robot.rigid.model.opt.gravity + robot.more_gravity
-    ) as model:
-        data, joints = (
-            mujoco.MjData(model),
-            [model.joint(signal) for signal in m.signals],
-        )
-        q_at, v_at = (
-            [int(getattr(joint, key)[0]) for joint in joints]
-            for key in ("qposadr", "dofadr")
-        )
-        for t in range(len(asked)):
-            data.qpos[q_at], data.qvel[v_at], data.qacc[v_at] = state[:, t]
-            for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
-                step(model, data)
+    asked, weight = np.array(rotors) * state[2], np.zeros(state.shape[1:])
+    model = copy.copy(robot.rigid.model)
+    known = model.opt.gravity.copy()
+    data = mujoco.MjData(model)
+    joints = [model.joint(signal) for signal in m.signals]
+    q_at = [int(joint.qposadr[0]) for joint in joints]
+    v_at = [int(joint.dofadr[0]) for joint in joints]
+    for t in range(len(asked)):
+        data.qpos[q_at] = state[0, t]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for torques, gravity, motion in (
+            (weight, known, np.zeros_like(state[1:, t])),
+            (asked, known + robot.more_gravity, state[1:, t]),
+        ):
+            model.opt.gravity[:] = gravity
+            data.qvel[v_at], data.qacc[v_at] = motion
+            mujoco.mj_comVel(model, data)
             mujoco.mj_rne(model, data, 1, data.qfrc_inverse)
-            asked[t] += data.qfrc_inverse[v_at]
-    return asked
+            torques[t] += data.qfrc_inverse[v_at]
+    return asked, weight
+
+
+def _turned(
+    robot: Robot,
+    recordings: _Moved,
+    known: Sequence[Measurement],
+    as_is: Mapping[str, _Torques],
+    found: dict[str, list[Finding]],
+) -> None:
+    """Report a joint whose efforts are explained far better if its sign is reversed. Efforts
+    are fitted by the torque of the links times a factor, damping, dry friction and a constant:
+    as recorded, with one joint reversed, with a free weight and spring."""
+    judged = {}  # joint → recordings that move it, with its effort
+    for name, own in recordings.items():
+        names = {m.name for m in own}
+        used = [m for m in known if m.name in names]
+        used = [m for m in used if m.has_effort()[m.column(name)]]
+        if used:
+            judged[name] = used
+    if not judged:
+        return
+    plain = {n: _left(judged[n], as_is, n) for n in judged}
+    free = {n: _left(judged[n], as_is, n, free=True) for n in judged}
+    errors: dict[str, dict[str, float]] = {}  # turned joint → joint → what it leaves
+    for k in robot.config.joints:
+        measured = [m for m in known if np.isfinite(m.measured[:, m.column(k)]).any()]
+        sign = {m.name: np.where(np.array(m.signals) == k, -1.0, 1.0) for m in measured}
+        torques = {
+            m.name: turned
+            for m in measured
+            if (turned := _torques(robot, _with_sign(m, sign[m.name]))) is not None
+        }
+        left = {
+            n: _left(own, torques, n)
+            for n, own in judged.items()
+            if all(m.name in torques for m in own)
+        }
+        clear = any(
+            e < TURNED * plain[n] and e < AS_GOOD * free[n] for n, e in left.items()
+        )
+        if clear and all(e < AS_GOOD * plain[n] for n, e in left.items()):
+            errors[k] = left
+    total = {
+        k: sum(e / max(plain[n], 1e-300) for n, e in left.items())
+        for k, left in errors.items()
+    }
+    k = min(total, key=lambda k: total[k], default="")
+    if not k:
+        return
+    alike = [o for o in total if o != k and total[o] < AS_GOOD * total[k]]
+    turned = [k, *alike]
+    name = min(errors[k], key=lambda n: errors[k][n] / max(plain[n], 1e-300))
+    unit = UNITS[robot.units[name]][1]
+    sure = errors[k][name] < SURELY * plain[name]
+    text = (
+        f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model "
+        f"leaves {plain[name]:.3g} {unit} (RMS) of the effort of {name}, "
+        f"{errors[k][name]:.3g} with it turned, and {free[name]:.3g} with any weight or spring "
+        f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and "
+        f"{k}.qd) in a columns file; if the robot hangs or leans, state its `gravity` first"
+    )
+    if not sure:
+        text += (
+            ". Another centre of mass of a link or another payload may look like this"
+        )
+    if alike:
+        text += "; these recordings do not tell which of the joints it is"
+    severity = "error" if sure else "warning"
+    for m in recordings[name]:
+        found[m.name].append(
+            find("wrong_sign", name, text, severity=severity, topic=f"sign of {k}")
+        )
+
+
+def _with_sign(m: Measurement, sign: np.ndarray) -> Measurement:
+    return dataclasses.replace(m, **{name: getattr(m, name) * sign for name in COLUMNS})
+
+
+def _left(
+    recordings: Sequence[Measurement],
+    torques: Mapping[str, _Torques],
+    name: str,
+    *,
+    free: bool = False,
+) -> float:
+    """RMS of the effort of joint ``name`` without a positive multiple of the torque of its
+    links, friction and a constant; ``free``: without any weight and spring, too."""
+    effort, links, others = [], [], []
+    for m in recordings:
+        own, j = torques[m.name], m.column(name)
+        effort.append(own.effort[:, j])
+        links.append(own.links[:, j])
+        q = own.position[:, j]
+        more = [q, np.sin(q), np.cos(q)] if free else []
+        others.append(np.column_stack([_friction(own, j), *more]))
+    y, beside = np.concatenate(effort), np.concatenate(others)
+    columns = np.column_stack([np.concatenate(links), beside])
+    solution = np.linalg.lstsq(columns, y, rcond=None)[0]
+    if solution[0] <= 0.0:
+        return float(np.sqrt(np.mean(_beside(y, beside) ** 2)))
+    return float(np.sqrt(np.mean((y - columns @ solution) ** 2)))

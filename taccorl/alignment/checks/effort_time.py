@@ -22,6 +22,7 @@ from scipy.signal import lfilter, savgol_filter
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.measurements.correlation import BLOCK_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import MOVING
 from taccorl.data.finding import Finding, Severity, listed
@@ -55,7 +56,6 @@ LAGS_S, DELAYS_S = (
 )  # Lags and delays of targets that are tried
 ALIKE = 1e-3
 """Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
-BLOCK_S = 0.5  # Length of stretches that count as independent [s]
 
 
 @check("error", "effort_time", "other_gains")

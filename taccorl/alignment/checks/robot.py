@@ -63,9 +63,9 @@ def check_robot(
             for name in moved
             if name in m.signals
         }
+    lacking = [name for name in robot.units if name not in m.signals]
     found = pose_unknown(
-        [name for name in robot.units if name not in m.signals],
-        "at the model's zero pose",
+        lacking if robot.config.model else [], "at the model's zero pose"
     )
     factors: dict[str, float] = {}
     of_efforts: list[Finding] = []
@@ -75,7 +75,9 @@ def check_robot(
                 m, name, robot.rigid.joints[name].limits, robot.rigid.path.name
             )
             fit = fits[name] if name in moved else None
-            known = _factor(robot.config.joints[name], whole, name, fit)
+            known = None
+            if robot.config.model:  # else gains are fitted, or suspected
+                known = _factor(robot.config.joints[name], whole, name, fit)
             if (
                 known is not None
                 and not wrong
@@ -411,6 +413,8 @@ def _inertia_words(
     known: float,
 ) -> str:
     name = model.signal
+    if not robot.config.model:
+        return _stated_inertia_words(robot, name, motion, seen, known)
     nearest = min(
         robot.rigid.joints.values(),
         key=lambda f: abs(np.log(max(f.inertia + f.armature, 1e-9) / seen)),
@@ -430,4 +434,19 @@ def _inertia_words(
         f"effort and acceleration of {name} say {seen:.3g} {unit}, the model with its rotor {known:.3g}: {seen / known:.2g} "
         f"times.{hint}{in_degrees(seen / known, name, model.unit)} Else its effort is in another unit: write "
         f"{_line(m, name)}, or rotor_inertia and gear of {name} in {robot.path.name}"
+    )
+
+
+def _stated_inertia_words(
+    robot: Robot, name: str, motion: JointMotion, seen: float, known: float
+) -> str:
+    degrees = in_degrees(seen / known, name, robot.units[name])
+    stated = max(seen - motion.mounted_kgm2, 1e-3 * seen)
+    line = f"`inertia: {stated:.3g}`"
+    otherwise = f"Else write {line}" if degrees else f"Write {line}"
+    return (
+        f"effort and acceleration of {name} say {seen:.3g} "
+        f"{robot.joint(name).scale.unit_of('kg·m²')}, its file {known:.3g}: "
+        f"{seen / known:.2g} times.{degrees} {otherwise}, or the right unit or factor of "
+        f"q and tau in a columns file"
     )

@@ -19,6 +19,7 @@ import numpy as np
 
 from taccorl.alignment.checks.held_commands import Dropped, find_dropped
 from taccorl.alignment.checks.registry import check, find
+from taccorl.alignment.measurements.correlation import BLOCK_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import (
     BURST_POWER,
@@ -32,9 +33,6 @@ from taccorl.alignment.measurements.noise_floor import (
 from taccorl.data.finding import Finding, not_judged
 from taccorl.errors import TaccorlError
 
-BLOCK_S = (
-    0.5  # Length of a block in which the difference of two repeats is measured [s]
-)
 MOST_TIMES = 5  # Most times that a text lists
 
 

@@ -1,4 +1,4 @@
-"""Control law of a drive, the same for an axis file and for each joint of a robot file.
+"""Control law of the drive of a joint of a robot file.
 
 A controller that computes its torque elsewhere (a PD on a torque interface) is law ``impedance`` where its position target was
 logged, and law ``torque`` where the torque was. Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of
@@ -367,6 +367,7 @@ class DriveJoint(RigidJoint):
     """A joint whose drive has the law of a file."""
 
     follows_line: ClassVar[bool] = True
+    keeps_times: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -385,7 +386,7 @@ class DriveJoint(RigidJoint):
         self.command_hz = math.inf if law.law == "effort" else command_hz or 0.0
         # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
         # the output that a row shows before its own target acts. After it acts, the output is new.
-        loop_s = 1.0 / loop_hz if loop_hz else 0.0
+        loop_s = self.loop_s = 1.0 / loop_hz if loop_hz else 0.0
         self.facts = law.facts | {
             "effort_age": (-0.5 if law.effort_after_target else 0.5) * loop_s
         }

@@ -4,57 +4,47 @@ The joints are strongly over-damped, so that positions determine the time consta
 hardly K_p itself (the correlation of log K_p and log K_d is 0.9999): other errors of the model change K_p. So the ratios are
 reported with their own intervals, commanded gains are taken as true, and recorded torques are fitted, too.
 
-Letters in shapes: R residuals, P parameters.
+Letters in shapes: T rows, N sets of values, n measured entries, p fitted numbers.
 """
 
+import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.optimize import OptimizeResult, least_squares
 
 from taccorl.alignment.controller import spsa
-from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_model import JointModel, Numbers
 from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.alignment.controller.lanes import LANES
 from taccorl.alignment.controller.rigid_joint import Gains
-from taccorl.alignment.measurements.correlation import independent_rows
+from taccorl.alignment.least_squares import (
+    FINE,
+    TIGHT,
+    Estimate,
+    Free,
+    Solution,
+    Values,
+    inverse_of,
+    minimise,
+)
+from taccorl.alignment.measurements.correlation import Rows
 from taccorl.alignment.measurements.measurement import UNITS
 from taccorl.errors import TaccorlError
 
 PAPER_BOUNDS = {"kp": (10.0, 1e5), "kd": (1.0, 1e3), "torque_ff": (-8.0, 8.0)}
 """Bounds of K_p, K_d and T_ref [N·m/rad, N·m·s/rad, N·m] (App. B.1)."""
-REFERENCE = Gains(
-    500.0, 50.0, 0.0
-)  # Gains of the paper's reference simulator, at which a search starts
-_NORMAL_95 = 1.96
-_AT_BOUND = 1e-3  # so near to a bound, as a share of the value or of the span, is at it
+REFERENCE = Gains(500.0, 50.0, 0.0)
+"""Gains of the paper's reference simulator, at which a search starts."""
+_LATE = Free(name="late", unit="s", start=0.0, low=-0.5, high=0.5, scale=0.01)
 _LEAST_MOTION = 5e-3  # rad, m
 _LEAST_SECONDS = 2.0
-_MOST_ROUNDS = 4  # of weighing positions and torques against each other
-_MOST_LOG = 50.0
-_STEPS = {
-    "kp": 1e-3,
-    "kd": 1e-4,
-    "torque_ff": 1e-6,
-}  # of log K_p, log K_d / K_p and T_ref / K_p [rad], for derivatives
-_LOG_IN_PAPER = {"kp", "kd"}  # varied as logarithms
-_LATE_STEP_S, _MOST_LATE_S = 1e-4, 0.5
+_ROUNDS = 4  # of weighing positions and torques against each other
+_STEPS = 100  # of the solver
 _DIVERGED = 1e3
-
-
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """Estimate of one number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-    unit: str  # Unit of all three, such as ``N·m/rad``
-    fixed: bool = False  # True if the number was not fitted, because it was commanded and known, or not requested
-    at_bound: bool = False  # True if the fit ended at one of the bounds of the search
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,159 +112,135 @@ def identify_controller(
         raise TaccorlError(
             f"{model.signal}: free parameters {list(free)}; choose among {', '.join(PAPER_BOUNDS)}"
         )
-    search = _GainSearch(
-        motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free)
-    )
+    fits = _GainFits(motions_fit, model, [n for n in PAPER_BOUNDS if n in free])
+    remarks = []
     if spsa_rng is None:
-        x, unfinished = _by_least_squares(search)
-        spread, remarks = search.covariance(x), []
+        found = fits.best()
     else:
-        x, remarks = _by_spsa(search, spsa_rng)
-        unfinished = []
-        to_minimum = search.step_to_minimum(x)
-        spread = search.covariance(x) + np.outer(to_minimum, to_minimum)
-    estimates, ridge = _estimates(search, x, spread)
-    later = search.solve(
-        np.append(x, 1e-6), most=30
-    ).x  # with a delay of the rows as a further unknown
-    late, error = float(later[-1]), math.sqrt(search.covariance(later)[-1, -1])
+        found, remarks = _by_spsa(fits, spsa_rng)
+    estimates, ridge = _estimates(fits, found)
+    late = fits.fit(found.values, late=True)
+    low, high = late.intervals()["late"]
     estimates["late"] = Estimate(
-        value=late,
-        low=late - _NORMAL_95 * error,
-        high=late + _NORMAL_95 * error,
-        unit="s",
+        value=late.values["late"], low=low, high=high, unit="s"
     )
-    at_bound = [name for name in search.free if estimates[name].at_bound]
-    if at_bound:
-        unfinished = [
-            *unfinished,
-            f"{' and '.join(at_bound)} ended at a bound of the search",
-        ]
+    unfinished = []
+    if found.trouble:
+        unfinished.append(f"{_STEPS} steps of the solver were not enough")
+    if at_bound := [name for name in fits.free if estimates[name].at_bound]:
+        unfinished.append(f"{' and '.join(at_bound)} ended at a bound of the search")
+    gains = fits.gains(found.values)
     return ControllerFit(
-        gains=search.gains(x),
+        gains=gains,
         estimates=estimates,
         ridge=ridge,
         errors=(
-            *_errors(search, motions_fit, "fit", x),
-            *_errors(search, validation, "validation", x),
+            *(fits.error(motion, "fit", gains) for motion in motions_fit),
+            *(fits.error(motion, "validation", gains) for motion in validation),
         ),
         converged=not unfinished,
         remarks=(
             *(f"not converged, because {why}" for why in unfinished),
             *remarks,
-            *_remarks(search, estimates, ridge),
+            *_remarks(fits.motions, estimates, ridge),
         ),
     )
 
 
-def _by_least_squares(search: "_GainSearch") -> tuple[np.ndarray, list[str]]:
-    """The best x, and why it is not to be trusted."""
-    starts = (search.at(gains) for gains in (REFERENCE, search.model.gains))
-    found = min(map(search.solve, starts), key=lambda done: done.cost)
-    if all(np.isfinite(motion.effort).any() for motion in search.motions):
-        for _ in range(_MOST_ROUNDS):
-            search.weigh(found.x)
-            found = search.solve(found.x)
-    return found.x, [] if found.status > 0 else [
-        f"{found.nfev} steps of the solver were not enough"
-    ]
-
-
-def _by_spsa(
-    search: "_GainSearch", rng: np.random.Generator
-) -> tuple[np.ndarray, list[str]]:
-    """The best x, and remarks. The paper's search is over η = log K_p, log K_d, T_ref, of
-    which only free ones are varied."""
+def _by_spsa(fits: "_GainFits", rng: np.random.Generator) -> tuple[Solution, list[str]]:
+    """The point at which SPSA ends, and remarks. The paper's search is over
+    η = log K_p, log K_d, T_ref, of which only free ones are varied."""
+    searched = [_bounded(name) for name in fits.free]
 
     def gains(eta: np.ndarray) -> Gains:
-        found = dict(zip(search.free, eta, strict=True))
-        for name in _LOG_IN_PAPER & found.keys():
-            found[name] = math.exp(found[name])
-        return search.given._replace(**found)
+        found = {g.name: g.value(x) for g, x in zip(searched, eta, strict=True)}
+        return fits.given._replace(**found)
 
     def loss(eta: np.ndarray) -> float:
-        positions = (search.simulate(m, gains(eta))[0] for m in search.motions)
-        measured = (m.measured for m in search.motions)
-        return sum(map(spsa.paper_loss, positions, measured))
+        now = [gains(eta)]
+        return sum(
+            spsa.paper_loss(fits.responses(m, now)[0, 0], m.measured)
+            for m in fits.motions
+        )
 
-    values = [(getattr(search.given, n), *PAPER_BOUNDS[n]) for n in search.free]
-    eta = [
-        np.log(own) if name in _LOG_IN_PAPER else np.array(own)
-        for name, own in zip(search.free, values, strict=True)
-    ]
-    start, low, high = np.transpose(eta)
-    found = spsa.minimise(loss, start, low, high, rng)
+    start = np.array([g.coordinate(getattr(fits.given, g.name)) for g in searched])
+    low = np.array([g.coordinate(g.low) for g in searched])
+    high = np.array([g.coordinate(g.high) for g in searched])
+    best = spsa.minimise(loss, start, low, high, rng)
     remarks = [
-        f"SPSA: loss (eq. 9) {found.start_loss:.4g} → {found.loss:.4g} rad in "
-        f"{found.iterations} iterations. It ends near the minimum, not at it: intervals "
+        f"SPSA: loss (eq. 9) {best.start_loss:.4g} → {best.loss:.4g} rad in "
+        f"{best.iterations} iterations. It ends near the minimum, not at it: intervals "
         "contain the distance as well as the noise"
     ]
-    if not found.out_of_patience:
+    if not best.out_of_patience:
         remarks.append("SPSA was cut off while it still improved, if slowly")
-    return search.at(gains(found.x)), remarks
+    values = fits.values(gains(best.x))
+    fits.weigh(values)
+    ended = fits.fit(values, most=1)
+    squares = ended.jacobian.T @ ended.jacobian
+    distance = inverse_of(squares) @ (ended.jacobian.T @ ended.residuals)
+    # Noise is what is left at the minimum, to first order: the distance is no noise.
+    at_minimum = ended.residuals - ended.jacobian @ distance
+    found = dataclasses.replace(ended, residuals=at_minimum, moved=distance, trouble="")
+    return found, remarks
 
 
-def _estimates(
-    search: "_GainSearch", x: np.ndarray, spread: np.ndarray
-) -> tuple[dict[str, Estimate], float]:
-    """Intervals of the gains and of their ratios to K_p, and the correlation of log K_p and log K_d.
+def _estimates(fits: "_GainFits", found: Solution) -> tuple[dict[str, Estimate], float]:
+    """Intervals of the gains and of their ratios to K_p, and the correlation of log K_p
+    and log K_d.
 
-    Each number's (or its logarithm's) derivative by x, with x = log K_p, log K_d / K_p, T_ref / K_p: to first order its variance
-    is dᵀ C d."""
-    gains = search.gains(x)
-    unit = dict(zip(search.free, np.eye(len(x)), strict=True))
-    none = np.zeros(len(x))
+    Each number's (or its logarithm's) derivative by the coordinates of log K_p,
+    log (K_d / K_p), T_ref / K_p: to first order its variance is dᵀ C d."""
+    gains, spread = fits.gains(found.values), found.covariance()
+    unit = {
+        f.name: own if f.log else f.scale * own
+        for f, own in zip(found.frees, np.eye(len(found.frees)), strict=True)
+    }
+    none = np.zeros(len(found.frees))
     kp = unit.get("kp", none)
-    lag = unit.get("kd", -kp)
+    lag = unit.get("lag", -kp)
     kd = kp + lag
-    offset = unit.get("torque_ff", -gains.torque_ff / gains.kp * kp)
+    offset = unit.get("offset", -gains.torque_ff / gains.kp * kp)
     torque_ff = gains.torque_ff * kp + gains.kp * offset
-    velocity, effort = UNITS[search.model.unit]
+    velocity, effort = UNITS[fits.model.unit]
     numbers = {
-        "kp": (gains.kp, kp, True, f"{effort}/{search.model.unit}"),
+        "kp": (gains.kp, kp, True, f"{effort}/{fits.model.unit}"),
         "kd": (gains.kd, kd, True, f"{effort}/({velocity})"),
         "torque_ff": (gains.torque_ff, torque_ff, False, effort),
         "lag": (gains.kd / gains.kp, lag, True, "s"),
-        "offset": (gains.torque_ff / gains.kp, offset, False, search.model.unit),
+        "offset": (gains.torque_ff / gains.kp, offset, False, fits.model.unit),
     }
     estimates = {}
     for name, (value, by_x, is_log, text) in numbers.items():
-        reach = _NORMAL_95 * math.sqrt(max(float(by_x @ spread @ by_x), 0.0))
-        factor = math.exp(min(reach, _MOST_LOG))
-        low, high = (
-            (value / factor, value * factor)
-            if is_log
-            else (value - reach, value + reach)
-        )
+        reach = found.quantile * math.sqrt(max(float(by_x @ spread @ by_x), 0.0))
+        factor = math.exp(min(reach, 50.0))
         estimates[name] = Estimate(
             value=value,
-            low=low,
-            high=high,
+            low=value / factor if is_log else value - reach,
+            high=value * factor if is_log else value + reach,
             unit=text,
-            fixed=name in PAPER_BOUNDS and name not in unit,
-            at_bound=name in unit
-            and _is_at_bound(value, *PAPER_BOUNDS[name], is_log=is_log),
+            fixed=name in PAPER_BOUNDS and name not in fits.free,
+            at_bound=name in fits.free and _bounded(name).is_at_end(value),
         )
-    if "kp" not in unit or "kd" not in unit:
+    if not {"kp", "kd"} <= set(fits.free):
         return estimates, math.nan
-    return estimates, float(
-        kp @ spread @ kd / np.sqrt((kp @ spread @ kp) * (kd @ spread @ kd))
-    )
+    variances = (kp @ spread @ kp) * (kd @ spread @ kd)
+    return estimates, float(kp @ spread @ kd / np.sqrt(variances))
 
 
-def _is_at_bound(value: float, low: float, high: float, *, is_log: bool) -> bool:
-    if is_log:
-        return min(value / low, high / value) < 1.0 + _AT_BOUND
-    return min(value - low, high - value) < _AT_BOUND * (high - low)
+def _bounded(name: str) -> Free:
+    """A gain with the paper's bounds."""
+    low, high = PAPER_BOUNDS[name]
+    return Free(name=name, unit="1", start=low, low=low, high=high, log=low > 0.0)
 
 
 def _remarks(
-    search: "_GainSearch", estimates: dict[str, Estimate], ridge: float
+    motions: Sequence[JointMotion], estimates: dict[str, Estimate], ridge: float
 ) -> list[str]:
     remarks = []
     kp, lag, late = estimates["kp"], estimates["lag"], estimates["late"]
-    stated = [motion.name for motion in search.motions if motion.kp_known]
-    if 0 < len(stated) < len(search.motions):
+    stated = [motion.name for motion in motions if motion.kp_known]
+    if 0 < len(stated) < len(motions):
         remarks.append(
             f"commanded gains are stated in {', '.join(stated)} and not in the others, which are taken to have had the twin's; "
             "state them for all"
@@ -284,7 +250,7 @@ def _remarks(
             f"K_p alone is known to a factor {kp.high / kp.low:.2g} only (ridge {ridge:.5f}); positions tell K_d / K_p = "
             f"{lag.value * 1e3:.2f} ms ({lag.low * 1e3:.2f} … {lag.high * 1e3:.2f}). State the commanded gains"
         )
-    rows = late.value * search.motions[0].rate_hz
+    rows = late.value * motions[0].rate_hz
     if abs(rows) > 0.25 and not late.low <= 0.0 <= late.high:
         ends = sorted((abs(late.low), abs(late.high)))
         remarks.append(
@@ -293,27 +259,6 @@ def _remarks(
             "believing K_p"
         )
     return remarks
-
-
-def _errors(
-    search: "_GainSearch",
-    motions: Sequence[JointMotion],
-    use: Literal["fit", "validation"],
-    x: np.ndarray,
-) -> list[MotionError]:
-    errors = []
-    for motion in motions:
-        both = [
-            search.simulate(search.scaled(motion), g)[0]
-            for g in (search.model.gains, search.gains(x))
-        ]
-        before, after = (
-            float(np.sqrt(np.nanmean((q - motion.measured) ** 2))) for q in both
-        )
-        errors.append(
-            MotionError(name=motion.name, use=use, rmse_before=before, rmse_after=after)
-        )
-    return errors
 
 
 def _check_usable(motion: JointMotion, model: JointModel) -> None:
@@ -346,184 +291,150 @@ def _check_usable(motion: JointMotion, model: JointModel) -> None:
         )
 
 
-class _GainSearch:
-    """Residuals of recordings as a function of x, the free ones of log K_p, log (K_d / K_p) and T_ref / K_p. In these
-    coordinates the valley of the loss is straight: positions determine the ratios, and hardly K_p. Values beyond the bounds are
-    clipped. Gains are those in force in the first recording; the other recordings' gains are in proportion, if they were
-    commanded so. A coordinate beyond P is the time by which the rows' positions are older than their times [s]."""
+class _GainFits:
+    """Fits of the gains to recordings, in numbers in which the valley of the loss is
+    straight: ``kp``, ``lag`` = K_d / K_p [s] and ``offset`` = T_ref / K_p [rad], each if
+    its gain is free. Positions determine the last two, and hardly K_p.
+
+    Gains beyond their bounds are clipped. They are those in force in the first recording;
+    the other recordings' are in proportion, if they were commanded so."""
 
     def __init__(
-        self, motions: Sequence[JointMotion], model: JointModel, free: tuple[str, ...]
+        self, motions: Sequence[JointMotion], model: JointModel, free: Sequence[str]
     ) -> None:
-        first = motions[0]
+        first, own = motions[0], model.gains
         self._kp_scale, self._kd_scale = first.kp_scale, first.kd_scale
-        self.motions = [self.scaled(motion) for motion in motions]
+        self.motions = [self._scaled(motion) for motion in motions]
         self.model, self.free = model, free
-        own = model.gains
-        self.given = Gains(
-            own.kp * self._kp_scale, own.kd * self._kd_scale, own.torque_ff
-        )
-        """Values of the gains that are not free: commanded in the first recording, or the twin's own."""
-        self.sigma_rad = 1e-4  # near to what an encoder has: keeps the solver's tolerances meaningful
-        self.sigma_effort: float | None = None
-        """Noise of the effort [N·m]; None: efforts are not used."""
+        kp, kd = own.kp * self._kp_scale, own.kd * self._kd_scale
+        self.given = Gains(kp, kd, own.torque_ff)
+        """Values of the gains that are not free: those commanded in the first recording,
+        or the twin's own."""
+        self._noise = [1e-4, math.inf]
+        """Of positions [rad] and efforts [N·m]; inf: efforts are not used."""
 
-    def scaled(self, motion: JointMotion) -> JointMotion:
+    def _numbers(self) -> tuple[Free, ...]:
+        kp, kd, torque_ff = map(_bounded, PAPER_BOUNDS)
+        if "kp" not in self.free:
+            kp = dataclasses.replace(kp, low=self.given.kp, high=self.given.kp)
+        lag = dataclasses.replace(
+            kd, name="lag", low=kd.low / kp.high, high=kd.high / kp.low
+        )
+        offset = dataclasses.replace(
+            torque_ff,
+            name="offset",
+            low=torque_ff.low / kp.low,
+            high=torque_ff.high / kp.low,
+            scale=0.01,
+        )
+        every = {"kp": kp, "kd": lag, "torque_ff": offset}
+        return tuple(every[name] for name in self.free)
+
+    def _scaled(self, motion: JointMotion) -> JointMotion:
         """``motion`` with gain scales relative to those of the first recording."""
-        return replace(
+        return dataclasses.replace(
             motion,
             kp_scale=motion.kp_scale / self._kp_scale,
             kd_scale=motion.kd_scale / self._kd_scale,
         )
 
-    def gains(self, x: np.ndarray) -> Gains:
-        """Gains at coordinates ``x`` (P,), clipped to the bounds; gains that are not free have the values of ``given``."""
-        at = dict(zip(self.free, x, strict=False))
-        kp = (
-            self._within("kp", math.exp(min(at["kp"], _MOST_LOG)))
-            if "kp" in at
-            else self.given.kp
-        )
-        kd = (
-            self._within("kd", kp * math.exp(min(at["kd"], _MOST_LOG)))
-            if "kd" in at
-            else self.given.kd
-        )
-        torque_ff = (
-            self._within("torque_ff", kp * at["torque_ff"])
-            if "torque_ff" in at
-            else self.given.torque_ff
-        )
-        return Gains(float(kp), float(kd), float(torque_ff))
+    def gains(self, values: Mapping[str, float]) -> Gains:
+        """Gains with these ``values``, clipped to their bounds."""
+        kp, kd, torque_ff = self.given
+        kp = values.get("kp", kp)
+        if "lag" in values:
+            kd = _bounded("kd").within(values["lag"] * kp)
+        if "offset" in values:
+            torque_ff = _bounded("torque_ff").within(values["offset"] * kp)
+        return Gains(kp, kd, torque_ff)
 
-    def at(self, gains: Gains) -> np.ndarray:
-        """Coordinates x (P,) of ``gains``, clipped to the bounds."""
-        kp = self._within("kp", gains.kp) if "kp" in self.free else self.given.kp
-        every = {"kp": math.log(kp), "kd": math.log(self._within("kd", gains.kd) / kp)}
-        every["torque_ff"] = self._within("torque_ff", gains.torque_ff) / kp
-        low, high = self.x_bounds()
-        return np.clip(
-            np.array([every[name] for name in self.free]), low + 1e-9, high - 1e-9
-        )
+    def values(self, gains: Gains) -> Values:
+        """Start values of a fit from ``gains``, clipped to their bounds."""
+        kp = _bounded("kp").within(gains.kp) if "kp" in self.free else self.given.kp
+        kd = _bounded("kd").within(gains.kd)
+        torque_ff = _bounded("torque_ff").within(gains.torque_ff)
+        return {"kp": kp, "lag": kd / kp, "offset": torque_ff / kp}
 
-    def x_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest (P,) and highest (P,) coordinates x."""
-        (kp_low, kp_high), (kd_low, kd_high), (least, most) = (
-            PAPER_BOUNDS[name] for name in Gains._fields
-        )
-        every = {
-            "kp": (math.log(kp_low), math.log(kp_high)),
-            "kd": (
-                math.log(kd_low / max(kp_high, self.given.kp)),
-                math.log(kd_high / min(kp_low, self.given.kp)),
+    def responses(self, motion: JointMotion, cases: Sequence[Gains]) -> np.ndarray:
+        """(N, 2, T) reported positions [rad] and efforts [N·m] with each of N ``cases``;
+        after a divergence far from any measurement."""
+        found = self.model.simulate_all([motion], [Numbers(gains) for gains in cases])
+        both = np.array([(one.reported, one.effort) for one in found[0]])
+        return np.nan_to_num(both, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+
+    def _residuals(self, motion: JointMotion, cases: Sequence[Values]) -> np.ndarray:
+        """(N, n) of the measured positions and, if used, efforts of one recording, in
+        units of their noise."""
+        answers = self.responses(motion, [self.gains(values) for values in cases])
+        for (reported, _), values in zip(answers, cases, strict=True):
+            if late_s := values.get("late", 0.0):
+                times = np.maximum(motion.time_s - late_s, motion.time_s[0])
+                reported[:] = CubicSpline(motion.time_s, reported)(times)
+        measured = np.stack([motion.measured, motion.effort], axis=1)
+        rows = (answers.transpose(0, 2, 1) - measured) / self._noise
+        return rows[:, self._layout(motion).measured]
+
+    def _layout(self, motion: JointMotion) -> Rows:
+        measured = np.stack([motion.measured, motion.effort], axis=1)
+        return Rows(np.isfinite(measured) & np.isfinite(self._noise), motion.rate_hz)
+
+    def fit(
+        self, start: Mapping[str, float], late: bool = False, most: int = _STEPS
+    ) -> Solution:
+        """Least squares from ``start`` in at most so many steps.
+
+        Args:
+            late: fit a delay of the measured rows [s], too.
+        """
+        numbers = self._numbers()
+        if late:
+            numbers = (*numbers, _LATE)
+        return minimise(
+            lambda cases: np.concatenate(
+                [self._residuals(motion, cases) for motion in self.motions], axis=1
             ),
-            "torque_ff": (
-                least / min(kp_low, self.given.kp),
-                most / min(kp_low, self.given.kp),
-            ),
-        }
-        low, high = np.array([every[name] for name in self.free]).T
-        return low, high
-
-    def _within(self, name: str, value: float) -> float:
-        low, high = PAPER_BOUNDS[name]
-        return min(max(value, low), high)
-
-    def simulate(
-        self, motion: JointMotion, gains: Gains
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) reported positions [rad] and (T,) efforts [N·m]; after a divergence both are far from any measurement."""
-        done = self.model.simulate(motion, gains)
-        return _finite(done.reported), _finite(done.effort)
-
-    def parts(self, x: np.ndarray) -> list[np.ndarray]:
-        """Residuals at ``x`` in units of the channel's noise, where something was measured: of each recording those of its
-        positions, one per measured row, then those of its efforts if efforts are used."""
-        late_s, parts = float(sum(x[len(self.free) :])), []
-        for motion in self.motions:
-            reported, effort = self.simulate(motion, self.gains(x))
-            if late_s:
-                reported = CubicSpline(motion.time_s, reported)(
-                    np.maximum(motion.time_s - late_s, motion.time_s[0])
-                )
-            seen = np.isfinite(motion.measured)
-            parts.append((reported - motion.measured)[seen] / self.sigma_rad)
-            if self.sigma_effort is not None:
-                seen = np.isfinite(motion.effort)
-                parts.append((effort - motion.effort)[seen] / self.sigma_effort)
-        return parts
-
-    def residual(self, x: np.ndarray) -> np.ndarray:
-        """(R,) ``parts``, concatenated."""
-        return np.concatenate(self.parts(x))
-
-    def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Derivatives (R, P) of the residuals by ``x``, by central differences."""
-        steps = [*(_STEPS[name] for name in self.free), _LATE_STEP_S][: len(x)]
-        ends = [
-            [self.residual(x + sign * step) for sign in (1, -1)]
-            for step in np.diag(steps)
-        ]
-        return np.column_stack(
-            [(a - b) / (2 * step) for (a, b), step in zip(ends, steps, strict=True)]
-        )
-
-    def solve(self, start: np.ndarray, most: int = 100) -> OptimizeResult:
-        """Least squares from ``start``, a point within the bounds, in at most so many evaluations; returns SciPy's result."""
-        late_s = np.full(len(start) - len(self.free), _MOST_LATE_S)
-        bounds = tuple(
-            np.append(end, sign * late_s)
-            for end, sign in zip(self.x_bounds(), (-1, 1), strict=True)
-        )
-        jac: Any = self.jacobian
-        return least_squares(
-            self.residual,
+            numbers,
             start,
-            jac,
-            bounds,
-            x_scale="jac",
-            max_nfev=most,
-            xtol=1e-10,
-            ftol=1e-12,
+            [self._layout(motion) for motion in self.motions],
+            at_once=LANES,
+            most=most,
+            step=FINE,
+            tolerance=1e-8 if late else TIGHT,
         )
 
-    def covariance(self, x: np.ndarray) -> np.ndarray:
-        """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, and σ² that of the residuals times their number for each
-        independent one (``independent_rows``); very large where J is singular."""
-        parts, jacobian = self.parts(x), self.jacobian(x)
-        residual, norms = (
-            np.concatenate(parts),
-            np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30),
-        )
-        _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
-        half = right / np.maximum(singular, 1e-12)[:, None] / norms
-        variance = float(residual @ residual) / max(len(residual) - len(norms), 1)
-        return (
-            half.T
-            @ half
-            * variance
-            * len(residual)
-            / independent_rows([part[:, None] for part in parts])
-        )
+    def best(self) -> Solution:
+        """The best fit, of one from each of two starts, with the noise of its residuals."""
+        starts = (self.values(gains) for gains in (REFERENCE, self.model.gains))
+        found = min(map(self.fit, starts), key=lambda one: one.error)
+        rounds, channels = 1, 1
+        if all(np.isfinite(motion.effort).any() for motion in self.motions):
+            rounds, channels = _ROUNDS, 2
+        for _ in range(rounds):
+            self.weigh(found.values, channels)
+            found = self.fit(found.values)
+        return found
 
-    def step_to_minimum(self, x: np.ndarray) -> np.ndarray:
-        """(P,) step from ``x`` to the minimum of least squares, to first order: −J⁺ r."""
-        return np.linalg.lstsq(self.jacobian(x), -self.residual(x))[0]
-
-    def weigh(self, x: np.ndarray) -> None:
-        """Set the noise of both channels to the RMS residuals at ``x`` (P,)."""
-        left = [
-            (self.simulate(motion, self.gains(x)), motion) for motion in self.motions
+    def weigh(self, values: Values, channels: int = 1) -> None:
+        """Set the noise of the first ``channels``, positions and efforts, to the RMS
+        residuals at ``values``."""
+        gains = [self.gains(values)]
+        apart = [
+            self.responses(m, gains)[0, :channels] - [m.measured, m.effort][:channels]
+            for m in self.motions
         ]
-        positions = np.concatenate(
-            [reported - motion.measured for (reported, _), motion in left]
-        )
-        efforts = np.concatenate(
-            [effort - motion.effort for (_, effort), motion in left]
-        )
-        self.sigma_rad = max(float(np.sqrt(np.nanmean(positions**2))), 1e-12)
-        self.sigma_effort = max(float(np.sqrt(np.nanmean(efforts**2))), 1e-12)
+        noise = np.sqrt(np.nanmean(np.square(np.concatenate(apart, axis=1)), axis=1))
+        self._noise[:channels] = np.maximum(noise, 1e-12)
 
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.nan_to_num(values, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
+    def error(
+        self, motion: JointMotion, use: Literal["fit", "validation"], gains: Gains
+    ) -> MotionError:
+        """RMS errors of ``motion`` with the twin's own gains and with ``gains``."""
+        answers = self.responses(self._scaled(motion), [self.model.gains, gains])
+        squares = np.square(answers[:, 0] - motion.measured)
+        before, after = np.sqrt(np.nanmean(squares, axis=1))
+        return MotionError(
+            name=motion.name,
+            use=use,
+            rmse_before=float(before),
+            rmse_after=float(after),
+        )

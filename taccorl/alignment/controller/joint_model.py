@@ -240,7 +240,7 @@ class JointModel:
             self.joint.command_hz if self.joint.command_hz < math.inf else 1.0 / step_s
         )
         parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
-        late_s = self.joint.target_late_s if self.joint.follows_line else 0.0
+        late_s = max(self.joint.target_late_s, 0.0) * self.joint.follows_line
         own_times = late_s > 0.0 or motion.command_s is not None
         if self.joint.follows_line:
             parts = round(steps) if own_times else min(parts, round(steps))

@@ -1,6 +1,6 @@
 """Rigid-body properties of one joint for the one-joint model: inertia, weight, and torque from the motion of other joints. Each
-kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), any robot of an MJCF or URDF file
-(``robot_joint``), and an axis by itself (``machines.axis_file``).
+kind of machine has its own ``RigidJoint``: the PiPER's twin (``arm_joint``), and any robot or axis
+(``robot_joint``).
 
 Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 """
@@ -97,6 +97,8 @@ class RigidJoint(ABC):
     """Known fields of ``drive_numbers.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
+    loop_s: float = 0.0
+    """Period of the drive's loop that the machine's file states [s]; 0: none."""
     stated_age_s: float = 0.0  # Part of ``position_age_s`` that the machine's file states beyond half a loop period [s]
     speed_delay_s: float = 0.0  # Delay of the measured velocity in the controller [s]
     exact_timing: ClassVar[bool] = False
@@ -106,7 +108,9 @@ class RigidJoint(ABC):
     follows_line: ClassVar[bool] = False
     """Target between two rows. True: interpolated linearly. False: held at the value of the later row, as in a replay."""
     keeps_times: ClassVar[bool] = False
-    """True: targets of rows with jitter act at their own arrival times. False: at the times of their rows."""
+    """True: a recording may begin in motion, and targets of rows with jitter act at
+    their own arrival times. False: it begins at rest, and they act at the times of
+    their rows."""
     target_late_s: float = 0.0
     """Delay from a target's arrival (see ``keeps_times``) until it acts in the controller [s]."""
 
@@ -115,6 +119,8 @@ class RigidJoint(ABC):
         "kd",
     )  # Gains that a recording can state and a fit can determine
     holds_torque_ff: bool = False  # True: ``torque_ff`` stays as the file states it. False: it is always fitted.
+    wave: float = 1.0
+    """Position that counts as 1 rad in periodic forces: of a slide ``Scale.wave`` [m]."""
     known_names: tuple[
         str, ...
     ] = ()  # Numbers and effects that the file marks as known (``DriveLaw.known``)
@@ -130,6 +136,10 @@ class RigidJoint(ABC):
         return self.gains._replace(
             **{name: values[name] for name in Gains._fields if name in values}
         ), {}
+
+    def with_values(self, values: Mapping[str, float]) -> "RigidJoint":
+        """The joint with fitted numbers, by name, that ``numbers`` does not convert."""
+        return self
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         """Ratios of a recording's gains to ``gains``: (for the position error, for the velocity); 1 if the recording states

@@ -26,6 +26,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
+from taccorl.alignment.measurements.even_rows import EVEN, LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.table_files import (
@@ -329,9 +330,8 @@ def own_cell_columns(
     )
 
 
-EVEN, LONGEST_GAP_S, LONGEST_GAP_ROWS = 0.1, 0.25, 5
-"""Steps within the first share of the period are even; a gap longer than the second [s] and the third [periods] is not
-bridged."""
+LONGEST_GAP_ROWS = 5
+"""A gap longer than so many periods, and than ``LONGEST_GAP_S``, is not bridged."""
 
 
 @dataclass(frozen=True, kw_only=True)

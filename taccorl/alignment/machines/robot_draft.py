@@ -25,7 +25,7 @@ _LAWS = {
     "cascade": "kd (kp (q* − q) − q̇) + torque_ff. Columns as for impedance; kp in 1/s",
     "velocity": "kd (q̇* − q̇) + torque_ff. Column NAME.qd_target; no kp",
     "torque": "τ* + torque_ff. Column NAME.tau_target (a current times k_t: `factor:` in a columns file); no kp, no kd",
-    "effort": "the measured torque, for logs without targets. Columns NAME.q and NAME.tau; no kp, no kd",
+    "effort": "the measured torque, for logs without targets. Columns NAME.q and NAME.tau; no kp, kd, gains, effort_limit",
     "pwm": "k_t (V d − k_e q̇) / R, duty d = kp (q* − q) − kd q̇ within ± 1: supply_v, resistance_ohm, torque_nm_per_a",
 }
 _MEANING = {

@@ -1,5 +1,5 @@
 """A robot file: any robot as a kinematic tree of an MJCF or URDF file, with facts about each joint's drive that only its user
-knows.
+knows. Without a model, its joints are axes: a slide on a bench, a wheel, a servo with a pendulum.
 
 ``docs/your_robot.md`` has one with its keys. ``taccorl init-robot my_arm.xml`` writes one with the facts of the model, and
 ``TODO`` for the others.
@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -18,15 +19,25 @@ import mujoco
 import numpy as np
 import yaml
 
-from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.controller.drive_law import WINDING, DriveLaw
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, PointMass
-from taccorl.alignment.machines.robot_joint import PAYLOAD_AT, RobotJoint, acts_on_joint
-from taccorl.alignment.machines.robot_model import RobotModel, load_robot_model
+from taccorl.alignment.machines.model_drive import DriveFacts
+from taccorl.alignment.machines.robot_joint import (
+    PAYLOAD_AT,
+    KeptMotions,
+    RobotJoint,
+    acts_on_joint,
+)
+from taccorl.alignment.machines.robot_model import (
+    JointFacts,
+    RobotModel,
+    load_robot_model,
+)
 from taccorl.data.strict_yaml import Rules
-from taccorl.errors import SpecError, TaccorlError, nearest
+from taccorl.errors import SpecError, TaccorlError, nearest, plain_name
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
-from taccorl.sim.effects.scaled import OF_A_TURN
+from taccorl.sim.effects.scaled import OF_A_TURN, bounded
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -34,8 +45,10 @@ TODO = "TODO"  # Placeholder for a value that only the user knows; a file that c
 REMOVABLE = 0.95
 """Largest share of a body's mass that a ``payload`` below 0 may remove. A choice: what is left must be above 0."""
 _LEAST_REACH_M = 0.05
+_HINGE = mujoco.mjtJoint.mjJNT_HINGE
 MOST_EARLY_S = 0.01
-"""``position_age_s`` of a file must be above minus this value [s]. A choice: longer than the period of any drive's loop."""
+"""``position_age_s`` and ``target_late_s`` of a file must be above minus this value [s]. A
+choice: longer than the period of any drive's loop."""
 _ALONG = 0.9999  # least cosine between axes that count as parallel
 _HEADER = (
     "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
@@ -61,9 +74,38 @@ class JointConfig(DriveLaw):
     rate. Without it, a target holds until the next row."""
     position_age_s: float = 0.0
     """Age of the measured position when the torque acts, beyond that of the loop's timing [s]; ``diagnose`` fits it."""
+    unit: Literal["rad", "m"] | None = None
+    """Unit of the position of a joint without a model: rad of a hinge, m of a slide."""
+    inertia: float | None = None
+    """Inertia of a joint without a model [kg·m²], its rotor included; a fit starts there."""
+    limits: tuple[float, float] | None = None
+    """Lowest and highest position of a joint without a model [rad]."""
+    weight_sin: float = 0.0
+    """S [N·m] in S sin q + C cos q, which holds the weight of a hinge without a model."""
+    weight_cos: float = 0.0
+    """C [N·m] in it; of a slide without a model its weight [N]."""
+    payload_kg: float = 0.0
+    """Mass that a joint without a model carries [kg], unless a recording states another;
+    not part of ``inertia``."""
+    lever_m: float = 0.0
+    """Distance of the payload from the axis, unless a recording states another [m]."""
+    arm_kg: float = 0.0
+    """Mass of the arm that holds the payload, a uniform rod as long as the lever [kg]."""
+    hangs_at_rad: float = 0.0
+    """Position at which payload and arm hang straight down [rad]."""
     target_late_s: float = 0.0
-    """Delay from a target's row until it acts in the drive [s]; ``diagnose`` fits it from −2 ms to 0. Below 0: the position of a
-    row is read after the row's target was sent, or as it is half a step later, as MuJoCo's semi-implicit steps give it."""
+    """Delay from a target's row until it acts in the drive [s]; ``diagnose`` fits it from
+    −2 ms to 0, of a joint without a model to 3 ms; a longer delay is an effect. Below 0: the
+    position of a row is read after its target was sent, or is half a step newer, as MuJoCo's
+    semi-implicit steps give it."""
+    speed_late_s: float = 0.0
+    """Delay of the speed in the loop of a joint without a model beyond that of a difference
+    of two samples [s]; minus half a period if the drive measures the speed."""
+    force_unit_n: float | None = None
+    """Effort [N·m] of this joint that corresponds to 1 N·m at a joint of a small arm;
+    bounds of effects are multiplied by it (``RobotJoint.scale`` has the default)."""
+    length_unit_m: float | None = None
+    """Range of positions [rad] that corresponds to 1 rad at a joint of a small arm."""
     effects: list[Effect] = field(default_factory=list)
     """Effects beyond rigid bodies and control law; empty if there are none."""
     FITTED: ClassVar[tuple[str, ...]] = (
@@ -71,27 +113,44 @@ class JointConfig(DriveLaw):
         "effort_scale",
         "speed_delay_s",
         "position_age_s",
-        "target_late_s",
+        *WINDING,
+        *("inertia", "weight_sin", "weight_cos", "target_late_s", "speed_late_s"),
+    )
+    WITHOUT_MODEL: ClassVar[tuple[str, ...]] = (
+        *("unit", "inertia", "limits", "weight_sin", "weight_cos", "payload_kg"),
+        *("lever_m", "arm_kg", "hangs_at_rad", "speed_late_s"),
+    )
+    """Keys of a joint without a model, which has them for the others."""
+    OF_HINGES: ClassVar[tuple[str, ...]] = (
+        *("weight_sin", "lever_m", "arm_kg", "hangs_at_rad"),
+    )
+    OPTIONAL: ClassVar[tuple[str, ...]] = (
+        *("loop_hz", "command_hz", "force_unit_n", "length_unit_m", "inertia"),
     )
 
-    def __post_init__(self) -> None:
+    def check(self, has_model: bool) -> None:
+        """Check the numbers of a file. Raises TaccorlError, which begins with the key:
+        one is out of range, missing, or not used by its law or by a joint with a model."""
+        positive = [name for name in self.OPTIONAL if getattr(self, name) is not None]
         check_numbers(
             "joint",
             self,
-            positive=("gear",),
-            not_negative=("rotor_inertia",),
-            finite=("position_age_s", "target_late_s"),
+            positive=("gear", *positive),
+            not_negative=("rotor_inertia", "payload_kg", "lever_m", "arm_kg"),
+            finite=(
+                *("position_age_s", "target_late_s"),
+                *("weight_sin", "weight_cos", "hangs_at_rad"),
+            ),
         )
-        optional = ("loop_hz", "command_hz")
-        check_numbers(
-            "joint",
-            self,
-            positive=[name for name in optional if getattr(self, name) is not None],
-        )
-        if not self.position_age_s > -MOST_EARLY_S:
-            raise TaccorlError(
-                f"joint.position_age_s: is {self.position_age_s:g} s; write a value above −{MOST_EARLY_S:g} s"
-            )
+        if has_model:
+            self._check_beside_model()
+        else:
+            self._check_alone()
+        for name in ("position_age_s", "target_late_s"):
+            if not (value := getattr(self, name)) > -MOST_EARLY_S:
+                raise TaccorlError(
+                    f"joint.{name}: is {value:g} s; write a value above −{MOST_EARLY_S:g} s"
+                )
         self.check_law("joint")
         self.check_known(
             "joint", {e.name: [p.name for p in e.parameters()] for e in self.effects}
@@ -101,6 +160,59 @@ class JointConfig(DriveLaw):
                 "joint.gains: with law pwm, stall torque and back-EMF are fitted instead of kp and kd; write the servo's own "
                 "kp and kd, and `gains: commanded`"
             )
+
+    def _check_beside_model(self) -> None:
+        for field_ in dataclasses.fields(self):
+            name = field_.name
+            if name in self.WITHOUT_MODEL and getattr(self, name) != field_.default:
+                raise TaccorlError(f"joint.{name}: the model states it; remove it")
+
+    def _check_alone(self) -> None:
+        for name in ("unit", "inertia"):
+            if getattr(self, name) is None:
+                raise TaccorlError(
+                    f"joint.{name}: key {name!r} is missing; a joint states it where the "
+                    "file has no `model:`"
+                )
+        if self.armature > (self.inertia or 0.0):
+            raise TaccorlError(
+                f"joint.rotor_inertia: {self.armature:g} is greater than inertia, {self.inertia:g}, of which it is a part; "
+                "correct one of them"
+            )
+        newest = -0.5 / self.loop_hz if self.loop_hz else 0.0
+        if not self.speed_late_s >= newest:
+            raise TaccorlError(
+                f"joint.speed_late_s: is {self.speed_late_s:g} s; write at least {newest:g} s, minus half a period of "
+                "loop_hz: the value of a measured speed"
+            )
+        if self.limits is not None and not self.limits[0] < self.limits[1]:
+            raise TaccorlError(
+                f"joint.limits: {list(self.limits)} must be ascending; write the lowest position first"
+            )
+        if self.gains == "fitted" and not self.gain_names:
+            raise TaccorlError(
+                f"joint.gains: law {self.law} has no gains to fit; remove this key"
+            )
+        of_hinge = [name for name in self.OF_HINGES if getattr(self, name)]
+        if self.unit == "m" and of_hinge:
+            raise TaccorlError(
+                f"joint.{of_hinge[0]}: does not apply to a slide, whose weight [N] is weight_cos; remove this key"
+            )
+
+    def with_numbers(self, base: Mapping[str, float]) -> "JointConfig":
+        """Copy with fitted numbers: name of a number → value as it was fitted."""
+        own = ("weight_sin", "weight_cos", "target_late_s", "speed_late_s")
+        new = {key: base[key] for key in (*own, "position_age_s") if key in base}
+        new |= self.law_numbers(base)
+        if base.get("loop_s", 0.0) > 0.0:
+            new["loop_hz"] = 1.0 / base["loop_s"]
+        if self.inertia is not None and "inertia" in base:
+            share = min(self.rotor_inertia / self.inertia, 1.0)
+            new |= {
+                "inertia": base["inertia"],
+                "rotor_inertia": share * base["inertia"],
+            }
+        return dataclasses.replace(self, **{key: float(v) for key, v in new.items()})
 
     @property
     def is_uncertain(self) -> bool:
@@ -117,8 +229,10 @@ class JointConfig(DriveLaw):
 class RobotConfig:
     """Content of a robot file."""
 
-    kind: Literal["robot"]
-    model: str  # Path of the MJCF or URDF file, relative to this file
+    kind: Literal["robot"] = "robot"
+    model: str = ""
+    """Path of the MJCF or URDF file, relative to this file. Without one each joint states
+    its ``unit`` and ``inertia``, and moves without loading the others."""
     gravity_compensation: float = (
         0.0  # Share of the weight that the controller compensates, 0 … 1
     )
@@ -152,6 +266,7 @@ class Robot:
     path: Path  # Path of the robot file
     assumed: Mapping[int, PointMass] = field(default_factory=dict)
     """Id of a body → payload of which a search assumes the place and fits the mass."""
+    motions: KeptMotions = field(default_factory=KeptMotions, repr=False, compare=False)
 
     @property
     def units(self) -> dict[str, str]:
@@ -340,10 +455,9 @@ class Robot:
         """YAML text of the robot file for ``path``, to which the model's path is relative, without default values."""
         model = self.rigid.path.resolve()
         folder = Path(path).resolve().parent
-        content: dict[str, Any] = {
-            "kind": "robot",
-            "model": Path(os.path.relpath(model, folder)).as_posix(),
-        }
+        content: dict[str, Any] = {"kind": "robot"}
+        if self.config.model:
+            content["model"] = Path(os.path.relpath(model, folder)).as_posix()
         content |= _set(self.config, ("gravity_compensation",))
         content |= {"gravity": self.config.gravity} if self.config.gravity else {}
         content["joints"] = {}
@@ -351,7 +465,7 @@ class Robot:
             names = [
                 f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"
             ]
-            content["joints"][name] = _set(joint, names)
+            content["joints"][name] = _plain(_set(joint, names))
             if joint.effects:
                 # z_m of a payload is always written: its default is a place in the PiPER's hand, and robot files must state one.
                 placed = [
@@ -376,9 +490,37 @@ class Robot:
 
     def digest(self) -> str:
         """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""
-        return hashlib.sha256(
-            self.text(self.path).encode() + self.rigid.path.read_bytes()
-        ).hexdigest()[:16]
+        model = self.rigid.path.read_bytes() if self.config.model else b""
+        return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
+
+
+def robot_of(joints: Mapping[str, JointConfig], path: Path) -> Robot:
+    """A robot without a model: each of ``joints`` states its own unit and inertia.
+    ``path``: of its file, which its messages name."""
+    spec = mujoco.MjSpec()
+    spec.option.gravity = np.zeros(3)
+    facts: dict[str, JointFacts] = {}
+    for name, config in joints.items():
+        unit, inertia = config.unit or "rad", config.inertia or 1.0
+        body = spec.worldbody.add_body(mass=inertia, inertia=[inertia] * 3)
+        body.explicitinertial = True
+        kind = mujoco.mjtJoint.mjJNT_SLIDE if unit == "m" else _HINGE
+        body.add_joint(name=name, type=kind, axis=[0.0, 0.0, 1.0])
+        facts[name] = JointFacts(
+            name=name,
+            unit=unit,
+            limits=config.limits,
+            inertia=inertia,
+            armature=config.armature,
+            drive=DriveFacts(),
+            effects=(),
+        )
+    rigid = RobotModel(path, spec.compile(), facts, ())
+    return Robot(RobotConfig(joints=dict(joints)), rigid, path)
+
+
+def _plain(content: dict[str, Any]) -> dict[str, Any]:
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in content.items()}
 
 
 def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -391,46 +533,113 @@ def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
 
 
 def load_robot(path: Path) -> Robot:
-    """Load a robot file and its model. Raises SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the model
-    lacks; the message names file and line; TaccorlError: the model cannot be used (``load_robot_model``)."""
+    """Load a robot file and its model, or an axis file: a robot of one joint without one.
+    Raises SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the
+    model lacks; the message names file and line; TaccorlError: the model cannot be used
+    (``load_robot_model``)."""
     path = Path(path)
     _refuse_todo(path)
-    document = EffectsDocument(RobotConfig, path)
+    document = _RobotDocument(RobotConfig, path)
     config = document.value
-    model = path.parent / config.model
-    if not model.is_file():
-        raise document.error(
-            "model",
-            f"no file {config.model!r} beside it; write the path of the MJCF or URDF file",
-        )
-    rigid = load_robot_model(model, config.gravity_compensation)
-    if not config.joints:
-        raise document.error(
-            "joints",
-            f"the file names no joint; the model has {', '.join(rigid.joints)}",
-        )
-    robot = Robot(config, rigid, path)
+    document.check()
+    if config.model:
+        model = path.parent / config.model
+        if not model.is_file():
+            raise document.error(
+                "model",
+                f"no file {config.model!r} beside it; write the path of the MJCF or URDF file",
+            )
+        rigid = load_robot_model(model, config.gravity_compensation)
+        if not config.joints:
+            raise document.error(
+                "joints",
+                f"the file names no joint; the model has {', '.join(rigid.joints)}",
+            )
+        robot = Robot(config, rigid, path)
+    else:
+        robot = robot_of(config.joints, path)
     document.refuse(_rules(robot, document))
-    return robot
+    return document.in_units(robot)
 
 
-def _rules(robot: Robot, document: EffectsDocument) -> Rules:
+class _RobotDocument(EffectsDocument[RobotConfig]):
+    """A robot file, or an axis file, whose keys are those of its one joint. Bounds of
+    effects follow from joints, which the model has: ``in_units`` checks them."""
+
+    is_axis = False
+
+    def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
+        if cls is not RobotConfig:
+            return super()._dataclass(cls, node, key)
+        items = dict(self._items(node, key))
+        kind = self._scalar(str, items["kind"], "kind") if "kind" in items else ""
+        self.is_axis = kind == "axis"
+        if not self.is_axis:
+            return super()._dataclass(cls, node, key)
+        if "name" not in items:
+            raise self.error("", "key 'name' is missing")
+        name = self._scalar(str, items.pop("name"), "name")
+        plain_name(name, "axis.name")
+        del items["kind"]
+        values = self._values(JointConfig, [*items.items()], key)
+        return RobotConfig(joints={name: JointConfig(**values)})
+
+    def place(self, joint: str) -> str:
+        """Path of a joint's keys in the file."""
+        return "" if self.is_axis else f"joints/{joint}/"
+
+    def check(self) -> None:
+        """Check the numbers of all joints. Raises SpecError, with the line."""
+        for name, config in self.value.joints.items():
+            try:
+                config.check(has_model=bool(self.value.model))
+            except TaccorlError as error:
+                key, _, text = str(error).removeprefix("joint.").partition(": ")
+                raise self.error(f"{self.place(name)}{key}", text) from error
+
+    def _made(self, make: Any, values: dict[str, Any], key: str) -> Any:
+        is_effect = isinstance(make, type) and issubclass(make, Effect)
+        if is_effect and make is not Payload:
+            wide = [(p.name, -math.inf, math.inf) for p in make.parameters()]
+            make = bounded(make.name, tuple(wide))
+        return super()._made(make, values, key)
+
+    def in_units(self, robot: Robot) -> Robot:
+        """``robot`` with the effects of the file in the units of their joints."""
+        for name, config in robot.config.joints.items():
+            joint, made = robot.joint(name), []
+            document_key = f"{self.place(name)}effects"
+            for k, effect in enumerate(config.effects):
+                key = f"{document_key}/{k}"
+                stated = {
+                    field: getattr(effect, field)
+                    for field in effect.settings()
+                    if self.has(f"{key}/{field}")
+                }
+                made.append(self._made(partial(joint.made, effect.name), stated, key))
+            robot = robot.with_joint(name, dataclasses.replace(config, effects=made))
+        return robot
+
+
+def _rules(robot: Robot, document: _RobotDocument) -> Rules:
     config, rigid = robot.config, robot.rigid
     bodies = {rigid.model.body(k).name: k for k in range(1, rigid.model.nbody)}
     for joint, drive in config.joints.items():
         unknown = (
             f"{config.model} has no joint {joint!r}; {nearest(joint, rigid.joints)}"
         )
+        place = document.place(joint)
         yield joint not in rigid.joints, f"joints/{joint}", unknown
         for k, effect in enumerate(drive.effects):
-            key, name = f"joints/{joint}/effects/{k}", effect.name
+            key, name = f"{place}effects/{k}", effect.name
             twice = name in [other.name for other in drive.effects[:k]]
             yield (
                 twice,
                 key,
                 f"{name} stands twice at {joint}, which has one of each effect; remove one",
             )
-            can_act = acts_on_joint(type(effect), weight=True, rotor=True, payload=True)
+            gives = {"weight": bool(config.model), "payload": bool(config.model)}
+            can_act = acts_on_joint(type(effect), rotor=True, **gives)
             yield (
                 not can_act,
                 key,
@@ -459,7 +668,7 @@ def _rules(robot: Robot, document: EffectsDocument) -> Rules:
                 f"link: {joint} moves no body {link!r}; {nearest(link, bodies)}",
             )
     joint, why = robot.wrong_mass()
-    yield joint, f"joints/{joint}/effects", why
+    yield joint, f"{document.place(joint)}effects", why
 
 
 def _refuse_todo(path: Path) -> None:

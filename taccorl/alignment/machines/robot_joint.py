@@ -1,11 +1,12 @@
 """One joint of a robot file for the one-joint model: its drive, weight, payloads, and what the motion of other joints adds."""
 
+import copy
 import dataclasses
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import cache
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from taccorl.alignment.controller.drive_law import DriveJoint, with_gains
-from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel
 from taccorl.alignment.controller.joint_motion import (
     JointMotion,
     Surroundings,
@@ -37,13 +38,13 @@ from taccorl.alignment.controller.rigid_joint import (
 from taccorl.alignment.machines.robot_model import JointFacts
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError, nearest
-from taccorl.sim.effects import make_effect
+from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
-from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, scaled
+from taccorl.sim.effects.scaled import OF_A_TURN, Scale, bounded, scaled
 
-if TYPE_CHECKING:
-    from taccorl.alignment.machines.robot_file import Robot  # which makes the joints
+if TYPE_CHECKING:  # which makes the joints
+    from taccorl.alignment.machines.robot_file import JointConfig, Robot
 
 _GIVES = (
     "target",
@@ -61,8 +62,11 @@ of four joints, whose targets change every 10 ms, it leaves an error of 1.06 noi
 SWEEPS = 4
 """Gauss–Seidel sweeps over the joints in ``moved_together``. A choice: each sweep removes two thirds of the error."""
 MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
-"""Largest number of positions in ``_KEPT``, which serves all joints of a recording; and of entries of its mass matrices."""
+"""Largest number of positions in ``KeptMotions``, and of entries of mass matrices."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+FORCE_OF_MASS = 0.1
+"""Force unit of a slide without ``effort_limit`` over its mass [N/kg]. A choice: dry
+friction is searched up to 20 times this, a friction coefficient of 0.2."""
 LEAST_INERTIA = 0.01
 """Least inertia of a joint with a ``payload`` of negative mass, as a share of its inertia in the model. A choice: a search may
 try places of the mass that would make the inertia negative."""
@@ -71,22 +75,18 @@ PAYLOAD_AT = (
     "y_m",
     "z_m",
 )  # Parameters of ``payload`` for its place along the axes of its body
-_SLIDE_WAVES = Scale(
-    unit="m", length=1.0 / WAVE_SHARE
-)  # bounds of wave numbers are those of a file, in rad/m
 
 
-@contextmanager
-def under_gravity(
-    model: mujoco.MjModel, gravity_mps2: np.ndarray
-) -> Iterator[mujoco.MjModel]:
-    """Context manager: ``model`` with another gravity ``gravity_mps2`` (3,) [m/s²], in the frame of the world, for a while."""
-    own = model.opt.gravity.copy()
-    model.opt.gravity[:] = gravity_mps2
-    try:
-        yield model
-    finally:
-        model.opt.gravity[:] = own
+def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> mujoco.MjModel:
+    """Copy of ``model`` with gravity ``gravity_mps2`` (3,) [m/s²] in the world frame."""
+    return _copy_under_gravity(model, np.asarray(gravity_mps2, float).tobytes())
+
+
+@lru_cache(maxsize=64)  # a search asks for the same few thousands of times
+def _copy_under_gravity(model: mujoco.MjModel, gravity_mps2: bytes) -> mujoco.MjModel:
+    copied = copy.copy(model)
+    copied.opt.gravity[:] = np.frombuffer(gravity_mps2)
+    return copied
 
 
 @cache
@@ -122,10 +122,9 @@ class RobotJoint(DriveJoint):
         stated: "Robot | None" = None,
         along: "Along | None" = None,
     ) -> None:
-        self._robot, self._config = robot, (law := robot.config.joints[signal])
-        super().__init__(
-            law, signal, robot.rigid.joints[signal].unit, law.loop_hz, law.command_hz
-        )
+        self._robot, self.signal = robot, signal
+        self._use(law := robot.config.joints[signal])
+        self._stated_loop_hz = law.loop_hz
         self._stated, self._along = robot if stated is None else stated, along
         self._masses = robot.masses() if masses is None else masses
         own = [self._masses[signal].body] if signal in self._masses else []
@@ -133,13 +132,44 @@ class RobotJoint(DriveJoint):
         self._payload_in = [*own, robot.last_body(signal)][0]
         # At a slide the weight of an unknown mass is a constant force, too.
         self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
-        self.position_age_s, self.stated_age_s = (
-            self.position_age_s + law.position_age_s,
-            law.position_age_s,
-        )
-        self.target_late_s = law.target_late_s
+        self.scale = self._scale()
+        self.wave = self.scale.wave
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
         self._unloaded: dict[bytes, Rigid] = {}
+
+    def _use(self, config: "JointConfig") -> None:
+        """Take the numbers of the drive from ``config``."""
+        signal, unit = self.signal, self._robot.rigid.joints[self.signal].unit
+        super().__init__(config, signal, unit, config.loop_hz, config.command_hz)
+        self._config = config
+        self.stated_age_s = config.position_age_s
+        self.position_age_s += config.position_age_s
+        self.target_late_s = config.target_late_s
+        if not self.has_model:
+            late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
+            self.facts = {
+                **self.facts,
+                "speed_age": self.speed_delay_s,
+                "speed_delay__delay_s": late_s,
+            }
+            self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
+
+    @property
+    def config(self) -> "JointConfig":
+        """Numbers of the drive: those of the file, or of ``with_values``."""
+        return self._config
+
+    @property
+    def has_model(self) -> bool:
+        """Whether a model has inertia and weight; else the file has, and fits them."""
+        return bool(self._robot.config.model)
+
+    def with_values(self, values: Mapping[str, float]) -> "RobotJoint":
+        if self.has_model:
+            return self
+        fitted = copy.copy(self)
+        fitted._use(self._config.with_numbers(values))
+        return fitted
 
     @property
     def known(self) -> JointFacts:
@@ -155,6 +185,8 @@ class RobotJoint(DriveJoint):
         )
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
+        if not self.has_model:  # ``with_values`` has them all
+            return self.gains, {}
         gains, facts = super().numbers(values)
         if "stall_nm" not in values:
             return gains, facts
@@ -167,11 +199,13 @@ class RobotJoint(DriveJoint):
 
     def timestep_s(self, motion: JointMotion) -> float:
         c = self._config
-        return c.timestep_s(
-            motion.rate_hz, self.known.inertia + c.armature, motion.kp_scale, c.loop_hz
-        )
+        inertia = c.inertia or self.known.inertia + c.armature
+        loop_hz = self._stated_loop_hz
+        return c.timestep_s(motion.rate_hz, inertia, motion.kp_scale, loop_hz)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        if self._config.inertia is not None:
+            return self._stated_rigid(motion, self._config.inertia)
         masses = self._every_mass(bodies)
         terms = self._terms(motion.pose, masses)
         # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
@@ -209,8 +243,20 @@ class RobotJoint(DriveJoint):
         own = model.joint(self.signal).dofadr[0]
         return float(1.0 / np.linalg.inv(mass)[own, own])
 
+    def _stated_rigid(self, motion: JointMotion, inertia: float) -> Rigid:
+        c = self._config
+        inertia += motion.mounted_kgm2
+        if self.unit == "m":
+            return Rigid(inertia, c.armature, weight_n=c.weight_cos)
+        weight = motion.moment_kgm * GRAVITY_M_PER_S2  # m l g sin(q − q₀)
+        sine = c.weight_sin + weight * math.cos(c.hangs_at_rad)
+        cosine = c.weight_cos - weight * math.sin(c.hangs_at_rad)
+        return Rigid(inertia, c.armature, sine, cosine)
+
     def inertia_kgm2(self, m: Measurement) -> float:
         """Inertia [kg·m²] of the joint in the pose in which a recording begins, with the payloads and the rotor of the file."""
+        if self._config.inertia is not None:
+            return self._config.inertia + self.surroundings(m).mounted_kgm2
         return (
             self._terms(self.pose(m), self._every_mass(self.effects(()))).inertia
             + self._config.armature
@@ -219,15 +265,15 @@ class RobotJoint(DriveJoint):
     def _terms(self, pose: np.ndarray, masses: Sequence[PointMass] = ()) -> Rigid:
         """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor."""
         model = self._robot.rigid.model
-        if (key := pose.tobytes() + model.opt.gravity.tobytes()) not in self._unloaded:
+        if (key := pose.tobytes()) not in self._unloaded:
             self._unloaded[key] = rigid_terms(model, self.signal, pose)
         terms = with_masses(self._unloaded[key], model, self.signal, pose, masses)
         if not (more := self._robot.more_gravity).any():
             return terms
-        with under_gravity(model, more):  # the weight is linear in gravity
-            extra = with_masses(
-                rigid_terms(model, self.signal, pose), model, self.signal, pose, masses
-            )
+        leaned = under_gravity(model, more)  # the weight is linear in gravity
+        extra = with_masses(
+            rigid_terms(leaned, self.signal, pose), leaned, self.signal, pose, masses
+        )
         names = ("gravity_sin", "gravity_cos", "weight_n")
         return terms._replace(
             **{name: getattr(terms, name) + getattr(extra, name) for name in names}
@@ -283,6 +329,10 @@ class RobotJoint(DriveJoint):
         return pose
 
     def surroundings(self, m: Measurement) -> Surroundings:
+        """Raises TaccorlError: a payload is stated at a joint of a model, or without its
+        lever at one without."""
+        if not self.has_model:
+            return self._mounted(m)
         if any(kg > 0 for kg in m.payload_kg.values()):
             raise TaccorlError(
                 f"{m.name}: payload_kg applies to the PiPER's hands only; write a second model file with the mass fixed to its "
@@ -302,10 +352,45 @@ class RobotJoint(DriveJoint):
             positions=positions,
         )
 
+    def _mounted(self, m: Measurement) -> Surroundings:
+        """With the masses that the file or the recording mounts on a joint without model:
+        the inertia m l² and the weight m g l sin(q − q₀), and those of the arm."""
+        c, name = self._config, self.signal
+        payload, lever, arm = (
+            getattr(m, key).get(name, getattr(c, key))
+            for key in ("payload_kg", "lever_m", "arm_kg")
+        )
+        if self.unit == "m" and (lever or arm):
+            raise TaccorlError(
+                f"{m.name}: lever_m or arm_kg of {name} is stated, but a slide has no lever; remove it"
+            )
+        if self.unit == "rad" and payload + arm > 0.0 and lever == 0.0:
+            raise TaccorlError(
+                f"{m.name}: payload_kg or arm_kg of {name} is stated, but the length of its lever is not; write `lever_m: …` "
+                f"in its file, or `lever_m: {{{name}: …}}` in measurements.yaml"
+            )
+        mounted = payload
+        if self.unit == "rad":
+            mounted = payload * lever**2 + arm * lever**2 / 3.0
+        return dataclasses.replace(
+            super().surroundings(m),
+            payload_kg=payload,
+            payload_at_known=True,
+            moment_kgm=payload * lever + 0.5 * arm * lever,
+            mounted_kgm2=mounted,
+        )
+
     def whole(self, m: Measurement) -> Measurement:
         """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording states
         none. Raises TaccorlError: the model lacks a signal, or has it in another unit."""
         names = tuple(self._robot.units)
+        if not self.has_model:
+            own = [name for name in names if name in m.signals]
+            if not own:
+                raise TaccorlError(
+                    f"{m.name} has no signal {names[0]!r}, which its file names; {nearest(names[0], m.signals)}"
+                )
+            m = m.only(own)
         for name, unit in zip(m.signals, m.units, strict=True):
             if name not in names:
                 model = self._robot.rigid.path.name
@@ -314,12 +399,12 @@ class RobotJoint(DriveJoint):
                 )
             if unit != self._robot.units[name]:
                 raise TaccorlError(
-                    f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}"
+                    f"{m.name}: {name} is in {unit}, its file states {self._robot.units[name]}"
                 )
             for key in ("lever_m", "arm_kg"):
-                if name in getattr(m, key):
+                if self.has_model and name in getattr(m, key):
                     raise TaccorlError(
-                        f"{m.name}: {key} of {name} is stated, which is supported for axis files only; remove it from "
+                        f"{m.name}: {key} of {name} is stated, which is for joints without a model; remove it from "
                         "measurements.yaml, and fix the mass to its link in the model"
                     )
             if (
@@ -381,14 +466,46 @@ class RobotJoint(DriveJoint):
             return bounded(
                 "payload", (mass, *((name, -far, far) for name in PAYLOAD_AT))
             )
-        if self.unit == "rad":
-            return cls
-        return scaled(
-            cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m")
+        return scaled(cls.name, self.scale)
+
+    def made(self, name: str, /, **values: Any) -> Effect:
+        """The effect of that name as a file may state it, in the units of the joint.
+        Raises TaccorlError: an effect or parameter is unknown, or out of bounds."""
+        cls = effects.get(name)
+        for key in values:
+            if key not in (known := cls.settings()):
+                raise TaccorlError(
+                    f"effect {name}: no parameter {key!r}; {nearest(key, known)}"
+                )
+        return (cls if cls is Payload else self.in_units(cls))(**values)
+
+    def _scale(self) -> Scale:
+        """Size of the joint's forces and motions relative to a joint of a small arm, by
+        which bounds of effects are multiplied: the file's ``force_unit_n`` and
+        ``length_unit_m``. Defaults: 1 of a hinge of a model; else a tenth of
+        ``effort_limit``, or of a slide ``FORCE_OF_MASS`` times its mass, and its stroke."""
+        c, known = self._config, self.known
+        force, length, drive = 1.0, 1.0, 0.0
+        if self.unit == "m":
+            force = max(1.0, FORCE_OF_MASS * known.inertia)
+            if known.limits is not None:
+                length = known.limits[1] - known.limits[0]
+        if self.unit == "m" or not self.has_model:
+            if c.effort_limit is not None:
+                force = 0.1 * c.effort_limit
+            if c.law != "effort" and c.loop_gains.kp > 0.0:
+                drive = 1.0 / c.loop_gains.kp
+        return Scale(
+            unit=self.unit,
+            force=c.force_unit_n or force,
+            length=c.length_unit_m or length,
+            drive=drive,
         )
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         if self.unit == "m" and cls.name in OF_A_TURN:
+            return None
+        if cls is Payload and not self.has_model:
             return None
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,
@@ -484,8 +601,8 @@ def needed_along(
     """``torque_along`` of ``positions`` (T, nq) with the robot's own gravity: twice (T, nv), and (T, nv, nv)."""
     needed, carried, masses = torque_along(robot.rigid.model, positions, period_s)
     if (more := robot.more_gravity).any():
-        with under_gravity(robot.rigid.model, more) as model:
-            needed += torque_along(model, positions, period_s, still=True)[0]
+        leaned = under_gravity(robot.rigid.model, more)
+        needed += torque_along(leaned, positions, period_s, still=True)[0]
     return needed, carried, masses
 
 
@@ -503,11 +620,30 @@ def moved_together(robot: "Robot", m: Measurement) -> Along | None:
         getattr(m, name).tobytes() for name in ("target", "measured", *m.extra_columns)
     ]
     key = hashlib.sha1(b"".join([said, *arrays])).digest()
-    if key not in _KEPT:
-        while sum(len(one.positions) for one in _KEPT.values() if one) > MOST_KEPT:
-            del _KEPT[next(iter(_KEPT))]
-        _KEPT[key] = _moved_together(robot, m)
-    return _KEPT[key]
+    return robot.motions.of(key, lambda: _moved_together(robot, m))
+
+
+class KeptMotions:
+    """Motions of a robot's joints, which serve all joints of a recording. A copy that
+    another process gets is empty."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._found: dict[bytes, Along | None] = {}
+
+    def __reduce__(self) -> "tuple[type[KeptMotions], tuple[()]]":
+        return KeptMotions, ()
+
+    def of(self, key: bytes, make: Callable[[], Along | None]) -> Along | None:
+        """The motion of ``key``; ``make`` computes it if it is not there."""
+        with self._lock:
+            if key in self._found:
+                return self._found[key]
+        made = make()
+        with self._lock:
+            while sum(len(a.positions) for a in self._found.values() if a) > MOST_KEPT:
+                del self._found[next(iter(self._found))]
+            return self._found.setdefault(key, made)
 
 
 def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
@@ -554,6 +690,3 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         needed_along(robot, q, m.period_s / fine)[:2] if driven else (needed, carried)
     )
     return Along(frozenset(angles), q, needed, carried) if angles else None
-
-
-_KEPT: dict[bytes, Along | None] = {}

@@ -399,7 +399,7 @@ def _rules(index: MeasurementIndex, folder: Path, holders: Sequence[str]) -> Rul
                 or "there is none"
             )
             what = (
-                "arm" if set(known) & set(ROBOT.arms) else "axis of a file of kind axis"
+                "arm" if set(known) & set(ROBOT.arms) else "joint of the machine's file"
             )
             for holder in getattr(note, key):
                 yield (

@@ -117,7 +117,7 @@ class Stated:
     payload_kg: dict[str, float] = field(default_factory=dict)
     """Arm, or name of an axis → known mass of the payload [kg]."""
     lever_m: dict[str, float] = field(default_factory=dict)
-    """Axis → distance from it to its payload [m], if it differs from that in the axis file."""
+    """Axis → distance from it to its payload [m], if it differs from that in the file."""
     arm_kg: dict[str, float] = field(default_factory=dict)
     """Axis → mass of the arm that holds the payload [kg]: a uniform rod from the axis to the lever's end."""
     payload_position_m: dict[str, tuple[float, float, float]] = field(

@@ -1,22 +1,23 @@
 """Tactile calibration, paper App. B.2: λ_noise from readings without contact, then (k_n, k_d) on matched contact replays.
 
-The fit uses least squares on the counts of all taxels near the object. The match is measured, on recordings that were
-not used for the fit, by the five quantities that the paper aligns (``touch.match``).
+Counts of all taxels near the object are fitted (``alignment.least_squares``). The match
+is measured, on recordings that were not used for the fit, by the five quantities that the
+paper aligns (``touch.match``).
 
 k_n and the sensor's gain (counts for a reading of 1) cannot be separated by counts, so that the gain is not fitted.
 
 Letters in shapes: T frames, P pads, R × C taxels.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from taccorl.alignment.controller.identification import Estimate
-from taccorl.alignment.measurements.correlation import Rows, block_sums, rate_of
+from taccorl.alignment.least_squares import Estimate, Free, Solution, Values, minimise
+from taccorl.alignment.measurements.correlation import Rows, rate_of
 from taccorl.alignment.touch.match import TouchMatch, touch_match
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
@@ -30,8 +31,8 @@ MIN_FRAMES = (
 )
 _NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
 _MIN_IN_CONTACT = 20  # frames
-_STIFFNESS_PER_M, _DAMPING_S_PER_M = (1.0, 1e6), (0.0, 1e4)
-_STEP = 1e-3  # of finite differences, in shares of the numbers to start from
+_K_N = Free(name="k_n", unit="1/m", start=1.0, low=1.0, high=1e6, log=True)
+_K_D = Free(name="k_d", unit="s/m", start=0.0, low=0.0, high=1e4)
 
 
 @dataclass(frozen=True)
@@ -116,58 +117,18 @@ def calibrate_touch(
         )
     model = TouchModel(config)
     noise = noise_level(fit)
-    taxels = [motion.near(_NEAR_M).any(axis=0) for motion in fit]
     in_contact = [int(motion.near(0.0).any(axis=(1, 2, 3)).sum()) for motion in fit]
     if sum(in_contact) < _MIN_IN_CONTACT:
         raise TaccorlError(
             f"touch calibration: {sum(in_contact)} frames in contact in {_names(fit)}; record presses of known depth"
         )
-    start = np.array(
-        [model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m]
-    )
-    scale = np.array([max(start[0], 1.0), max(start[1], 0.005 * start[0], 1e-3)])
-
-    def left(x: np.ndarray) -> list[np.ndarray]:
-        found = []
-        for motion, of in zip(fit, taxels, strict=True):
-            counts = model.counts(motion, model.simulate(motion, *(x * scale)))
-            found.append(
-                ((counts - motion.measured)[:, of] / noise.std_count[of]).astype(float)
-            )
-        return found
-
-    def stacked(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([one.ravel() for one in left(x)])
-
-    def slopes(x: np.ndarray) -> np.ndarray:
-        here = stacked(x)  # steps are absolute: at k_d = 0 a relative one would be none
-        return np.stack(
-            [(stacked(x + step) - here) / _STEP for step in _STEP * np.eye(2)], axis=1
-        )
-
-    low_x, high_x = np.array([_STIFFNESS_PER_M, _DAMPING_S_PER_M]).T / scale
-    first = np.clip(start / scale, low_x, high_x)
-    solved = least_squares(
-        stacked,
-        first,
-        jac=slopes,  # pyright: ignore[reportArgumentType]
-        bounds=(low_x, high_x),
-        x_scale="jac",
-    )
-    curvature = np.linalg.pinv(solved.jac.T @ solved.jac)
-    layout = [
-        Rows(np.isfinite(own), rate_of(m.time_s[:, 0]))
-        for own, m in zip(left(solved.x), fit, strict=True)
-    ]
-    # If residuals of one block of time hang together in any way (sandwich).
-    pulls = block_sums(solved.jac * solved.fun[:, None], layout) @ curvature
-    covariance = pulls.T @ pulls * np.outer(scale, scale)
-    value, std = solved.x * scale, np.sqrt(np.diag(covariance))
-    low, high = value - 1.96 * std, value + 1.96 * std
+    found = _least_squares(fit, noise, model)
+    stiffness, damping = (_estimate(found, f) for f in found.frees)
+    own = model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m
     threshold = noise.threshold_count
     simulated = [
         [model.counts(m, model.simulate(m, *numbers)) for m in validation]
-        for numbers in (start, value)
+        for numbers in (own, (stiffness.value, damping.value))
     ]
     measured, pitch_m = [m.measured for m in validation], validation[0].layout.pitch_m
     before, after = (
@@ -179,32 +140,64 @@ def calibrate_touch(
         )
     return TouchCalibration(
         noise=noise,
-        stiffness=Estimate(
-            value=float(value[0]), low=float(low[0]), high=float(high[0]), unit="1/m"
-        ),
-        damping=Estimate(
-            value=float(value[1]),
-            low=float(max(low[1], 0.0)),
-            high=float(high[1]),
-            unit="s/m",
-        ),
+        stiffness=stiffness,
+        damping=damping,
         before=before,
         after=after,
         fitted_to=tuple(m.name for m in fit),
         validation=tuple(m.name for m in validation),
-        trouble=_trouble(solved.status, value, std),
+        trouble=_trouble(found, stiffness, damping),
     )
 
 
-def _trouble(status: int, value: np.ndarray, std: np.ndarray) -> str:
+def _least_squares(
+    motions: Sequence[TouchMotion], noise: NoiseLevel, model: TouchModel
+) -> Solution:
+    """Fit k_n and k_d to the counts of all taxels that come near the object."""
+    taxels = [np.asarray(motion.near(_NEAR_M).any(axis=0)) for motion in motions]
+    k_n, k_d = model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m
+    scale = max(k_d, 0.005 * k_n, 1e-3)
+    numbers = [
+        dataclasses.replace(_K_N, start=k_n),
+        dataclasses.replace(_K_D, start=k_d, scale=scale),
+    ]
+
+    def residuals(values: Values) -> np.ndarray:
+        rows = []
+        for motion, own in zip(motions, taxels, strict=True):
+            simulated = model.simulate(motion, values["k_n"], values["k_d"])
+            counts = model.counts(motion, simulated)[:, own].astype(float)
+            rows.append((counts - motion.measured[:, own]) / noise.std_count[own])
+        return np.concatenate([one.ravel() for one in rows])
+
+    return minimise(
+        lambda cases: np.array([residuals(values) for values in cases]),
+        numbers,
+        {},
+        [
+            Rows(np.ones((len(m.time_s), own.sum()), bool), rate_of(m.time_s[:, 0]))
+            for m, own in zip(motions, taxels, strict=True)
+        ],
+    )
+
+
+def _estimate(found: Solution, number: Free) -> Estimate:
+    low, high = found.intervals()[number.name]
+    return Estimate(
+        value=found.values[number.name], low=low, high=high, unit=number.unit
+    )
+
+
+def _trouble(found: Solution, stiffness: Estimate, damping: Estimate) -> str:
     said = []
-    if status <= 0:
+    if found.trouble:
         said.append("not converged: still improving when it was stopped")
-    if value[0] <= 1.01 * _STIFFNESS_PER_M[0] or value[0] >= 0.99 * _STIFFNESS_PER_M[1]:
+    if _K_N.name in found.at_bound:
         said.append(
-            f"k_n is at its bound, {value[0]:g}: the taxels hardly read what depth says; check object and pose"
+            f"k_n is at its bound, {stiffness.value:g}: the taxels hardly read what depth says; check object and pose"
         )
-    if value[1] <= std[1]:
+    two_standard_errors = damping.high - damping.value
+    if damping.value <= two_standard_errors / 2:
         said.append(
             "k_d is no more than its error: readings come late or the presses are too slow to show it"
         )

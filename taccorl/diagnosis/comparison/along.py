@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.measurements.correlation import BLOCK_S
 from taccorl.alignment.measurements.measurement import UNITS
 from taccorl.diagnosis.comparison.localise import (
     LEAST_SHARE,
@@ -18,7 +19,7 @@ from taccorl.diagnosis.comparison.localise import (
     bridged,
     motions_of,
 )
-from taccorl.diagnosis.comparison.result import BLOCK_S, Comparison, Kind, drawn_blocks
+from taccorl.diagnosis.comparison.result import Comparison, Kind, drawn_blocks
 
 BINS = 14
 """Number of bins of equal width along a variable."""

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.measurements.correlation import BLOCK_S
 from taccorl.alignment.measurements.folder import Use
 from taccorl.alignment.measurements.noise_floor import SignalFloor
 from taccorl.alignment.touch.match import TouchMatch, touch_match
@@ -28,9 +29,6 @@ Way = Literal["joint", "twin"]
 """How it was replayed: each joint alone, or the whole twin."""
 USES: tuple[Use, ...] = ("fit", "validation", "test")
 """Uses of recordings, in the order of tables."""
-BLOCK_S = 0.5
-"""Duration of a block [s]. Residuals of neighbouring rows are correlated, so that intervals are computed from whole blocks
-(block bootstrap, Carlstein 1986)."""
 FELT_FLOORS = 4.0
 """A taxel is touched if it reads more than so many of its noise floors."""
 DRAWS = 400

@@ -7,19 +7,21 @@ from typing import cast
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
 from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF
+from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects.load import Payload
 
-TILT = "unbalance: a base that leans by "
-"""Beginning of a remark on the tilt that one joint alone suggests."""
+TILT = "tilt"
+"""Identifier of the remark on the tilt that one joint alone suggests."""
 
 
-def remarked[FindingT: Finding](f: FindingT, text: str) -> FindingT:
-    """The finding with one more remark about its result."""
-    d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
+def remarked[FindingT: Finding](f: FindingT, *remarks: str | Remark) -> FindingT:
+    """The finding with more remarks about its result."""
+    every = cast(tuple[str, ...], (*f.diagnosis.remarks, *remarks))
+    d = dataclasses.replace(f.diagnosis, remarks=every)
     return dataclasses.replace(f, diagnosis=d)
 
 
@@ -48,7 +50,7 @@ def numbers_off(f: Finding) -> tuple[str, ...]:
 def without_numbers(f: Finding, owner: Finding) -> Finding:
     """The finding at a joint that feels the payload of ``owner``; if that may be in another body as well, without numbers of the
     file that are off: they may make up for its place."""
-    d, off = f.diagnosis, " and ".join(numbers_off(f))
+    d, off = f.diagnosis, numbers_off(f)
     if not (owner.diagnosis.or_in and off):
         return f
     d = dataclasses.replace(
@@ -56,8 +58,8 @@ def without_numbers(f: Finding, owner: Finding) -> Finding:
         changed=(),
         status="nothing_missing" if d.status == "numbers_off" else d.status,
     )
-    text = f"{off} would remove a part of the error; so may the payload of {owner.part} in another body"
-    return remarked(dataclasses.replace(f, diagnosis=d), text)
+    found = Remark("payload_elsewhere", {"numbers": off, "part": owner.part})
+    return remarked(dataclasses.replace(f, diagnosis=d), found)
 
 
 def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
@@ -78,7 +80,8 @@ def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
 
 def without_tilt(f: Finding) -> Finding:
     """The finding without the remark on the tilt that it alone suggests."""
-    remarks = tuple(text for text in f.diagnosis.remarks if not text.startswith(TILT))
+    every = cast(tuple[str | Remark, ...], f.diagnosis.remarks)
+    remarks = tuple(r for r in every if not (isinstance(r, Remark) and r.id == TILT))
     return dataclasses.replace(
         f, diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks)
     )
@@ -87,7 +90,7 @@ def without_tilt(f: Finding) -> Finding:
 def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     """The finding without a payload among the rivals of what was added, and among what ``add-effect`` may write."""
     d = f.diagnosis
-    text = f"no payload: one mass, in whichever link, does not explain what {', '.join(joints)} do"
+    refused = "one mass, in whichever link, does not explain these joints together"
 
     def without(names: Sequence[str]) -> tuple[str, ...]:
         return tuple(name for name in names if name != "payload")
@@ -95,7 +98,7 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     rivals = {name: without(others) for name, others in d.rivals.items()}
     told = [
         [
-            dataclasses.replace(e, verdict=text) if e.name == "payload" else e
+            dataclasses.replace(e, verdict=refused) if e.name == "payload" else e
             for e in r.evidence
         ]
         for r in d.rounds
@@ -111,7 +114,8 @@ def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     d = dataclasses.replace(
         d, rivals=rivals, rounds=tuple(rounds), offers=offers, changed=changed
     )
-    return remarked(dataclasses.replace(f, diagnosis=d), text)
+    remark = Remark("payload_without", {"joints": list(joints)})
+    return remarked(dataclasses.replace(f, diagnosis=d), remark)
 
 
 def placed(
@@ -147,20 +151,15 @@ def placed(
             for of in (known.identifiable, known.absolute)
         ]
         known = dataclasses.replace(known, identifiable=numbers[0], absolute=numbers[1])
-    others = [
-        f"{' and '.join(names)} of {part}"
-        for part, names in stands_for.items()
-        if "payload" not in names
-    ]
-    places = [name for name in own if name in PAYLOAD_AT]
-    text = (
-        f"payload: its mass, {' and '.join(places)} are fitted to all joints that feel it and lack little besides"
-        if places
-        else "payload: its mass is fitted to all joints that feel it; its place is the centre of mass of its body"
-    )
+    shared = ["mass_kg", *(name for name in own if name in PAYLOAD_AT)]
+    remarks = [Remark("payload_shared", {"numbers": shared})]
     if TORQUE_FF.name not in d.base:
-        text += f"; {TORQUE_FF.name} of {f.part} is as the file states it"
-    text += f"; it stands for {', '.join(others)} as well" if others else ""
+        stays = {"name": TORQUE_FF.name, "part": f.part}
+        remarks.append(Remark("torque_stays", stays))
+    for part, names in stands_for.items():
+        if "payload" not in names:
+            other = {"effects": list(names), "part": part}
+            remarks.append(Remark("payload_stands_for", other))
     of_mass = d.or_number[0] == EFFORT_SCALE and any(
         EFFORT_SCALE in names for names in stands_for.values()
     )
@@ -183,7 +182,7 @@ def placed(
         dataclasses.replace(c, after=base.get(c.name, c.after)) for c in d.changed
     )
     d = dataclasses.replace(d, changed=changed, or_in=tuple(ties))
-    return remarked(dataclasses.replace(f, diagnosis=d, known=known), text)
+    return remarked(dataclasses.replace(f, diagnosis=d, known=known), *remarks)
 
 
 def left_of(finding: Finding) -> float:

@@ -1,4 +1,5 @@
-"""Any robot as a machine: ``kind: robot`` (``alignment.machines.robot_file``). Its parts are its joints, by the model's names."""
+"""Any robot or axis as a machine: ``kind: robot``, or an axis file, which is written as a
+robot without a model (``alignment.machines.robot_file``). Its parts are its joints."""
 
 import dataclasses
 import math
@@ -64,12 +65,13 @@ from taccorl.diagnosis.problems.tilted_base import (
     change_between_poses,
     tilt_like,
 )
+from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.problem import candidate, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import Scale
@@ -91,10 +93,11 @@ ONE_POSE = {"rad": 0.3, "m": 0.1}
 """Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
 
 
+@machines.register("axis")
 @machines.register("robot")
 @dataclass(frozen=True)
 class RobotMachine(Machine):
-    """A robot described by an MJCF or URDF file and a robot file."""
+    """A robot described by a robot file, and by an MJCF or URDF file if it has a model."""
 
     robot: Robot
     """Content of the robot file, and its model."""
@@ -124,18 +127,19 @@ class RobotMachine(Machine):
 
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         config, joint = self.robot.config.joints[part], self.robot.joint(part)
-        times = ("position_age_s", "target_late_s")
-        own = {**config.numbers, **{n: (getattr(config, n), "s") for n in times}}
-        made = [
-            joint.in_units(type(e))(
-                **{p.name: getattr(e, p.name) for p in e.parameters()}
-            )
-            for e in config.effects
-        ]
+        times = ["position_age_s", "target_late_s"]
+        own = dict(config.numbers)
+        if config.inertia is not None:
+            own = {"inertia": (config.inertia, "kg·m²"), **own}
+            times = ["target_late_s", "speed_late_s"]
+            weights = ("weight_sin", "weight_cos")
+            for name in weights if joint.unit == "rad" else weights[1:]:
+                own[name] = (getattr(config, name), "N·m")
+        own |= {name: (getattr(config, name), "s") for name in times}
         return {
             n: (value, Scale(unit=joint.unit).unit_of(unit))
             for n, (value, unit) in own.items()
-        } | numbers_of(made)
+        } | numbers_of(config.effects)
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -227,6 +231,8 @@ class RobotMachine(Machine):
         self, part: str, measurements: Measurements, **options: Any
     ) -> Finding:
         found = diagnose_joint(self.robot, part, measurements, **options)
+        if not self.robot.config.model:
+            return found
         if any(
             "payload" in own
             for own in (found.diagnosis.names, *found.diagnosis.rivals.values())
@@ -296,9 +302,11 @@ class RobotMachine(Machine):
                 return ()
         return others
 
-    def _tilt(self, found: JointFinding, measurements: Measurements) -> str:
-        """Text that states by how much the base would have to be tilted so that gravity gives the torque of the effect
-        ``unbalance``, in the poses of the fit recordings. Empty if ``unbalance`` was neither added nor tied with the added
+    def _tilt(
+        self, found: JointFinding, measurements: Measurements
+    ) -> Remark | None:
+        """By how much the base would have to be tilted so that gravity gives the torque of the effect
+        ``unbalance``, in the poses of the fit recordings. None if ``unbalance`` was neither added nor tied with the added
         effect, or if the error is at the floor in poses between which that torque would differ."""
         d = found.diagnosis
         values = (
@@ -314,26 +322,24 @@ class RobotMachine(Machine):
             if e.name == "unbalance"
         ]
         if not values:
-            return ""
+            return None
         own = [self._whole(m) for m in of_joints(measurements, [found.part]).fit]
         numbers = (
             values[0][f"unbalance.{name}"] for name in ("torque_nm", "hangs_at_rad")
         )
         down = tilt_like(self.robot, found.part, own, *numbers)
         if down is None:
-            return ""
+            return None
         if (
             d.status == "at_floor"
             and change_between_poses(self.robot, found.part, own, down) > MOST_LEFT
         ):
-            return ""  # an equal torque in poses in which a tilt has others
+            return None  # an equal torque in poses in which a tilt has others
         g = self.robot.rigid.model.opt.gravity
         leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
-        return (
-            f"{TILT}{leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
-            f"a level; if it leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into "
-            f"{self.robot.path.name} instead"
-        )
+        gravity = f"[{', '.join(f'{x:.4f}' for x in down + 0.0)}]"
+        values = {"degrees": float(leans), "part": found.part, "gravity": gravity}
+        return Remark(TILT, values | {"file": self.robot.path.name})
 
     def reconsidered(
         self,
@@ -346,6 +352,8 @@ class RobotMachine(Machine):
         Where no joint alone determines its mass and place, or several found one, one mass is fitted to all joints
         (``one_mass``). So is what else was found at a joint, where it changes the error of others that lack less. One tilt of
         the base is fitted to all joints where several lack what it would explain (``one_tilt``)."""
+        if not self.robot.config.model:
+            return list(findings)
         how = measurements, gains, diagnosed
         return self._with_one_tilt(
             self._beside_larger(self._with_payloads(findings, how), how),
@@ -769,36 +777,25 @@ class RobotMachine(Machine):
         own = {
             key: value for key, value in values.items() if key not in ("arm", "joints")
         }
-        make_effect(name, **own)  # which names what is wrong
-        return joint.in_units(effects.get(name))(**own)
+        return joint.made(name, **own)
 
     def with_additions(self, additions: Sequence[Addition]) -> "RobotMachine":
         robot = self.robot
         for a in additions:
-            config = robot.config.joints[a.part]
-            numbers = {
-                key: float(value) for key, value in config.law_numbers(a.base).items()
-            }
-            # The file has the registered classes, whose numbers are the same.
-            made = [
-                (e.name, {f.name: getattr(e, f.name) for f in dataclasses.fields(e)})
+            config = robot.config.joints[a.part].with_numbers(a.base)
+            joint = robot.joint(a.part)  # bounds of a search may be narrower
+            new = [
+                joint.made(e.name, **{key: getattr(e, key) for key in e.settings()})
                 for e in a.effects
             ]
-            new = [make_effect(name, **own) for name, own in made]
-            for name in ("position_age_s", "target_late_s"):
-                if name in a.base:
-                    numbers[name] = float(a.base[name])
-            half_s = 0.5 * float(a.base.get("loop_s", 0.0))
-            if half_s > 0.0:
-                numbers["loop_hz"] = 0.5 / half_s
             if "speed_delay_s" in a.base:  # in the file beyond a whole period
+                half_s = 0.5 * float(a.base.get("loop_s", 0.0))
                 delay_s = float(a.base["speed_delay_s"]) - half_s
-                new.append(make_effect("speed_delay", delay_s=delay_s))
+                new.append(joint.made("speed_delay", delay_s=delay_s))
             kept = [e for e in config.effects if e.name not in {n.name for n in new}]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]
-            robot = robot.with_joint(
-                a.part, dataclasses.replace(config, **numbers, effects=effects_)
-            )
+            config = dataclasses.replace(config, effects=effects_)
+            robot = robot.with_joint(a.part, config)
         if (wrong := robot.wrong_mass())[0]:
             raise TaccorlError(wrong[1])
         return dataclasses.replace(self, robot=robot)

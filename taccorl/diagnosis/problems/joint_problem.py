@@ -1,16 +1,21 @@
-"""One joint as a problem for the search: its controller's numbers, candidate effects and recordings. Channels are the angle, and
-the motor's effort if every recording has it. Commanded gains that the recordings state stay fixed, because fitted gains can hide
-a missing effect (on the knee of a Unitree Go2 the fit gave K_p 116 for a commanded 20; recordings of
+"""One joint as a problem for the search: its controller's numbers, candidate effects and
+recordings. Channels are the angle, and the motor's effort if every recording has it. Free
+numbers of a joint without a model are those of ``axis_numbers``.
+
+Commanded gains that the recordings state stay fixed, because fitted gains can hide a missing
+effect (on the knee of a Unitree Go2 the fit gave K_p 116 for a commanded 20; recordings of
 iit-DLSLab/sim2real-robot-identification).
 """
 
 import dataclasses
+import math
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.checks.effort_time import law_error
 from taccorl.alignment.checks.motion import plateau
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
@@ -18,13 +23,17 @@ from taccorl.alignment.controller.drive_law import FOLLOWED, WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import LANES
 from taccorl.alignment.controller.joint_model import (
     SAME_RATE,
+    Answers,
     JointModel,
     JointResponse,
     Numbers,
     PayloadLever,
+    simulate_each,
 )
 from taccorl.alignment.controller.joint_motion import JointMotion, first_rows
 from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.controller.rigid_joint import RigidJoint
+from taccorl.alignment.machines.robot_joint import RobotJoint
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import (
@@ -34,8 +43,16 @@ from taccorl.alignment.measurements.noise_floor import (
     noise_floor,
 )
 from taccorl.diagnosis.comparison.regimes import with_regimes
+from taccorl.diagnosis.problems.axis_numbers import (
+    DRIVE_IS_STATED,
+    GAINS_WITHIN,
+    OF_DRIVE,
+    axis_numbers,
+    no_candidates,
+    of_motor,
+)
 from taccorl.diagnosis.problems.position_waves import position_waves
-from taccorl.diagnosis.search.identifiable import TIMING_S
+from taccorl.diagnosis.search.identifiable import EARLY_S, TIMING_S
 from taccorl.diagnosis.search.problem import (
     Candidate,
     Case,
@@ -50,6 +67,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.drive import SpeedDelay
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.load import Cogging
 from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.twin import TwinConfig
 
@@ -101,9 +119,6 @@ POSITION_AGE = Free(
 )
 """Age of the measured position when the drive's torque acts, beyond that of the loop. It is fitted with commanded gains if the
 machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is equivalent."""
-EARLY_S = 2e-3
-"""Most by which a target may act before its row's position was read [s]: MuJoCo's default step; half of it, or a position that
-is read right after its target was sent, are usual."""
 TARGET_LATE = Free(
     name="target_late_s",
     unit="s",
@@ -192,17 +207,25 @@ class JointProblem(WithoutMaps):
             not silent and (gains != "fitted" or not joint.gain_names),
         )
         own, bare = joint.freed(held)
-        self.known, self.loop_s = (
-            joint.known_names,
-            unlike_rows(joint.speed_delay_s * joint.exact_timing, everything),
-        )
+        self.axis: RobotJoint | None = None
+        """The joint, if it has no model: its body's numbers are fitted, too."""
+        if isinstance(joint, RobotJoint) and not joint.has_model:
+            self.axis = joint
+            self.commanded = joint.config.gains == "commanded"
+            if gains == "fitted" != joint.config.gains:
+                raise TaccorlError(
+                    f"--gains=fitted: write `gains: fitted` of {signal} into its file and "
+                    "remove --gains"
+                )
+        self.known = joint.known_names
+        self.loop_s = unlike_rows(joint.loop_s, everything)
         self._stated = {
             f"{effect.name}.{p.name}": getattr(effect, p.name)
             for effect in own
             for p in effect.parameters()
         }
         self.present = tuple(effect.name for effect in own)
-        self.model = JointModel(bare)
+        self.model, self._answers = JointModel(bare), Answers()
         self._speed_where = self.model.joint.selectors(SpeedDelay) or {}
         self.effort = effort and all(
             m.has_effort()[m.column(signal)] for m in everything
@@ -222,12 +245,16 @@ class JointProblem(WithoutMaps):
         self._own_floors = [
             floors_by_motion(everything, f.kind, left) for f in self.floors
         ]
+        self._least_floor = self._floor_of_loop()
+        self.law_error = self._law_error(measurements)
         sides = (measurements.fit, measurements.validation, measurements.test)
         recordings = [[self._recording(m) for m in side] for side in sides]
         self.fit, self.validation, self.test = with_regimes(
             recordings, everything, self.floors[0]
         )
         self.base, kd = self._base(), self.model.gains.kd
+        if self.axis is not None:
+            self.of_file = of_motor(self.axis, self.effort)
         alone = self.commanded and not (
             self.effort or joint.winding or joint.facts.get("commands_speed")
         )
@@ -241,10 +268,12 @@ class JointProblem(WithoutMaps):
                 kd, Scale(unit=joint.unit).unit_of(KD.unit)
             )
         self.candidates: dict[str, Candidate] = {}
-        self.learn(self.model.gains._asdict())
         self.start: Values = (
             self.model.gains._asdict() | dict(joint.winding) | self._stated
         )
+        if self.axis is not None:
+            self.start = {f.name: f.start for f in self.base} | self._stated
+        self.learn(self.start)
         if any(f.name == SPEED_DELAY.name for f in self.base):
             delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
             self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
@@ -261,6 +290,8 @@ class JointProblem(WithoutMaps):
     def numbers(self) -> str:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         known = f"; known: {', '.join(self.known)}" * bool(self.known)
+        if self.axis is not None:
+            return self._axis_words() + known
         if self.model.joint.winding:
             return f"gains as the file states them, stall torque and back-EMF fitted{known}"
         if self._first:
@@ -274,13 +305,49 @@ class JointProblem(WithoutMaps):
     @property
     def measured(self) -> str:
         """Text that names the channels whose errors are minimised and reported, such as positions."""
-        return (
-            "efforts"
-            if self._first
-            else "angles and efforts together"
-            if self.effort
-            else "angles"
-        )
+        positions = "angles" if self.axis is None else "positions"
+        if self._first:
+            return "efforts"
+        return f"{positions} and efforts together" if self.effort else positions
+
+    def _axis_words(self) -> str:
+        present = {*self.present}
+        free = [f for f in self.base if not f.held and not {*f.unless} & present]
+        names = ", ".join(f.name for f in free)
+        if self.law_error <= DRIVE_IS_STATED:
+            return (
+                f"fitted: {names}; gains and times of the drive stay: efforts are its "
+                f"law's, to {self.law_error:.2g} noise floors"
+            )
+        near = ""
+        if self.commanded and any(f.name == "kp" for f in free):
+            near = (
+                f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)"
+            )
+        return f"fitted: {names}{near}; other numbers as the file states them"
+
+    def _floor_of_loop(self) -> float:
+        """Least floor of an axis's position. Without repeats an encoder's resolution is no
+        floor: the loop answers an error of the force by one of the position."""
+        axis = self.axis
+        if axis is None or not self.effort or not self.floors[0].lower_bound:
+            return 0.0
+        if axis.config.law not in ("impedance", "cascade"):
+            return 0.0
+        return self.floors[-1].value / axis.config.loop_gains.kp
+
+    def _law_error(self, measurements: Measurements) -> float:
+        """Error of the file's law of an axis [noise floors of the effort]; inf if nothing
+        determines it."""
+        axis = self.axis
+        if axis is None or not (axis.config.loop_hz and self.effort):
+            return math.inf
+        if axis.config.gains != "commanded":
+            return math.inf
+        used = (*measurements.fit, *measurements.validation)
+        age_s = axis.speed_delay_s
+        errors = [law_error(axis.config, m, self.signal, age_s) for m in used]
+        return max(errors) / self.floors[-1].value
 
     @property
     def inertia_kgm2(self) -> float:
@@ -338,9 +405,12 @@ class JointProblem(WithoutMaps):
         would report it; with ``law: effort`` the effort alone. NaN after the last measured row. ``cases``: always fitted numbers,
         and effects in addition to those of the machine that are not fitted."""
         motions = [measured_part(recording) for recording in recordings]
-        answers = self.model.simulate_all(
-            motions, [self._numbers(*case) for case in cases]
-        )
+        models = [self._model_of(base) for base, _ in cases]
+        numbers = [
+            self._numbers(*case, model.joint)
+            for case, model in zip(cases, models, strict=True)
+        ]
+        answers = simulate_each(models, motions, numbers, self._answers)
         scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
         channels = slice(self._first, 1 + self.effort)
         return [
@@ -351,7 +421,21 @@ class JointProblem(WithoutMaps):
             for those, r in zip(answers, recordings, strict=True)
         ]
 
-    def _numbers(self, base: Mapping[str, float], effects: Sequence[Effect]) -> Numbers:
+    def _model_of(self, values: Mapping[str, float]) -> JointModel:
+        if self.axis is None:
+            return self.model
+        return JointModel(self.model.joint.with_values(values))
+
+    def _numbers(
+        self, base: Mapping[str, float], effects: Sequence[Effect], joint: RigidJoint
+    ) -> Numbers:
+        scale, waits_s = base.get(EFFORT_SCALE.name, 1.0), base.get("loop_waits_s", 0.0)
+        at = joint.target_late_s
+        waits_s += (
+            base.get(TARGET_LATE.name, at) - at
+        )  # 0 of an axis, whose joint has it
+        if self.axis is not None:
+            return Numbers(joint.gains, effects, waits_s=waits_s, effort_scale=scale)
         lever, half_s = (
             PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE)),
             0.5 * base.get(LOOP.name, 0.0),
@@ -363,9 +447,6 @@ class JointProblem(WithoutMaps):
                     **self._speed_where, delay_s=base[SPEED_DELAY.name] - half_s
                 ),
             ]
-        joint = self.model.joint
-        waits_s = base.get("loop_waits_s", 0.0) - joint.target_late_s
-        waits_s += base.get(TARGET_LATE.name, joint.target_late_s)
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
             self.model.joint.numbers(base),
@@ -380,14 +461,17 @@ class JointProblem(WithoutMaps):
                 2.0 * half_s * bool(gains.kd)
             )  # what the position's age takes from K_d is of no speed
             facts |= {"effort_age": (1.0 - newer) * half_s, "speed_age": speed_age}
-        scale = base.get(EFFORT_SCALE.name, 1.0)
         return Numbers(gains, effects, lever, age_s, facts, waits_s, scale)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
         seen = self._seen(values)
+        if self.axis is not None:
+            self._left_out = no_candidates(self.axis, self.effort)
         for name in registry:
             cls = registry.get(name)
+            if self.law_error <= DRIVE_IS_STATED and cls.slot in OF_DRIVE:
+                continue
             if "dry_friction" in cls.needs and name not in self.present:
                 continue
             where = (
@@ -396,6 +480,7 @@ class JointProblem(WithoutMaps):
                 else None
             )
             scaled = self.commanded and not self.model.joint.winding
+            scaled = scaled or self.axis is not None
             if where is not None and (scaled or name not in _GAIN_LIKE):
                 c = candidate(self.model.joint.in_units(cls), seen, **where)
                 frees = holding(c.frees, self.known, self._stated)
@@ -420,6 +505,13 @@ class JointProblem(WithoutMaps):
         newest = max(-0.6 * max(joint.speed_delay_s, EARLY_S), -SPEED_DELAY.high)
         delay = dataclasses.replace(SPEED_DELAY, low=newest)
         units = Scale(unit=joint.unit)
+        if self.axis is not None:
+            held = [dataclasses.replace(EFFORT_SCALE, held=True)] if self.effort else []
+            error, effort = self.law_error, self.effort
+            table = axis_numbers(
+                self.axis, TORQUE_FF, LOOP, effort=effort, law_error=error
+            )
+            return (*table, *held)
         scale = [dataclasses.replace(EFFORT_SCALE, held=True)] * (
             self.effort and not self._left_out
         )
@@ -475,6 +567,7 @@ class JointProblem(WithoutMaps):
             motion_of(m, self.signal, self.model.joint),
         )
         floors = [own[m.name][self.signal].value for own in self._own_floors]
+        floors[0] = max(floors[0], self._least_floor)
         return recording_of(
             m, self.signal, motion, kinds[self._first : 1 + self.effort], floors
         )
@@ -482,22 +575,36 @@ class JointProblem(WithoutMaps):
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
         motions: list[JointMotion] = [r.data for r in self.fit]
-        gains, facts = self.model.joint.numbers(values)
-        position = self.model.joint.target_kind == "position"
-        answers = [self.model.simulate(m, gains, facts=facts) for m in motions]
+        model = self._model_of(values)
+        gains, facts = model.joint.numbers(values)
+        position = model.joint.target_kind == "position"
+        answers = [model.simulate(m, gains, facts=facts) for m in motions]
+        drive = {}
+        if self.axis is not None and gains.kp > 0.0:
+            drive["drive_rad_per_nm"] = 1.0 / gains.kp
         motor_nm = [
-            np.abs(self.model.motor_nm(m, a)).max()
+            np.abs(model.motor_nm(m, a)).max()
             for m, a in zip(motions, answers, strict=True)
         ]
         asked = [
             self._asked(m) if position else a.reported
             for m, a in zip(motions, answers, strict=True)
         ]
+        waves = self._position_waves(model, motions)
         return seen_in(motions, answers, asked) | {
+            **drive,
             "peak_motor_nm": float(max(motor_nm)),
             "span_rad": float(np.ptp(np.concatenate(asked))),
-            **position_waves(motions, [self.model.inertia_kgm2(m) for m in motions]),
+            **waves,
         }
+
+    def _position_waves(
+        self, model: JointModel, motions: Sequence[JointMotion]
+    ) -> dict[str, float]:
+        joint = self.model.joint
+        inertias = [model.inertia_kgm2(m) for m in motions]
+        cogging = joint.in_units(Cogging)
+        return position_waves(motions, inertias, cogging, length=joint.wave)
 
 
 def floor_words(floors: Sequence[SignalFloor]) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taccorl.alignment.checks.trial import least_motion
 from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -78,16 +79,20 @@ def swept_joints(measurements: Measurements) -> tuple[str, ...]:
 
 
 def moves(m: Measurement, signal: str) -> bool:
-    """True if the recording commands the joint to move, by more than 2 mrad (2 mm), while its arm presses nothing: contact forces
-    at the hand turn its joints, and the one-joint model does not include them."""
+    """True if the recording commands the joint to move, by more than 2 mrad (2 mm; alone
+    in a recording ``least_motion``, if that is less), while its arm presses nothing: contact
+    forces at the hand turn its joints, and the one-joint model does not include them."""
     if m.pressed is not None and signal.startswith(f"{m.pressed.arm}_"):
         return False
     if signal not in m.signals:
         return False
     positions = m.moved(signal)
+    least = MOVES_RAD
+    if len(m.signals) == 1:
+        least = min(least, least_motion(m, signal))
     return (
         bool(np.isfinite(positions).any())
-        and float(np.nanmax(positions) - np.nanmin(positions)) > MOVES_RAD
+        and float(np.nanmax(positions) - np.nanmin(positions)) > least
     )
 
 
@@ -137,6 +142,8 @@ def diagnose_joint(
     own = apart(own, drifted)
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
     found = solved(signal, problem, search, without, progress)
+    if problem.axis is not None:
+        return JointFinding(**vars(found), floors=tuple(problem.floors))
     known = known_numbers(problem, found.diagnosis)
     told = vars(found) | {
         "known": known,

@@ -73,8 +73,8 @@ class OneTiltProblem(OneMassProblem):
         if key not in self._weights:
             columns = []
             for e in self.across:
-                with under_gravity(self._robot.rigid.model, self._g_mps2 * e) as model:
-                    terms = rigid_terms(model, joint, own.data.pose)
+                model = under_gravity(self._robot.rigid.model, self._g_mps2 * e)
+                terms = rigid_terms(model, joint, own.data.pose)
                 columns.append((terms.gravity_sin, terms.gravity_cos))
             self._weights[key] = np.array(columns).T
         sine, cosine = self._weights[key] @ (lean.a, lean.b)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.controller.joint_motion import JointMotion
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Cogging
 
 SPAN_RAD = math.pi
@@ -28,9 +29,9 @@ MOST_WAVES = 3
 def position_waves(
     motions: Sequence[JointMotion],
     inertias_kgm2: Sequence[float],
+    cogging: type[Effect] = Cogging,
     *,
     length: float = 1.0,
-    least_span: float = SPAN_RAD,
 ) -> dict[str, float]:
     """The strongest waves over the position, as facts for ``Cogging.starts``.
 
@@ -39,12 +40,15 @@ def position_waves(
 
     Args:
         inertias_kgm2: J of each motion [kg·m²].
-        length: position that counts as 1 rad, for slides [m]: wave numbers are those of position / ``length``.
-        least_span: span, in these units, up to which nothing is returned.
+        cogging: the effect in the units of the joint, whose bounds of ``periods``
+            are those of the search.
+        length: position that counts as 1 rad: 1 of a hinge; of a slide
+            ``Scale.wave`` [m]. Returned wave numbers are those of position / ``length``.
 
     Returns:
-        ``wave_periods_1`` N, ``wave_phase_1`` φ [rad], … of up to ``MOST_WAVES`` waves, strongest first; empty where the motions
-        span at most ``least_span``.
+        ``wave_periods_1`` N, ``wave_phase_1`` φ [rad], … of up to ``MOST_WAVES`` waves,
+        strongest first. Empty if a hinge turns by at most ``SPAN_RAD``; of a slide the
+        grid, which counts turns, is of no use.
     """
     angles, left = [], []
     for m, inertia in zip(motions, inertias_kgm2, strict=True):
@@ -78,17 +82,16 @@ def position_waves(
         return {}
     q, left_over = np.concatenate(angles), np.concatenate(left)
     low, span = float(q.min()), float(np.ptp(q))
-    if span <= least_span:
+    periods_of = next(p for p in cogging.parameters() if p.name == "periods")
+    if periods_of.unit == "1" and span <= SPAN_RAD:
         return {}
-    bounds = next(p for p in Cogging.parameters() if p.name == "periods")
-    width = math.tau / bounds.high / BINS
+    lowest, highest = periods_of.low * length, periods_of.high * length
+    width = math.tau / highest / BINS
     place = np.round((q - low) / width).astype(int)
     size = FINER * (int(place.max()) + 1)
     spectrum = np.fft.rfft(np.bincount(place, left_over), size)
     periods = math.tau * np.arange(len(spectrum)) / (size * width)
-    power = np.where(
-        (periods >= bounds.low) & (periods <= bounds.high), np.abs(spectrum), 0.0
-    )
+    power = np.where((periods >= lowest) & (periods <= highest), np.abs(spectrum), 0.0)
     found: dict[str, float] = {}
     for k in range(1, MOST_WAVES + 1):
         at = int(np.argmax(power))

@@ -56,8 +56,8 @@ def weights_by_turn(
     now = robot.rigid.model.opt.gravity + robot.more_gravity
     weights = np.empty((2, 3))
     for k, axis in enumerate(np.eye(3)):
-        with under_gravity(robot.rigid.model, -np.cross(axis, now)) as model:
-            terms = [rigid_terms(model, joint, pose) for pose in poses]
+        model = under_gravity(robot.rigid.model, -np.cross(axis, now))
+        terms = [rigid_terms(model, joint, pose) for pose in poses]
         weights[:, k] = np.mean([(t.gravity_sin, t.gravity_cos) for t in terms], axis=0)
     return weights
 
@@ -68,10 +68,8 @@ def change_between_poses(
     """By how much the torque differs between the poses of the recordings by which a hinge is loaded more if gravity has the
     direction ``down`` (3,): largest distance of its S and C from their mean, as a share of the mean."""
     now = robot.rigid.model.opt.gravity + robot.more_gravity
-    with under_gravity(robot.rigid.model, np.linalg.norm(now) * down - now) as model:
-        terms = [
-            rigid_terms(model, joint, robot.joint(joint).pose(m)) for m in recordings
-        ]
+    model = under_gravity(robot.rigid.model, np.linalg.norm(now) * down - now)
+    terms = [rigid_terms(model, joint, robot.joint(joint).pose(m)) for m in recordings]
     loads = np.array([(t.gravity_sin, t.gravity_cos) for t in terms])
     mean = loads.mean(axis=0)
     return float(

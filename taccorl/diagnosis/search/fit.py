@@ -10,11 +10,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import t as student
 
 from taccorl.alignment.least_squares import (
     COARSE,
     FAR,
     FINE,
+    MANY_RECORDINGS,
     TIGHT,
     WIDE,
     Solution,
@@ -24,6 +26,7 @@ from taccorl.alignment.least_squares import (
 from taccorl.alignment.least_squares import rms as rms
 from taccorl.alignment.measurements.correlation import Rows, rate_of
 from taccorl.diagnosis.search.problem import (
+    LEAST_ROWS,
     Case,
     Free,
     Problem,
@@ -39,6 +42,9 @@ _SCALE_ROUNDS, _SAME_SCALE = 8, 1.5
 _ASIDE = tuple(side * step for side in (-1.0, 1.0) for step in (0.01, 0.03, 0.1, 0.3))
 _DENTS, _DEEPER = 4, 0.998
 """``out_of_dents`` goes on at most ``_DENTS`` times, each time to at most ``_DEEPER`` times the error."""
+MOST_HELD = 4.0
+"""Factor on the variance of a number without a group of rows from which on they hold most
+of what is known of it. A choice."""
 DECADES = 100.0
 """Ratio of the ends of a range from which on it is no tolerance. A choice."""
 
@@ -152,17 +158,80 @@ def moved_by(
     others: Sequence[Recording],
     steps: np.ndarray,
 ) -> np.ndarray:
-    """(p,) Gauss–Newton step from ``model`` to the fit of all recordings, those of ``fitted_to`` and ``others``, 0 for numbers at
-    their bound, with ``_moved_by_noise`` as the root of the sum of squares. ``steps``: (p,) half widths of the differences."""
-    columns = _secants(problem, model, fitted_to, others, steps)
+    """(p,) change of the coordinates with other recordings; 0 for numbers at their bound.
+
+    Root of the sum of squares of the Gauss–Newton step to the fit of all recordings, of
+    the scatter of such steps if one of them, or one regime of motion, is left out (the
+    larger one, ``_scatter``, beyond ``model.covariance``), and of ``_moved_by_noise``.
+
+    Args:
+        fitted_to, others: recordings of ``model``, and further ones.
+        steps: (p,) half widths of the differences.
+    """
     inside = np.array([f.name not in model.at_bound for f in model.frees])
-    together = (model.jacobian.T @ model.jacobian + columns.T @ columns)[
-        np.ix_(inside, inside)
-    ]
+    columns = _secants(problem, model, fitted_to, others, steps)
     here = stacked(problem, model.values, model.effects, others)
-    moved = np.zeros(len(inside))
-    moved[inside] = -inverse_of(together) @ (columns.T @ here)[inside]
-    return np.hypot(moved, _moved_by_noise(problem, model, fitted_to))
+    jacobian = np.concatenate([model.jacobian, columns])[:, inside]
+    left = np.concatenate([model.residuals, here])
+    every = (*fitted_to, *others)
+    moved, scatter = np.zeros(len(inside)), np.zeros(len(inside))
+    moved[inside] = -inverse_of(jacobian.T @ jacobian) @ (jacobian.T @ left)
+    for groups in (_by_recording(every), _by_regime(every)):
+        if len(groups) >= MANY_RECORDINGS:
+            scatter[inside] = np.maximum(
+                scatter[inside], _scatter(jacobian, left, groups)
+            )
+    more = np.maximum(scatter**2 - np.diag(model.covariance()), 0.0)
+    noise = _moved_by_noise(problem, model, fitted_to)
+    return np.sqrt(moved**2 + more + noise**2)
+
+
+def _by_recording(recordings: Sequence[Recording]) -> list[np.ndarray]:
+    """(n,) bool for each recording: its entries among the stacked residuals of all."""
+    counts = [int(np.isfinite(r.measured).sum()) for r in recordings]
+    number = np.repeat(np.arange(len(counts)), counts)
+    return [number == k for k in range(len(counts))]
+
+
+def _by_regime(recordings: Sequence[Recording]) -> list[np.ndarray]:
+    """(n,) bool for each regime of motion that is not everywhere."""
+
+    def entries(r: Recording, name: str) -> np.ndarray:
+        seen = np.isfinite(r.measured)
+        rows, _ = r.regimes.get(name, (np.zeros(len(seen), dtype=bool), 1.0))
+        return np.broadcast_to(rows[:, None], seen.shape)[seen]
+
+    names = dict.fromkeys(name for r in recordings for name in r.regimes)
+    found = [np.concatenate([entries(r, name) for r in recordings]) for name in names]
+    return [rows for rows in found if LEAST_ROWS <= rows.sum() < len(rows)]
+
+
+def _scatter(
+    jacobian: np.ndarray, left: np.ndarray, groups: Sequence[np.ndarray]
+) -> np.ndarray:
+    """(p,) jackknife: half width of a 95 % interval over that of the normal distribution,
+    by the Gauss–Newton steps without each of G groups of rows.
+
+    Groups do not count for a number of which they hold most of the information: what the
+    others say of it does not contradict them.
+
+    Args:
+        jacobian, left: (n, p) derivatives of (n,) residuals.
+        groups: (n,) bool each.
+    """
+    squares, pull = jacobian.T @ jacobian, jacobian.T @ left
+    steps = []
+    for rows in groups:
+        own = jacobian[rows]
+        inverse = inverse_of(squares - own.T @ own)
+        known = np.diag(inverse) <= MOST_HELD * np.diag(inverse_of(squares))
+        steps.append(np.where(known, -inverse @ (pull - own.T @ left[rows]), np.nan))
+    counts = np.isfinite(steps).sum(axis=0)
+    found = np.zeros(jacobian.shape[1])
+    for k in np.flatnonzero(counts > 1):
+        few = student.ppf(0.975, counts[k] - 1) / student.ppf(0.975, np.inf)
+        found[k] = few * np.nanstd([s[k] for s in steps]) * np.sqrt(counts[k] - 1.0)
+    return found
 
 
 def _moved_by_noise(

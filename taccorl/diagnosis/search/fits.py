@@ -312,33 +312,39 @@ class Fits:
             seen.setdefault(p.name, []).append(p)
             self.probes.setdefault((key, p.name), p)
         order = list(seen)
-        simpler = {
-            form
-            for n in order[:SURELY_FULL]
-            for form in simple_forms(candidates[n].cls)
-        }
         names = [
             n
             for k, n in enumerate(order)
-            if k < PROBED or n in simpler or (likely and is_likely(candidates[n]))
+            if k < PROBED or (likely and is_likely(candidates[n]))
         ]
         starts = {
             n: [
                 parent.fit.values | p.scaled(candidates[n])
-                for p in seen[n][:3]
-                if 2 * p.explained >= seen[n][0].explained
+                for p in own[:3]
+                if 2 * p.explained >= own[0].explained
             ]
-            for n in names
+            for n, own in seen.items()
         }
         short: dict[str, Fit] = {}
-        for k, n in enumerate(names, 1):
-            there = self.models.get(key | {n})
-            self.progress(f"first refit with {n}, {k} of {len(names)}")
-            short[n] = (
-                there.fit
-                if there is not None and there.full
-                else self._short(parent.fit, n, starts[n][0])
-            )
+
+        def leading() -> set[str]:
+            least = sorted(short, key=lambda n: short[n].error)
+            return {*least[:SURELY_FULL], *order[:SURELY_FULL]}
+
+        def first_refits(names: Sequence[str]) -> None:
+            for k, n in enumerate(names, 1):
+                there = self.models.get(key | {n})
+                self.progress(f"first refit with {n}, {k} of {len(names)}")
+                short[n] = (
+                    there.fit
+                    if there is not None and there.full
+                    else self._short(parent.fit, n, starts[n][0])
+                )
+
+        first_refits(names)
+        forms = {f for n in leading() for f in simple_forms(candidates[n].cls)}
+        first_refits([f for f in order if f in forms and f not in short])
+        names = list(short)
         left = min((f.error**2 for f in short.values()), default=0.0)
         most_removed = parent.fit.error**2 - left
         # Along a ridge of several numbers a few steps do not go far.
@@ -354,8 +360,7 @@ class Fits:
             there = self.models.get(key | {n})
             if there is not None and there.full:
                 continue
-            sure = n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL], *simpler)
-            if sure or short[n].error <= enough:
+            if n in leading() | forms or short[n].error <= enough:
                 self.progress(f"refitting with {n}, {k} of at most {len(names)}")
                 began = [short[n].values, *starts[n][1:]]
                 self._keep(self._full(parent.fit, n, began), full=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.diagnosis.search.fit import Fit, fit
-from taccorl.diagnosis.search.problem import Problem, Recording, Values
+from taccorl.diagnosis.search.fit import Fit
+from taccorl.diagnosis.search.problem import Problem, Recording
 from taccorl.diagnosis.search.screen import alike, probe
 
 VISIBLE = 0.75
@@ -40,18 +40,18 @@ class Identifiability:
 
 
 def identifiability(
-    problem: Problem,
-    recordings: Sequence[Recording],
-    start: Values,
-    present: Sequence[str] = (),
+    problem: Problem, recordings: Sequence[Recording], here: Fit
 ) -> Identifiability:
-    """Fit the always fitted numbers from ``start``, with the effects ``present``, and probe all candidates."""
-    here = fit(problem, recordings, present, start)
+    """Probe all candidates beside the effects of ``here``.
+
+    Args:
+        here: fit of the always fitted numbers to ``recordings``, with the machine's effects.
+    """
     problem.learn(here.values)
     typical = [
         dataclasses.replace(c, starts=(c.starts[len(c.starts) // 2],))
         for name, c in problem.candidates.items()
-        if name not in present
+        if name not in here.names
     ]
     probes = probe(problem, recordings, here, typical)
     shown = [p for p in probes if p.visible >= VISIBLE]

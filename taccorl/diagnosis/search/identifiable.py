@@ -38,6 +38,9 @@ TIMING_S = 3e-3
 """τ_max [s]. A choice: a loop of 1 kHz (difference of two samples, output held: 1 ms) that filters its speed over 2 ms."""
 POSITION_AGE_S = 1.5e-3
 """a_max [s]. A choice: half a period of a loop of 500 Hz (1 ms), and half a step of the twin (0.4 ms), which has no such age."""
+EARLY_S = 2e-3
+"""Most by which a target may act before its row's position was read [s]: MuJoCo's default step. Half of it, or a position that is
+read right after its target was sent, are usual."""
 LATE = (".delay_s", ".time_constant_s")
 """Ends of the names of delays and lags."""
 GAINS = ("kp", "kd", "torque_ff")

@@ -88,6 +88,7 @@ def diagnose(
     test: Sequence[Recording] = (),
     *,
     start: Mapping[str, float] | None = None,
+    begin: Mapping[str, float] | None = None,
     present: Sequence[str] = (),
     without: Sequence[str] = (),
     config: SearchConfig | None = None,
@@ -100,6 +101,7 @@ def diagnose(
         validation: recordings by whose error effects are chosen.
         test: recordings on which no choice depends; they give the final error.
         start: start values; defaults of the problem's numbers if not given.
+        begin: where the first fit begins; ``start`` if not given.
         present: effects that the twin has already: they are refitted and never removed.
         without: effects that are left out of the search.
         config: criteria of acceptance; the default ones if not given.
@@ -118,7 +120,7 @@ def diagnose(
         config or SearchConfig(),
         progress,
     )
-    fits = Fits(problem, *how)
+    fits = Fits(problem, *how, begin)
     others = (
         {}
         if fits.at_floor(fits.base)

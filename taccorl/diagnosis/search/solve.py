@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from taccorl.diagnosis.search.drift import Drift
-from taccorl.diagnosis.search.fit import residuals
+from taccorl.diagnosis.search.fit import fit, residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.known_numbers import limits_of_known
@@ -133,7 +133,8 @@ def solve(
             "can be evaluated; record a motion that is measured to its end, or mark another one with use: validation"
         )
     progress("which effects the recordings can show")
-    can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    first = fit(problem, fit_to, problem.present, problem.start)
+    can_tell = identifiability(problem, fit_to, first)
     absent = [
         name
         for name in problem.known
@@ -145,6 +146,7 @@ def solve(
         validation,
         test,
         start=problem.start,
+        begin=first.values,
         present=problem.present,
         without=[*without, *absent],
         config=search,

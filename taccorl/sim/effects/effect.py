@@ -173,7 +173,7 @@ class Effect:
     tell them apart, and which recording can."""
 
     range_by: ClassVar[str] = ""
-    """End of the message for a parameter outside its bounds: the keys of the axis file that set them; empty if none does."""
+    """End of the message for a parameter outside its bounds: the keys of the joint's file that set them; empty if none does."""
     reduces_to: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect, without unit; at its lower bound both effects are equal. A fitted
     value less than 0.1 above that bound is rejected in favour of the simpler effect."""

@@ -32,6 +32,9 @@ _MOST_PERIODS, _MOST_STARTS = (
     60.0,
     32,
 )  # where a search for cogging ends; enough for a span of π
+FINEST_PER_M = 1e5
+"""Largest wave number of ``cogging`` that a file may state: of a slide it is in
+rad/m, and a pitch of 0.1 mm has 6e4."""
 _QUARTERS = (0.0, math.pi / 2, math.pi, -math.pi / 2)  # sine and cosine of both signs
 
 
@@ -93,6 +96,10 @@ class Cogging(JointEffect):
         "a choice: fewer are weight or a cable; of the joint's turn, so a gear's ratio times the motor's periods",
     )  # fmt: skip
     phase_rad: float = number("φ", "rad", None, 0, (-math.tau, math.tau))
+
+    @classmethod
+    def accepted(cls, p: Parameter) -> tuple[float, float]:
+        return (1.0, FINEST_PER_M) if p.name == "periods" else (p.low, p.high)
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:

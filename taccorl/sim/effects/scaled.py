@@ -32,7 +32,10 @@ SOFT = 5.0
 """Compliance that a gear may have in multiples of the drive's; of series elastic actuators it is 0.1 to 3. A choice."""
 WAVE_SHARE = 0.25
 """Share w of a slide's length unit that stands for 1 rad in periodic forces (magnets, a screw): wave numbers 2π / pitch are
-6 / w … 200 / w, pitches 0.8 to 26 % of a stroke. A choice."""
+6 / w … 800 / w, pitches 0.2 to 26 % of a stroke. A choice."""
+FINER = 4.0
+"""Factor on the largest wave number of a slide's periodic forces: a screw's pitch of
+5 mm is 0.5 % of a stroke of 1 m. A choice."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +87,14 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     changed = {}
     for p in base.parameters():
         ends = {key: getattr(p, key) for key in ("absent", "low", "high", "typical")}
-        number = {
+        number: dict[str, Any] = {
             k: v if v is None or not math.isfinite(v) else v * factors[p.name]
             for k, v in ends.items()
         }
         if p.unit == "rad/(N·m)":
             number["high"] = max(p.high * factors[p.name], SOFT * scale.drive)
+        if name == "cogging" and p.name == "periods" and scale.unit == "m":
+            number["high"] *= FINER
         changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
@@ -108,7 +113,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
             for start in base.starts(own)
         ]
 
-    by = "; in the file of an axis `force_unit_n` and `length_unit_m` set such bounds"
+    by = "; `force_unit_n` and `length_unit_m` of the joint set such bounds"
     return _changed(
         base, changed, (scaled, name, scale), starts=classmethod(starts), range_by=by
     )

@@ -94,7 +94,8 @@ def changed(
 
 
 @pytest.mark.parametrize(
-    "columns", [COLUMNS, ("measured", "target"), ("measured",), ("target",)]
+    "columns",
+    [COLUMNS, ("measured", "target"), ("measured",), ("target",), ("effort",)],
 )
 def test_exchanged_columns_of_two_joints_are_named(
     machine: RobotMachine, columns: tuple[str, ...]

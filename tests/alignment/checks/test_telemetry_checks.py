@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axes import altered, axis_answer, axis_motion, axis_of
 from made_rows import of_signal, play
 from made_sweep import (
     ARMS_JOINTS,
@@ -34,7 +35,7 @@ from taccorl.alignment.checks.first_order import (
     onset_delay,
     pure_shift,
 )
-from taccorl.alignment.checks.motion import check_start
+from taccorl.alignment.checks.motion import _answers_a_jump, check_start
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import (
     check_measurement,
@@ -43,12 +44,10 @@ from taccorl.alignment.checks.telemetry import (
 )
 from taccorl.alignment.checks.trial import Trial
 from taccorl.alignment.controller.drive_law import DriveLaw
-from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
-from taccorl.diagnosis.problems.axis_problem import axis_motion, simulated
 from taccorl.errors import TaccorlError
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
@@ -570,13 +569,13 @@ def test_friction_that_trails_the_twin_does_not_lead_it() -> None:
     time_s = np.arange(2500) / 250
     target = 0.24 / np.pi * np.arcsin(np.sin(2 * np.pi * time_s / 9))
     motion = dataclasses.replace(servo(time_s, 0.0 * time_s, target), units=("m",))
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo", unit="m", law="cascade", inertia=12.0, kp=30.0, kd=600.0
     )
 
     def slide(force_n: float = 0.0, **own: float) -> np.ndarray:
-        made = dataclasses.replace(axis, **own)
-        return simulated(
+        made = altered(axis, **own)
+        return axis_answer(
             made,
             axis_motion(made, motion),
             [make_effect("coulomb_friction", torque_nm=force_n)],
@@ -1045,8 +1044,8 @@ def test_a_step_from_rest_is_data_whether_its_target_jumps_in_the_first_row_or_l
     seen = check_measurement(m)
     assert not [f for f in seen if f.severity == "error"]
     assert not {"no_motion", "not_at_rest", "start_offset"} & {f.check for f in seen}
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, kp=10.0, kd=0.8)
-    answer_rad = simulated(axis, axis_motion(axis, m), []).reported
+    axis = axis_of(name="servo", unit="rad", inertia=0.02, kp=10.0, kd=0.8)
+    answer_rad = axis_answer(axis, axis_motion(axis, m), []).reported
     assert np.sqrt(np.mean((answer_rad - q) ** 2)) < 0.01 * abs(step_rad)
 
 
@@ -1200,6 +1199,26 @@ def test_a_sweep_that_never_moves_the_joint():
 def test_too_short(clean):
     assert "of motion in 140 rows" in text_of(some(clean, slice(180, 320)), "too_short")
     assert found(sweep(0, seconds=2.0))["short"] == [""]
+
+
+@pytest.mark.parametrize("kp", [40.0, 150.0, 600.0])
+@pytest.mark.parametrize("rate_hz", [100, 200, 500])
+@pytest.mark.parametrize("steps", [True, False])
+def test_a_step_of_the_target_in_row_0_is_no_speed_at_row_0(kp, rate_hz, steps):
+    """A mass of 0.05 kg·m², well damped, at rest: its target steps by 0.2 rad in row 0. Or on its way with a target that
+    moves on at 0.6 rad/s. q by the exact solution of its equation."""
+    from scipy.linalg import expm
+
+    inertia, kd = 0.05, 1.4 * np.sqrt(kp * 0.05)
+    step = expm(np.array([[0.0, 1.0], [-kp / inertia, -kd / inertia]]) / rate_hz)
+    time_s = np.arange(30) / rate_hz
+    lag = 0.0 if steps else 0.6 * kd / kp  # of the mass behind a moving target
+    target = 0.2 + (0.0 if steps else 0.6) * time_s
+    state, rows = np.array([-0.2 if steps else 0.0, 0.0]), []
+    for goal in target:
+        rows.append(goal - lag + state[0])
+        state = step @ state
+    assert _answers_a_jump(target, np.array(rows)) == steps
 
 
 def test_not_at_rest_at_the_start(clean):

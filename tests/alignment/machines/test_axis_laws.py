@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from axes import altered, axis_answer, axis_motion, axis_of, config_of, joint_of
 from made_rows import of_signal
 
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, EffectEntry
+from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 
@@ -21,7 +22,7 @@ WINDING: dict[str, Any] = {
     "torque_nm_per_a": 1.0,
     "emf_v_s_per_rad": 1.1,
 }
-SERVO = AxisConfig(
+SERVO = axis_of(
     name="servo", unit="rad", inertia=0.02, law="pwm", kp=6.0, lever_m=0.15, **WINDING
 )
 
@@ -33,9 +34,8 @@ def recording(
     return of_signal("made", RATE_HZ, target, np.zeros(len(target)), "servo", **more)
 
 
-def answer(axis: AxisConfig, m: Measurement) -> JointResponse:
-    model = JointModel(DrivenAxis(axis))
-    return model.simulate(motion_of(m, "servo", DrivenAxis(axis)), model.gains)
+def answer(axis: Robot, m: Measurement) -> JointResponse:
+    return axis_answer(axis, axis_motion(axis, m))
 
 
 def integrated(
@@ -71,7 +71,7 @@ def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
     assert found.effort[-1] == pytest.approx(
         weight * math.sin(found.reported[-1]), rel=0.03
     )
-    stiff = dataclasses.replace(SERVO, emf_v_s_per_rad=1e-6)
+    stiff = altered(SERVO, emf_v_s_per_rad=1e-6)
     assert np.abs(answer(stiff, m).reported - truth).max() > 0.05, (
         "without back-EMF it is much faster"
     )
@@ -79,36 +79,35 @@ def test_a_pwm_servo_with_a_pendulum_clips_its_duty_and_loses_the_back_emf():
 
 def sampled(
     target: np.ndarray,
-    axis: AxisConfig,
+    axis: Robot,
     filter_s: float = 0.0,
     dead: float = 0.0,
     gain: float = 1.0,
 ) -> np.ndarray:
     """(T,) position of an axis of law impedance or pwm whose loop of ``loop_hz`` computes its speed from two readings, smooths it
     over ``filter_s`` and holds its output; ``dead``: half the dead band [rad], ``gain``: factor on negative torques."""
-    every, clips = round(1.0 / (axis.loop_hz or 1.0) / DT_S), axis.law == "pwm"
-    most = axis.stall_nm if clips else math.inf
+    config = config_of(axis)
+    every, clips = round(1.0 / (config.loop_hz or 1.0) / DT_S), config.law == "pwm"
+    most = config.stall_nm if clips else math.inf
     state = {"n": 0, "seen": 0.0, "speed": 0.0, "asked": 0.0}
 
     def torque(goal: float, q: float, v: float) -> float:
         if state["n"] % every == 0:
-            fresh = (q - state["seen"]) * (axis.loop_hz or 1.0)
+            fresh = (q - state["seen"]) * (config.loop_hz or 1.0)
             share = 1.0 - math.exp(-every * DT_S / filter_s) if filter_s else 1.0
             state["speed"] += share * (fresh - state["speed"])
             error = math.copysign(max(abs(goal - q) - dead, 0.0), goal - q)
-            asked = axis.loop_gains.kp * error - axis.loop_gains.kd * state["speed"]
+            asked = config.loop_gains.kp * error - config.loop_gains.kd * state["speed"]
             state.update(seen=q, asked=min(max(asked, -most), most))
         state["n"] += 1
-        drawn = state["asked"] - axis.back_emf * v
+        drawn = state["asked"] - config.back_emf * v
         return drawn * (gain if drawn < 0.0 else 1.0)
 
-    return integrated(target, torque, axis.inertia)
+    return integrated(target, torque, config.inertia)
 
 
-QUICK = dataclasses.replace(SERVO, kd=0.1, loop_hz=1000.0, lever_m=0.0)
-ARM = AxisConfig(
-    name="servo", unit="rad", inertia=0.002, kp=3.0, kd=0.08, loop_hz=1000.0
-)
+QUICK = altered(SERVO, kd=0.1, loop_hz=1000.0, lever_m=0.0)
+ARM = axis_of(name="servo", unit="rad", inertia=0.002, kp=3.0, kd=0.08, loop_hz=1000.0)
 
 
 @pytest.mark.parametrize(
@@ -139,12 +138,9 @@ def test_a_sampled_loop_damps_late_only_what_its_duty_and_its_direction_leave(
         ("error_deadband", "width_rad", "dead"),
         ("direction_gain", "factor", "gain"),
     ]
-    entries = tuple(
-        EffectEntry(name, {p: effect[k]}) for name, p, k in own if k in effect
-    )
+    entries = tuple((name, {p: effect[k]}) for name, p, k in own if k in effect)
     found = answer(
-        dataclasses.replace(axis, speed_late_s=late_s, effects=entries),
-        recording(target),
+        altered(axis, speed_late_s=late_s, effects=entries), recording(target)
     )
     assert np.abs(found.reported - truth).max() < most, np.abs(
         found.reported - truth
@@ -155,7 +151,7 @@ def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of
     """The drive's loop runs at 2 kHz, a row is logged every 1 ms, and its target acts 1.5 ms later. Its effort is that of the
     loop period before it. The model's effort is off by 0.006 N·m with steps of one loop period (0.5 ms), and by 0.29 N·m with
     steps of 1 ms, in which old and new target are averaged. A fitted loop rate must not change the step."""
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo",
         unit="rad",
         inertia=0.04,
@@ -178,8 +174,8 @@ def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of
             q += DT_S * v
     m = of_signal("made", 1000, target, np.zeros(800), "servo")
     joint, fitted = (
-        DrivenAxis(axis),
-        DrivenAxis(axis, dataclasses.replace(axis, loop_hz=None)),
+        joint_of(axis),
+        joint_of(altered(axis, loop_hz=None)).with_values({"loop_s": 1 / 2000}),
     )
     motion = motion_of(m, "servo", joint)
     assert joint.timestep_s(motion) == pytest.approx(5e-4) and fitted.timestep_s(
@@ -194,7 +190,7 @@ def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of
 
 def test_a_velocity_loop_reaches_its_velocity_as_a_lag_of_inertia_over_gain():
     """J q̈ = kd (v* − q̇): q = v* (t − T (1 − e^(−t/T))), T = J / kd = 0.1 s."""
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
+    axis = axis_of(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
     time_s = np.arange(200) / RATE_HZ
     found = answer(axis, recording(np.full(200, 1.5), "velocity"))
     np.testing.assert_allclose(
@@ -208,10 +204,10 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
         "integral_action": {"rate_per_s": 15.0},
         "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0},
     }
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0
     )
-    axis.effects = tuple(EffectEntry(*one) for one in numbers.items())
+    axis = altered(axis, effects=tuple(numbers.items()))
     target, total = np.where(np.arange(400) < 10, 0.0, 0.3), np.zeros(1)
 
     def torque(goal: float, q: float, v: float) -> float:
@@ -223,9 +219,9 @@ def test_an_integral_of_a_cascade_adds_up_the_error_of_its_speed():
     assert found.reported[-1] == pytest.approx(0.3, abs=1e-3) and found.effort[
         -1
     ] == pytest.approx(0.6, rel=0.01)
-    axis.effects += (
-        EffectEntry("coulomb_friction", {"torque_nm": 0.5}),
-    )  # within which it begins with any effort
+    dry = ("coulomb_friction", {"torque_nm": 0.5})
+    axis = altered(axis, effects=(*numbers.items(), dry))
+    # within the dry friction it begins with any effort
     for seen, given in ((0.3, 0.3), (0.9, 0.5), (np.nan, 0.0)):
         held = answer(
             axis,
@@ -239,7 +235,7 @@ def test_an_integral_of_the_position_of_a_cascade_is_before_its_speed_loop(
     speed_rate: float,
 ):
     """τ = kd (u + r_s ∫ u dt), u = kp (e + 3 ∫ e dt) − q̇, alone and beside an integral of u: both hold a spring at the target."""
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo", unit="rad", inertia=0.08, law="cascade", kp=25.0, kd=4.0
     )
     numbers = {
@@ -247,7 +243,7 @@ def test_an_integral_of_the_position_of_a_cascade_is_before_its_speed_loop(
         "integral_action": {"rate_per_s": speed_rate},
         "cable_spring": {"stiffness_nm_per_rad": 2.0, "rest_rad": 0.0},
     }
-    axis.effects = tuple(EffectEntry(*one) for one in numbers.items())
+    axis = altered(axis, effects=tuple(numbers.items()))
     target, total = np.where(np.arange(400) < 10, 0.0, 0.3), np.zeros(2)
 
     def torque(goal: float, q: float, v: float) -> float:
@@ -258,12 +254,12 @@ def test_an_integral_of_the_position_of_a_cascade_is_before_its_speed_loop(
 
     found = answer(axis, recording(target))
     assert np.abs(found.reported - integrated(target, torque, 0.08)).max() < 1e-4
-    plain = dataclasses.replace(axis, effects=axis.effects[1:])
+    plain = altered(axis, effects=[*numbers.items()][1:])
     assert np.abs(answer(plain, recording(target)).reported - found.reported).max() > (
         1e-3
     )
-    others = (SERVO, dataclasses.replace(axis, law="impedance", effects=()))
-    assert not any(law.allows_effect("position_integral") for law in others)
+    others = (SERVO, altered(axis, law="impedance", effects=()))
+    assert not any(config_of(law).allows_effect("position_integral") for law in others)
 
 
 def test_an_integral_of_the_position_adds_up_what_a_sampled_cascade_knows():
@@ -282,8 +278,8 @@ def test_an_integral_of_the_position_adds_up_what_a_sampled_cascade_knows():
         v += DT_S * torque / 0.08
         q += DT_S * v
     numbers = {"inertia": 0.08, "kp": 20.0, "kd": 8.0, "loop_hz": float(hz)}
-    axis = AxisConfig(name="servo", unit="rad", law="cascade", **numbers)
-    axis.effects = (EffectEntry("position_integral", {"rate_per_s": rate}),)
+    axis = axis_of(name="servo", unit="rad", law="cascade", **numbers)
+    axis = altered(axis, effects=[("position_integral", {"rate_per_s": rate})])
     assert np.abs(answer(axis, recording(target)).reported - truth).max() < 1e-4
 
 
@@ -316,8 +312,8 @@ def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_th
     gains, kind = (
         ({"kp": 8.0, "kd": 4.0}, "position") if law == "cascade" else ({"kd": 4.0}, law)
     )
-    effect = EffectEntry("integral_action", {"rate_per_s": rate})
-    axis = AxisConfig(
+    effect = ("integral_action", {"rate_per_s": rate})
+    axis = axis_of(
         name="servo",
         unit="rad",
         inertia=0.08,
@@ -326,9 +322,7 @@ def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_th
         loop_hz=hz,
         speed_late_s=3e-3,
     )
-    found = answer(
-        dataclasses.replace(axis, effects=(effect,)), recording(target, kind)
-    )
+    found = answer(altered(axis, effects=(effect,)), recording(target, kind))
     assert np.abs(found.reported - truth).max() < 2e-4, np.abs(
         found.reported - truth
     ).max()
@@ -339,7 +333,7 @@ def test_an_integral_adds_up_what_the_loop_knows_and_a_row_shows_it_as_old_as_th
 
 def test_a_torque_accelerates_and_none_lets_the_axis_coast():
     """0.01 N·m on 0.02 kg·m² for 0.5 s: 0.0625 rad and 0.25 rad/s, kept with the motor off."""
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
+    axis = axis_of(name="servo", unit="rad", inertia=0.02, law="torque")
     target = np.where(np.arange(200) < 100, 0.01, 0.0)
     found = answer(axis, recording(target, "torque")).reported
     assert found[100] == pytest.approx(0.0625, rel=0.01)
@@ -350,7 +344,7 @@ def test_torques_of_an_outer_loop_are_replayed_near_the_measured_position_and_fr
     """Commands of kp 2, kd 0.2 beside 0.005 N·m that the model lacks: alone they are 0.06 mrad with K = (20 π)² · 0.02, and drift
     else. Friction of 0.05 N·m is ten times as much. The spring is no effort of the motor."""
     axis, goals = (
-        AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque"),
+        axis_of(name="servo", unit="rad", inertia=0.02, law="torque"),
         0.4 * np.sin(np.arange(800) / 60),
     )
     for friction_nm, least, most in ((0.0, 0.0, 2e-4), (0.05, 4e-4, 1.5e-3)):
@@ -396,7 +390,7 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
     with pytest.raises(
         TaccorlError, match=r"made:.*supply voltage.*servo.*stated,.*law torque.*use"
     ):
-        torque_axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
+        torque_axis = axis_of(name="servo", unit="rad", inertia=0.02, law="torque")
         answer(
             torque_axis, dataclasses.replace(m, target_kinds=("torque",), payload_kg={})
         )
@@ -405,7 +399,7 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
 def test_targets_act_at_their_own_times_and_late_by_what_the_file_states():
     """J q̈ = τ from rest: 0.01 N·m from 0.1037 s on give τ t² / 2 J. The row is at 0.1 s; its target came
     2.2 ms later, and the file states 1.5 ms."""
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo", unit="rad", inertia=0.02, law="torque", target_late_s=1.5e-3
     )
     time_s = np.arange(200) / RATE_HZ
@@ -417,7 +411,7 @@ def test_targets_act_at_their_own_times_and_late_by_what_the_file_states():
 
 def test_a_torque_that_the_controller_adds_moves_the_axis_and_is_in_its_effort():
     """J = 0.02: 0.01 N·m from 0.5 s on beside a velocity loop whose target is 0: q̇ → 0.01 / 0.2 rad/s, and no effort is left."""
-    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
+    axis = axis_of(name="servo", unit="rad", inertia=0.02, law="velocity", kd=0.2)
     m = recording(np.zeros(200), "velocity")
     added = np.where(np.arange(200) < 100, 0.0, 0.01)[:, None]
     found = answer(axis, dataclasses.replace(m, torque_ff=added))
@@ -432,7 +426,7 @@ def test_the_effort_of_a_row_is_before_its_target_or_after_it_as_the_file_says()
     """At rest 18 N·m/rad times a step of 0.01 rad: 0.18 N·m in the step's row, or in the next."""
     m = recording(np.where(np.arange(50) < 20, 0.0, 0.01))
     before, after = (
-        answer(dataclasses.replace(SERVO, effort_after_target=own), m).effort[19:21]
+        answer(altered(SERVO, effort_after_target=own), m).effort[19:21]
         for own in (False, True)
     )
     assert before == pytest.approx([0.0, 0.0]) and after == pytest.approx([0.0, 0.18])
@@ -445,16 +439,14 @@ def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():
         lever_m={"servo": 0.2},
         arm_kg={"servo": 0.06},
     )
-    axis = DrivenAxis(SERVO)
+    axis = joint_of(SERVO)
     rigid = axis.rigid(motion_of(m, "servo", axis), [])
     assert rigid.inertia == pytest.approx(0.02 + 0.012 + 0.0008)
     assert (rigid.gravity_sin, rigid.gravity_cos) == pytest.approx((9.81 * 0.066, 0.0))
-    stated = DrivenAxis(
-        dataclasses.replace(SERVO, payload_kg=0.3, lever_m=0.2, arm_kg=0.06)
-    )
+    stated = joint_of(altered(SERVO, payload_kg=0.3, lever_m=0.2, arm_kg=0.06))
     always = dataclasses.replace(recording(np.zeros(50)), payload_kg={})
     assert stated.rigid(motion_of(always, "servo", stated), []) == rigid
-    nowhere = DrivenAxis(dataclasses.replace(SERVO, lever_m=0.0))
+    nowhere = joint_of(altered(SERVO, lever_m=0.0))
     with pytest.raises(
         TaccorlError,
         match=r"made: payload_kg or arm_kg of servo is stated.*write `lever_m",
@@ -464,11 +456,10 @@ def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():
 
 def test_a_gain_s_register_is_worth_its_factor():
     """800 steps of 0.0075 / rad are 6 / rad: 18 N·m/rad at 12 V, 4 Ω and 1 N·m/A."""
-    assert dataclasses.replace(
-        SERVO, kp=800.0, kp_factor=0.0075
-    ).loop_gains == pytest.approx(SERVO.loop_gains)
-    assert SERVO.loop_gains.kp == pytest.approx(18.0)
-    fitted = AxisConfig(
+    register = config_of(altered(SERVO, kp=800.0, kp_factor=0.0075))
+    assert register.loop_gains == pytest.approx(config_of(SERVO).loop_gains)
+    assert config_of(SERVO).loop_gains.kp == pytest.approx(18.0)
+    fitted = axis_of(
         name="servo",
         unit="rad",
         inertia=0.02,
@@ -477,7 +468,7 @@ def test_a_gain_s_register_is_worth_its_factor():
         kd=10.0,
         kd_factor=0.1,
     )
-    again = fitted.with_numbers({"kp": 9.0, "kd": 1.1})
+    again = config_of(fitted).with_numbers({"kp": 9.0, "kd": 1.1})
     assert (again.kp, again.kd) == pytest.approx((450.0, 11.0)), (
         "the file keeps its register's steps"
     )
@@ -496,8 +487,7 @@ def test_targets_of_the_rate_of_the_rows_are_held_although_stamps_are_rounded():
     m = dataclasses.replace(recording(target), time_s=np.linspace(0.0, 3.9834, 240))
     assert 59.9 < m.rate_hz < 60.0
     held, stated, faster = (
-        answer(dataclasses.replace(SERVO, command_hz=hz), m).reported
-        for hz in (None, 60.0, 120.0)
+        answer(altered(SERVO, command_hz=hz), m).reported for hz in (None, 60.0, 120.0)
     )
     np.testing.assert_array_equal(held, stated)
     assert np.abs(faster - held).max() > 1e-3

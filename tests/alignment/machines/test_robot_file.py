@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pickle
 from pathlib import Path
 
 import mujoco
@@ -19,6 +20,7 @@ from taccorl.alignment.machines.robot_joint import (
     RobotJoint,
     moved_together,
     needed_along,
+    under_gravity,
 )
 from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
@@ -859,3 +861,101 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(
         TaccorlError, match=r"arm\.xml.*joint 'elbo' .*elbow.*Rename.*columns"
     ):
         checks(renamed)
+
+
+def test_a_robot_under_another_gravity_leaves_its_model_as_it_is(
+    tmp_path: Path,
+) -> None:
+    """The model is shared by all joints, and by threads."""
+    model = robot(tmp_path, ROBOT_YAML, TWO_LINKS).rigid.model
+    own = model.opt.gravity.copy()
+    leaned = under_gravity(model, np.array([1.0, 2.0, 3.0]))
+    assert leaned.opt.gravity.tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(model.opt.gravity, own)
+
+
+def test_motions_that_a_robot_keeps_are_its_own_and_do_not_travel(
+    tmp_path: Path,
+) -> None:
+    one, other = (robot(tmp_path, ROBOT_YAML, TWO_LINKS) for _ in range(2))
+    assert one.motions.of(b"key", lambda: None) is None
+
+    def unexpected() -> None:
+        raise AssertionError("it was kept")
+
+    changed = one.with_joint("elbow", one.config.joints["elbow"])
+    assert changed.motions.of(b"key", unexpected) is None
+    for empty in (other, pickle.loads(pickle.dumps(one))):
+        with pytest.raises(AssertionError):
+            empty.motions.of(b"key", unexpected)
+
+
+AXIS_YAML = """kind: axis
+name: slide
+unit: m
+inertia: 40.0
+kp: 40000.0
+kd: 2000.0
+limits: [-0.15, 0.15]
+effects:
+- {effect: coulomb_friction, torque_nm: 3.0}
+"""
+ALONE_YAML = """kind: robot
+joints:
+  slide:
+    {unit: m, inertia: 40.0, kp: 40000.0, kd: 2000.0, limits: [-0.15, 0.15],
+     effects: [{effect: coulomb_friction, torque_nm: 3.0}]}
+"""
+
+
+def test_an_axis_file_is_a_robot_of_one_joint_without_a_model(tmp_path: Path) -> None:
+    for name, text in (("axis", AXIS_YAML), ("alone", ALONE_YAML)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    axis, alone = (load_robot(tmp_path / f"{n}.yaml") for n in ("axis", "alone"))
+    assert axis.config == alone.config and axis.digest() == alone.digest()
+    written = tmp_path / "written.yaml"
+    written.write_text(axis.text(written))
+    assert load_robot(written).config == axis.config
+    assert axis.units == {"slide": "m"}
+    joint = axis.joint("slide")
+    assert joint.known.limits == (-0.15, 0.15) and not joint.has_model
+    assert joint.with_values({"inertia": 50.0}).config.inertia == 50.0
+
+
+def test_joints_without_a_model_do_not_load_each_other(tmp_path: Path) -> None:
+    other = "  wheel: {unit: rad, inertia: 0.02, kp: 10.0, kd: 0.8}\n"
+    (tmp_path / "two.yaml").write_text(ALONE_YAML + other)
+    two = load_robot(tmp_path / "two.yaml")
+    t = np.arange(200) / 200
+    rows = np.column_stack([0.1 * np.sin(9.0 * t), np.sin(9.0 * t)])
+    signals, units = ("slide", "wheel"), ("m", "rad")
+    moving = {"time_s": t, "target": rows, "measured": rows, "effort": 0.0 * rows}
+    m = logged("both", signals, units, **moving)
+    for name, inertia in (("slide", 40.0), ("wheel", 0.02)):
+        joint = two.joint(name)
+        motion = motion_of(joint.whole(m), name, joint)
+        assert not motion.coupling_nm.any()
+        assert joint.rigid(motion, []).inertia == inertia
+    whole = two.joint("wheel").whole(m.only(["wheel"]))
+    assert whole.signals == signals and not whole.target[:, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (ALONE_YAML.replace("unit: m, ", ""), r"bad\.yaml:3: .*'unit' is missing"),
+        (ALONE_YAML.replace("inertia: 40.0, ", ""), "'inertia' is missing"),
+        (ALONE_YAML.replace("40.0, ", "40.0, arm_kg: 1.0, "), "arm_kg: does not apply"),
+        (
+            ROBOT_YAML.replace("effort_limit: 100.0}", "inertia: 2.0}"),
+            r"bad\.yaml:\d+: .*inertia: the model states it",
+        ),
+    ],
+)
+def test_a_model_or_the_file_states_a_joint_s_body(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "arm.xml").write_text(TWO_LINKS)
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(SpecError, match=words):
+        load_robot(tmp_path / "bad.yaml")

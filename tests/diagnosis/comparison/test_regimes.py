@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from axes import problem_of
 from made_traces import FLOOR_RAD, swing, trace
 from simulated_slide import AXIS, NOISE_M, recorded_slide
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.comparison.regimes import ALL, RegimeErrors, regime_errors
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
 
 _, POSITION = swing(seconds=8.0)
 NOISE = FLOOR_RAD * np.random.default_rng(0).standard_normal(len(POSITION))
@@ -117,7 +117,7 @@ def test_regimes_for_the_search_have_the_noise_of_their_own_repeats():
         * (-1.0) ** np.arange(6000)[:, None]
     )
     quiet, loud = (
-        AxisProblem(
+        problem_of(
             AXIS, Measurements((first, dataclasses.replace(again, measured=m)))
         ).fit[0]
         for m in (again.measured, rough)

@@ -27,7 +27,7 @@ from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.fit import Fit, best_fit, rms, stacked
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError, TaccorlError
-from taccorl.report.verdict import verdict
+from taccorl.report.account import account
 from taccorl.sim.effects import effects
 
 RATE_HZ, DT_S, NOISE_RAD = 200, 2e-5, 1e-4
@@ -168,17 +168,15 @@ def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(
     d, after = found.diagnosis, found.diagnosis.errors["after"]["validation"]
     assert after < 1.2 and not [name for name in d.names if name not in d.present]
     assert d.base["speed_delay_s"] == pytest.approx(-0.5e-3 * stated, abs=0.1e-3)
-    (off, *more), told = d.changed, verdict("swing", d).finding
+    (off, *more), told = d.changed, account("swing", d)
     assert off.without > 2.0 and d.status == "numbers_off"
     if stated:
         assert [c.name for c in d.changed] == ["speed_delay_s", "position_age_s"]
         assert more[0].before == 4e-4 and more[0].after == pytest.approx(
             0.0, abs=0.05e-3
         )
-        assert (
-            "speed_delay_s of the file is off" in told
-            and "the effect speed_delay" in told
-        )
+        assert {"speed_delay_s"} <= {*told.values("changed", "name")}
+        assert told.values("in_effect", "effect") == ["speed_delay"]
     else:
         assert (
             off.name == "loop_hz"

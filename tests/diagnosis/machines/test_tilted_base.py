@@ -19,7 +19,8 @@ from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.tilted_base import change_between_poses, tilt_like
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError
-from taccorl.report.verdict import verdict
+from taccorl.report.account import account
+from taccorl.report.evidence import Seen
 from taccorl.sim.effects import effects
 
 TILT_RAD = math.radians(4.0)
@@ -130,26 +131,20 @@ def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(
     assert d.after.values["unbalance.torque_nm"] == pytest.approx(torque_nm, rel=0.01)
     assert d.after.values["unbalance.hangs_at_rad"] == pytest.approx(0.0, abs=0.01)
     assert d.one_pose == {"unbalance": ("lift",)}
-    assert any(
-        "gravity: [0.0" in remark and "robot.yaml" in remark for remark in d.remarks
-    )
-    said = verdict("pan", d, can_tell=found.can_tell)
-    assert said.command == "taccorl excite pan --effects=unbalance,cable_spring"
-    assert (
-        said.level == "moderate"
-        and "unbalance" in said.confidence
-        and "lift" in said.record_next
-    )
-    tied = verdict(
-        "pan", dataclasses.replace(d, rivals={"unbalance": ("cable_spring",)})
-    )
-    assert (
-        tied.level == "moderate"
-        and "lift" in tied.record_next
-        and "unbalance,cable_spring" in tied.command
-    )
-    elsewhere = verdict("pan", dataclasses.replace(d, one_pose={}, remarks=()))
-    assert elsewhere.level == "high" and "lift" not in elsewhere.record_next
+    seen = Seen(can_tell=found.can_tell)
+    a = account("pan", d, seen)
+    (tilt,) = a.get("tilt")
+    assert tilt.values["gravity"].startswith("[0.0") and a.level == "moderate"
+    assert tilt.values["file"] == "robot.yaml"
+    assert a.command == "taccorl excite pan --effects=unbalance,cable_spring"
+    assert a.values("one_pose", "effect") == ["unbalance"]
+    assert a.values("record_pose", "joints") == [("lift",)]
+    rivals = {"unbalance": ("cable_spring",)}
+    tied = account("pan", dataclasses.replace(d, rivals=rivals))
+    assert tied.level == "moderate" and "record_pose" in tied.ids
+    assert "unbalance,cable_spring" in tied.command
+    elsewhere = account("pan", dataclasses.replace(d, one_pose={}, remarks=()))
+    assert elsewhere.level == "high" and "record_pose" not in elsewhere.ids
 
 
 @pytest.mark.slow
@@ -293,7 +288,9 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
         without=WITHOUT,
     )
     remarks = [
-        text for text in found[0].diagnosis.remarks if "tilt of the base" in text
+        text
+        for text in found[0].diagnosis.remarks
+        if isinstance(text, str) and "tilt of the base" in text
     ]
     mended, _ = machine(tmp_path).mended(found)
     mended.save(tmp_path / "mended.yaml")
@@ -325,7 +322,7 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
             < replay_error(machine(tmp_path), raised)
         )
     else:
-        assert "gravity:" not in " ".join(found[0].diagnosis.remarks)
+        assert "tilt" not in account("pan", found[0].diagnosis).ids
         assert "at pan" in remarks[0] and "at lift" in remarks[0]
         assert found[1].diagnosis.names == ()
         assert written.robot.config.gravity == [] and "unbalance" in written.effects

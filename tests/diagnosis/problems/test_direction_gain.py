@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from axes import axis_answer, axis_motion, axis_of, effect_class
 from simulated_slide import logged, one_round
 
-from taccorl.alignment.machines.axis_file import AxisConfig
+from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.diagnosis.problems.axis_problem import axis_motion, simulated
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects import effects
 
@@ -21,10 +21,10 @@ RATE_HZ, PARTS = 200, 50
 MASS_KG, KP, KD = 30.0, 12_000.0, 900.0
 OIL_KG, PER_S, STIFF = 50.0, 12.0, 4000.0
 LIMITS = (-0.15, 0.15)
-AIR = AxisConfig(
+AIR = axis_of(
     name="rod", unit="m", inertia=25.0, kp=KP, kd=KD, limits=LIMITS, effort_limit=1500.0
 )
-OIL = AxisConfig(
+OIL = axis_of(
     name="rod",
     unit="m",
     law="cascade",
@@ -100,11 +100,7 @@ def moved(
 
 
 def found_in(
-    axis: AxisConfig,
-    force: Force,
-    mass_kg: float,
-    friction_n=(0.0, 0.0),
-    considered=effects,
+    axis: Robot, force: Force, mass_kg: float, friction_n=(0.0, 0.0), considered=effects
 ) -> Diagnosis:
     first = moved("first", force, mass_kg, (0.3, 1.1), 1, friction_n)
     again = moved("again", force, mass_kg, (0.3, 1.1), 2, friction_n, repeat_of="first")
@@ -165,14 +161,14 @@ def test_seals_that_rub_more_one_way_are_no_gain() -> None:
 @pytest.mark.parametrize("target", [0.1, -0.1])
 def test_a_velocity_loop_has_another_speed_backwards(target: float) -> None:
     """q̇ = q̇* forwards and 0.6 q̇* backwards, K_d / J = 80 1/s after the start."""
-    axis = AxisConfig(name="rod", unit="m", law="velocity", inertia=OIL_KG, kd=STIFF)
-    cls = axis.effect_class("direction_gain")
+    axis = axis_of(name="rod", unit="m", law="velocity", inertia=OIL_KG, kd=STIFF)
+    cls = effect_class(axis, "direction_gain")
     rest = moved("first", air(1.0), MASS_KG, (0.3, 1.1), 1)
     m = dataclasses.replace(
         rest, target=np.full_like(rest.target, target), target_kinds=("velocity",)
     )
     numbers: dict[str, Any] = {"factor": 0.6}
-    at = simulated(axis, axis_motion(axis, m), [cls(**numbers)]).reported
+    at = axis_answer(axis, axis_motion(axis, m), [cls(**numbers)]).reported
     assert (at[400] - at[200]) * RATE_HZ / 200 == pytest.approx(
         target * (0.6 if target < 0 else 1.0), rel=1e-6
     )

@@ -95,6 +95,19 @@ def test_gains_of_a_simulated_servo_are_found(tmp_path: Path) -> None:
     assert values["kp"] == pytest.approx(KP / (1.0 + STEP_S * KD / (2.0 * J)), rel=3e-3)
 
 
+def test_an_axis_has_early_targets_too(tmp_path: Path) -> None:
+    """Its inertia is fitted: J + ½ h K_d = 0.0512 kg·m²."""
+    _, made = servo(tmp_path, f"kp: {KP}, kd: {KD}")
+    (tmp_path / "axis.yaml").write_text(
+        f"kind: axis\nname: hinge\nunit: rad\ninertia: 0.06\nkp: {KP}\nkd: {KD}\n"
+    )
+    problem = load_machine(tmp_path / "axis.yaml").motion_problem("hinge", made, "auto")
+    found = fit(problem, problem.fit, [], problem.start)
+    assert found.error < 1.15
+    assert found.values["target_late_s"] == pytest.approx(-STEP_S / 2, abs=5e-5)
+    assert found.values["inertia"] == pytest.approx(J + STEP_S * KD / 2.0, rel=5e-3)
+
+
 def test_a_simulated_servo_lacks_nothing(tmp_path: Path) -> None:
     robot, made = servo(tmp_path, "kp: 15.0, kd: 1.0, gains: fitted")
     found = robot.diagnose("hinge", made).diagnosis

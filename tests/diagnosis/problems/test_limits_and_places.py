@@ -8,14 +8,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from axes import axis_of, problem_of
 from simulated_slide import logged, one_round
 
 from taccorl.alignment.controller.drive_numbers import Drive
 from taccorl.alignment.controller.joint_kernel import simulate
-from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects import effects, make_effect
@@ -24,7 +23,7 @@ from taccorl.sim.twin import TwinConfig
 
 INERTIA, KP, KD = 0.05, 40.0, 1.5
 RATE_HZ, PARTS, NOISE_RAD = 200, 50, 1e-3
-AXIS = AxisConfig(name="joint", unit="rad", inertia=INERTIA, kp=KP, kd=KD)
+AXIS = axis_of(name="joint", unit="rad", inertia=INERTIA, kp=KP, kd=KD)
 NEW = ("torque_speed_limit", "position_dependent_friction", "end_stop")
 
 
@@ -212,7 +211,7 @@ def test_an_end_stop_is_found_on_either_side(
 def test_lost_commands_are_no_candidate_of_a_search_and_stay_in_a_twin_that_has_them() -> (
     None
 ):
-    axis = AxisProblem(AXIS, Measurements((recorded("one", sweep(0.5, 0.6), 1),)))
+    axis = problem_of(AXIS, Measurements((recorded("one", sweep(0.5, 0.6), 1),)))
     assert "dropped_commands" not in axis.candidates
     assert set(NEW) <= axis.candidates.keys()
     dropping = make_effect(

@@ -17,7 +17,7 @@ from taccorl.diagnosis.problems.pads import agreed, diagnose_arm, pressed_arms
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.solve import PartFinding
 from taccorl.errors import TaccorlError
-from taccorl.report.evidence_words import evidence_words
+from taccorl.report.evidence import grade
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
@@ -293,7 +293,7 @@ def test_evidence_in_words(fields: dict, words: str):
     }
     texts = {"name": "touch_lag", "trouble": "", "verdict": ""}
     assert (
-        evidence_words(
+        grade(
             Evidence(values={}, base={}, at_bound=(), **texts, **numbers | fields)
         )
         == words

@@ -1,12 +1,11 @@
 """An integral in the position loop of a cascade, beside dry friction, is found; recordings by this test's own integration."""
 
 import numpy as np
+from axes import axis_of, problem_of
 from made_rows import of_signal
 
-from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 
@@ -59,11 +58,11 @@ def test_an_integral_on_the_position_of_a_cascade_is_found_beside_dry_friction()
     None
 ):
     """In the speed loop it would be another motion: ``integral_action`` alone leaves more than ten times the error."""
-    axis = AxisConfig(
+    axis = axis_of(
         name="servo", unit="rad", inertia=INERTIA, law="cascade", kp=KP, kd=KD
     )
     made = Measurements((recording("one", 0.4, 1),), (recording("held", 0.3, 2),))
-    problem = AxisProblem(axis, made)
+    problem = problem_of(axis, made)
     found = diagnose(
         problem,
         problem.fit,

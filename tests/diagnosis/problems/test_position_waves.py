@@ -71,10 +71,8 @@ def test_a_slides_magnets_are_found_by_their_pitch_and_their_effect_is_in_newton
         0.09 / 0.05, 0.1, 1
     )  # of the wheel above, whose 42 periods a radian are 840 rad/m here
     sliding = dataclasses.replace(turning, measured=0.05 * turning.measured)
-    found = position_waves(
-        [sliding], [INERTIA / 0.05], length=scale.wave, least_span=0.0
-    )
     slide = scaled("cogging", scale)
+    found = position_waves([sliding], [INERTIA / 0.05], slide, length=scale.wave)
     (start, *_) = slide.starts(found | {"span_rad": 0.18, "peak_torque_nm": 30.0})
     assert start["periods"] == pytest.approx(PERIODS / 0.05, rel=0.03)
     assert start["phase_rad"] == pytest.approx(found["wave_phase_1"])

@@ -1,23 +1,20 @@
 """Bristles of dry friction, a number of ``coulomb_friction`` that is absent at 0."""
 
-import dataclasses
-
 import pytest
+from axes import altered
 from simulated_slide import AXIS, FRICTION_N, one_round, recorded_slide, simulated
 
-from taccorl.alignment.machines.axis_file import AxisConfig, EffectEntry
+from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.folder import Measurements
 
-DRY = dataclasses.replace(
-    AXIS, effects=(EffectEntry("coulomb_friction", {"torque_nm": FRICTION_N}),)
-)
+DRY = altered(AXIS, effects=(("coulomb_friction", {"torque_nm": FRICTION_N}),))
 BRISTLES_M = 2e-4
 CONSIDERED = ("coulomb_friction", "power_law_friction", "stribeck_friction")
 
 
 @pytest.mark.parametrize("axis", [AXIS, pytest.param(DRY, marks=pytest.mark.slow)])
 def test_bristles_are_found_with_the_friction_and_as_a_number_that_the_file_lacks(
-    axis: AxisConfig,
+    axis: Robot,
 ):
     """Stribeck friction with bristles explains as much with two numbers more."""
     fit = [
@@ -72,7 +69,7 @@ def test_bristles_are_fitted_where_rigid_friction_alone_is_at_the_floor(
 
 
 @pytest.mark.parametrize("axis", [AXIS, pytest.param(DRY, marks=pytest.mark.slow)])
-def test_friction_that_sticks_has_no_bristles(axis: AxisConfig):
+def test_friction_that_sticks_has_no_bristles(axis: Robot):
     found = one_round(axis, recorded_slide(), CONSIDERED)
     assert (
         found.names == ("coulomb_friction",)

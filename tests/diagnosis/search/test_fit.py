@@ -15,6 +15,7 @@ from taccorl.diagnosis.search.evidence import (
 from taccorl.diagnosis.search.fit import (
     FAR,
     FINE,
+    _scatter,
     fit,
     moved_by,
     out_of_dents,
@@ -334,3 +335,22 @@ def test_every_second_recording_is_searched_and_each_setting_and_regime_stays(
         for k, (setting, step) in enumerate(zip(settings, steps, strict=True))
     ]
     assert "".join(str(r.data) for r in thinned(every)) == kept
+
+
+def test_an_interval_takes_in_the_scatter_between_groups_of_rows():
+    """One number, whose derivative is 1: its step is minus the mean residual, and the
+    jackknife's variance that of the mean of four groups of as many rows."""
+    means = np.array([1.0, -2.0, 0.5, 3.0])
+    left = np.repeat(means, 10)
+    groups = [np.repeat(np.arange(4), 10) == k for k in range(4)]
+    found = _scatter(np.ones((40, 1)), left, groups)
+    # Student's t of 3 degrees of freedom over the normal quantile: 3.182 / 1.960
+    assert found == pytest.approx(3.182 / 1.960 * means.std(ddof=1) / 2.0, rel=1e-3)
+
+
+def test_a_group_without_which_a_number_is_hardly_known_does_not_count_for_it():
+    """The first group holds 100 of 103 rows of information, and the others agree."""
+    left = np.repeat([0.0, 1.0, 1.0, 1.0], 10)
+    steep = np.repeat([10.0, 1.0, 1.0, 1.0], 10)[:, None]
+    groups = [np.repeat(np.arange(4), 10) == k for k in range(4)]
+    assert _scatter(steep, left, groups) == pytest.approx(0.0, abs=1e-12)

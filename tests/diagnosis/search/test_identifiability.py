@@ -6,6 +6,7 @@ from imagined_motions import NOISE_RAD, SIGNAL, recorded
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, STIFFER_CHIRP
 from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.identifiability import (
     ALIKE,
     RIDGE,
@@ -32,7 +33,8 @@ def told(
     )
     problem = JointProblem(config, SIGNAL, made)
     assert problem.commanded is stated
-    return identifiability(problem, problem.fit, problem.start, problem.present)
+    first = fit(problem, problem.fit, problem.present, problem.start)
+    return identifiability(problem, problem.fit, first)
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,14 @@
 """Numbers that a machine's file marks as known stay, and a wrong one is named: a slide of 100 kg with 20 N of friction."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
+from axes import altered, config_of, problem_of
 from made_problem import Bump, Hidden, MadeProblem, Ripple, record
 from simulated_slide import AXIS, FRICTION_N, MASS_KG, recorded_slide
 
-from taccorl.alignment.machines.axis_file import EffectEntry, axis_text, load_axis
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
+from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.diagnosis.search.problem import Stopped, holding
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
@@ -17,7 +16,7 @@ from taccorl.errors import TaccorlError
 
 
 def found(*candidates: str, **changed: Any) -> Diagnosis:
-    problem = AxisProblem(dataclasses.replace(AXIS, **changed), recorded_slide())
+    problem = problem_of(altered(AXIS, **changed), recorded_slide())
     without = [
         n for n in problem.candidates if n not in (*candidates, *problem.present)
     ]
@@ -141,16 +140,18 @@ def test_a_name_that_no_diagnosis_moves_is_refused_with_its_line(
     ]
     path.write_text("\n".join(lines), encoding="utf-8")
     with pytest.raises(TaccorlError, match=words) as error:
-        load_axis(path)
+        load_robot(path)
     assert "drive.yaml:7:" in str(error.value) and name in str(error.value)
 
 
 def test_what_is_known_is_read_as_it_is_written(tmp_path: Path):
-    friction = EffectEntry("coulomb_friction", {"torque_nm": FRICTION_N})
-    axis = dataclasses.replace(
+    friction = ("coulomb_friction", {"torque_nm": FRICTION_N})
+    axis = altered(
         AXIS,
         effects=(friction,),
         known=("inertia", "coulomb_friction.torque_nm", "backlash"),
     )
-    (tmp_path / "drive.yaml").write_text(axis_text(axis), encoding="utf-8")
-    assert load_axis(tmp_path / "drive.yaml").known == axis.known
+    (tmp_path / "drive.yaml").write_text(axis.text(axis.path), encoding="utf-8")
+    assert config_of(load_robot(tmp_path / "drive.yaml")).known == (
+        config_of(axis).known
+    )

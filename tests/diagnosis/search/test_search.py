@@ -22,7 +22,7 @@ from taccorl.diagnosis.search.problem import EFFORT_SCALE, Found, Free, Stopped
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
-from taccorl.report.verdict import verdict
+from taccorl.report.account import account
 from taccorl.sim.effects.effect import number
 
 
@@ -134,8 +134,8 @@ def test_what_only_a_test_recording_shows_is_said_and_ends_no_diagnosis():
     assert found.names == () and found.status == "something_else"
     assert [p.recording for p in found.standing_out] == ["recording 2"]
     assert found.nearest == ()
-    told = verdict("it", found).finding
-    assert "recording 2" in told and "test recording" in told
+    (out,) = account("it", found).get("stands_out")
+    assert out.values["place"].startswith("recording 2, ")
 
 
 def test_a_search_reports_each_effect_that_it_accepts_and_its_end():
@@ -656,7 +656,7 @@ def test_one_factor_on_all_efforts_is_told_beside_an_effect_of_one_number_and_in
     assert [c.after for c in found.changed] == pytest.approx(
         [1.5] * (not names), rel=0.01
     )
-    assert "one factor" in verdict("it", found).finding
+    assert {"tie_efforts", "scale_efforts"} & {*account("it", found).ids}
 
 
 class Damped(MadeProblem):
@@ -683,16 +683,18 @@ def test_another_gain_than_the_stated_one_is_told_beside_the_effect_that_it_look
         for k in (0, 1)
     )
     found = diagnose(Damped(Ripple), fit, validation)
-    words = verdict("it", found).finding
+    told = account("it", found)
     assert found.names == names
     if names:
         assert found.or_number == ("kd", pytest.approx(1.6, rel=0.01))
-        assert f"kd of the file is off by a factor of {found.or_number[1]:.4g}" in words
+        (tie,) = told.get("tie_number")
+        assert tie.values == {"name": "kd", "factor": found.or_number[1]}
     else:
         assert [(c.name, c.after) for c in found.changed] == [
             ("kd", pytest.approx(1.2, rel=0.01))
         ]
-        assert found.status == "numbers_off" and "kd of the file is off" in words
+        assert found.status == told.kind == "numbers_off"
+        assert "kd" in told.values("changed", "name")
 
 
 Cube = kind("cube", lambda t, seed: drive(t, seed) ** 3, Square)
