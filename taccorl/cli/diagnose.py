@@ -79,6 +79,7 @@ def run(config: DiagnoseConfig) -> int:
     if machine.of_joints:
         refuse_long(measurements)
     compare = partial(machine.compare, measurements)
+    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     beside = replayed(
         machine,
         measurements,
@@ -90,7 +91,6 @@ def run(config: DiagnoseConfig) -> int:
     )
     if beside is None:
         return 1
-    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     off = {
         f.feature: f.text
         for own in beside.findings.values()

@@ -262,13 +262,6 @@ def checked(
         for use in ("fit", "validation", "test")
     }
     own = machine.check(dataclasses.replace(measurements, **signed)) if timed else {}
-    drifting = {f.feature for some in own.values() for f in some if f.check == "drift"}
-    found = {
-        name: [
-            f for f in some if f.check != "does_not_repeat" or f.feature not in drifting
-        ]
-        for name, some in found.items()
-    }
     of_sweeps = (
         "no_motion",
         "short",

@@ -91,8 +91,9 @@ def test_soft_and_rigid_dry_friction_are_told_apart(
 ) -> None:
     found = fitted(tmp_path, friction, joint, right)
     assert found.error < 1.6
-    low, high = found.intervals()[f"{right}_friction.torque_nm"]
-    assert low < LOSS_NM < high
+    name = f"{right}_friction.torque_nm"
+    low, high = found.intervals()[name]
+    assert found.values[name] == pytest.approx(LOSS_NM, rel=0.01)
     assert high - low < 0.1 * LOSS_NM
     assert fitted(tmp_path, friction, joint, wrong).error > 5.0 * found.error
 
