@@ -348,18 +348,15 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
 
 
 def _section(one: "Alignment") -> Section:
-    lines: list[Cell | str] = []
-    if one.trouble:
-        lines.append(Cell(f"not aligned: {one.trouble}", "error"))
-    if one.unchanged and one.floors_left >= FAR_ABOVE_FLOOR:
-        lines.append(
-            "no other gains leave a smaller error: the twin's stay, although they leave "
-            f"{one.floors_left:.3g} noise floors"
-        )
-    elif one.unchanged:
-        lines.append(
-            "the recordings agree with the twin's numbers, which stay as they are"
-        )
+    lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
+    if one.unchanged:
+        text = "the recordings agree with the twin's numbers, which stay as they are"
+        if one.floors_left >= FAR_ABOVE_FLOOR:
+            text = (
+                "no other gains leave a smaller error: the twin's stay, although they "
+                f"leave {one.floors_left:.3g} noise floors"
+            )
+        lines.append(Cell(text))
     if not one.numbers:
         return Section(title=one.part, text=lines)
     rows = []

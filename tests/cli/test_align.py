@@ -173,9 +173,9 @@ def test_a_lead_is_found_beside_fitted_gains(said: Any, tmp_path: Path):
 
 def test_what_floors_are_left_is_not_called_agreement():
     left = Alignment(part=SIGNAL, numbers=(), unchanged=True, floors_left=14.0)
-    (line,) = _section(left).text
+    (line,) = map(str, _section(left).text)
     assert "14 noise floors" in line and "agree" not in line
-    (line,) = _section(dataclasses.replace(left, floors_left=1.1)).text
+    (line,) = map(str, _section(dataclasses.replace(left, floors_left=1.1)).text)
     assert "the recordings agree with the twin's numbers" in line
 
 
