@@ -34,6 +34,7 @@ from typing import Any, Literal, NamedTuple
 import yaml
 
 from pipelines.lerobot_commands import Training
+from pipelines.post_training import PostTraining
 from pipelines.steps import chosen, parsed, step
 from pipelines.surrogate_twin import is_folder, mended, named
 from taccorl.cli import augment, collect, merge
@@ -113,6 +114,10 @@ class LearnConfig:
     corrections: int = 0
     """Corrections of each policy (taccorl correct: the expert takes over at drawn times), from which, beside its demonstrations,
     another policy learns."""
+    post_train: list[Path] = field(default_factory=list)
+    """Settings of taccorl post-train: each policy is post-trained by each of these files, and scored again in the same scenes."""
+    post_train_options: list[str] = field(default_factory=list)
+    """Further words for taccorl post-train, among them the number of iterations, such as [--iterations=30,--anchor.weight=0]."""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
@@ -259,6 +264,10 @@ def _check(config: LearnConfig) -> None:
         raise SystemExit(
             f"--corrections={config.corrections}: takes no --real, and no folder of --twins"
         )
+    for path in config.post_train:
+        if not path.is_file():
+            raise SystemExit(f"--post_train={path}: no such file")
+        PostTraining.of(path, path.parent, path, config.post_train_options, 0)
     if not all(0 <= weight <= 1 for weight in config.sim_weight):
         raise SystemExit(f"--sim_weight={config.sim_weight}: shares of the loss, 0 … 1")
     if config.sim_weight and not config.real:
@@ -528,18 +537,53 @@ def _learned(
             )
     finally:
         gpus.put(gpu)
-    cells = itertools.product(
-        config.difficulty, config.executed, config.hide, made.robots
+    cells = list(
+        itertools.product(config.difficulty, config.executed, config.hide, made.robots)
     )
     scores = [
         _scored(config, (made.task, pictures), training, about, cell, gpu)
         for cell in cells
     ]
+    for path in config.post_train:
+        gpu = gpus.get()  # for itself, as a training has it
+        try:
+            better = _post_trained(config, made, training, about | {"ppo": path}, gpu)
+        finally:
+            gpus.put(gpu)
+        scores += [
+            _scored(
+                config, (made.task, pictures), better, about | better.about(), c, gpu
+            )
+            for c in cells
+        ]
     if config.corrections and "corrected" not in made.about:
         better = _corrected(config, made, training, about, (pictures, gpu))
         settings = seed, episodes + config.corrections, pictures, sensors
         scores += _learned(config, better, settings, gpus).scores
     return Learned(training.policy, made.dataset, made.asked.store, scores)
+
+
+def _post_trained(
+    config: LearnConfig, made: Made, training: Training, about: dict, gpu: str
+) -> PostTraining:
+    """Post-train the policy of ``training`` in the twin of its demonstrations, by the settings ``about["ppo"]``."""
+    better = PostTraining.of(
+        training.policy,
+        training.folder,
+        about["ppo"],
+        config.post_train_options,
+        training.steps,
+    )
+    options = [
+        f"--env.task={made.task}",
+        f"--env.twin={made.asked.twin}",
+        f"--env.difficulty={config.difficulty[0]}",
+        f"--seed={about['seed']}",
+    ]
+    if words := better.command(options):
+        words = [sys.executable, "-m", "taccorl.cli.main", *words]
+        _logged(words, better.folder.with_suffix(".log"), gpu, about)
+    return better
 
 
 def _corrected(
@@ -602,7 +646,7 @@ def _corrected(
 def _scored(
     config: LearnConfig,
     scene: tuple[str, str],
-    training: Training,
+    training: Training | PostTraining,
     about: dict,
     cell: tuple[str, int, str, Path | None],
     gpu: str,
@@ -694,6 +738,7 @@ def _row(score: Path) -> str:
         if "real" in about
         else ""
     )
+    made += ", then PPO by {settings}".format(**about) if "settings" in about else ""
     cells = [scenes["tasks"][0], about["sensors"], made, about["seed"]]
     cells += [
         scenes["pictures"],

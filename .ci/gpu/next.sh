@@ -28,7 +28,7 @@ P
   fi
 done
 tar czf "$OUT/scores.tgz" --ignore-failed-read $(find learn_* -path '*score_*' \( -name '*.json' -o -name '*.jsonl' -o -name '*.log' \) ! -path '*failures*') \
-  $(find learn_* -name scores.md -o -name progress.jsonl) $(ls learn_ppo/*/policy_*.log learn_speed/*.log) ./*.log times study*.jsonl
+  $(find learn_* -name scores.md -o -name progress.jsonl) $(ls learn_ppo/*/policy_*.log learn_speed/*.{log,prof}) ./*.log times study*.jsonl
 cat times
 tail -qn 1 made_*.log
 for log in learn_*/*/policy_*.log; do echo "$log $(tail -c 120 "$log" | tr '\r' '\n' | tail -n 1)"; done

@@ -1,7 +1,7 @@
 """Are two effects found that are missing at once? Simulated robots of ``pipelines.studies.foreign`` and a simulated slide.
 
 ``python -m pipelines.studies.pairs rows.jsonl`` runs the cases that the file lacks and counts all. Robots are simulated apart
-from the twin; the slide by the twin's own equations (``taccorl surrogate --twin=``). The search is that of ``taccorl diagnose
+from the twin; the slide by the twin's own equations (``slides``). The search is that of ``taccorl diagnose
 --until=noise_floor``. Material: with the other effect fitted, each leaves at least 1.5 noise floors of validation error. First:
 what ``taccorl diagnose`` names without ``--until``. ``robots.ALIKE`` count as one. Removed: share of test errors above a floor.
 """
@@ -19,12 +19,10 @@ import numpy as np
 
 from pipelines.studies.foreign import ROBOTS, Case, Plant, recordings, unseen_sweep
 from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, cpu_words, share_row, study
+from pipelines.studies.slides import draw_slide
+from pipelines.studies.slides import recordings as slide_recordings
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine
-from taccorl.diagnosis.experiment_design.machine_surrogate import (
-    recordings as slide_recordings,
-)
 from taccorl.diagnosis.experiment_design.motions import ground_of
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
@@ -88,7 +86,7 @@ def made(
     if seed >= FIRST_SLIDE_SEED:
         (folder / "slide.yaml").write_text(SLIDE, encoding="utf-8")
         machine = RobotMachine(load_robot(folder / "slide.yaml"), "slide")
-        case = draw_machine(ground_of(machine, "slide", speed=0.3), seed, [one, other])
+        case = draw_slide(ground_of(machine, "slide", speed=0.3), seed, [one, other])
         return machine, "slide", slide_recordings(case)
     rng = np.random.default_rng([seed, 5])
     weighted = "gravity_mismatch" in (one, other)

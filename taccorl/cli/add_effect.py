@@ -141,6 +141,10 @@ def _diagnosed(
             f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
             for number in own
         ]
+        unknown = [n for n in names if n not in effects and n not in _numbers(machine)]
+        if unknown:
+            text = f"{unknown[0]}: no such effect; {nearest(unknown[0], effects)}"
+            raise TaccorlError(f"{text}; and {path} has no diagnosis")
         raise TaccorlError(
             f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(by_hand)}"
         )
@@ -218,6 +222,17 @@ def _diagnosed(
             f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}"
         )
     return additions, shlex.split(report["provenance"].get("command", "")), said
+
+
+def _numbers(machine: "Machine") -> set[str]:
+    """Names of all numbers of the machine's parts, such as kp."""
+    found: set[str] = set()
+    for part in machine.units:
+        try:
+            found |= machine.numbers(part).keys()
+        except (TaccorlError, ValueError, KeyError):  # no part of its own: a gripper
+            continue
+    return found
 
 
 def _found(diagnosis: dict[str, Any]) -> list[str]:

@@ -12,7 +12,7 @@ import itertools
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,6 +24,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Cell, Section
 
 if TYPE_CHECKING:
+    from taccorl.alignment.measurements.folder import Measurements
     from taccorl.diagnosis.align import Alignment
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.piper import PiperTwin
@@ -159,8 +160,8 @@ def _joints_and_pads(
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.cli.progress import Bars
-    from taccorl.diagnosis.align import Alignment, align_parts
-    from taccorl.diagnosis.problems.joints import SIGNALS
+    from taccorl.diagnosis.align import align_parts
+    from taccorl.diagnosis.problems.joints import SIGNALS, of_joints
 
     measurements = config.read(machine)
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
@@ -168,9 +169,18 @@ def _joints_and_pads(
     if spsa_seed is not None and not set(selected) & set(SIGNALS):
         raise TaccorlError(NO_JOINT)
 
+    judged = () if SHIFTED in config.accept else selected
+    shifted: list[str] = []
+
     def replay() -> "Comparison":
         with Bars(len(measurements.all)) as bars:
-            return machine.compare(measurements, progress=bars.update)
+            found = machine.compare(measurements, progress=bars.update)
+        shifted.extend(s for s in judged if _is_shifted(found, s))
+        clock = {
+            name: tuple(_of_gains(f) if f.feature in judged else f for f in own)
+            for name, own in found.clock.items()
+        }
+        return dataclasses.replace(found, clock=clock)
 
     beside = replayed(
         machine,
@@ -183,67 +193,102 @@ def _joints_and_pads(
     if beside is None:
         return None
     before = beside.comparison
-    troubled = (
-        {} if SHIFTED in config.accept else _come_late(before, beside.late, selected)
-    )
-    parts = [part for part in selected if part not in troubled]
-    with Bars(len(parts), f"fitting {len(parts)} parts") as bars:
+    with Bars(len(selected), f"fitting {len(selected)} parts") as bars:
         count = itertools.count(1)
         found = align_parts(
-            parts,
+            selected,
             machine.config,
             measurements,
             fit_kp=config.fit_kp or spsa_seed is not None,
             spsa_seed=spsa_seed,
             workers=config.workers,
-            done=lambda part: bars.update(part, next(count), len(parts)),
+            done=lambda part: bars.update(part, next(count), len(selected)),
         )
+    if shifted:
+        found = _beside_fitted(machine, found, of_joints(measurements, shifted))
     floors = {
         (s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"
     }
     use = "validation" if measurements.validation else "fit"
-    found += [
-        Alignment(part=part, trouble=trouble) for part, trouble in troubled.items()
-    ]
-    found.sort(key=lambda one: selected.index(one.part))
     return [_beside_floor(one, floors.get((one.part, use))) for one in found]
 
 
-def _come_late(
-    before: "Comparison", late: "Mapping[str, Sequence[Finding]]", parts: Sequence[str]
-) -> dict[str, str]:
-    """Joint → why its gains are not fitted: most of its recordings come ``LATE_S`` or more after the replay."""
+def _is_shifted(
+    comparison: "Comparison", signal: str, severity: str | None = None
+) -> bool:
+    """True if most recordings that move ``signal`` are shifted from the replay.
+    ``severity``: only findings of this one."""
+    found = [f for own in comparison.clock.values() for f in _shifts(own, signal)]
+    found = [f for f in found if severity in (None, f.severity)]
+    return 2 * len(found) > len(comparison.of(signal))
+
+
+def _shifts(findings: Sequence[Finding], signal: str) -> list[Finding]:
+    from taccorl.alignment.checks.clock import SHIFTED
+
+    return [f for f in findings if (f.check, f.feature) == (SHIFTED, signal)]
+
+
+def _of_gains(f: Finding) -> Finding:
+    """A shift from the replay before gains are fitted, as a warning without a way out."""
+    from taccorl.alignment.checks.clock import SHIFTED
+
+    if f.check != SHIFTED:
+        return f
+    size, rows, _ = f.text.partition("rows)")
+    text = f"{size}{rows}: other gains look like this, too"
+    text += "; it is judged again beside the fitted ones"
+    return dataclasses.replace(f, severity="warning", text=text)
+
+
+def _beside_fitted(
+    machine: "PiperTwin", found: "list[Alignment]", measurements: "Measurements"
+) -> "list[Alignment]":
+    """``found``, in which joints that are shifted from the replay with the fitted gains as
+    well are not aligned. ``measurements``: of the joints that were shifted before."""
+    from taccorl.alignment.checks.clock import SHIFTED
+    from taccorl.diagnosis.align import aligned
+
+    twin, _ = aligned(machine.config, found)
+    again = dataclasses.replace(machine, config=twin).compare(measurements)
+    result = []
+    for one in found:
+        trouble = one.trouble
+        if not trouble and _is_shifted(again, one.part, "error"):
+            every = [f for own in again.clock.values() for f in _shifts(own, one.part)]
+            trouble = f"{every[0].text}; --accept={SHIFTED} aligns nevertheless"
+        trouble = trouble or _late(again, one.part)
+        result.append(dataclasses.replace(one, trouble=trouble))
+    return result
+
+
+def _late(comparison: "Comparison", part: str) -> str:
+    """Why the fitted gains of a joint are not written: most of its recordings come
+    ``LATE_S`` or more after the replay with them; empty if they do not."""
     import numpy as np
 
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.alignment.checks.first_order import delay_between
 
-    found = {}
-    for part in parts:
-        traces = before.of(part)
-        shifted = [
-            t
-            for t in traces
-            if any(
-                (f.check, f.feature) == (SHIFTED, part)
-                for f in late.get(t.recording, ())
-            )
-        ]
-        if 2 * len(shifted) <= len(traces):
-            continue
-        delays_s = [
-            delay_between(
-                t.target, t.measured, t.replayed, float(np.median(np.diff(t.time_s)))
-            ).delay_s
-            for t in shifted
-        ]
-        if (delay_s := float(np.median(delays_s))) >= LATE_S:
-            found[part] = (
-                f"its measurement comes {1e3 * delay_s:.0f} ms after the replay, in {len(shifted)} of {len(traces)} recordings: "
-                "a clock offset, or a delay that the twin lacks; fitted gains would take it up. Log command and measurement by "
-                f"one clock, or find the delay with taccorl diagnose; --accept={SHIFTED} aligns nevertheless"
-            )
-    return found
+    if not _is_shifted(comparison, part):
+        return ""
+    traces = comparison.of(part)
+    shifted = [
+        t for t in traces if _shifts(comparison.clock.get(t.recording, ()), part)
+    ]
+    delays_s = [
+        delay_between(
+            t.target, t.measured, t.replayed, float(np.median(np.diff(t.time_s)))
+        ).delay_s
+        for t in shifted
+    ]
+    if (delay_s := float(np.median(delays_s))) < LATE_S:
+        return ""
+    return (
+        f"its measurement comes {1e3 * delay_s:.0f} ms after the replay, in {len(shifted)} of {len(traces)} recordings, with the "
+        "fitted gains as well: a clock offset, or a delay that the twin lacks, which these gains take up in part. Log command "
+        f"and measurement by one clock, or find the delay with taccorl diagnose; --accept={SHIFTED} aligns nevertheless"
+    )
 
 
 def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
@@ -303,9 +348,15 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
 
 def _section(one: "Alignment") -> Section:
     lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
-    lines += [
-        "the recordings agree with the twin's numbers, which stay as they are"
-    ] * bool(one.unchanged)
+    if one.unchanged and one.floors_left >= FAR_ABOVE_FLOOR:
+        lines.append(
+            "no other gains leave a smaller error: the twin's stay, although they leave "
+            f"{one.floors_left:.3g} noise floors"
+        )
+    elif one.unchanged:
+        lines.append(
+            "the recordings agree with the twin's numbers, which stay as they are"
+        )
     if not one.numbers:
         return Section(title=one.part, text=lines)
     rows = []

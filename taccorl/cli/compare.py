@@ -109,7 +109,14 @@ def run(config: CompareConfig) -> int:
         comparisons.extend(_compared(config, twins, measurements))
         return comparisons[0]
 
-    beside = replayed(twins[0], measurements, "not compared", config.accept, replay)
+    beside = replayed(
+        twins[0],
+        measurements,
+        "not compared",
+        config.accept,
+        replay,
+        joints=config.joints,
+    )
     if beside is None:
         return 1
     first, last = comparisons[0], comparisons[-1]

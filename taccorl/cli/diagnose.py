@@ -70,12 +70,18 @@ def run(config: DiagnoseConfig) -> int:
     if machine.of_joints:
         refuse_long(measurements)
     compare = partial(machine.compare, measurements)
+    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     beside = replayed(
-        machine, measurements, "not diagnosed", config.accept, compare, clocks=False
+        machine,
+        measurements,
+        "not diagnosed",
+        config.accept,
+        compare,
+        clocks=False,
+        joints=selected if config.joints else (),
     )
     if beside is None:
         return 1
-    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     off = {
         f.feature: f.text
         for own in beside.findings.values()

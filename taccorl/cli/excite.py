@@ -6,17 +6,16 @@
 The score of a motion or press is the difference, in noise floors, that remains between the rival effects after each is refitted,
 together with the recordings that exist already (--measurements). Motions beyond the joint's limits or the motor's torque are
 refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Where none separates two of the
-rivals, they are tried with the motor's effort recorded, too, then in another pose of a robot file's other joints, then with a
-mass mounted on an axis. Where nothing separates any of the rivals, nothing is written. Otherwise it writes a recording plan:
-plan.yaml, and for each motion or press a table of targets, which a driver can send, at 200 Hz or, for a robot or axis file, at
-the rate of its recordings; for presses also their entries of measurements.yaml; for a sensor of cells the load of each cell.
-Collisions are checked only where other joints of a robot file move to another pose (--pose=), between shapes of its model.
+rivals, they are tried with the motor's effort recorded, too. Where nothing separates any of the rivals, nothing is written.
+Otherwise it writes a recording plan: plan.yaml, and for each motion or press a table of targets, which a driver can send, at
+200 Hz or, for a robot or axis file, at the rate of its recordings; for presses also their entries of measurements.yaml; for a
+sensor of cells the load of each cell. Other joints stand where the recordings have them. Collisions are not checked.
 """
 
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,6 +35,10 @@ FLOOR_RAD = 2e-4
 """Noise floor of an angle where nothing states one [rad]. A choice."""
 OF_JOINTS, OF_TOUCH = "backlash,joint_compliance", "touch_lag,touch_delay"
 """Examples of rival effects in messages: of joints, and of pads and cells."""
+NO_POSE = (
+    "--pose: motions are planned in the pose of the recordings; record one in the other "
+    "pose, and give it as --measurements="
+)
 
 
 @dataclass(kw_only=True)
@@ -65,9 +68,6 @@ class ExciteConfig:
     speed: float | None = None
     """Highest speed of targets of a robot or axis file [rad/s, m/s], or of the load of a sensor of cells, in the unit of its file
     per second; that of the recordings if not given."""
-    pose: dict[str, float] = field(default_factory=dict)
-    """Positions of other joints of the arm or robot during the motion [rad, m], such as {shoulder: 0.8}. If not given: those of
-    the recordings, or, of a joint at which the diagnosis found an effect in one pose only, another pose that is chosen."""
     num: int = 3
     """Number of motions or presses to write, best first."""
     out: Path = Path("recording_plan")
@@ -77,6 +77,8 @@ class ExciteConfig:
 def main(argv: list[str]) -> int:
     """Run ``taccorl excite`` with the words ``argv`` after it; returns the exit status, 0: a plan was written, 1: no recording
     separates any of the effects, whichever of them is true."""
+    if any(word.partition("=")[0] == "--pose" for word in argv):
+        raise TaccorlError(NO_POSE)
     config = parse(ExciteConfig, argv, positional="joint")
     if config.num < 1:
         raise TaccorlError(f"--num={config.num}: at least 1")
@@ -107,7 +109,7 @@ def main(argv: list[str]) -> int:
     if isinstance(machine, CellsMachine):
         made = _cells(config, machine, recorded)
     elif not isinstance(machine, PiperTwin):
-        made = _joint(config, machine, name, diagnosis, recorded)
+        made = _joint(config, machine, name, recorded)
     elif config.pads:
         made = PadsPart(machine.config, config.pads, recorded)
     else:
@@ -173,7 +175,7 @@ def _part_of_piper(config: ExciteConfig) -> str:
         )
     refuse(
         config,
-        ("gains", "floor_rad", "pose"),
+        ("gains", "floor_rad"),
         f"applies to joints only; remove it with --pads={config.pads}",
     )
     return f"{config.pads} pads"
@@ -189,7 +191,7 @@ def _part(config: ExciteConfig, machine: "Machine") -> str:
             f"--pads={config.pads}: {machine.name} has no pads; remove --pads"
         )
     if isinstance(machine, CellsMachine):
-        for name in ("joint", "gains", "floor_rad", "pose"):
+        for name in ("joint", "gains", "floor_rad"):
             refuse(
                 config,
                 (name,),
@@ -291,7 +293,6 @@ def _arm_joint(
     from taccorl.diagnosis.experiment_design.motions import (
         JointPart,
         arm_ground,
-        posed,
         rest_pose,
     )
 
@@ -303,37 +304,17 @@ def _arm_joint(
     if measurements is not None and not swept:
         raise TaccorlError(f"{config.measurements}: no recording has {joint}")
     floor_rad = _floor(config, joint, "rad", swept)
-    ground = arm_ground(
-        twin, joint, posed(joint, rest_pose(joint, measurements), config.pose)
-    )
+    ground = arm_ground(twin, joint, rest_pose(joint, measurements))
     return JointPart(ground, floor_rad, measurements, gains=config.gains)
 
 
 def _joint(
-    config: ExciteConfig,
-    machine: "Machine",
-    part: str,
-    diagnosis: Mapping[str, Any],
-    recorded: "Measurements | None",
+    config: ExciteConfig, machine: "Machine", part: str, recorded: "Measurements | None"
 ) -> "Part":
     """A joint of a robot file, or an axis."""
     from taccorl.diagnosis.experiment_design.motions import JointPart, ground_of
-    from taccorl.diagnosis.experiment_design.other_pose import chosen_pose, stated_pose
-    from taccorl.report.terminal import show
 
     ground = ground_of(machine, part, recorded, span=config.span, speed=config.speed)
-    others = [*next(iter((diagnosis.get("one_pose") or {}).values()), [])]
-    if config.pose:
-        ground = replace(
-            ground,
-            pose=stated_pose(machine, part, ground.like, ground.span, config.pose),
-        )
-    elif others and recorded is not None:
-        stood = f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
-        show(Section(text=[stood]))
-        ground = replace(
-            ground, pose=chosen_pose(machine, part, ground.like, ground.span, others)
-        )
     floor = _floor(config, part, machine.drive(part).unit, recorded and recorded.all)
     return JointPart(ground, floor, recorded, gains=config.gains)
 

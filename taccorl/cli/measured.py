@@ -30,6 +30,11 @@ MANY_ROWS = 1_000_000
 MOST_ROWS = 500_000
 """Rows of one recording beyond which a joint is not diagnosed. A choice: at 0.2 µs a row and replay (three physics steps a row),
 3400 replays for one effect of EMPS take six minutes then, and 70 000 replays to the noise floor two hours."""
+OF_EFFORTS = (
+    *("wrong_inertia", "reversed_effort", "beyond_effort", "effort_time"),
+    *("frozen_effort", "unsigned_effort"),
+)
+"""Checks of one joint's efforts and inertia, which do not hinder the diagnosis of others."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -114,14 +119,16 @@ def replayed(
     replay: "Callable[[], Comparison]",
     why: str = "looks like missing physics",
     clocks: bool = True,
+    joints: Sequence[str] = (),
 ) -> Replayed | None:
     """Check measurements before and after their replay, and show the findings. ``verdict``: text with which the message begins
     if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
     with the measurements. ``why``: what an offset of one row does.
-    ``clocks``: whether to show which clocks nothing judged. Returns None if there are errors, or most clocks are off."""
+    ``clocks``: whether to show which clocks nothing judged. ``joints``: as of ``checked``. Returns None if there are errors, or
+    most clocks are off."""
     from taccorl.report.terminal import show
 
-    findings = checked(machine, measurements, verdict, accept)
+    findings = checked(machine, measurements, verdict, accept, joints)
     if findings is None:
         return None
     comparison = replay()
@@ -160,10 +167,18 @@ def checked(
     measurements: "Measurements",
     verdict: str,
     accept: Sequence[str] = (),
+    joints: Sequence[str] = (),
 ) -> dict[str, list["Finding"]] | None:
-    """Run the checks of telemetry and of the machine, and print their findings. ``verdict``: text with which the message
-    begins if there are errors. ``accept``: checks whose errors become warnings. Returns: name of a recording → its findings;
-    None if there are errors."""
+    """Run the checks of telemetry and of the machine, and print their findings.
+
+    Args:
+        verdict: text with which the message begins if there are errors.
+        accept: checks whose errors become warnings.
+        joints: those that are asked for, if not all; what is wrong with the efforts of
+            others is a warning.
+
+    Returns: name of a recording → its findings; None if there are errors.
+    """
     from taccorl.alignment.checks.telemetry import (
         accepted,
         check_copies,
@@ -223,6 +238,15 @@ def checked(
         for m in measurements.all
     }
     found = one_cause(found, measurements.all, machine.command_rates)
+    if joints:
+        found = {n: [_of_asked(f, joints) for f in own] for n, own in found.items()}
+    drifting = {f.feature for own in found.values() for f in own if f.check == "drift"}
+    found = {
+        name: [
+            f for f in own if f.check != "does_not_repeat" or f.feature not in drifting
+        ]
+        for name, own in found.items()
+    }
     wrong = sorted(
         {name for name, own in found.items() if any(f.severity == "error" for f in own)}
     )
@@ -243,6 +267,14 @@ def checked(
         )
     show(Section(text=lines))
     return None if wrong else found
+
+
+def _of_asked(f: "Finding", joints: Sequence[str]) -> "Finding":
+    """A warning in place of an error of the efforts of a joint that is not asked for."""
+    if f.severity != "error" or f.check not in OF_EFFORTS or f.feature in joints:
+        return f
+    text = f"{f.text}. A warning, as {', '.join(joints)} alone is asked for"
+    return dataclasses.replace(f, severity="warning", text=text)
 
 
 def refuse_long(measurements: "Measurements") -> None:

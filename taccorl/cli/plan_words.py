@@ -10,7 +10,7 @@ from taccorl.diagnosis.experiment_design.motions import EFFORT_SHARE, JointPart
 from taccorl.diagnosis.experiment_design.plan import Part, Plan, Planned
 from taccorl.diagnosis.experiment_design.presses import PadsPart
 from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW
-from taccorl.report.planned import WAY, Words
+from taccorl.report.planned import Words
 
 
 def words(part: Part) -> Words:
@@ -27,26 +27,13 @@ def _of_joint(part: JointPart) -> Words:
     ground, unit, of_piper = part.ground, part.drive.unit, part.ground.of_piper
     small, factor = ("µm", 1e6) if unit == "m" else ("mrad", 1e3)
     peak = "peak force with weight" if unit == "m" else "peak torque with weight"
-    pose, place = ground.pose, {"pose": part.pose} if of_piper else {}
+    place = {"pose": part.pose} if of_piper else {}
     checked = "Collisions are not checked: look where the motion goes. "
-    if pose is not None:
-        hidden = (
-            f"; {pose.unchecked} moving links have no shape in it and are not checked"
-            * bool(pose.unchecked)
-        )
-        checked = (
-            f"On the way to the pose and during the motions no shapes of the model touch that did not touch before{hidden}. "
-            "What stands around the robot is not checked: look where the motion goes. "
-        )
-        place = {"pose": part.pose, "way_to_the_pose": WAY} if pose.driven else {}
-    if ground.mounted_kg:
-        place["payload_kg"] = {part.name: ground.mounted_kg}
-    there = "there, too" if pose is None else "as `pose` says"
     stand = (
         "Gains as in the file; other joints stand where the model's zero pose has them"
     )
     stand = (
-        f"Masses and gains as in {ground.like.name}, other joints {there}"
+        f"Masses and gains as in {ground.like.name}, other joints there, too"
         if ground.like
         else stand
     )
@@ -84,8 +71,7 @@ def _of_joint(part: JointPart) -> Words:
         }
 
     def row(p: Planned) -> tuple[str, ...]:
-        payload_kg = p.item.payload_kg or ground.mounted_kg
-        payload = f"{payload_kg:g} kg" if payload_kg else ""
+        payload = f"{p.item.payload_kg:g} kg" if p.item.payload_kg else ""
         return f"× {p.item.gain:g}", payload, f"{p.peak:.3g} {ground.effort_unit}"
 
     def remarks(found: Plan) -> Iterator[str]:
@@ -108,9 +94,6 @@ def _of_joint(part: JointPart) -> Words:
         facts={"units": units, **place, "how": how},
         entry=entry,
         row=row,
-        way={}
-        if pose is None
-        else {f"{name}.q_target": q for name, q in pose.way(ground.rate_hz).items()},
         remarks=remarks,
     )
 

@@ -3,15 +3,15 @@
 Write recordings of a simulated robot with hidden effects, drawn from the seed, to try ``taccorl compare`` and ``diagnose``
 without a robot. The simulation is independent of the twin: other equations, finer steps, bristle friction, a sampled controller.
 With --pads its fingers press known objects, and the hidden effects are in the pads. With --cells=true it is a simulated sensor
-of force cells, for a cells file (``taxel.yaml``). With --twin=my_robot.yaml it is the machine of that file: a robot, an axis or
-a sensor of cells, to try the commands on it before anything is recorded, or a PiPER with the effects that its twin.yaml states.
+of force cells, for a cells file (``taxel.yaml``). With --twin= it is the sensor of a cells file, to try the commands on it before
+anything is recorded, or a PiPER with the effects that its twin.yaml states.
 The hidden effects are in a sealed file; ``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
 """
 
 import json
 import math
 import shlex
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -42,15 +42,10 @@ class SurrogateConfig:
     cells: bool = False
     """Record presses of a sensor of force cells, instead of a robot."""
     twin: Path | None = None
-    """File of a robot, an axis or a sensor of cells: record that machine, instead of a PiPER. Joints and axes are computed by the
-    twin's own equations, with other numbers, noise and a random torque, so that effects are found more easily than on a robot.
-    A twin.yaml of the PiPER: its gains and effects, in all joints or in --signal, by the independent simulation."""
-    span: list[float] = field(default_factory=list)
-    """With --twin: lowest and highest position of the joint or axis [rad, m]; the limits in its file if not given."""
-    speed: float | None = None
-    """With --twin: highest speed of the joint's or axis's targets [rad/s, m/s]."""
+    """File of a sensor of cells: record that sensor. A twin.yaml of the PiPER: its gains and effects, in all joints or in
+    --signal, by the independent simulation."""
     signal: str | None = None
-    """Joint that moves and has the effects, such as left_joint5, or one of --twin; drawn if not given."""
+    """Joint that moves and has the effects, such as left_joint5; drawn if not given."""
     strength: float | None = None
     """Strength of each effect: the error, in noise floors, that remains without it after a refit of the gains. If not given,
     drawn from 1 to 30, on pads from 1.5 to 15."""
@@ -95,11 +90,6 @@ def run(config: SurrogateConfig) -> int:
         why = f"applies to a drawn robot; {config.twin} states its own"
         refuse(config, ("cells", "effects", "strength", "gains_known"), why)
         robot = machine.config
-    refuse(
-        config,
-        ("span", "speed"),
-        "applies to a machine's file only; give --twin= of one, or remove it",
-    )
     if config.cells:
         return _cells(config, config.secret, out)
     is_arm = config.pads == "no"
@@ -138,7 +128,7 @@ def _cells(
     from taccorl.surrogate.writing import PRESSES
 
     with_option = "--cells=true" if twin is None else f"--twin={twin}"
-    of_robots = ("pads", "signal", "strength", "gains_known", "design", "span", "speed")
+    of_robots = ("pads", "signal", "strength", "gains_known", "design")
     refuse(config, of_robots, f"applies to robots only; remove it with {with_option}")
     possible = [n for n in HIDDEN if sensor is None or n not in OF_GRIDS]
     hidden = (
@@ -160,31 +150,17 @@ def _cells(
 def _machine(
     config: SurrogateConfig, secret: int, machine: "Machine", out: Path
 ) -> int:
-    """Record the machine of a file."""
-    from taccorl.diagnosis.experiment_design.machine_surrogate import (
-        draw_machine,
-        write_machine,
-    )
-    from taccorl.diagnosis.experiment_design.motions import ground_of
+    """Record the sensor of a cells file. Raises TaccorlError: it is a robot or an axis."""
     from taccorl.diagnosis.machines.cells import CellsMachine
-    from taccorl.surrogate.writing import SWEEPS
 
     assert config.twin is not None
-    words = f"applies to the PiPER or to --cells=true only; remove it with --twin={config.twin}"
-    refuse(config, ("pads", "cells", "gains_known", "design"), words)
-    if isinstance(machine, CellsMachine):
-        return _cells(config, secret, out, machine.config, config.twin)
-    names = list(machine.units)
-    part = config.signal or names[secret % len(names)]
-    ground = ground_of(machine, part, span=config.span, speed=config.speed)
-    made = write_machine(
-        draw_machine(ground, secret, config.effects, config.strength), out
-    )
-    print(
-        f"{len(made.all)} recordings of {part} in {out / SWEEPS}: simulated, not real; by the twin's own equations"
-    )
-    _print_next(out / SWEEPS, config.twin, out)
-    return 0
+    if not isinstance(machine, CellsMachine):
+        raise TaccorlError(
+            f"--twin={config.twin}: a robot or an axis of your own is not simulated; "
+            "without --twin= a PiPER is, and `taccorl excite` plans recordings of yours"
+        )
+    refuse(config, ("cells",), f"is not needed with --twin={config.twin}; remove it")
+    return _cells(config, secret, out, machine.config, config.twin)
 
 
 def _sweeps(

@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,6 @@ import yaml
 
 from taccorl.diagnosis.experiment_design.plan import SAME, TELLS, Part, Plan, Planned
 from taccorl.report.section import Section
-
-WAY = "0_to_the_pose.csv"
-"""Table of the way to another pose, in the plan's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +31,6 @@ class Words:
     """Facts of a recording for plan.yaml,"""
     row: Callable[[Planned], Sequence[str]]
     """and for the table, below ``heads`` without the first."""
-    way: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Table of the way to the pose in which it is recorded: column → (T,); empty if there is none."""
     remarks: Callable[[Plan], Iterable[str]] = lambda found: ()
     """Lines below the scores."""
 
@@ -117,8 +112,6 @@ def write_plan(
             {"table": table, **own.entry(p), **condition, "floors_apart": apart}
         )
         write_table(folder / table, p.columns, part.rate_hz)
-        if own.way:
-            write_table(folder / WAY, own.way, part.rate_hz)
     rate_hz = (
         part.rate_hz if isinstance(part.rate_hz, int) else float(f"{part.rate_hz:.6g}")
     )

@@ -324,6 +324,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "regimes": plain(report.regimes()),
         "diagnoses": {f.part: _diagnosis(f.diagnosis) for f in report.found},
         "can_tell": {f.part: plain(f.can_tell) for f in report.found},
+        "drifts": {f.part: [plain(d) for d in f.drifts] for f in report.found},
         "cells": _cell_numbers(report.last),
         "not_compared": list(c.left_out),
     }

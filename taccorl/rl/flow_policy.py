@@ -23,6 +23,7 @@ from lerobot.utils.constants import (
 )
 from torch import Tensor, nn
 
+from taccorl.policies.tactile_pi05.cameras import NormReLU
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, num_part_numbers
 from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
@@ -126,6 +127,9 @@ class TactileFlowPolicy(FlowPolicy):
         )  # the anchor is the loss of the flow alone
         config.num_inference_steps = num_steps
         self.policy, self.model = policy.float(), policy.model
+        for module in self.model.modules():
+            if isinstance(module, NormReLU):
+                module.compiles_updates = settings.compile
         if settings.trained == "expert":
             self.model.paligemma_with_expert.paligemma.requires_grad_(False)
         self.scored_HD = torch.zeros(

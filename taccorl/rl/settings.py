@@ -20,6 +20,9 @@ class PolicySettings:
     """Weights that are trained. expert: those of action expert and touch, not of the vision-language model; all: every weight."""
     tf32: bool = False
     """On a GPU, multiply float32 matrices with 10-bit mantissas: faster, but ratios before the first update differ from 1."""
+    compile: bool = False
+    """On a GPU, compile what encoders of pictures compute between their convolutions, for updates; half a minute in the first
+    one. Only for --policy.backbone=small, and best with batches that all have one size."""
 
     def __post_init__(self) -> None:
         _one_of("policy.trained", self.trained, ("expert", "all"))

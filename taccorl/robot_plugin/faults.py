@@ -12,6 +12,9 @@ import numpy as np
 from taccorl.errors import TaccorlError, printable
 
 _CYCLE = 8  # different frames that may alternate and still count as one
+_SURE = 25.0
+"""Taxels are stuck if by chance they would stand still with probability e⁻²⁵ or less: of 44
+lines at 100 Hz one in half a year."""
 _LONGEST_TEXT = 40  # characters of a value that an error shows
 
 
@@ -79,6 +82,25 @@ def close_all(parts: Mapping[str, Callable[[], object]]) -> list[str]:
         except BaseException as error:  # Ctrl-C, too: the other parts are closed first
             failures.append(f"{name}: {described(error)}")
     return failures
+
+
+def stuck_taxels(unchanged: np.ndarray) -> int:
+    """Number of taxels in rows and columns of a pad that stand still while others do not.
+
+    Args:
+        unchanged: (rows, columns) bool: the taxel gave one number for some frames.
+
+    Returns: 0 if no row or column stands still, if all do, or if that may be chance:
+    with a share s of the other taxels unchanged, n taxels are so with probability sⁿ.
+    """
+    rows, columns = np.all(unchanged, axis=1), np.all(unchanged, axis=0)
+    lines = np.logical_or.outer(rows, columns)
+    others = unchanged[~lines]
+    if not lines.any() or not others.size:
+        return 0
+    count = int(lines.sum())
+    share = max(float(others.mean()), 1 / others.size)
+    return count if -count * math.log(share) > _SURE else 0
 
 
 class Repeats:

@@ -23,7 +23,14 @@ from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
 from taccorl.data.spec import data_specs_folder
 from taccorl.data.timing import NS_PER_S, match
 from taccorl.errors import TaccorlError
-from taccorl.robot_plugin.faults import Repeats, Unfit, close_all, described, number
+from taccorl.robot_plugin.faults import (
+    Repeats,
+    Unfit,
+    close_all,
+    described,
+    number,
+    stuck_taxels,
+)
 
 _log = logging.getLogger(__name__)
 SENSOR = "flexitac_v2"
@@ -34,6 +41,8 @@ _KEPT_S = 5.0  # of frames, for windows of touch
 _LEAST_REST_COUNT = 5  # resting counts from which a taxel's noise does not reach 0
 REPEATED = "it repeats its frames"
 DEAD = "a line of its taxels reads 0 that is above 0 at rest"
+STUCK = "lines of its taxels stand still while others change"
+_STUCK_FRAMES = 5  # in which taxels do not change that are stuck: 0.05 s
 
 
 class PadDriver(Protocol):
@@ -171,6 +180,8 @@ class Pads:
         self._ended = threading.Event()
         self._stamps_s: dict[str, float] = {}
         self._repeats: dict[str, Repeats] = {}
+        self._still: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        """Pad → its last counts (taxels,), and for how many frames each is unchanged."""
         self.faults: dict[str, str] = {}
         """Pad → why nothing newer of it can be used, if that is so."""
         self.broken = ""
@@ -191,7 +202,7 @@ class Pads:
         or not the one that was there before."""
         self._ended = threading.Event()  # of this connection: its threads keep it
         self.broken, self.baseline = "", None
-        self._stamps_s, self.faults = {}, {}
+        self._stamps_s, self.faults, self._still = {}, {}, {}
         self._repeats = {name: Repeats() for name in self.names}
         for frames in self._frames.values():
             frames.clear()
@@ -237,6 +248,16 @@ class Pads:
                 text = f"pad {name}: {stuck} of {len(baseline)} taxels always read 0 or"
                 text += f" {self.spec.max_count} at rest: is it unplugged or pressed? A"
                 raise TaccorlError(f"{text} driver that subtracts needs pads.raw=false")
+            same = self._as_pad((first == first[0]).all(axis=0))
+            if self.config.raw and (stuck := stuck_taxels(same)):
+                text = (
+                    f"pad {name}: {stuck} of {len(baseline)} taxels, in whole rows or"
+                )
+                text += (
+                    f" columns, give one number in {len(first)} frames at rest while"
+                )
+                text += " others change: is a line unplugged? A driver that filters"
+                raise TaccorlError(f"{text} needs pads.raw=false")
             parts.append(baseline)
         self.baseline = np.concatenate(parts)
 
@@ -377,7 +398,19 @@ class Pads:
             dead = int(((values == 0) & (rest >= _LEAST_REST_COUNT)).sum())
             if dead >= self._line:
                 return DEAD
+        last, frames = self._still.get(name, (values, np.zeros(len(values), int)))
+        # What saturates is pressed, and stands still for as long as it is.
+        still = (values == last) & (values < self.spec.max_count)
+        frames = np.where(still, frames + 1, 0)
+        self._still[name] = values, frames
+        stuck = stuck_taxels(self._as_pad(frames >= _STUCK_FRAMES))
+        if stuck and self.baseline is not None:  # else ``calibrate`` sees it
+            return f"{STUCK}: {stuck} of {len(values)}"
         return "" if is_new else REPEATED
+
+    def _as_pad(self, values: np.ndarray) -> np.ndarray:
+        """(rows, columns) of the pad for one of each taxel (taxels,)."""
+        return values.reshape(self.spec.rows, self.spec.columns)
 
     def _identify(self) -> None:
         """Compare the resting counts with those of the first connection: a pad in another's port shows another's."""

@@ -377,8 +377,16 @@ class TouchRobot(Robot):
             f"{self.name}{' (dry run, nothing was sent)' if self.config.dry_run else ''}: {self.body.origin}"
         ]
         for what, values in sorted(self.timing.items()):
-            p50, p99 = np.percentile(list(values), [50, 99]) * 1e3
-            lines.append(f"  {what}: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
+            known = np.array([x for x in values.copy() if math.isfinite(x)])
+            text = f"  {what}:"
+            if len(known):
+                p50, p99 = np.percentile(known, [50, 99]) * 1e3
+                text += f" p50 {p50:.1f} ms, p99 {p99:.1f} ms"
+            if missing := len(values) - len(known):
+                text += (
+                    f" no sample had come in {missing} of {len(values)} observations"
+                )
+            lines.append(text)
         periods = np.array(self.timing.get("period", ()))
         if len(periods) > 1:
             most_s = HELD_SHARE / self.config.fps

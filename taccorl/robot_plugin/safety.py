@@ -73,6 +73,7 @@ _NUMBER = re.compile(r"(?<!\w)-?\d[\d.e+-]*")  # in a reason of a stop, not in a
 _IMPOSSIBLE = (
     10.0  # largest speeds: no collision or hand moves a joint so fast. A choice
 )
+_FARTHEST_S = 1000.0  # a quarter of an hour in one direction. A choice
 _AT_TARGET = 0.2  # of what a joint moves in a period at its largest speed: 0.02 rad at 3 rad/s and 30 Hz
 
 
@@ -198,6 +199,8 @@ class Guard:
             return self.stop(str(error), is_lost=True)
         if jump := self._jump(seen, stamps_s["state"]):
             return self.stop(jump, is_lost=True)
+        if absurd := self._absurd(seen.position):
+            return self.stop(absurd, is_lost=True)
         self.is_unfit = False
         passed_s = stamps_s["state"] - self._stamps_s.get("state", -math.inf)
         if self._observed is not None and 0 < passed_s < 1:
@@ -235,6 +238,30 @@ class Guard:
             f"position of {self.names[k]} moved by {moved[k]:.3g} in {passed_s:.3g} s, more than "
             f"{_IMPOSSIBLE:g} times its largest speed {self._speed[k]:g}: the encoder or its reader is wrong"
         )
+
+    def _absurd(self, position: np.ndarray) -> str:
+        """Text on a position where no such joint can be; empty if there is none."""
+        low, high = self._measured
+        if not (beyond := (position < low) | (position > high)).any():
+            return ""
+        k = int(np.argmax(beyond))
+        name = self.names[k]
+        return (
+            f"position of {name} is {position[k]:g}, possible is {low[k]:g} … "
+            f"{high[k]:g}: the encoder, its unit or its reader is wrong; or correct "
+            f"safety.ranges.{name} or safety.max_speed"
+        )
+
+    @property
+    def _measured(self) -> tuple[np.ndarray, np.ndarray]:
+        """(A,) lowest and highest position that a joint can have: its range and half as
+        much on both sides; without a range as far as its largest speed leads in
+        ``_FARTHEST_S``."""
+        known = np.isfinite(self._low) & np.isfinite(self._high)
+        beside = np.where(known, 0.5 * (self._high - self._low), 0.0)
+        far = _FARTHEST_S * self._speed
+        low = np.where(known, self._low - beside, -far)
+        return low, np.where(known, self._high + beside, far)
 
     def _admitted(self, seen: Observed) -> tuple[Observed, dict[str, float]]:
         """The observation with every number checked, and the time of each channel's
@@ -424,9 +451,14 @@ class Guard:
             if age_s <= min(most_s, last_s):
                 continue
             note = self._observed.notes.get(channel, "")
-            limit_s = last_s if age_s > last_s else most_s
-            reason = f"{channel} is {age_s:.2f} s old, at most {limit_s:g} s"
-            reason += f": {note}" if note else ""
+            kind = channel.partition(":")[0]
+            limit_s, option = most_s, f"max_age_s.{kind}"
+            if age_s > last_s:
+                limit_s, option = last_s, "stop_after_s"
+            reason = (
+                f"the newest sample of {channel} is {age_s:.2f} s old, at most {limit_s:g} s (safety.{option}): "
+                f"{note or 'its driver sends none'}"
+            )
             if age_s > last_s:
                 return self.stop(reason, is_lost=True)
             causes[f"{channel} {note}"] = reason
@@ -466,11 +498,14 @@ class Guard:
         rows = zip(
             self.names, self._speed, self._low, self._high, self._effort, strict=True
         )
+        measured = zip(self.names, *self._measured, strict=True)
         return [
             *(
                 f"{name}: {speed:g} a second, {low:g} … {high:g}, effort {effort:g}"
                 for name, speed, low, high, effort in rows
             ),
+            "measured: "
+            + ", ".join(f"{n} {low:g} … {high:g}" for n, low, high in measured),
             f"hands: {place}",
             f"sum of a pad: {config.pad_sum_count:g} counts",
             f"age at which the arms hold: {ages}; at which they stop: "

@@ -54,16 +54,6 @@ _BOUND = (
     "geom_xpos",
 )
 _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat")
-_JUDGED = (
-    "xpos",
-    "xmat",
-    "cvel",
-    "subtree_com",
-    "site_xpos",
-    "site_xmat",
-    "sensordata",
-)
-"""What joint states and predicates are computed from."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +192,7 @@ class Simulation(SeenScene):
             name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)
         }
         self._tcp_sites = {arm: m.site(f"{arm}_tcp").id for arm in ROBOT.arms}
+        self._judged = self._judged_rows()
         owner = m.geom_bodyid
         self._part_geoms = np.flatnonzero(
             np.isin(owner, list(self._bodies.values())) & (m.geom_contype > 0)
@@ -229,6 +220,22 @@ class Simulation(SeenScene):
                 m.sensor("{}_on_{}_force".format(*pair)).adr[0],
             )
             for pair in self.task.mating
+        }
+
+    def _judged_rows(self) -> dict[str, np.ndarray]:
+        """Field → its rows that joint states and predicates are computed from: parts, clamped bodies, hands, TCPs, sensors."""
+        hands = [self.model.body(f"{arm}_{ROBOT.hand}").id for arm in ROBOT.arms]
+        bodies = np.unique([*self._bodies.values(), *hands])
+        roots = np.unique(self.model.body_rootid[bodies])
+        sites = np.unique(list(self._tcp_sites.values()))
+        return {
+            "xpos": bodies,
+            "xmat": bodies,
+            "cvel": bodies,
+            "subtree_com": roots,
+            "site_xpos": sites,
+            "site_xmat": sites,
+            "sensordata": np.arange(self.model.nsensordata),
         }
 
     # reset -----------------------------------------------------------------------------------------------------------
@@ -373,7 +380,7 @@ class Simulation(SeenScene):
         in_parts = watch is not None or bool(scans) or self.effects.rewrites
         batch = self.batch
         if isinstance(batch, WarpBatch) and batch.is_resident and not in_parts:
-            fields = _JUDGED if lean and not self.effects.past else None
+            fields = self._judged if lean and not self.effects.past else None
             targets_SNA = np.stack(arrive)
             batch.step_targets(
                 ids, self.action_actuators, targets_SNA, num_steps, fields

@@ -7,7 +7,7 @@ copies back what is bound. MuJoCo Warp and Torch are imported at the first use. 
 import copy
 import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
@@ -60,8 +60,8 @@ class WarpSettings:
     the mean is 1.8. A world that reaches the limit goes on with what it has, as in MuJoCo C."""
     mode: str = "copied"
     """What stays on the device. copied: states are copied back five times a control step, OpenGL draws. resident: a control step
-    is one launch, and MuJoCo Warp's ray tracer draws. Not to be trusted yet: a policy that completed 96 of 192 scenes by
-    MuJoCo C had completed one by step 716 of 900 in this mode, on an H200 (docs/training.md)."""
+    is one launch, and MuJoCo Warp's ray tracer draws; states and pictures were those of the copied mode on an H200, but of
+    192 scenes a weak policy completed fewer (docs/training.md)."""
 
     @classmethod
     def parse(cls, physics: str) -> "WarpSettings | None":
@@ -240,7 +240,7 @@ class WarpBatch(Batch):
         def work(worlds: "_Worlds", run: np.ndarray) -> None:
             worlds.run(nstep, refresh=is_refreshed)
 
-        fields = tuple(self._bound) if is_refreshed else ()
+        fields = dict.fromkeys(self._bound) if is_refreshed else {}
         self._advance(ids, nstep, work, fields, with_state=is_refreshed)
 
     def step_targets(
@@ -249,15 +249,16 @@ class WarpBatch(Batch):
         columns: np.ndarray,
         targets_SNA: np.ndarray,
         nstep: int,
-        fields: Sequence[str] | None = None,
+        fields: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """S times: write ``targets_SNA[s]`` into the controls ``columns`` (A,) and take ``nstep`` physics steps. One launch and
         one wait for all of it; the model's sensors are computed once, at the end.
 
         Args:
             ids: simulations that step, as in ``Batch.step``; their rows of ``targets_SNA`` (S, N, A) are used.
-            fields: derived fields that are current afterwards, among those that are bound; the states stay on the device, as
-                after a ``step`` with ``mjSTAGE_NONE``. None: all of them, and the states.
+            fields: derived fields that are current afterwards, among those that are bound → which of their rows (bodies,
+                sites, numbers of sensors) in each simulation; the states stay on the device, as after a ``step`` with
+                ``mjSTAGE_NONE``. None: all of them, and the states.
 
         Raises:
             TaccorlError: as ``step``.
@@ -270,7 +271,7 @@ class WarpBatch(Batch):
             controls[rows[:, None], columns] = targets_SNA[-1][rows]
             self._known["ctrl"][run] = controls[run]
 
-        chosen = tuple(self._bound) if fields is None else tuple(fields)
+        chosen = dict.fromkeys(self._bound) if fields is None else fields
         num = nstep * len(targets_SNA)
         self._advance(ids, num, work, chosen, with_state=fields is None)
 
@@ -279,7 +280,7 @@ class WarpBatch(Batch):
         ids: Any,
         num_steps: int,
         work: Callable[["_Worlds", np.ndarray], None],
-        fields: Sequence[str],
+        fields: Mapping[str, np.ndarray | None],
         *,
         with_state: bool,
     ) -> None:
@@ -443,7 +444,7 @@ class WarpBatch(Batch):
         """States of ``rows`` (N,) bool, and those derived fields of theirs that are older."""
         partial = rows & self._partial
         if partial.any() and self._world is not None:
-            self._pull_fields(self._world, partial, tuple(self._bound))
+            self._pull_fields(self._world, partial, dict.fromkeys(self._bound))
             self._partial &= ~partial
         self._pull_state(rows)
 
@@ -456,12 +457,15 @@ class WarpBatch(Batch):
             self._behind &= ~rows
 
     def _pull_fields(
-        self, worlds: "_Worlds", rows: np.ndarray, fields: Sequence[str]
+        self,
+        worlds: "_Worlds",
+        rows: np.ndarray,
+        fields: Mapping[str, np.ndarray | None],
     ) -> None:
-        for name in fields:
+        for name, parts in fields.items():
             values = self._bound[name]
             values.flags.writeable = True
-            worlds.read(worlds.tensor(name), rows, values)
+            worlds.read(worlds.tensor(name), rows, values, parts)
             values.flags.writeable = False
 
 
@@ -652,11 +656,23 @@ class _Worlds:
         """Write the row ``source`` of a tensor into ``rows`` (N,) bool."""
         tensor[self._index(rows)] = tensor[source].clone()
 
-    def read(self, tensor: Any, rows: np.ndarray, values: np.ndarray) -> None:
-        """Read a device's tensor (N, …) into ``rows`` (N,) bool of ``values`` (N, …)."""
-        found = tensor[self._index(rows)].cpu().numpy()
+    def read(
+        self,
+        tensor: Any,
+        rows: np.ndarray,
+        values: np.ndarray,
+        parts: np.ndarray | None = None,
+    ) -> None:
+        """Read a device's tensor (N, …) into ``rows`` (N,) bool of ``values`` (N, …); with ``parts`` (k,) only those along the
+        second axis."""
+        found = tensor[self._index(rows)]
+        if parts is not None:
+            found = found[:, torch.from_numpy(parts).to(found.device)]
+            into = np.flatnonzero(rows)[:, None], parts
+            values[into] = found.cpu().numpy().reshape(-1, *values[:1, parts].shape[1:])
+            return
         chosen = slice(None) if rows.all() else rows  # a mask costs three times a copy
-        values[chosen] = found.reshape(-1, *values.shape[1:])
+        values[chosen] = found.cpu().numpy().reshape(-1, *values.shape[1:])
 
     def _index(self, rows: np.ndarray) -> Any:
         if rows.all():

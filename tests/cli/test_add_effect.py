@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -323,3 +324,24 @@ def test_in_place_changes_the_file_itself_and_nothing_else(folder, said, tmp_pat
     )
     code, text = said(*words, f"--twin={path}")
     assert code == 2 and "another twin" in text, "it is one now"
+
+
+@pytest.mark.parametrize(
+    ("name", "stated"),
+    [
+        ("coulomb_frictoin", "did you mean 'coulomb_friction'"),
+        (
+            "kd,comand_delay",
+            "comand_delay: no such effect; did you mean 'command_delay'",
+        ),
+        ("nosuch", "nosuch: no such effect; known: armature, "),
+        ("coulomb_friction", "no diagnosis there; run `taccorl diagnose` first"),
+        ("kd", "no diagnosis there; run `taccorl diagnose` first"),
+    ],
+)
+def test_an_unknown_effect_is_named_before_the_missing_diagnosis(
+    name: str, stated: str, said: Any, tmp_path: Path
+):
+    code, text = said(name, f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}")
+    assert code == 2 and stated in text
+    assert ("no such effect" in text) == ("first" not in stated)

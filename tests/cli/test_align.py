@@ -13,10 +13,15 @@ from made_press import K_D, K_N, ball_at, press
 from one_joint import recorded
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
+from taccorl.alignment.checks.clock import SHIFTED
+from taccorl.alignment.checks.registry import find
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.touch.match import MATCH_NUMBERS
+from taccorl.cli.align import _section
+from taccorl.data.finding import Finding
 from taccorl.diagnosis.align import Alignment, align_part, aligned
+from taccorl.diagnosis.comparison import compare
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.twin import TwinConfig
@@ -116,6 +121,62 @@ def test_a_search_that_cannot_be_or_has_no_effect_is_refused(
     code, text = said("align", folder / "sweeps", *words, "--out=found")
     assert code == 2 and stated in text
     assert not (tmp_path / "found").exists()
+
+
+def scaled(kp: float, kd: float) -> TwinConfig:
+    """The nominal twin with other gains of left_joint5."""
+    config = TwinConfig()
+    control = copy.deepcopy(config.controller_of("left"))
+    control.kp_nm_per_rad[J] *= kp
+    control.kd_nms_per_rad[J] *= kd
+    config.arm_controllers["left"] = control
+    return config
+
+
+def earlier(m: Measurement) -> Measurement:
+    """``m`` whose positions stand one row too early."""
+    measured = np.concatenate([m.measured[1:], m.measured[-1:]])
+    return dataclasses.replace(m, measured=measured)
+
+
+def test_gains_are_fitted_before_a_lead_is_an_error(
+    folder: Path, said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Of K_d 1.5 times the twin's, here with leads that only the twin's gains show."""
+    lead = find(SHIFTED, SIGNAL, f"{SIGNAL}: 5 ms (1.0 rows): write rows")
+    replays = iter([lead] * 4 + [None] * 4)
+
+    def judge(*_: Any, **__: Any) -> list[Finding]:
+        found = next(replays)
+        return [] if found is None else [found]
+
+    monkeypatch.setattr(compare, "check_against_twin", judge)
+    code, text = said("align", folder / "sweeps")
+    assert code == 0, text
+    assert next(replays, "none left") == "none left", "each recording is judged twice"
+    assert "write rows" not in text
+    assert (tmp_path / "alignment" / "twin.yaml").exists()
+
+
+def test_a_lead_is_found_beside_fitted_gains(said: Any, tmp_path: Path):
+    """Gains off by two hide a row; only the fitted ones show it, and none are written."""
+    made = sweeps(scaled(1.0, 0.5), seconds=3.0)
+    uses = (
+        tuple(map(earlier, side)) for side in (made.fit, made.validation, made.test)
+    )
+    write_folder(tmp_path / "sweeps", Measurements(*uses, rule=made.rule))
+    code, text = said("align", "sweeps")
+    assert code == 1, text
+    assert "target_rows_late: 1" in text
+    assert not (tmp_path / "alignment" / "twin.yaml").exists()
+
+
+def test_what_floors_are_left_is_not_called_agreement():
+    left = Alignment(part=SIGNAL, numbers=(), unchanged=True, floors_left=14.0)
+    (line,) = _section(left).text
+    assert "14 noise floors" in line and "agree" not in line
+    (line,) = _section(dataclasses.replace(left, floors_left=1.1)).text
+    assert "the recordings agree with the twin's numbers" in line
 
 
 @pytest.mark.slow

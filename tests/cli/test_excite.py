@@ -245,6 +245,10 @@ def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(
             "--gains applies to joints only; remove it with --pads=left",
         ),
         ([], "missing --joint=left_joint5, or --pads=left for the pads of that arm"),
+        (
+            [SIGNAL, RIVALS, "--pose={{left_joint2: 1.2}}"],
+            "--pose: motions are planned in the pose of the recordings; record one",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_said_and_nothing_written(

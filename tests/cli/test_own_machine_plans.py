@@ -12,7 +12,7 @@ import yaml
 from axes import altered
 
 from taccorl.alignment.checks.telemetry import check_measurement
-from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.experiment_design.motions import (
     EFFORT_SHARE,
@@ -245,38 +245,12 @@ def test_excite_writes_targets_that_the_axis_can_follow(drive, said, tmp_path):
     )
 
 
-@pytest.mark.slow
-def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(
+def test_a_surrogate_of_the_users_axis_is_refused_with_the_way_out(
     drive, said, tmp_path
 ):
     out = tmp_path / "made"
-    words = ["--secret=4", f"--twin={drive}", "--speed=0.4", f"--out={out}"]
-    code, text = said(
-        "surrogate", *words, "--effects=[viscous_friction]", "--strength=8"
-    )
-    assert code == 0 and "simulated, not real" in text
-    truth = json.loads(said("surrogate", f"--reveal={out}")[1])
-    (hidden,) = truth["hidden"]
-    assert 8 / 1.5 <= hidden["error_floors"] <= 8 * 1.5
-    made = read_measurements(out / "sweeps", units={"slide": "m"})
-    assert (
-        {m.origin.domain for m in made.all} == {"surrogate"}
-        and made.validation
-        and made.test
-    )
-    assert all(np.isfinite(m.effort).all() for m in made.all)
-    code, text = said(
-        "compare", out / "sweeps", f"--twin={drive}", f"--out={tmp_path / 'compared'}"
-    )
-    assert code == 0
-    scores = json.loads((tmp_path / "compared" / "report.json").read_text())["scores"]
-    assert min(s["ratio"] for s in scores if s["use"] == "test") > 1.5
-    assert (
-        "cannot be hidden in slide"
-        in said(
-            "surrogate", *words, "--effects=[encoder_eccentricity]", f"--out={out}2"
-        )[1]
-    )
+    code, text = said("surrogate", "--secret=4", f"--twin={drive}", f"--out={out}")
+    assert code == 2 and "taccorl excite" in text and not out.exists()
 
 
 def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said, tmp_path):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from pipelines import cotrain, learn
+from pipelines.paper_tables import row_of
+from pipelines.post_training import PostTraining
 from pipelines.surrogate_twin import named
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
@@ -81,6 +83,62 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(
         "collect",
         "augment",
     ]  # which find what they made; no training
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_policy_is_post_trained_and_scored_in_the_same_scenes_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [
+        "--small",
+        "--post_train=[configs/post_train/tiny.yaml]",
+        "--post_train_options=[--iterations=1,--anchor.weight=0,--rerun=false]",
+        f"--out={tmp_path}",
+    ]
+    (done,) = learn.main(words)
+    start, after = (row_of(score) for score in done.scores)
+    same = ("task", "n", "first_scene", "seed", "demonstrations", "steps", "executed")
+    assert [start[name] for name in same] == [after[name] for name in same]
+    assert "stage" not in start
+    assert after["stage"] == "ppo"
+    assert after["settings"].startswith("tiny_")
+    assert after["decisions"] == 4 * 6  # environments, decisions of each
+    assert after["updates"] == 1
+    assert len(after["curve"]) == 1
+    assert after["key"] != start["key"]
+    monkeypatch.setattr(learn, "step", lambda *_: None)
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("run again"))
+    assert learn.main(words) == [done]
+
+
+def test_a_stopped_run_of_post_training_goes_on_and_a_finished_one_does_not(tmp_path):
+    config = Path("configs/post_train/tiny.yaml")
+    words = ["--iterations=2", "--anchor.weight=0"]
+    run = PostTraining.of(tmp_path / "start", tmp_path, config, words, 7)
+    assert run.command(["--env.task=puzzle"])[:2] == [
+        "post-train",
+        f"--config_path={config}",
+    ]
+    run.policy.mkdir(parents=True)
+    row = {"decisions": 24, "actor_steps": 0, "seconds": {"physics": 1.5}}
+    (run.folder / "progress.jsonl").write_text(json.dumps(row) + "\n")
+    resumed = run.command(["--env.task=puzzle"])
+    assert resumed == ["post-train", "--resume=true", f"--out={run.folder}"]
+    with (run.folder / "progress.jsonl").open("a") as file:
+        file.write(json.dumps(row | {"decisions": 48, "actor_steps": 3}) + "\n")
+    assert run.command([]) == []
+    assert run.about() == {
+        "stage": "ppo",
+        "settings": run.settings,
+        "decisions": 48,
+        "updates": 1,
+        "ppo_s": 3,
+    }
+    other = PostTraining.of(tmp_path / "start", tmp_path, config, words[:1], 7)
+    assert other.folder != run.folder
+    with pytest.raises(SystemExit, match="--iterations=30"):
+        PostTraining.of(tmp_path / "start", tmp_path, config, words[1:], 7)
 
 
 @pytest.mark.slow

@@ -18,17 +18,23 @@ from pathlib import Path
 from typing import get_type_hints
 
 import pytest
+from simulated_sweeps import write_folder
 
+from pipelines.studies.slides import draw_slide, recordings
 from taccorl.cli.main import VERBS
 from taccorl.cli.parse import _inner_names
+from taccorl.diagnosis.experiment_design.motions import ground_of
+from taccorl.diagnosis.machines.load import load_machine
 
+SEED = 5
+"""Seed of the simulated arm."""
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SECTIONS = (  # run after README.md, in this order
     ("training.md", "## Train, with LeRobot's own commands"),
     ("training.md", "## Both domains"),
     ("your_robot.md", "## A robot of an MJCF or URDF file"),
-    ("your_robot.md", "## Try it before anything is recorded, and plan recordings"),
+    ("your_robot.md", "## Plan recordings"),
     ("twin.md", "## Diagnose its joints"),
     ("twin.md", "## Diagnose its pads"),
     ("data.md", "## Look at it"),
@@ -225,28 +231,17 @@ class Walk:
         Path("my_arm.xml").write_text(ARM)
 
     def tables_of_an_arm(self) -> None:
-        """The TODOs of the arm's file, filled in, and recordings of a surrogate with dry friction that it lacks."""
+        """The TODOs of the arm's file, filled in, and simulated recordings with dry friction
+        that it lacks."""
         path = Path("my_robot.yaml")
         text = path.read_text().replace(
             "gravity_compensation: TODO", "gravity_compensation: 0.0"
         )
         path.write_text(text.replace("gains: TODO", "gains: commanded"))
         assert "TODO" not in re.sub(r"#.*", "", path.read_text())
-        hidden = (
-            "--secret=5",
-            "--twin=my_robot.yaml",
-            "--effects=[coulomb_friction]",
-            "--strength=12",
-        )
-        self.run(
-            "taccorl",
-            "surrogate",
-            *hidden,
-            "--signal=elbow",
-            "--speed=1.5",
-            "--out=arm",
-        )
-        Path("arm/sweeps").rename("sweeps")
+        ground = ground_of(load_machine(path), "elbow", speed=1.5)
+        case = draw_slide(ground, SEED, ["coulomb_friction"])
+        write_folder(Path("sweeps"), recordings(case), ("elbow",))
 
     def sweeps_of_the_piper(self) -> None:
         shutil.rmtree("sweeps")

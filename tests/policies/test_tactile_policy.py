@@ -33,6 +33,7 @@ from tiny_policies import (
 )
 
 from taccorl.errors import TaccorlError
+from taccorl.policies.tactile_pi05 import cameras
 from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, NormReLU
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     TactilePI05Config,
@@ -467,6 +468,30 @@ def test_norm_sum_and_relu_are_those_of_pytorchs_modules_in_the_maps_own_precisi
     torch.testing.assert_close(layer(x, beside), (normed(x) + beside).clamp(min=0))
     with torch.autocast("cpu", torch.bfloat16):
         assert layer(x.bfloat16()).dtype == torch.bfloat16
+
+
+def test_norms_are_compiled_in_training_and_on_request_in_updates_alone(monkeypatch):
+    """Never where an evaluation asks: each of its batches would be compiled anew."""
+    calls = []
+
+    def noted(*given):
+        calls.append(given[0].shape)
+        return cameras._norm_relu(*given)
+
+    monkeypatch.setattr(cameras, "_compiled_norm_relu", noted)
+    layer, x = NormReLU(32), torch.randn(2, 32, 5, 4)
+    for training, requested, gradients, compiled in (
+        (True, False, True, True),
+        (False, False, True, False),
+        (False, True, True, True),
+        (False, True, False, False),
+    ):
+        layer.train(training)
+        layer.compiles_updates = requested
+        calls.clear()
+        with torch.set_grad_enabled(gradients):
+            layer(x)
+        assert bool(calls) == compiled
 
 
 def test_each_camera_has_key_points_of_its_own_and_none_may_be_missing():

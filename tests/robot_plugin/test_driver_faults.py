@@ -4,6 +4,7 @@ all after a stop, and every reason is in the log."""
 import logging
 import math
 import re
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from driven_robot import NAMES, Bench, DrivenRobot
 
+from taccorl.errors import TaccorlError
 from taccorl.robot_plugin.bodies import Sample
 from taccorl.robot_plugin.safety import Stopped
 
@@ -108,6 +110,17 @@ def dead(part: Any) -> Callable[[Bench, np.ndarray], np.ndarray]:
     return change
 
 
+def stuck(part: Any) -> Callable[[Bench, np.ndarray], np.ndarray]:
+    """Frames whose taxels ``part`` keep one number each, that of rest."""
+
+    def change(bench: Bench, frame: np.ndarray) -> np.ndarray:
+        if frame.shape == bench.rest.shape:  # not one of another size
+            frame[part] = np.round(bench.rest).astype(np.uint8)[part]
+        return frame
+
+    return change
+
+
 def acting(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
     return lambda action: (action or {}) | {name: value}
 
@@ -152,6 +165,10 @@ FAULTS = {
     "pad half zero": Fault("hold", f"{PAD}.*reads 0", frame=dead(HALF)),
     "pad row zero": Fault("hold", f"{PAD}.*reads 0", frame=dead(ROW)),
     "pad column zero": Fault("hold", f"{PAD}.*reads 0", frame=dead(COLUMN)),
+    "pad half stuck": Fault("hold", f"{PAD}.*stand still", frame=stuck(HALF)),
+    "pad other half stuck": Fault("hold", f"{PAD}.*stand still", frame=stuck(np.s_[:, 16:])),
+    "pad row stuck": Fault("hold", f"{PAD}.*stand still", frame=stuck(ROW)),
+    "pad column stuck": Fault("hold", f"{PAD}.*stand still", frame=stuck(COLUMN)),
     "pad size": Fault("hold", PAD, frame=lambda _, f: f[:4, :4]),
     "pad floats": Fault("hold", PAD, frame=lambda _, f: f.astype(float)),
     "pad OSError": Fault("hold", PAD, frame=lambda *_: OSError("unplugged")),
@@ -287,6 +304,70 @@ def test_without_a_finite_position_nothing_is_sent(
     run(robot, {name: range(END)})
     assert robot.guard.stopped
     assert robot.bench.commands == []
+    robot.disconnect()
+
+
+@pytest.mark.parametrize("part", [HALF, np.s_[:, 16:], ROW, COLUMN])
+@pytest.mark.parametrize("level", [3, 25, 254])
+def test_a_pad_that_is_stuck_above_0_is_refused_at_connect(
+    robot: DrivenRobot, part: Any, level: int
+) -> None:
+    """Between 0 and 255, which were refused before: each taxel at a number of its own."""
+
+    def change(bench: Bench, frame: np.ndarray) -> np.ndarray:
+        frame[part] = np.minimum(level + bench.rest.astype(int)[part] % 4, 254)
+        return frame
+
+    robot.bench.change_frame = [change]
+    with pytest.raises(TaccorlError, match=r"pad left: \d+ of 384 taxels.*one number"):
+        robot.connect()
+    assert not robot.is_connected
+
+
+@pytest.mark.parametrize("noise_counts", [0.2, 0.5, 1.3, 4.0])
+def test_a_pad_that_works_is_never_stuck(tmp_path: Path, noise_counts: float) -> None:
+    """80 frames, 40 of them with a row that is pressed to the end of its range."""
+    robot = DrivenRobot(tmp_path, Bench(noise_counts=noise_counts))
+    robot.connect()
+    for period in range(80):
+        pressed = period > 40
+        press: Any = [lambda _, f: np.concatenate([np.full_like(f[:1], 255), f[1:]])]
+        robot.bench.change_frame = press if pressed else []
+        robot.pass_period()
+        assert robot.pads is not None
+        assert not robot.pads.faults
+    robot.disconnect()
+
+
+@pytest.mark.parametrize(
+    ("ranges", "value", "said"),
+    [
+        ({}, 1e6, r"position of shoulder.pos is 1e\+06, possible is -3000 … 3000"),
+        ({"shoulder.pos": [-2.0, 1.0]}, 90.0, "is 90, possible is -3.5 … 2.5"),
+        ({"shoulder.pos": [-2.0, 1.0]}, -1e300, "possible is -3.5 … 2.5"),
+    ],
+)
+def test_an_absurd_first_position_is_refused(
+    tmp_path: Path, ranges: dict[str, list[float]], value: float, said: str
+) -> None:
+    robot = DrivenRobot(tmp_path, Bench(), safety={"ranges": ranges})
+    robot.connect()
+    robot.bench.position[0] = value
+    assert re.search(said, robot.loop(3))
+    assert robot.bench.commands == []
+    robot.disconnect()
+
+
+def test_ages_without_a_sample_are_counted_in_the_summary(robot: DrivenRobot) -> None:
+    robot.connect()
+    ages = robot.timing
+    ages["age of camera:front"] = deque([0.01, 0.03, math.inf, math.inf])
+    ages["age of state"] = deque([math.inf])
+    text = "\n".join(robot.summary())
+    assert "age of camera:front: p50 20.0 ms, p99 29.8 ms" in text
+    assert "no sample had come in 2 of 4 observations" in text
+    assert "age of state: no sample had come in 1 of 1" in text
+    assert "nan" not in text
     robot.disconnect()
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.checks.effort_time import LawFit, law_fit
+from taccorl.alignment.checks.effort_time import SIGN_SURE, LawFit, law_fit
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
 from taccorl.alignment.checks.unsigned import unsigned_register
@@ -32,6 +32,13 @@ INERTIA_OFF = 5.0  # Ratio of the model's inertia to that in the recording from 
 INERTIA_SURE = 0.6
 """Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known, and by
 which a reversed effort must be explained better than the effort as it is."""
+BY_LAW = 0.02
+"""Efforts are those of a register if the constant torque beside their law is below this
+share of half the register's range. A choice: a constant weight comes as near to a power
+of two of its own steps by chance in one of 20 recordings."""
+BY_ITSELF = 1e-12
+"""Efforts of 54 bits and more, which no float64 tells apart, are if each lies within this
+share of half the range from what means 0."""
 REVERSED_LEFT = 0.2
 """Share that a reversed effort leaves at most of what the effort as it is leaves, where no law shows its sign: a centre of mass
 on the other side of the axis leaves more. A choice."""
@@ -78,7 +85,9 @@ def check_robot(
             ):
                 factors[name] = known
                 continue
-            wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
+            wrong += beyond_effort(
+                robot.config.joints[name], m, name, robot.path.name, fit
+            )
             if name in moved and not wrong:
                 model = JointModel(robot, name)
                 words = partial(_inertia_words, robot, whole, model)
@@ -169,8 +178,13 @@ def beyond_limits(
     return [find("beyond_limits", name, text, (row, row + 1))]
 
 
-def negative_efforts(m: Measurement, name: str) -> list[UnsignedColumn]:
-    """Registers by which all efforts of signal ``name`` are below 0 and nearer to 0 than the column's numbers; nearest first."""
+def unsigned_efforts(
+    m: Measurement, name: str, slope: int = 0, nearer: float = 0.5
+) -> list[UnsignedColumn]:
+    """Registers by which the efforts of signal ``name`` are ``nearer`` to 0 than the
+    column's numbers, on average; nearest first. ``slope``: sign of the recorded efforts
+    against their law; 0: not known. Above 0 they rise with the law, which sign and
+    magnitude below 0 do not."""
     effort = m.effort[:, m.column(name)]
     size = float(np.nanmean(np.abs(effort))) if np.isfinite(effort).any() else 0.0
     means = [
@@ -178,21 +192,101 @@ def negative_efforts(m: Measurement, name: str) -> list[UnsignedColumn]:
         for own in m.registers
         if own.signal == name and own.quantity == "tau" and not own.changes
     ]
-    near = [pair for pair in means if pair[0] < 0.5 * size]
+    falls = {-1: True, 0: None, 1: False}[slope]
+    near = [
+        pair
+        for pair in means
+        if pair[0] < nearer * size
+        and falls in (None, pair[1].register.key == "sign_bit")
+    ]
     return [own for _, own in sorted(near, key=lambda pair: pair[0])]
 
 
+def _against_law(
+    law: DriveLaw, m: Measurement, name: str, effort: np.ndarray
+) -> tuple[float, float, float] | None:
+    """(slope, constant, RMS of the rest) of ``effort`` (T,) of signal ``name`` over the
+    torque of the file's law at the rows' own targets, positions and speeds [N·m, N]; None
+    if the recording does not determine them."""
+    torque = law_torque(law, m, name)
+    rows = np.isfinite(effort) if torque is None else np.isfinite(effort + torque)
+    if torque is None or not rows.any() or np.ptp(torque[rows]) == 0.0:
+        return None
+    columns = np.column_stack([torque[rows], np.ones(rows.sum())])
+    solved, *_ = np.linalg.lstsq(columns, effort[rows], rcond=None)
+    rest = effort[rows] - columns @ solved
+    return float(solved[0]), float(solved[1]), float(np.sqrt(np.mean(rest**2)))
+
+
+def law_torque(law: DriveLaw, m: Measurement, name: str) -> np.ndarray | None:
+    """(T,) torque of the file's ``law`` at the rows' own targets and positions, NaN in the
+    first row [N·m, N]; None for a law without a gain of the position or speed."""
+    if law.law in ("pwm", "effort", "torque"):
+        return None
+    j, late = m.column(name), 0 if law.effort_after_target else 1
+    kp, kd, torque_ff = law.loop_gains
+    kp_scale, kd_scale = law.gain_scales(name, m)
+    q, target = m.measured[:, j], np.roll(m.target[:, j], late)
+    speed = kd * kd_scale * np.gradient(q, m.period_s)
+    wanted = kd * kd_scale * target
+    if law.target_kind == "position":
+        wanted = kp * kp_scale * (target - q)
+    torque = wanted - speed + torque_ff
+    if m.torque_ff.size:
+        torque = torque + np.roll(m.torque_ff[:, j], late)
+    torque[0] = np.nan
+    return torque
+
+
+def unsigned_by_law(law: DriveLaw, m: Measurement, name: str) -> list[Finding]:
+    """Finding on efforts that follow the file's law, without a constant torque, only if
+    they are read as a register that a driver logged without its sign; empty if none
+    does."""
+    effort = m.effort[:, m.column(name)]
+    best: tuple[float, UnsignedColumn] | None = None
+    for own in unsigned_efforts(m, name, nearer=math.inf):
+        signed = own.decoded(effort)
+        found = _against_law(law, m, name, signed)
+        if found is None:
+            continue
+        slope, constant, rest = found
+        off = abs(constant) / own.half
+        alike = 1 / INERTIA_OFF <= slope <= INERTIA_OFF
+        if alike and off < BY_LAW and rest < SIGN_SURE * float(np.nanstd(signed)):
+            best = min((off, own), best or (math.inf, own), key=lambda pair: pair[0])
+    if best is not None:
+        off, own = best
+        why = (
+            "read so, it is the effort of the drive's law and a constant of "
+            f"{off:.1%} of half the register's range; as it is, that constant is far larger"
+        )
+        return [unsigned_register(own, why)]
+    for own in unsigned_efforts(m, name):
+        if float(np.nanmax(np.abs(own.decoded(effort)))) < BY_ITSELF * own.half:
+            why = f"all its numbers lie within {BY_ITSELF:.0e} of one that is no effort"
+            return [unsigned_register(own, why)]
+    return []
+
+
 @check("error", "beyond_effort")
-def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[Finding]:
-    """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none. ``law``:
-    the drive of signal ``name``. ``file``: name of its file, for the message."""
+def beyond_effort(
+    law: DriveLaw, m: Measurement, name: str, file: str, fit: LawFit | None = None
+) -> list[Finding]:
+    """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``, or of a register without its sign;
+    empty if there are none. ``law``: the drive of signal ``name``. ``file``: name of its file, for the message. ``fit``: law
+    that the recorded efforts follow."""
     limit, j = law.effort_limit, m.column(name)
-    if limit is None or not m.has_effort()[j]:
+    if not m.has_effort()[j]:
         return []
+    if limit is None:
+        return unsigned_by_law(law, m, name)
     row = int(np.nanargmax(np.abs(m.effort[:, j])))
     if abs(m.effort[row, j]) <= EFFORT_BEYOND * limit:
-        return []
-    for own in negative_efforts(m, name):
+        return unsigned_by_law(law, m, name)
+    if found := unsigned_by_law(law, m, name):
+        return found
+    slope = 0 if fit is None else fit.sign
+    for own in unsigned_efforts(m, name, slope):
         largest = float(np.nanmax(np.abs(own.decoded(m.effort[:, j]))))
         if largest <= EFFORT_BEYOND * limit:
             why = f"{m.effort[row, j]:.4g} {UNITS[m.units[j]][1]} are beyond its effort_limit of {limit:g}"
@@ -223,8 +317,8 @@ def reversed_effort(
     sign = 0 if fit is None else fit.sign
     if sign > 0 or (sign == 0 and left >= math.sqrt(1.0 - INERTIA_SURE**2)):
         return []
-    for own in negative_efforts(m, name):
-        if own.register.key == "sign_bit":  # the other kind keeps the sign of changes
+    for own in unsigned_efforts(m, name, slope=-1):
+        if np.nanmax(own.decoded(m.effort[:, m.column(name)])) <= 0.0:
             return [unsigned_register(own, "it falls where its law asks for more")]
     if fit is not None and sign < 0:
         why = f"is {fit.kp:.2f} ± {fit.sd[0]:.2f} times what its law makes of target and position"

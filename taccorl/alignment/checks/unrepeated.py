@@ -75,13 +75,14 @@ class Pair(NamedTuple):
             )
 
 
-@check("warning", "dropped_commands", "does_not_repeat")
+@check("warning", "dropped_commands", "does_not_repeat", "drift")
 @check("note", "not_judged")
 def check_repeatability(
     measurements: Sequence[Measurement],
 ) -> Iterator[tuple[str, Finding]]:
     """Recordings with dropped commands, and those that differ by far more than their noise from one that they repeat: name, and
-    finding; each signal's under the recording that shows it most. A note under the first one if there are no repeats."""
+    finding; each signal's under the recording that shows it most. A note under the first one if there are no repeats. ``drift``,
+    which needs a model, is found by machines (``diagnosis.search.drift``)."""
     groups: dict[tuple[str, ...], list[Measurement]] = {}
     for m in measurements:
         groups.setdefault(m.signals, []).append(m)
@@ -188,7 +189,8 @@ def _unrepeated(
     cause = (
         "dropped commands explain it (see dropped_commands)"
         if certain
-        else "dropped commands were searched for and do not explain it: a disturbance torque, dry friction, slip, or two clocks"
+        else "dropped commands were searched for and do not explain it: a disturbance torque, dry friction, slip, "
+        "two clocks, or a number that changes with time, which diagnose names"
     )
     text = (
         f"{signal} does not repeat: two recordings of one motion differ by {repeats * 1e3:.3g} {unit}, {repeats / quiet:.1f} "

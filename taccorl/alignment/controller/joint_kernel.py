@@ -49,6 +49,9 @@ from taccorl.sim.effects.friction import (
     BRISTLE_DAMPING_S,
     DRY_SHARE,
     DRY_TIME_S,
+    SOFT_MOST,
+    SOFT_SHARE,
+    SOFT_TIME_S,
 )
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
@@ -57,6 +60,7 @@ _FRICTION_RATE = 2.0 / (
     DRY_SHARE * DRY_TIME_S
 )  # 1/s, MuJoCo's b = 2 / (d_max · time constant)
 _FRICTION_SOFTNESS = (1.0 - DRY_SHARE) / DRY_SHARE
+_SOFT_MASSES = SOFT_SHARE / (1.0 - SOFT_SHARE)
 _LIMIT_RATE = 2.0 / (LIMIT_SHARE * LIMIT_TIME_S)
 _LIMIT_STIFFNESS = (
     1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE
@@ -77,6 +81,35 @@ def _friction(
     return min(
         max((reference * metric - force) * stiff / (metric + stiff), -limit), limit
     )
+
+
+@compiled
+def _soft_friction(
+    p: Any,
+    force: Any,
+    metric: Any,
+    about: Any,
+    free: Any,
+    v: Any,
+    limit: Any,
+    ahead_s: float,
+    step_s: float,
+) -> Any:
+    """MuJoCo's soft dry friction f = −S (a + b v), within ± F, on a mass ``metric`` under ``force``
+    beside rigid friction of ``_friction`` within ± ``limit``. S is ``_SOFT_MASSES`` times ``free``,
+    MuJoCo's estimate of the inertia; v is taken ``ahead_s`` later than now."""
+    own_s = p.soft_friction__time_constant_s
+    time_s = where(own_s > 0.0, max(own_s, 2.0 * step_s), SOFT_TIME_S)
+    rate = 2.0 / (SOFT_MOST * time_s)
+    later = 1.0 + ahead_s * rate
+    stiff, reference = _SOFT_MASSES * later * free, -rate / later * v
+    # Unclipped it is an inertia, under which the rigid friction is known. Beyond its limit it is
+    # clipped in the solution as well, since the sum of both frictions falls with the acceleration.
+    force += stiff * reference
+    force += _friction(force, metric + stiff, about, v, limit, step_s)
+    soft = stiff * (reference - force / (metric + stiff))
+    most = p.soft_friction__torque_nm
+    return min(max(soft, -most), most)
 
 
 @compiled
@@ -189,18 +222,23 @@ def _asked(
 
 @compiled
 def _two_masses(
+    p: Any,
     m11: Any,
     m22: Any,
     link: Any,
     f1: Any,
     f2: Any,
     about: Any,
+    free: Any,
     v: Any,
     limit: Any,
     step_s: float,
+    with_soft: bool,
 ) -> Any:
     """Accelerations of motor and gear, M̂ = [[m11, link], [link, m22]] in (q, gear), under forces f1 and f2 and dry friction."""
     metric, pull = m11 - link * link / m22, f1 - link / m22 * f2
+    if with_soft:
+        pull += _soft_friction(p, pull, metric, about, free, v, limit, step_s, step_s)
     pull += _friction(pull, metric, about, v, limit, step_s)
     a1 = pull / metric
     return a1, (f2 - link * a1) / m22
@@ -398,6 +436,13 @@ def _simulated(
     )
     with_integral, with_load = holds(integral_rate > 0.0), holds(load_share > 0.0)
     with_position_integral = holds(position_rate > 0.0)
+    with_soft = holds(p.soft_friction__torque_nm > 0.0)
+    # MuJoCo has it from its mass matrix with all joints free, relative to the joint's own inertia.
+    free_share = where(
+        p.free_inertia > 0.0,
+        (p.free_inertia + p.armature__added_kgm2) / whole_inertia,
+        1.0,
+    )
     with_given = (with_load and not midpoint) or holds(reverse_gain != 1.0)
     rubs = (
         with_load
@@ -478,7 +523,7 @@ def _simulated(
     of_error = integral_rate * (p.kd if kind == VELOCITY else p.kp)
     of_errors = of_error + position_rate * p.kp
     if with_integral or with_position_integral:
-        most = coulomb + static + yield_nm
+        most = coulomb + static + yield_nm + p.soft_friction__torque_nm
         seen_nm = p.start_nm + where(
             p.effort_holds_weight == 0.0, holding * carried, 0.0
         )
@@ -737,6 +782,9 @@ def _simulated(
         f1 = force - load_nm - ahead * h * stiffness * v
         m11 = inertia + ahead * h * damping + ahead * ahead * h * h * stiffness
         if not geared:
+            if with_soft:
+                apparent = free_share * (whole_inertia if midpoint else m11)
+                f1 += _soft_friction(p, f1, m11, m11, apparent, v, limit, ahead * h, h)
             if rubs:
                 f1 += _friction(f1, m11, m11, v, limit, h)
             v_next = v + h * f1 / m11
@@ -757,7 +805,10 @@ def _simulated(
                 - load_nm
             )
             about = m11 / (motor_mobility * inertia)
-            a1, a2 = _two_masses(m11, m22, link, f1, f2, about, v, limit, h)
+            apparent = free_share * (1.0 / motor_mobility if midpoint else about)
+            a1, a2 = _two_masses(
+                p, m11, m22, link, f1, f2, about, apparent, v, limit, h, with_soft
+            )
             touches = (spring == 0.0) & (stretch != 0.0)
             if holds(touches):
                 stiffer = 1.0 + h * _LIMIT_RATE + h * h * _LIMIT_STIFFNESS
@@ -767,15 +818,18 @@ def _simulated(
                 )
                 soft = _LIMIT_SOFTNESS * gear_mobility / stiffer
                 b1, b2 = _two_masses(
+                    p,
                     m11,
                     m22 + 1.0 / soft,
                     link,
                     f1,
                     f2 + back / soft,
                     about,
+                    apparent,
                     v,
                     limit,
                     h,
+                    with_soft,
                 )
                 pushes = touches & ((back - b2) * stretch <= 0.0)  # it never pulls
                 a1, a2 = where(pushes, b1, a1), where(pushes, b2, a2)

@@ -43,6 +43,9 @@ class Rigid(NamedTuple):
     gravity_cos: float = 0.0  # C [N·m] in the same torque
     compensation_sin: float = 0.0  # S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity
     compensation_cos: float = 0.0  # C [N·m] in the same torque
+    free_inertia: float = 0.0
+    """1 / (M⁻¹)ⱼⱼ with the rotors of all joints, at the model's zero pose [kg·m²]: the inertia with the other joints free; 0: as
+    ``inertia``."""
     weight_n: float = 0.0
     """Force that holds the weight of masses besides the model's at a slide [N], which does not change as it slides."""
 
@@ -207,7 +210,7 @@ def rigid_terms(
     mujoco.mj_forward(model, data)
     mass = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    inertia, rotor = float(mass[dof, dof]), float(model.dof_armature[dof])
+    inertia, rotor = float(mass[dof, dof]), _rotor_inertia(model, joint)
     if model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE:
         return Rigid(inertia, rotor)
     weight, carried = [], []
@@ -217,6 +220,18 @@ def rigid_terms(
         weight.append(float(data.qfrc_bias[dof]))
         carried.append(float(data.qfrc_gravcomp[dof]))
     return Rigid(inertia, rotor, *weight, *carried)
+
+
+def _rotor_inertia(model: mujoco.MjModel, joint: str) -> float:
+    """Inertia [kg·m², kg] of the rotors at a joint: its own armature, and that of each of its
+    actuators times the square of the gear."""
+    one = model.joint(joint)
+    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    own = np.isin(model.actuator_trntype, kinds)
+    own &= model.actuator_trnid[:, 0] == one.id
+    gear = model.actuator_gear[own, 0]
+    rotors = float(gear**2 @ model.actuator_armature[own])
+    return float(model.dof_armature[one.dofadr[0]]) + rotors
 
 
 def with_masses(

@@ -6,7 +6,7 @@ import hashlib
 import math
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -212,7 +212,24 @@ class RobotJoint(DriveJoint):
             max(terms.inertia, LEAST_INERTIA * self.known.inertia)
             + self._config.armature
         )
-        return terms._replace(inertia=inertia, rotor_inertia=self._config.armature)
+        return terms._replace(
+            inertia=inertia,
+            rotor_inertia=self._config.armature,
+            free_inertia=self._free_inertia,
+        )
+
+    @cached_property
+    def _free_inertia(self) -> float:
+        """``Rigid.free_inertia``, without payloads."""
+        model, joints = self._robot.rigid.model, self._robot.config.joints
+        data, mass = mujoco.MjData(model), np.empty((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        for name, joint in joints.items():
+            dof = model.joint(name).dofadr[0]
+            mass[dof, dof] += joint.armature
+        own = model.joint(self.signal).dofadr[0]
+        return float(1.0 / np.linalg.inv(mass)[own, own])
 
     def _stated_rigid(self, motion: JointMotion, inertia: float) -> Rigid:
         c = self._config

@@ -21,7 +21,6 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from taccorl.alignment.machines import omitted_actuators as actuators
 from taccorl.alignment.machines.model_drive import (
     DriveFacts,
     JointDraft,
@@ -37,6 +36,7 @@ from taccorl.alignment.machines.model_xml import (
     unbalanced,
     without_shapes,
 )
+from taccorl.alignment.machines.omitted_actuators import leave_out
 from taccorl.alignment.machines.stated_fields import StatedFields, remarks_on_rest
 from taccorl.alignment.machines.unmodelled import remarks_on_unmodelled
 from taccorl.data.finding import listed
@@ -85,8 +85,7 @@ class JointFacts:
     """Inertia of all bodies that the joint moves, with other joints at the model's zero pose [kg·m² or kg]; without armature."""
     armature: float  # Rotor inertia at the joint, of joint and actuators [kg·m² or kg]
     drive: DriveFacts
-    """Drive by the actuators of the joint, or, if it has none of its own, by those that
-    hold it through tendons and do not couple it with another joint."""
+    """Drive by the actuators of the joint."""
     effects: tuple[Effect, ...]  # Friction, springs and effects in the drive
 
 
@@ -112,11 +111,9 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     spec.memory = -1  # of contacts, which are not computed
     _refuse_closed_chains(path, spec)
     try:
-        omitted = actuators.omitted_actuators(spec)
+        remarks += leave_out(spec, root)
     except TaccorlError as error:
         raise TaccorlError(f"{path}: {error}") from error
-    remarks += actuators.remarks_on(omitted)
-    actuators.without(spec, omitted)
     remarks += remarks_on_unmodelled(spec, root)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
@@ -130,7 +127,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
         raise TaccorlError(
             f"{path}: joint {k + 1} of {model.njnt}, of body {body}, has no name; give it one"
         )
-    joints, of_joints = _joint_facts(model, names, root, omitted)
+    joints, of_joints = _joint_facts(model, names, root)
     remarks += of_joints
     remarks += [
         remark for facts in joints.values() for remark in _of_limits(root, facts)
@@ -379,10 +376,7 @@ def _inertias(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _joint_facts(
-    model: mujoco.MjModel,
-    names: Sequence[str],
-    root: Element,
-    omitted: list[actuators.OmittedActuator],
+    model: mujoco.MjModel, names: Sequence[str], root: Element
 ) -> tuple[dict[str, JointFacts], list[str]]:
     """Facts of each joint, and remarks on what the model states beyond them."""
     places, inertias = Places(root), _inertias(model)
@@ -399,9 +393,6 @@ def _joint_facts(
             if model.actuator_trnid[a, 0] == k
         ]
         drive = drive_of(draft, every)
-        if not every and (held := actuators.held_by(omitted, name)):
-            numbers = {"kp": held[1], "kd": held[2]} | drive.numbers
-            drive = DriveFacts(numbers=numbers, actuators=(held[0],))
         rotors = [a.gear**2 * a.fields.get("actuator_armature") for a in every]
         armature = own.get("dof_armature") + sum(rotors)
         spring(draft, float(model.qpos_spring[model.jnt_qposadr[k]]))

@@ -82,19 +82,40 @@ class FileForm:
 
 
 def read_columns(
-    path: Path, choose: Callable[[list[str]], list[str]], spec: FileForm | None = None
+    path: Path,
+    choose: Callable[[list[str]], list[str]],
+    spec: FileForm | None = None,
+    *,
+    exact: bool = False,
 ) -> tuple[list[str], dict[str, np.ndarray]]:
     """Read columns of a CSV, parquet or MATLAB file as numbers: the header, and name of each chosen column → its numbers (T,).
     ``choose``: function that selects the columns to read from the header; it may raise. ``spec``: columns file, which states
     separator, decimal sign and encoding of CSV files; the defaults if not given. Raises RecordingError: a column is missing or
-    occurs twice, or a cell is empty or not a number; the message names file, line and column."""
+    occurs twice, or a cell is empty or not a number; the message names file, line and column.
+    ``exact``: columns of whole numbers beyond 2⁵³, which no float64 holds, come as
+    Python's integers (dtype object)."""
     if path.suffix == ".mat":
-        return _read_mat(path, choose)
-    return (
-        _read_parquet(path, choose)
-        if path.suffix == ".parquet"
-        else _read_csv(path, choose, spec)
-    )
+        header, columns = _read_mat(path, choose)
+    elif path.suffix == ".parquet":
+        header, columns = _read_parquet(path, choose)
+    else:
+        header, columns = _read_csv(path, choose, spec)
+    if not exact:
+        columns = {name: own.astype(float) for name, own in columns.items()}
+    return header, columns
+
+
+def _numbers(values: Sequence[float | int] | np.ndarray) -> np.ndarray:
+    """(T,) ``values`` (T,) as float64; as Python's integers (dtype object) where all are
+    whole and one is beyond 2⁵³."""
+    as_float = np.asarray(values, dtype=float)
+    if not len(as_float) or np.abs(as_float).max() < 2.0**53:
+        return as_float
+    if isinstance(values, np.ndarray) and values.dtype.kind not in "iu":
+        return as_float
+    if not (np.isfinite(as_float).all() and (as_float == np.round(as_float)).all()):
+        return as_float
+    return np.array([int(value) for value in values], dtype=object)
 
 
 def _chosen(
@@ -198,7 +219,7 @@ def _read_csv(
                 )
             wanted = _chosen(path, header, choose)
             at = [header.index(name) for name in wanted]
-            found: list[list[float]] = []
+            found: list[list[float | int]] = []
             for row in rows:
                 if not row:
                     continue
@@ -244,11 +265,10 @@ def _read_csv(
         raise _undecodable(path, encoding, str(error)) from error
     except (OSError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
-    return header, dict(
-        zip(
-            wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True
-        )
-    )
+    columns = zip(*found, strict=True) if found else [()] * len(wanted)
+    return header, {
+        name: _numbers(own) for name, own in zip(wanted, columns, strict=True)
+    }
 
 
 def _undecodable(path: Path, encoding: str, what: str) -> RecordingError:
@@ -267,8 +287,9 @@ def _undecodable(path: Path, encoding: str, what: str) -> RecordingError:
 
 def _number(
     cell: str, path: Path, line: int, column: str, decimal: str = "point"
-) -> float:
-    """The number in a cell. Raises RecordingError: it is none, is not finite, or has the other decimal sign."""
+) -> float | int:
+    """The number in a cell; an integer where no float64 holds it. Raises RecordingError:
+    it is none, is not finite, or has the other decimal sign."""
     own = cell.strip()
     if decimal == "comma" and "." in own:
         raise RecordingError(
@@ -290,7 +311,9 @@ def _number(
         raise RecordingError(
             f"{path}:{line}: column {column!r}: {cell} is not finite; {_CUT}"
         )
-    return value
+    if abs(value) < 2.0**53:
+        return value
+    return int(own) if own.lstrip("+-").isdecimal() else value
 
 
 def _is_number(text: str) -> bool:
@@ -323,7 +346,7 @@ def _read_parquet(
             raise RecordingError(
                 f"{path}: column {name!r} holds {column.type}, not numbers{hint}"
             )
-        columns[name] = np.asarray(column.to_numpy(), dtype=float)
+        columns[name] = _numbers(np.asarray(column.to_numpy()))
     _check_numbers(path, columns)
     return header, columns
 
@@ -333,7 +356,7 @@ def _check_numbers(path: Path, columns: dict[str, np.ndarray]) -> None:
     bad = {
         name: rows
         for name, values in columns.items()
-        if len(rows := np.flatnonzero(~np.isfinite(values)))
+        if len(rows := np.flatnonzero(~np.isfinite(values.astype(float))))
     }
     if empty := [name for name, rows in bad.items() if len(rows) == len(columns[name])]:
         raise EmptyColumns({tuple(empty): [path]})
@@ -358,7 +381,7 @@ def _read_mat(
             f"{path}: cannot be read as a MATLAB file up to version 7: {' '.join(str(error).split())}"
         ) from error
     vectors = {
-        name: np.asarray(value, dtype=float).ravel()
+        name: _numbers(np.asarray(value).ravel())
         for name, value in content.items()
         if isinstance(value, np.ndarray)
         and value.dtype.kind in "fiu"

@@ -40,7 +40,9 @@ from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.registers import (
     Register,
     UnsignedColumn,
+    as_text,
     find_registers,
+    possible_registers,
 )
 from taccorl.alignment.measurements.table_files import (
     SUFFIXES,
@@ -132,6 +134,7 @@ UNITS_OF_OWN = (
     "Nm",
     "N",
 )  # Units of such columns in a table with own names
+_SIGNS = (("sign_bit", None), ("wraps_at", None))  # Keys of registers, not given
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
 _KINDS: dict[str, TargetKind] = {
@@ -163,8 +166,13 @@ class Column:
     def quantity(self, numbers: np.ndarray) -> np.ndarray:
         """(any shape) the quantity [``unit``] for the column's ``numbers``, of the same shape."""
         register = self.register
-        signed = numbers if register is None else register.decoded(numbers)
-        return (signed - self.zero) * self.factor
+        if register is not None:
+            numbers = register.decoded(numbers)
+        elif numbers.dtype == object:  # of 64 bits: 0 is taken off before it is rounded
+            whole = self.zero == int(self.zero)
+            numbers = numbers - (int(self.zero) if whole else self.zero)
+            return numbers.astype(float) * self.factor
+        return (numbers - self.zero) * self.factor
 
     @property
     def register(self) -> Register | None:
@@ -479,7 +487,10 @@ def read_table(
     a number; the message names file, line and column."""
     path = Path(path)
     header, columns = read_columns(
-        path, lambda own: wanted_columns(_resolved(path, own, spec, units), own), spec
+        path,
+        lambda own: wanted_columns(_resolved(path, own, spec, units), own),
+        spec,
+        exact=True,
     )
     resolved = _resolved(path, header, spec, units)
     return measurement_of_columns(
@@ -505,7 +516,8 @@ def measurement_of_columns(
 
     ``columns``: name of each column of ``spec`` → its numbers (T,). ``own_names``: the table has taccorl's own names. Raises
     RecordingError: there are too few rows, a motor is neither on nor off, or a number is none of its register."""
-    time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
+    time = columns[spec.time.column].astype(float)
+    time_s = time * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(
             f"{path}: {len(time_s)} rows, too few for a measurement; record it again, or remove the file"
@@ -597,7 +609,7 @@ def _check_register(path: Path, column: Column, numbers: np.ndarray) -> None:
     if len(bad):
         raise RecordingError(
             f"{path}: column {column.column!r}: {numbers[bad[0]]:.12g} in row {bad[0] + 1} after the header is no number of a "
-            f"register with {register.key}: {register.value:.12g}, which holds 0 … below {register.end:.12g}; correct "
+            f"register with {register.key}: {as_text(register.value)}, which holds 0 … below {as_text(register.end)}; correct "
             f"{register.key}, or remove it where the column is signed"
         )
 
@@ -606,14 +618,20 @@ def _unsigned(
     own_names: bool, signal: str, key: str, column: Column, numbers: np.ndarray
 ) -> Iterator[UnsignedColumn]:
     """Registers that may have been logged without their sign in this column, each with the line that reads it."""
-    for register, changes, row in find_registers(numbers):
+    found = find_registers(numbers)
+    if key == "tau" and not any(changes for _, changes, _ in found):
+        known = {register for register, _, _ in found}
+        others = [own for own in possible_registers(numbers) if own not in known]
+        found += [(register, 0, 0) for register in others]
+    for register, changes, row in found:
         if key != "tau" and (not changes or register.key == "sign_bit"):
             continue  # a position may lie anywhere, and jumps where its sensor wraps
-        new = replace(column, **{register.key: register.value})
+        side = -1.0 if register.key == "zero" and numbers.max() <= 0 else 1.0
+        new = replace(column, **{register.key: side * register.value})
         stated = [
-            f"{name}: {value:.12g}"
-            for name in ("factor", "sign_bit", "wraps_at")
-            if (value := getattr(new, name)) not in (None, 1.0)
+            f"{name}: {as_text(value)}"
+            for name, usual in (("factor", 1.0), ("zero", 0.0), *_SIGNS)
+            if (value := getattr(new, name)) != usual
         ]
         unit = [] if column.unit in UNITS_OF_OWN else [f"unit: {column.unit}"]
         moved = [f"column: {column.column}"] * (column.column != f"{signal}.{key}")

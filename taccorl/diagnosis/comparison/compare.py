@@ -21,7 +21,7 @@ from taccorl.alignment.controller.joint_model import (
     with_other_numbers,
 )
 from taccorl.alignment.controller.joint_motion import JointMotion
-from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import (
@@ -97,8 +97,11 @@ def compare(
     for (use, m), response in zip(uses, responses, strict=True):
         traces += traces_of(m, use, response, floors)
         if np.isfinite(response.reported).any():
+            changed = partial(_other_numbers, config, m)
             clock[m.name] = tuple(
-                check_against_twin(response.measurement, response.reported, levels)
+                check_against_twin(
+                    response.measurement, response.reported, levels, changed=changed
+                )
             )
     for signal in GRIPPERS:
         names = [m.name for m in every if signal in held_up(m)]
@@ -233,6 +236,16 @@ def compare_joints(
             *_not_read(every),
         ),
     )
+
+
+def _other_numbers(config: TwinConfig, m: Measurement, signal: str) -> list[np.ndarray]:
+    """``with_other_numbers`` of one of the arms' joints; none for others, or if its
+    recording cannot be replayed alone."""
+    try:
+        model = JointModel(config, signal)
+        return with_other_numbers(model, joint_motion(m, config, signal))
+    except TaccorlError:
+        return []
 
 
 def replay_all(

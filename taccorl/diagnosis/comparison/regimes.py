@@ -24,9 +24,8 @@ from taccorl.diagnosis.comparison.localise import (
     motions_of,
 )
 from taccorl.diagnosis.comparison.result import USES, Trace
-from taccorl.diagnosis.search.problem import Recording
+from taccorl.diagnosis.search.problem import LEAST_ROWS, Recording
 from taccorl.diagnosis.search.result import SearchConfig
-from taccorl.diagnosis.search.standing_out import LEAST_ROWS
 
 ALL = "all rows"
 """Name of the regime that holds every row."""

@@ -11,9 +11,8 @@ Letters in shapes: T rows.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -32,18 +31,12 @@ from taccorl.alignment.measurements.motions import (
 )
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.aimed import AIMED, ENDS, JUMPS, at_once, reach
-from taccorl.diagnosis.experiment_design.other_pose import (
-    OtherPose,
-    chosen_pose,
-    in_other_pose,
-)
 from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
 from taccorl.diagnosis.machines.machine import GainsAre, Machine
 from taccorl.diagnosis.machines.piper import PiperTwin
-from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.joints import moves
 from taccorl.diagnosis.search.problem import Values
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
@@ -61,8 +54,6 @@ EFFORT_SHARE = 0.8
 """Largest share of the effort limit that a planned motion may need."""
 EFFORT_NOISE_SHARE = 5e-3
 """Noise of efforts that have not been recorded yet, as a share of the largest one. A choice."""
-MOUNTED_SHARE = 0.5
-"""A mass that is mounted on an axis adds this share of its inertia. A choice."""
 SPEED_SLACK = 1.05
 """Multiple of the highest speed that the answer to an aimed motion may have: targets that follow it are overshot."""
 SIZES = (1.0, 0.7, 0.5, 0.35, 0.25)
@@ -83,10 +74,6 @@ class Ground:
     """Range of its motion."""
     like: Measurement | None = None
     """Recording whose pose, gains and masses the planned motions take over; None: the values of the machine's file are used."""
-    pose: OtherPose | None = None
-    """Pose of the other joints, if it is not that of ``like``."""
-    mounted_kg: float = 0.0
-    """Payload of an axis [kg], instead of that of ``like`` or of its file; 0: that one."""
 
     @property
     def of_piper(self) -> bool:
@@ -143,8 +130,7 @@ class Ground:
             gain: factor on the gains that ``like`` states.
             payload_kg: mass in the PiPER's gripper [kg].
         """
-        drive, rows = self.machine.drive(self.part), len(positions)
-        like = self.like if self.pose is None else self.pose.like
+        drive, rows, like = self.machine.drive(self.part), len(positions), self.like
         if like is None:
             like = Measurement(
                 name=name,
@@ -163,12 +149,7 @@ class Ground:
         if drive.target_kind == "velocity":
             target[:, j] = np.diff(positions, append=positions[-1]) * self.rate_hz
         measured[:, j] = positions[0]
-        for other, position in (self.pose.positions if self.pose else {}).items():
-            measured[:, like.column(other)] = position
-            if like.target_kind(other) == "position":
-                target[:, like.column(other)] = position
-        holder = self.part.split("_", 1)[0] if self.of_piper else self.part
-        held_kg = payload_kg or self.mounted_kg
+        arm = self.part.split("_", 1)[0]
         nothing = dict.fromkeys(
             (
                 "velocity",
@@ -196,7 +177,7 @@ class Ground:
                 signal: kd * gain if signal == self.part else kd
                 for signal, kd in like.kd.items()
             },
-            payload_kg=like.payload_kg | ({holder: held_kg} if held_kg else {}),
+            payload_kg=like.payload_kg | ({arm: payload_kg} if payload_kg else {}),
             repeat_of=None,
             touch=None,
             findings=(),
@@ -426,27 +407,6 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
     return pose
 
 
-def posed(signal: str, pose: np.ndarray, positions: Mapping[str, float]) -> np.ndarray:
-    """``pose`` (7,) of the PiPER's arm of ``signal`` with other joints, or its gripper, at ``positions`` [rad, m]. Raises
-    TaccorlError: a name is none of them, or a position is beyond its limits."""
-    names, found = _of_arm(signal), pose.copy()
-    for name, position in positions.items():
-        if name == signal or name not in names:
-            arm = signal.split("_", 1)[0]
-            raise TaccorlError(
-                f"--pose: {name} is no other joint of the {arm} arm; {nearest(name, names)}"
-            )
-        column = ROBOT.action_names.index(name)
-        low, high = float(ROBOT.action_low[column]), float(ROBOT.action_high[column])
-        if not low <= position <= high:
-            limits = f"{round(low, 6):g} … {round(high, 6):g}"
-            raise TaccorlError(
-                f"--pose: {name} {position:g} is beyond its limits, {limits}"
-            )
-        found[names.index(name)] = position
-    return found
-
-
 def _of_arm(signal: str) -> list[str]:
     """The joints and the gripper of the PiPER's arm of ``signal``."""
     return [
@@ -465,7 +425,6 @@ class JointPart(Part):
         gains: treatment of gains in fits.
         efforts: the motor's effort is recorded with planned motions, too. At robot and axis files it is anyway where all existing
             recordings have it. It is compared with theirs, or if one has none, those are left out.
-        label, where: word and text of the condition of the recordings, if it is not the present one.
     """
 
     def __init__(
@@ -476,8 +435,6 @@ class JointPart(Part):
         *,
         gains: GainsAre = "auto",
         efforts: bool = False,
-        label: str = "",
-        where: str = "",
     ) -> None:
         self.machine, self.name, self.ground, self.floor = (
             ground.machine,
@@ -485,7 +442,7 @@ class JointPart(Part):
             ground,
             floor,
         )
-        self.measurements, self.label, self.where = measurements, label, where
+        self.measurements = measurements
         self.gains: GainsAre = gains
         of_piper, fit = (
             ground.of_piper,
@@ -516,8 +473,6 @@ class JointPart(Part):
             self.pose = {
                 name: round(float(q), 4) for name, q in at.items() if name != self.name
             }
-        elif ground.pose is not None:
-            self.pose = dict(ground.pose.positions)
 
     @property
     def column(self) -> str:
@@ -533,18 +488,11 @@ class JointPart(Part):
         else:
             raise TaccorlError("no motion of the library may be recorded")
         target = m.target[:, m.column(self.name)]
-        pose = (
-            {}
-            if ground.pose is None
-            else {name: ground.pose.positions[name] for name in ground.pose.driven}
-        )
-        held = {f"{name}.q_target": np.full(len(target), q) for name, q in pose.items()}
-        peak = float(np.abs(effort).max())
         return Planned(
             part=self,
             item=item,
-            columns={self.column: target, **held},
-            peak=peak,
+            columns={self.column: target},
+            peak=float(np.abs(effort).max()),
             made=(m, effort),
         )
 
@@ -564,15 +512,8 @@ class JointPart(Part):
         )
         own = [self.floor, *([EFFORT_NOISE_SHARE * p.peak] if self.efforts else [])]
         floors = problem.fit[0].floor if self.known else np.array(own)
-        recordings = [
-            *problem.fit[:-1],
-            dataclasses.replace(problem.fit[-1], floor=floors),
-        ]
-        pose = self.ground.pose
-        return Scene(
-            problem if pose is None else in_other_pose(problem, pose, m.name),
-            recordings,
-        )
+        last = dataclasses.replace(problem.fit[-1], floor=floors)
+        return Scene(problem, [*problem.fit[:-1], last])
 
     def aimed(self, rivals: Sequence[str]) -> Sequence[Motion]:
         limited = (
@@ -602,82 +543,14 @@ class JointPart(Part):
             for name, v in own.items()
         }
 
-    def elsewhere(self) -> Mapping[str, Callable[[], Part]]:
-        found: dict[str, Callable[[], Part]] = {}
-        if self.label:
-            return found
-        if self.drive.logs_effort and not self.efforts:
-            assumed = (
-                ""
-                if self.have_efforts
-                else f" (its noise taken as {EFFORT_NOISE_SHARE:.1%} of the largest)"
-            )
-            where = f"with the motor's effort recorded, too{assumed}"
-            found["with_efforts"] = partial(
-                self._elsewhere, self.ground, "with_efforts", where, efforts=True
-            )
-        machine, ground = self.machine, self.ground
-        if (
-            isinstance(machine, RobotMachine)
-            and ground.pose is None
-            and machine.robot.along_chain(self.name)
-        ):
-            found["other_pose"] = self._in_other_pose
-        if isinstance(machine, RobotMachine) and not machine.robot.config.model:
-            found["mounted_mass"] = self._with_mass
-        return found
-
-    def _elsewhere(
-        self, ground: Ground, label: str, where: str, efforts: bool = False
-    ) -> "JointPart":
-        options = {"efforts": efforts or self.efforts, "label": label, "where": where}
-        return JointPart(
-            ground, self.floor, self.measurements, gains=self.gains, **options
+    def with_efforts(self) -> "JointPart | None":
+        if self.efforts or not self.drive.logs_effort:
+            return None
+        part = JointPart(
+            self.ground, self.floor, self.measurements, gains=self.gains, efforts=True
         )
-
-    def _in_other_pose(self) -> "JointPart":
-        ground, machine = self.ground, self.machine
-        assert isinstance(machine, RobotMachine)
-        pose = chosen_pose(
-            machine,
-            self.name,
-            ground.like,
-            ground.span,
-            machine.robot.along_chain(self.name),
-        )
-        stand = ", ".join(f"{name} {q:g}" for name, q in pose.positions.items())
-        return self._elsewhere(
-            dataclasses.replace(ground, pose=pose),
-            "other_pose",
-            f"with other joints at {stand}",
-        )
-
-    def _with_mass(self) -> "JointPart":
-        ground, machine, name = self.ground, self.machine, self.name
-        assert isinstance(machine, RobotMachine)
-        config = machine.robot.config.joints[name]
-        stated = (
-            [{}, {}]
-            if ground.like is None
-            else [ground.like.payload_kg, ground.like.lever_m]
-        )
-        now_kg, lever_m = (
-            stated[0].get(name, config.payload_kg),
-            stated[1].get(name, config.lever_m),
-        )
-        if self.drive.unit == "rad" and not lever_m > 0.0:
-            raise TaccorlError(
-                "no lever_m in its file or in the recordings says where a mass can be mounted"
-            )
-        more_kg = (
-            MOUNTED_SHARE
-            * (config.inertia or 0.0)
-            / (1.0 if self.drive.unit == "m" else lever_m**2)
-        )
-        ground = dataclasses.replace(
-            ground, mounted_kg=float(f"{now_kg + more_kg:.3g}")
-        )
-        at = "" if self.drive.unit == "m" else f" at {lever_m:g} m"
-        return self._elsewhere(
-            ground, "mounted_mass", f"with a payload of {ground.mounted_kg:g} kg{at}"
-        )
+        part.label, part.where = "with_efforts", "with the motor's effort recorded, too"
+        if not self.have_efforts:
+            noise = f"{EFFORT_NOISE_SHARE:.1%} of the largest"
+            part.where = f"{part.where} (its noise taken as {noise})"
+        return part

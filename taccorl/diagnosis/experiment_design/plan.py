@@ -5,8 +5,7 @@ all its numbers is fitted to it; the residual in noise floors is the discriminat
 about one floor the recording would not separate the rivals. Existing recordings are part of both fits.
 
 What is recorded is a ``Part`` with a library as data: motions of a joint (``motions``), presses of pads (``presses``), loads of
-cells (``loads``). Where its library separates two rivals nowhere, it is tried in the part's other conditions, too: with the
-motor's effort recorded, in another pose, with a mass mounted.
+cells (``loads``). Where its library separates two rivals nowhere, it is tried with the motor's effort recorded, too.
 """
 
 import dataclasses
@@ -39,7 +38,7 @@ class Planned:
     """A recording that could be made, with its discrimination between rivals."""
 
     part: "Part"
-    """What a planned motion is to be recorded of (a joint, a pair of pads, a sensor's cells), with the arm's pose and load."""
+    """What a planned motion is to be recorded of: a joint, a pair of pads, a sensor's cells."""
     item: Any
     """The motion or press of the library."""
     columns: Mapping[str, np.ndarray]
@@ -148,7 +147,7 @@ class Part(ABC):
     rate_hz: float
     """Rate of the planned tables of targets or loads [rows/s], that of the recordings."""
     label: str = ""
-    """Word for the condition of the recordings in names of files, such as ``other_pose``; empty for the present one."""
+    """Word for the condition of the recordings in names of files, ``with_efforts``; empty for the present one."""
     where: str = ""
     """Text of this condition."""
     pose: Mapping[str, float] = {}
@@ -177,9 +176,9 @@ class Part(ABC):
         """Rival that does nothing below a limit → how far ``p`` goes toward it, 1 at the limit."""
         return {}
 
-    def elsewhere(self) -> "Mapping[str, Callable[[], Part]]":
-        """Name of another condition → the part in it, or a ``TaccorlError`` that says why it cannot be recorded."""
-        return {}
+    def with_efforts(self) -> "Part | None":
+        """The part with the motor's effort recorded, too; None if it is recorded already, or cannot be."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ class Plan:
     """Noise floor, as ``Part.floor``."""
     planned: tuple[Planned, ...]
     refused: dict[str, str]
-    """Motion, press or condition → reason why it must not be recorded."""
+    """Motion or press → reason why it must not be recorded."""
     reaches: dict[str, float] = field(default_factory=dict)
     """Rival that does nothing below a limit → how far the motions go toward it, 1 at the limit; empty if there is none, or they
     were not aimed."""
@@ -284,8 +283,8 @@ def plan(
     fitted: Mapping[str, Values] | None = None,
     done: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Plan:
-    """Score every motion or press of the part's library, best first. Where they separate a pair of rivals by nothing, the same in
-    the part's other conditions, one after the other; of those the recordings that separate such a pair, or show an effect of it.
+    """Score every motion or press of the part's library, best first. Where they separate a pair of rivals by nothing, the same
+    with the motor's effort recorded; of those the recordings that separate such a pair, or show an effect of it.
 
     Args:
         rivals: effects to separate, two or more.
@@ -296,36 +295,27 @@ def plan(
         TaccorlError: there are fewer than two rivals, or one is in the file or cannot act on the part.
     """
     found = scored(part, rivals, fitted or {}, done)
-    for label, make in part.elsewhere().items():
-        if not (pairs := found.hopeless):
-            break
-        try:
-            more = scored(other := make(), rivals, fitted or {}, done)
-        except TaccorlError as error:
-            found = dataclasses.replace(
-                found, refused=found.refused | {label: str(error)}
-            )
-            continue
-        shown = {(pair, truth) for pair, truth, _, _ in found.one_way()}
-        needed = [
-            p.name
-            for pair, truth, p, _ in more.one_way()
-            if pair in pairs and (pair, truth) not in shown
-        ]
-        needed += [
-            p.name
-            for p in more.planned
-            if any(p.discrimination[pair] >= TELLS for pair in pairs)
-        ]
-        found = dataclasses.replace(
-            found,
-            planned=best_first(
-                [*found.planned, *(p for p in more.planned if p.name in needed)]
-            ),
-            tried=found.tried
-            | {other.where: {pair: more.best(pair) for pair in pairs}},
-        )
-    return found
+    pairs, other = found.hopeless, part.with_efforts()
+    if not pairs or other is None:
+        return found
+    more = scored(other, rivals, fitted or {}, done)
+    shown = {(pair, truth) for pair, truth, _, _ in found.one_way()}
+    needed = [
+        p.name
+        for pair, truth, p, _ in more.one_way()
+        if pair in pairs and (pair, truth) not in shown
+    ]
+    needed += [
+        p.name
+        for p in more.planned
+        if any(p.discrimination[pair] >= TELLS for pair in pairs)
+    ]
+    kept = [p for p in more.planned if p.name in needed]
+    return dataclasses.replace(
+        found,
+        planned=best_first([*found.planned, *kept]),
+        tried={other.where: {pair: more.best(pair) for pair in pairs}},
+    )
 
 
 def scored(

@@ -12,6 +12,7 @@ import numpy as np
 
 from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_of_all
+from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -51,7 +52,9 @@ from taccorl.diagnosis.machines.machine import (
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import (
     JointFinding,
+    apart,
     diagnose_joint,
+    drifts_of,
     moves,
     of_joints,
 )
@@ -62,6 +65,7 @@ from taccorl.diagnosis.problems.tilted_base import (
     change_between_poses,
     tilt_like,
 )
+from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.problem import candidate, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
@@ -122,15 +126,15 @@ class RobotMachine(Machine):
 
     def numbers(self, part: str) -> dict[str, tuple[float, str]]:
         config, joint = self.robot.config.joints[part], self.robot.joint(part)
-        times = ("position_age_s", "target_late_s")
-        own = {**config.numbers, **{n: (getattr(config, n), "s") for n in times}}
+        times = ["position_age_s", "target_late_s"]
+        own = dict(config.numbers)
         if config.inertia is not None:
-            own = {"inertia": (config.inertia, "kg·m²"), **config.numbers}
-            for name in ("target_late_s", "speed_late_s"):
-                own[name] = (getattr(config, name), "s")
+            own = {"inertia": (config.inertia, "kg·m²"), **own}
+            times = ["target_late_s", "speed_late_s"]
             weights = ("weight_sin", "weight_cos")
             for name in weights if joint.unit == "rad" else weights[1:]:
                 own[name] = (getattr(config, name), "N·m")
+        own |= {name: (getattr(config, name), "s") for name in times}
         return {
             n: (value, Scale(unit=joint.unit).unit_of(unit))
             for n, (value, unit) in own.items()
@@ -171,7 +175,22 @@ class RobotMachine(Machine):
                 self.robot.path.name,
                 self.robot.joint(name).inertia_kgm2,
             )
+        for name, own_drifts in self._drifts(measurements).items():
+            for drift in own_drifts:
+                text = f"{name}: {drift.words}"
+                found[drift.second].append(find("drift", name, text))
         return found
+
+    def _drifts(self, measurements: Measurements) -> dict[str, list[Drift]]:
+        """Joint → its numbers that changed between recordings of one motion."""
+        moved = {
+            name: of_joints(measurements, [name]) for name in self.robot.config.joints
+        }
+        return {
+            name: drifts_of(self.robot, name, own)
+            for name, own in moved.items()
+            if own.fit
+        }
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
         for m in measurements.all:
@@ -192,6 +211,8 @@ class RobotMachine(Machine):
         self, measurements: Measurements, name: str, progress: Counted
     ) -> Comparison:
         laws = self.robot.config.joints
+        drifted = [d for own in self._drifts(measurements).values() for d in own]
+        measurements = apart(measurements, drifted)
         return compare_joints(
             self.robot,
             laws,

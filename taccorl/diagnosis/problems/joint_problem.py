@@ -45,6 +45,7 @@ from taccorl.alignment.measurements.noise_floor import (
 from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.axis_numbers import (
     DRIVE_IS_STATED,
+    GAINS_WITHIN,
     OF_DRIVE,
     axis_numbers,
     no_candidates,
@@ -93,7 +94,7 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
 ``gravity_mismatch``."""
-_NOT_ON_PIPER = ("position_integral", "presliding", "unbalance")
+_NOT_ON_PIPER = ("position_integral", "presliding", "soft_friction", "unbalance")
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them. Its loop is no
 cascade, so that the first one is ``integral_action``."""
 WEIGHS = 3.0
@@ -210,6 +211,7 @@ class JointProblem(WithoutMaps):
         """The joint, if it has no model: its body's numbers are fitted, too."""
         if isinstance(joint, RobotJoint) and not joint.has_model:
             self.axis = joint
+            self.commanded = joint.config.gains == "commanded"
             if gains == "fitted" != joint.config.gains:
                 raise TaccorlError(
                     f"--gains=fitted: write `gains: fitted` of {signal} into its file and "
@@ -317,7 +319,12 @@ class JointProblem(WithoutMaps):
                 f"fitted: {names}; gains and times of the drive stay: efforts are its "
                 f"law's, to {self.law_error:.2g} noise floors"
             )
-        return f"fitted: {names}; other numbers as the file states them"
+        near = ""
+        if self.commanded and any(f.name == "kp" for f in free):
+            near = (
+                f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)"
+            )
+        return f"fitted: {names}{near}; other numbers as the file states them"
 
     def _floor_of_loop(self) -> float:
         """Least floor of an axis's position. Without repeats an encoder's resolution is no
@@ -423,10 +430,8 @@ class JointProblem(WithoutMaps):
         self, base: Mapping[str, float], effects: Sequence[Effect], joint: RigidJoint
     ) -> Numbers:
         scale, waits_s = base.get(EFFORT_SCALE.name, 1.0), base.get("loop_waits_s", 0.0)
-        at = joint.target_late_s
-        waits_s += (
-            base.get(TARGET_LATE.name, at) - at
-        )  # 0 of an axis, whose joint has it
+        at = joint.target_late_s  # of an axis that of ``base``
+        waits_s += base.get(TARGET_LATE.name, at) - at
         if self.axis is not None:
             return Numbers(joint.gains, effects, waits_s=waits_s, effort_scale=scale)
         lever, half_s = (
@@ -669,6 +674,13 @@ def recording_of(
         channels=tuple(names[kind] for kind in kinds),
         data=motion,
         share=share,
+        setting=(
+            motion.payload_kg,
+            motion.moment_kgm,
+            motion.mounted_kgm2,
+            round(motion.kp_scale, 3),
+            round(motion.kd_scale, 3),
+        ),
     )
 
 

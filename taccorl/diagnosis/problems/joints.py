@@ -12,12 +12,21 @@ from taccorl.alignment.checks.trial import least_motion
 from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor
+from taccorl.alignment.measurements.noise_floor import (
+    DISAGREE,
+    Kind,
+    SignalFloor,
+    laid_pairs,
+    noise_floor,
+    without_beginning,
+)
+from taccorl.alignment.measurements.repeats import overlay
 from taccorl.diagnosis.problems.joint_problem import (
     PAYLOAD_PLACE,
     GainsAre,
     JointProblem,
 )
+from taccorl.diagnosis.search.drift import Drift, Repeat, drifts
 from taccorl.diagnosis.search.identifiable import (
     Known,
     absolute_numbers,
@@ -25,7 +34,7 @@ from taccorl.diagnosis.search.identifiable import (
 )
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import PartFinding, solved
+from taccorl.diagnosis.search.solve import PartFinding, solved, with_drifts
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import Done, Failed, run_in_processes
 from taccorl.robots import ROBOT
@@ -129,6 +138,8 @@ def diagnose_joint(
         raise TaccorlError(
             f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints"
         )
+    drifted = drifts_of(machine, signal, own, gains)
+    own = apart(own, drifted)
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
     found = solved(signal, problem, search, without, progress)
     if problem.axis is not None:
@@ -137,8 +148,88 @@ def diagnose_joint(
     told = vars(found) | {
         "known": known,
         "diagnosis": with_intervals(found.diagnosis, known),
+        "drifts": tuple(drifted),
     }
-    return JointFinding(**told, floors=tuple(problem.floors))
+    joint = JointFinding(**told, floors=tuple(problem.floors))
+    # For other machines a finding of their checks says it.
+    return with_drifts(joint, drifted) if isinstance(machine, TwinConfig) else joint
+
+
+def drifts_of(
+    machine: TwinConfig | HasJoints,
+    signal: str,
+    measurements: Measurements,
+    gains: GainsAre = "auto",
+) -> list[Drift]:
+    """Numbers of the joint that changed between recordings of one motion, in those that
+    differ by more than the noise of their rows. ``measurements``: those that move it."""
+    differing = _differing(signal, measurements)
+    if not differing:
+        return []
+    problem = JointProblem(machine, signal, measurements, gains=gains)
+    recordings = {r.name: r for r in (*problem.fit, *problem.validation, *problem.test)}
+    repeats = [
+        Repeat(
+            recordings[first.name],
+            recordings[second.name],
+            1e-9 * (second.start_ns - first.start_ns) or None,
+            time_s,
+            difference,
+        )
+        for first, second, time_s, difference in differing
+    ]
+    # With fitted gains viscous friction is a part of K_d.
+    usual = (
+        ("viscous_friction", "coulomb_friction")
+        if problem.commanded
+        else ("coulomb_friction",)
+    )
+    more = [
+        name
+        for name in usual
+        if name in problem.candidates and name not in problem.present
+    ]
+    return drifts(problem, repeats, (*problem.present, *more), dict(problem.start))
+
+
+type Differing = tuple[Measurement, Measurement, np.ndarray, np.ndarray]
+"""Two recordings of one motion, the earlier one first; times (M,) in it [s], and second − first (M,) of a joint, in its unit."""
+
+
+def _differing(signal: str, measurements: Measurements) -> list[Differing]:
+    """Repeats whose difference at one joint is ``DISAGREE`` times the noise of rows."""
+    pairs, found = laid_pairs(measurements.all), []
+    if not pairs:
+        return []
+    is_input = measurements.all[0].target_kind(signal) == "effort"
+    kind: Kind = "effort" if is_input else "position"
+    floors = noise_floor(measurements.all, kind)
+    for first, second, laid in pairs:
+        if second.start_ns < first.start_ns:
+            first, second, laid = second, first, overlay(second, first)
+        difference = without_beginning(laid.difference[kind], first.rate_hz)
+        own = difference[:, first.column(signal)]
+        if signal not in floors or not np.isfinite(own).any():
+            continue
+        if np.nanmean(own**2) > 2.0 * (DISAGREE * floors[signal].quiet) ** 2:
+            found.append((first, second, laid.time_s - first.time_s[0], own))
+    return found
+
+
+def apart(measurements: Measurements, drifted: Sequence[Drift]) -> Measurements:
+    """The measurements in which the later recordings of ``drifted`` count as motions of their
+    own, so that no noise floor is taken from how they differ from those that they repeat."""
+    names = {name for drift in drifted for name in (drift.first, drift.second)}
+    sides = {
+        use: tuple(
+            dataclasses.replace(m, repeat_of=None)
+            if m.name in names and m.repeat_of in names
+            else m
+            for m in getattr(measurements, use)
+        )
+        for use in ("fit", "validation", "test")
+    }
+    return dataclasses.replace(measurements, **sides) if names else measurements
 
 
 def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.folder import Measurements, repeat_pairs
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.touch.motion import TouchMotion, lacking_pads
 from taccorl.diagnosis.comparison.replays import matched_contact
@@ -17,6 +17,7 @@ from taccorl.diagnosis.problems.touch_problem import (
     TouchProblem,
     odd_cells,
 )
+from taccorl.diagnosis.search.drift import Drift, changed
 from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.problem import (
@@ -26,7 +27,7 @@ from taccorl.diagnosis.search.problem import (
     split_rows,
 )
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.solve import PartFinding, solved
+from taccorl.diagnosis.search.solve import PartFinding, solved, with_drifts
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.pads import TaxelGainMap
@@ -89,8 +90,13 @@ def diagnose_arm(
     every = [motion for some in motions.values() for motion in some]
     _check_pads(every)
     problem = TouchProblem(every, config)
+    drifted = drifts_of(every, config) if problem.repeats_differ else []
+    if drifted:
+        motions = {use: _apart(some, drifted) for use, some in motions.items()}
+        problem = TouchProblem(_apart(every, drifted), config)
     problem.recordings(motions["fit"], motions["validation"], motions["test"])
     found = solved(part_of(arm), problem, search, without, progress)
+    found = with_drifts(found, drifted)
     gains = None
     if not found.rows_split:
         gains = unjudged_gains(
@@ -114,6 +120,39 @@ def diagnose_arm(
     return dataclasses.replace(
         found, remark=f"{TaxelGainMap.name}: {named[0]}" if any(named) else ""
     )
+
+
+def drifts_of(motions: Sequence[TouchMotion], config: TwinConfig) -> list[Drift]:
+    """Numbers of the pads that changed between recordings of one press."""
+    alone = [_repeating_none(motion) for motion in motions]
+    problem, found = TouchProblem(alone, config), []
+    made = {motion.name: problem.recording(motion) for motion in alone}
+    for pair in repeat_pairs(motion.measurement for motion in motions):
+        first, second = sorted(pair, key=lambda m: m.start_ns)
+        over_s = 1e-9 * (second.start_ns - first.start_ns) or None
+        recordings = made[first.name], made[second.name]
+        found.append(
+            changed(problem, *recordings, over_s, problem.present, problem.start)
+        )
+    return [drift for drift in found if drift is not None]
+
+
+def _apart(
+    motions: Sequence[TouchMotion], drifted: Sequence[Drift]
+) -> list[TouchMotion]:
+    """As ``joints.apart``."""
+    names = {name for drift in drifted for name in (drift.first, drift.second)}
+    return [
+        _repeating_none(motion)
+        if {motion.name, motion.measurement.repeat_of} <= names
+        else motion
+        for motion in motions
+    ]
+
+
+def _repeating_none(motion: TouchMotion) -> TouchMotion:
+    own = dataclasses.replace(motion.measurement, repeat_of=None)
+    return dataclasses.replace(motion, measurement=own)
 
 
 def unjudged_gains(

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from taccorl.alignment.measurements.folder import repeat_pairs
+from taccorl.alignment.measurements.noise_floor import DISAGREE
 from taccorl.alignment.measurements.repeats import overlay
 from taccorl.alignment.touch.calibration import noise_level
 from taccorl.alignment.touch.model import TouchModel
@@ -218,6 +219,11 @@ class TouchProblem(WithoutMaps):
             for f in self.candidates[e.name].frees
         }
         """Start values of a search: the twin's own numbers."""
+
+    @property
+    def repeats_differ(self) -> bool:
+        """Whether repeats differ ``DISAGREE`` times as much as the noise of rows."""
+        return self._touched_count > DISAGREE * float(np.median(self._still_count))
 
     def _candidate(self, cls: type[Effect]) -> Candidate:
         found = candidate(

@@ -57,15 +57,13 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     """Decrease of the Bayesian information criterion from ``parent`` to ``child``: 10 is strong evidence (Kass and
     Raftery 1995); negative if the criterion rises.
 
-    The noise is known (residuals are in floors), and the residual of ``child`` above one floor also counts as noise. The
-    number of rows is that of independent residuals of ``child``. ``more_parameters``: those that ``parent`` lacks."""
+    The noise is known (residuals are in floors), and the residual of ``child`` above
+    one floor also counts as noise. The number of rows is that of independent residuals
+    of ``child``; ``parent`` may be of other recordings. ``more_parameters``: those that
+    ``parent`` lacks."""
     rows = child.effective_rows
-    noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
-    fallen = (
-        float(parent.residuals @ parent.residuals - child.residuals @ child.residuals)
-        / noise
-    )
-    return fallen * rows / len(child.residuals) - more_parameters * float(np.log(rows))
+    fallen = (parent.error**2 - child.error**2) / max(1.0, child.error**2)
+    return fallen * rows - more_parameters * float(np.log(rows))
 
 
 def gain_of(after: Blocks, before: Blocks) -> float:

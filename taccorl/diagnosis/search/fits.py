@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taccorl.alignment.least_squares import LOOSE
 from taccorl.diagnosis.search.evidence import (
     Blocks,
     above_floor,
@@ -20,7 +21,6 @@ from taccorl.diagnosis.search.evidence import (
 )
 from taccorl.diagnosis.search.fit import (
     FINE,
-    WIDE,
     Fit,
     best_fit,
     fit,
@@ -30,8 +30,14 @@ from taccorl.diagnosis.search.fit import (
     over_own_scale,
     rms,
     stacked,
+    stacked_all,
 )
-from taccorl.diagnosis.search.identifiable import POSITION_AGE_S, not_told_from_none
+from taccorl.diagnosis.search.identifiable import (
+    LATE,
+    POSITION_AGE_S,
+    not_told_from_none,
+)
+from taccorl.diagnosis.search.lateness import lateness_s
 from taccorl.diagnosis.search.problem import (
     Candidate,
     Problem,
@@ -44,24 +50,19 @@ from taccorl.diagnosis.search.problem import (
 )
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe, is_likely, probe
-from taccorl.diagnosis.search.settle import is_as_good, settled
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
 
 FIRST_STEPS, STEPS = 5, 30
 """Most steps of the solver in the first fit of a hypothesis, and in a full one."""
-PROBED, PROBED_BESIDE = 10, 4
-"""Number of effects, in the order of the screening, that are fitted for a few steps: added to the best model so far, and to that
-model without one of its effects. On the studies the true one was among the first 10, or ``is_likely``."""
+PROBED = 4
+"""Number of effects, in the order of the screening, that are fitted for a few steps,
+besides those that are ``is_likely``."""
+MOST_MORE = 0.02
+"""Largest relative increase of a squared error that is none (``is_as_good``)."""
 SURELY_FULL, NEAR_BEST = 2, 1.3
 """After a few steps these are fitted fully: the first 2 of the screening, the 2 with the least error, and all with at most 1.3
 times the least error. The factor is that of ``SearchConfig.floor``."""
-FAR_OFF = 10.0
-"""RMS residual [floors] from which on the first fits, too, leave dents (``out_of_dents``): a swing that sticks earlier."""
-STUCK = 1.001
-"""Factor on the error of a model: a fit that contains the model and leaves more than that has stopped in a worse place."""
-PAST_ROW = 0.02
-"""Share of a row by which a fit of a delay begins beyond a whole row."""
 NEARLY = 0.1
 """An effect counts as a simpler one if its parameter, without unit, is this close to where both agree. A choice."""
 SPEED_DELAY = "speed_delay_s"
@@ -83,7 +84,6 @@ class Model:
     """False: after a few steps only."""
     stands_out: tuple[Place, ...]
     """Regimes of the validation recordings that stand out."""
-    polished: bool = False
     flaw: str | None = None
     """Result of ``Fits.flaw``, once it was asked for."""
     standing_out: tuple[Place, ...] | None = None
@@ -144,6 +144,11 @@ def better(a: Model, b: Model, config: SearchConfig) -> bool:
     )
 
 
+def is_as_good(error: float, before: float) -> bool:
+    """Whether an RMS error [floors] has hardly risen."""
+    return error**2 - before**2 <= MOST_MORE * max(before, 1.0) ** 2
+
+
 def best(models: Iterable[Model], config: SearchConfig) -> Model:
     """Of the models that the one with the least error is not clearly better than, the one with the fewest numbers."""
     order = sorted(
@@ -153,6 +158,11 @@ def best(models: Iterable[Model], config: SearchConfig) -> Model:
     return min(as_good, key=lambda m: (m.numbers, m.squares.mean))
 
 
+def simple_forms(cls: type[Effect]) -> tuple[str, ...]:
+    """Effects with fewer numbers that ``cls`` equals at the ends of one of its own."""
+    return (*cls.reduces_to, *cls.equals_when_wide)
+
+
 class Fits:
     """Fits of hypotheses to the same recordings, and their errors.
 
@@ -160,6 +170,7 @@ class Fits:
         start: start values; numbers that are left out start at their defaults.
         present: effects that the twin has already.
         report: function that is called with a text about the present step.
+        begin: where the first fit begins; ``start`` if not given.
     """
 
     def __init__(
@@ -171,17 +182,15 @@ class Fits:
         present: tuple[str, ...],
         config: SearchConfig,
         report: Progress,
+        begin: Mapping[str, float] | None = None,
     ) -> None:
-        self.problem, self.fit_to, self.validation = (
-            problem,
-            list(fit_to),
-            list(validation),
-        )
+        self.problem = problem
+        self.fit_to, self.validation = list(fit_to), list(validation)
         self.present, self.config, self.report = present, config, report
         self.models: dict[frozenset[str], Model] = {}
         self.probes: dict[tuple[frozenset[str], str], Probe] = {}
         """(effects of a model, effect) → its best probe beside them."""
-        self._probed: dict[frozenset[str], int] = {}
+        self._extended: set[tuple[frozenset[str], frozenset[str]]] = set()
         self._repeats: dict[tuple[Model, Model], str] = {}
         there = chosen(problem, present)
         self.given = {
@@ -189,10 +198,13 @@ class Fits:
             for f in (*problem.base, *(f for x in there for f in x.frees))
         }
         """Value of every number of the problem as the machine's file has it, before any fit."""
+        self.late_s = max(lateness_s(problem, self.given, present, self.fit_to), 0.0)
+        """How much later than simulated with the machine's numbers it moves [s]."""
         self.state = ""
         """Text of how far the search is, before that of each step."""
         self.progress("fitting the numbers that are always fitted")
-        self._keep(self.fitted(present, [self.given], most=60), full=True)
+        first = [self.given if begin is None else self.given | dict(begin)]
+        self._keep(best_fit(problem, fit_to, present, first, 60), full=True)
         self.as_it_was = dataclasses.replace(
             self.first,
             values=self.given,
@@ -225,7 +237,7 @@ class Fits:
         most: int = STEPS,
     ) -> Fit:
         """The best of several fits of the effects ``names``; at most ``most`` steps in each."""
-        return best_fit(self.problem, self.fit_to, names, starts, most)
+        return best_fit(self.problem, self.fit_to, names, starts, most, LOOSE)
 
     def model_of(self, found: Fit, full: bool = True) -> Model:
         """``found`` with its errors."""
@@ -239,32 +251,55 @@ class Fits:
         return self.models[key]
 
     def without(self, model: Model, name: str, again: bool = False) -> Model:
-        """The model with one effect less, the others refitted; ``again``: from where ``model`` ended, so that both had the same
-        refits, even if it was fitted before."""
-        return self.whole(
-            tuple(n for n in model.names if n != name), model.fit.values, again
-        )
+        """The model with one effect less, the others refitted; ``again``: from where
+        ``model`` ended, so that both had the same refits, even if it was fitted before.
 
-    def whole(self, names: Sequence[str], start: Values, again: bool = False) -> Model:
-        """The model of exactly these effects, fitted fully from ``start`` unless it already is; ``again``: in any case."""
+        What makes the motion late gives its time to each other effect that does."""
+        others = tuple(n for n in model.names if n != name)
+        values = model.fit.values
+        late = [f.name for f in model.fit.frees if f.name.endswith(LATE)]
+        gone = sum(values[n] for n in late if n.startswith(f"{name}."))
+        shifted = [
+            values | {n: values[n] + gone}
+            for n in late
+            if gone > 0.0 and not n.startswith(f"{name}.")
+        ]
+        return self.whole(others, values, again, shifted)
+
+    def whole(
+        self,
+        names: Sequence[str],
+        start: Values,
+        again: bool = False,
+        further: Sequence[Values] = (),
+    ) -> Model:
+        """The model of exactly these effects, fitted fully from ``start`` and ``further``
+        ones unless it already is; ``again``: in any case."""
         there = self.models.get(frozenset(names))
         if there is not None and there.full and not again:
             return there
         self.progress(f"fitting {' and '.join(names) or 'no effect'}")
-        return self._keep(self.fitted(names, [start]), full=True)
+        return self._keep(self.fitted(names, [start, *further]), full=True)
 
     def children(
-        self, parent: Model, names: Sequence[str], most: int = PROBED
+        self, parent: Model, names: Sequence[str], likely: bool = True
     ) -> list[Model]:
-        """Models with one effect of ``names`` more, those of the likeliest effects fitted fully."""
+        """Models with one effect of ``names`` more, those of the likeliest effects
+        fitted fully.
+
+        Args:
+            likely: whether effects that ``is_likely`` are fitted wherever the
+                screening ranks them.
+        """
         key = frozenset(parent.names)
         free = [n for n in names if n not in key]
-        if free and self._probed.get(key, 0) < most:
-            self._probed[key] = most
-            self._extend(parent, free, most)
+        done = [tried for own, tried in self._extended if own == key]
+        if not any(tried.issuperset(free) for tried in done):
+            self._extended.add((key, frozenset(free)))
+            self._extend(parent, free, likely)
         return [m for n in free if (m := self.models.get(key | {n})) is not None]
 
-    def _extend(self, parent: Model, free: list[str], most: int) -> None:
+    def _extend(self, parent: Model, free: list[str], likely: bool) -> None:
         key, candidates = frozenset(parent.names), self.problem.candidates
         has = " and ".join(self.added(parent)) or "no effect added"
         self.state = f"{has}, validation error {parent.error:.2f} noise floors; "
@@ -277,10 +312,15 @@ class Fits:
             seen.setdefault(p.name, []).append(p)
             self.probes.setdefault((key, p.name), p)
         order = list(seen)
+        simpler = {
+            form
+            for n in order[:SURELY_FULL]
+            for form in simple_forms(candidates[n].cls)
+        }
         names = [
             n
             for k, n in enumerate(order)
-            if k < most or (is_likely(candidates[n]) and most == PROBED)
+            if k < PROBED or n in simpler or (likely and is_likely(candidates[n]))
         ]
         starts = {
             n: [
@@ -299,111 +339,52 @@ class Fits:
                 if there is not None and there.full
                 else self._short(parent.fit, n, starts[n][0])
             )
-        if short and min(f.error for f in short.values()) > FAR_OFF:
-            self.progress("refitting from beside what is far off")
-            short |= {
-                n: out_of_dents(self.problem, short[n], self.fit_to, FIRST_STEPS)
-                for n in names[:4]
-            }
-        most_removed = (
-            parent.fit.error**2
-            - min((f.error for f in short.values()), default=0.0) ** 2
-        )
-        for n in [
-            n for n in names if short[n].trouble
-        ]:  # along a ridge of several numbers a few steps do not go far
+        left = min((f.error**2 for f in short.values()), default=0.0)
+        most_removed = parent.fit.error**2 - left
+        # Along a ridge of several numbers a few steps do not go far.
+        for n in [n for n in names if short[n].trouble]:
             if parent.fit.error**2 - short[n].error ** 2 > 0.5 * most_removed > 0.0:
                 self.progress(f"further steps with {n}")
                 short[n] = self.fitted(
                     short[n].names, [short[n].values], 3 * FIRST_STEPS
                 )
         by_error = sorted(names, key=lambda n: short[n].error)
-        least = short[by_error[0]].error
-        for n in by_error:
+        enough = NEAR_BEST * max(short[by_error[0]].error, 1.0) if names else 0.0
+        for k, n in enumerate(by_error, 1):
             there = self.models.get(key | {n})
             if there is not None and there.full:
                 continue
-            bends = (
-                bool(candidates[n].cls.optional)
-                and short[n].error < 0.95 * parent.fit.error
-            )
-            near = short[n].error <= NEAR_BEST * max(least, 1.0)
-            if near or bends or n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL]):
-                self.progress(
-                    f"refitting with {n}, {by_error.index(n) + 1} of at most {len(names)}"
-                )
-                self.grown(
-                    self._keep(
-                        self._full(parent.fit, n, [short[n].values, *starts[n][1:]]),
-                        full=True,
-                    )
-                )
+            sure = n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL], *simpler)
+            if sure or short[n].error <= enough:
+                self.progress(f"refitting with {n}, {k} of at most {len(names)}")
+                began = [short[n].values, *starts[n][1:]]
+                self._keep(self._full(parent.fit, n, began), full=True)
             else:
                 self._keep(short[n], full=False)
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
-        """``parent`` with one effect more, after a few steps for each of its numbers; from where the numbers began if those of
-        ``parent``, which have made up for the effect, do not go with it, or went to an end of their range and are far off."""
-        steps = FIRST_STEPS * max(
-            sum(not f.optional for f in self.problem.candidates[name].frees), 1
-        )
-        model = self.fitted((*parent.names, name), [start], steps)
-        more = [start | self.given] * (model.error > STUCK * parent.error)
-        if parent.at_an_end and model.error > FAR_OFF:
-            more.append(self._afresh(parent, name))
-        # At a whole row a delayed target comes before that row's effort is measured, or after it: the error jumps there.
-        row_s = min(float(np.median(np.diff(r.time_s))) for r in self.fit_to)
-        for delay in [
-            f.name
-            for f in self.problem.candidates[name].frees
-            if f.name.endswith(".delay_s")
-        ]:
-            whole = int(model.values[delay] / row_s)
-            more += [
-                model.values | self.given | {delay: (k + PAST_ROW) * row_s}
-                for k in (whole, whole + 1)
-            ]
-        return min(
-            (
-                model,
-                *(self.fitted((*parent.names, name), [one], steps) for one in more),
-            ),
-            key=lambda m: m.error,
-        )
+        """``parent`` with one effect more, after a few steps for each of its numbers; one
+        that makes the motion late also from as late as the recordings are (``late_s``),
+        beside the numbers of the file: those of ``parent`` have made up for it."""
+        own = self.problem.candidates[name].frees
+        steps = FIRST_STEPS * max(sum(not f.optional for f in own), 1)
+        starts = [start]
+        late = [f.name for f in own if f.name.endswith(LATE)]
+        if late and self.late_s > 0.0:
+            starts.append(start | self.given | {late[0]: self.late_s})
+        return self.fitted((*parent.names, name), starts, steps)
 
     def _full(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
-        """``parent`` with one effect more; never worse than ``parent``, which it contains."""
-        frees = [f for f in self.problem.candidates[name].frees if not f.optional]
-        model = self.fitted((*parent.names, name), starts)
-        more = []
-        if (
-            model.error > STUCK * parent.error
-        ):  # stuck: from where the effect is hardly there
-            faint = {f.name: f.start for f in frees} | {
-                frees[0].name: frees[0].low if frees[0].log else 0.0
-            }
-            more.append(parent.values | faint)
-        if parent.error > FAR_OFF:
-            more.append(self._afresh(parent, name))
-        if (
-            model.error > self.config.floor
-        ):  # the numbers may have gone far to make up for it: from where they began
-            more.append(starts[0] | self.given)
-        return min(
-            (model, *(self.fitted((*parent.names, name), [one]) for one in more)),
-            key=lambda m: m.error,
-        )
+        """``parent`` with one effect more. Above the floor also from the numbers of the
+        file: those of ``parent`` may have gone far to make up for the effect."""
+        names = (*parent.names, name)
+        model = self.fitted(names, starts)
+        if model.error <= self.config.floor:
+            return model
+        afresh = self.fitted(names, [starts[0] | self.given])
+        return min(model, afresh, key=lambda m: m.error)
 
-    def _afresh(self, parent: Fit, name: str) -> Values:
-        """The best start of an effect's own beside the numbers that the file has, after one step."""
-        own = self.problem.candidates[name]
-        starts = [
-            parent.values | {f.name: f.start for f in own.frees} | one | self.given
-            for one in own.starts
-        ]
-        return self.fitted((*parent.names, name), starts, 1).values
-
-    def grown(self, model: Model) -> Model:
+    def with_optional(self, model: Model) -> Model:
         """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles. Also of a
         model at the floor, where an effect that always has such numbers may still do better: not where nothing can."""
         if above_floor(model.squares) < 1.0 + self.config.min_gain:
@@ -431,25 +412,6 @@ class Fits:
                 self.models[frozenset(model.names)] = model = other
         return model
 
-    def polished(self, model: Model) -> Model:
-        """The same hypothesis from a little beside where it ended, if it is above the floor, so that the next effect does not
-        explain what an unfinished fit has left."""
-        if self.at_floor(model) or model.polished or not self.added(model):
-            return model
-        self.progress(f"refitting {' and '.join(model.names)} from beside their values")
-        wide = fit(
-            self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE
-        )
-        least = min(
-            (model.fit, wide, self.fitted(model.names, [wide.values])),
-            key=lambda f: f.error,
-        )
-        found = self._keep(
-            out_of_dents(self.problem, least, self.fit_to, STEPS), full=True
-        )
-        found.polished = True
-        return found
-
     def finished(self, model: Fit) -> Fit:
         """Fit of the same hypothesis until it converges, with derivatives fine enough for its intervals. Numbers that go on
         moving while χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
@@ -465,7 +427,7 @@ class Fits:
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
         if not fine.frees:
             return fine
-        return self._with_intervals(*self._without_ended(fine))
+        return self._with_intervals(self.problem, fine)
 
     def as_stated(self, model: Fit, keep: Collection[str] = ()) -> Fit:
         """``model`` without the numbers of a drive's loop (``Free.leaves``) whose 95 % interval holds what the file has: they
@@ -502,17 +464,14 @@ class Fits:
         return model
 
     def _with_intervals(self, problem: Problem, fine: Fit) -> Fit:
-        """``fine``, fitted with fine derivatives, with all that its intervals need, and ``settled``."""
+        """``fine``, fitted with fine derivatives, with all that its intervals need."""
         fine, steps = over_own_scale(problem, fine, self.fit_to)
         if self.validation:
             moved = moved_by(problem, fine, self.fit_to, self.validation, steps)
             fine = dataclasses.replace(
                 fine, moved=np.hypot(moved, self._moved_by_late_targets(problem, fine))
             )
-        found = settled(
-            problem, fine, self.given, self.present, self.fit_to, self.validation
-        )
-        return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
+        return fine
 
     def _moved_by_late_targets(self, problem: Problem, model: Fit) -> np.ndarray:
         """(p,) standard deviation of the fitted coordinates because recordings do not state how long a target waits for the
@@ -536,19 +495,6 @@ class Fits:
             )
         return np.where([f.name == "speed_delay_s" for f in model.frees], 0.0, moved)
 
-    def _without_ended(self, model: Fit) -> tuple[Problem, Fit]:
-        """The problem and ``model`` with always fitted numbers, without gains, that were driven to an end of their range (a mass
-        to nothing) back where they began and held there, and the others refitted, if that costs 5 % of what the effects removed
-        at most."""
-        ended = {f.name for f in model.fled} - {"kp", "kd"}
-        won = self.base.error**2 - self.error(model) ** 2
-        if not ended or not self.added(model):
-            return self.problem, model
-        problem = with_held(self.problem, {name: self.given[name] for name in ended})
-        other = self._fine(model, problem)
-        lost = self.error(other) ** 2 - self.error(model) ** 2
-        return (problem, other) if lost <= 0.05 * won else (self.problem, model)
-
     def _fine(self, model: Fit, problem: Problem | None = None) -> Fit:
         return fit(
             problem or self.problem,
@@ -558,6 +504,12 @@ class Fits:
             self.config.last_steps,
             FINE,
         )
+
+    def changed_by(self, a: Fit, b: Fit, recordings: Sequence[Recording]) -> float:
+        """RMS difference of what ``a`` and ``b`` simulate for ``recordings`` [floors]."""
+        ends = [(m.values, m.effects) for m in (a, b)]
+        one, other = stacked_all(self.problem, ends, recordings)
+        return rms(one - other)
 
     def error(self, model: Fit) -> float:
         """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""
@@ -649,13 +601,10 @@ class Fits:
             ):  # the truth may lie at the end of a range, but then nothing is left
                 return f"no explanation: {c.frees[0].name} ends at {found.values[c.frees[0].name]:.3g}, an end of its range"
         fled = [f.name for f in found.fled if f.name not in self.base.fit.at_bound]
-        decided = (
-            fled and self._without_ended(found)[0] is self.problem
-        )  # else as good where they began
         ends = " and ".join(f"{name} {found.values[name]:.3g}" for name in fled)
         return (
             f"no explanation: the fit ends with {ends} at the end of its range"
-            if decided
+            if fled
             else ""
         )
 

@@ -13,58 +13,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from taccorl.alignment.least_squares import Free, Values
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect, Parameter
 
-_MOST = 700.0  # exp of it is the largest number there is
-Values = dict[str, float]
-"""Name of a number, ``kp`` or ``coulomb_friction.torque_nm`` → value in the unit of that parameter."""
+LEAST_ROWS = 10
+"""Fewer rows of a regime are not judged."""
 _SMALLEST = 1e-3
 """A strength that fades to 0 is searched, on a logarithmic scale, down to this share of its typical value."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Free:
-    """A number that is fitted, with its unit, start value and bounds."""
-
-    name: str
-    """``kp``, or ``coulomb_friction.torque_nm`` for a parameter of an effect."""
-    unit: str
-    """Unit of the number and its bounds; "1" if dimensionless."""
-    start: float
-    """Default start value of a fit."""
-    low: float
-    high: float
-    log: bool = False
-    """True: searched on a logarithmic scale; both bounds are then above 0."""
-    scale: float = 1.0
-    """For a linear scale: a change of the number that is relevant."""
-    held: bool = False
-    """True: the number stays at ``start``, because its user knows it (``known`` of the machine's file)."""
-    optional: bool = False
-    """True: the number may be absent while its effect is there (``Effect.optional``). It is fitted from starts above 0 only, and
-    otherwise stays at 0."""
-    leaves: bool = False
-    """True: the machine's file need not state it. Where the recordings do not tell it from what the file has, the last refit
-    leaves it out (``Fits.as_stated``)."""
-    unless: tuple[str, ...] = ()
-    """Names of effects with the same influence on the recordings: in a fit with one of them this number is held at ``start``."""
-
-    def within(self, value: float) -> float:
-        """``value`` clipped to the bounds."""
-        return min(max(value, self.low), self.high)
-
-    def coordinate(self, value: float) -> float:
-        """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
-        ``scale``, so that a relevant change is of order 1."""
-        value = self.within(value)
-        return math.log(value) if self.log else value / self.scale
-
-    def value(self, coordinate: float) -> float:
-        """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
-        raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
-        return self.within(raw)
 
 
 def free(p: Parameter, cls: type[Effect]) -> Free:
@@ -193,6 +150,8 @@ class Recording:
     short_noise: bool = False
     """True: noise does not last, so that what is left for longer than half a second is a misfit. False: as where joints or
     objects are not placed alike twice."""
+    setting: tuple[float, ...] = ()
+    """What others may have otherwise: load, gains."""
     share: np.ndarray | float = 1.0
     """(T, C) noise of an entry as a share of the floor of its channel."""
 
@@ -329,6 +288,23 @@ def split_rows(
         early.append(dataclasses.replace(r, measured=first))
         late.append(dataclasses.replace(r, measured=last))
     return early, late
+
+
+def thinned(recordings: Sequence[Recording]) -> list[Recording]:
+    """Every second recording, at least two, and those without which a regime of motion or
+    a value of a setting were lost. In their order."""
+    if len(recordings) <= 2:
+        return list(recordings)
+
+    def facts(r: Recording) -> set[Any]:
+        seen = {n for n, (rows, _) in r.regimes.items() if rows.sum() >= LEAST_ROWS}
+        return seen | set(enumerate(r.setting))
+
+    kept = list(recordings[::2])
+    for r in recordings[1::2]:
+        if facts(r) - set[Any]().union(*map(facts, kept)):
+            kept.append(r)
+    return [r for r in recordings if r in kept]
 
 
 def with_frees(problem: Problem, change: Callable[[Free], Free]) -> Problem:

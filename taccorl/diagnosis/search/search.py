@@ -1,21 +1,27 @@
 """Search for missing effects: a beam search over sets of effects with one rule.
 
     1. The numbers that are always fitted are fitted to the fit recordings.
-    2. While the validation error is above ``floor`` noise floors: each of the ``width`` best models is extended by one effect.
-       All effects are probed (``screen``), the likely ones are fitted together with all numbers (``Fits.children``).
-    3. A model is better than another one (``fits.better``) if its error on validation recordings is clearly lower, by paired
-       differences of half seconds, or if it is as good with fewer numbers. Beside the best model all models with one of its
-       effects exchanged, or without it, are fitted, until none of them is better: before a third effect is added, and at the end.
-    4. The best model is fitted to the end. Effects and optional numbers that are superfluous then go by the same rule.
-    5. Its ties are all fitted models that it is not clearly better than, those with more numbers that contain it, too.
+    2. While the validation error is above ``floor`` noise floors: each of the ``width``
+       best models is extended by one effect. All effects are probed (``screen``), the
+       likely ones are fitted together with all numbers (``Fits.children``). If none is
+       accepted at first, those that remove much of the fit error are extended: two
+       effects can hide each other on validation recordings.
+    3. A model is better than another one (``fits.better``) if its error on validation
+       recordings is clearly lower, by paired differences of half seconds, or if it is
+       as good with fewer numbers. Beside a model of several effects all models with one
+       of them exchanged, or without it, are fitted, until none of them is better.
+    4. The best model is fitted to all fit recordings, of which the search used every
+       second one. Effects and optional numbers that are superfluous go by the same rule.
+    5. Its ties are all fitted models that it is not clearly better than, those with more
+       numbers that contain it, too.
 
-If no single effect is accepted, those that remove much of the fit error are extended nevertheless: two effects can hide each
-other on validation recordings. Numbers of the file whose refit removes a part of the error are named (``changed_numbers``). The
+Numbers of the file that the recordings contradict are named (``changed_numbers``). The
 test recordings, which no choice has seen, give the final figures.
 
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
 """
 
+import copy
 import dataclasses
 import itertools
 import time
@@ -26,21 +32,20 @@ import numpy as np
 
 from taccorl.diagnosis.search.changed_numbers import (
     OF_LOOP,
-    better_than_present,
     changed_numbers,
     moved_gains,
-    of_gains,
     of_refit,
 )
 from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.fits import (
-    PROBED_BESIDE,
     Fits,
     Model,
     best,
     better,
+    model_of,
     refusal,
+    simple_forms,
 )
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import (
@@ -53,6 +58,7 @@ from taccorl.diagnosis.search.problem import (
     Values,
     never_stopped,
     no_progress,
+    thinned,
     with_other_number,
 )
 from taccorl.diagnosis.search.result import (
@@ -125,14 +131,14 @@ def diagnose(
         fits, other = other, None
     fits.problem.learn(fits.first.values)
     beam = Beam(fits, [name for name in fits.problem.candidates if name not in without])
-    answer, removed, remarks = beam.result()
+    answer, removed, remarks = beam.pruned(beam.search())
     if other is not None and better(other.base, answer, fits.config):
         fits, other, beam = other, None, Beam(other, beam.names)
-        answer, removed, remarks = beam.result()
+        answer, removed, remarks = beam.pruned(beam.search())
     steps = beam.steps(answer)
     rivals = beam.rivals(answer, steps)
     rounds = beam.rounds(answer, steps, rivals)
-    changed, model = changed_numbers(fits, answer.fit, beam.names)
+    changed, model = changed_numbers(fits, answer.fit)
     model = fits.as_stated(model, _named(changed))
     changed = tuple(
         dataclasses.replace(c, after=float(model.values.get(c.name, c.after)))
@@ -145,7 +151,8 @@ def diagnose(
     }
     without_it = {
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"]
-        for name, m in beam.parts(answer)
+        for name in fits.added(answer)
+        for m in [fits.without(answer, name)]
         if test
     }
     if (
@@ -194,8 +201,6 @@ def diagnose(
             *beam.remarks,
             *of_refit(fits, answer),
             *_of_pairs(beam, answer),
-            *of_gains(fits, model),
-            *(() if beam.remarks else better_than_present(fits, answer, beam.names)),
         ),
         at_bound=tuple(f.name for f in model.ended),
         undetermined=_undetermined(model),
@@ -223,27 +228,33 @@ Step = tuple[Model, Model, str]
 
 
 class Beam:
-    """Beam search over sets of the effects ``names``."""
+    """Beam search over sets of the effects ``names``.
 
-    def __init__(self, fits: Fits, names: Sequence[str]) -> None:
-        self.fits, self.config, self.names = fits, fits.config, list(names)
+    Args:
+        whole: fits to all fit recordings; the search itself uses fewer (``thinned``).
+    """
+
+    def __init__(self, whole: Fits, names: Sequence[str]) -> None:
+        self.whole, self.config, self.names = whole, whole.config, list(names)
         self.remarks: list[str] = []
         self.stopped = False
-
-    def result(self) -> tuple[Model, list[str], list[str]]:
-        """``search``, then ``pruned``. Where the last refit of all added effects is flawed (``Fits.flaw``), the search runs again
-        without them: it had preferred them to others."""
-        found = self.search()
-        (answer, removed, _) = result = self.pruned(found)
-        flawed = (
-            removed
-            and not self.fits.added(answer)
-            and self.fits.flaw(self.fits.models[frozenset(found.names)])
-        )
-        return self.pruned(self.search()) if flawed else result
+        fewer = thinned(whole.fit_to)
+        self.fits = whole
+        if len(fewer) < len(whole.fit_to) and not whole.at_floor(whole.base):
+            self.fits = Fits(
+                whole.problem,
+                fewer,
+                whole.validation,
+                whole.given,
+                whole.present,
+                whole.config,
+                whole.report,
+                whole.first.values,
+            )
 
     def search(self) -> Model:
-        """The best model with at most ``max_effects`` effects more than the twin has, or of the rounds before ``Stopped``."""
+        """The best model with at most ``max_effects`` effects more than the twin has, or
+        of the rounds before ``Stopped``."""
         fits = self.fits
         answer = fits.base
         try:
@@ -254,48 +265,42 @@ class Beam:
             if not (names := fits.added(answer)):
                 raise
             self.stopped = True
-            self.config = fits.config = dataclasses.replace(
-                self.config, max_effects=len(names)
-            )
+            self.config = dataclasses.replace(self.config, max_effects=len(names))
             self.remarks.append(
-                f"Stopped after {' and '.join(names)}: what may be beside or in place of it was not tried."
+                f"Stopped after {' and '.join(names)}: what may be beside or in place of "
+                "it was not tried."
             )
-        fits.report = never_stopped(fits.report)
+        for one in (fits, self.whole):
+            one.config, one.report = self.config, never_stopped(one.report)
         return answer
 
     def _answers(self) -> Iterator[Model]:
         """The best model after each round."""
         fits, c = self.fits, self.config
-        answer = fits.grown(fits.base)
+        answer = fits.with_optional(fits.base)
         level = [answer]
         for depth in range(c.max_effects):
             if any(fits.at_floor(m) for m in level):
                 break
-            grown = {
+            children = {
                 id(k): (k, m)
                 for m in level
                 for k in fits.children(m, self.names)
                 if k.full
             }
-            found = best(
-                [answer, *(k for k, m in grown.values() if not fits.why_not(k, m))], c
-            )
+            sound = [k for k, m in children.values() if not fits.why_not(k, m)]
+            found = best([answer, *sound], c)
             if found is not answer:
-                better_ones = [
-                    k
-                    for k, m in grown.values()
-                    if not fits.why_not(k, m) and not refusal(k, answer, c)
-                ]
                 more = self.much(level[0])  # which may hide on validation recordings
-                yield (answer := self._both(fits.polished(found)))
-                if (
-                    depth > 0
-                ):  # what was added first may only have been the nearest to two that are missing
+                rest = [
+                    k
+                    for k in sound
+                    if k.names != found.names and not refusal(k, answer, c)
+                ]
+                rest.sort(key=lambda k: above_floor(k.squares))
+                yield (answer := self._both(fits.with_optional(found)))
+                if depth > 0:
                     answer = self._exchanged(answer, further=False)
-                rest = sorted(
-                    (k for k in better_ones if k.names != found.names),
-                    key=lambda k: above_floor(k.squares),
-                )
                 rest += [k for k in more if k.fit.error < answer.fit.error]
                 level = [answer, *rest[: c.width - 1]]
             elif depth == 0:
@@ -304,44 +309,44 @@ class Beam:
                 break
             if not level:
                 break
-        yield self._exchanged(self._simpler(answer))
+        yield self._exchanged(answer)
 
     def _both(self, answer: Model) -> Model:
-        """The best of ``answer`` and of models with two effects in place of one that lies between them, as friction over a power
-        of the speed lies between Coulomb and viscous friction; with more effects only if ``answer`` is above the floor."""
-        fits, most = self.fits, self.config.max_effects
-        for name in fits.added(answer):
-            cls = fits.problem.candidates[name].cls
-            both = [
-                n for n in (*cls.reduces_to, *cls.equals_when_wide) if n in self.names
-            ]
-            names = tuple(
-                dict.fromkeys(
-                    n for own in answer.names for n in (both if own == name else [own])
-                )
-            )
-            more = len(names) - len(answer.names)
-            if len(both) > 1 and more <= (
-                0 if fits.at_floor(answer) else most - len(fits.added(answer))
-            ):
-                fits.grown(fits.whole(names, answer.fit.values))
-        return best([answer, *self.sound(answer)], self.config)
+        """``answer``, or the best model with two effects in place of one that lies between
+        them and leaves clearly less, as friction over a power of the speed lies between
+        dry and viscous friction. The dry one may be another with one number.
 
-    def _simpler(self, answer: Model) -> Model:
-        """The best of ``answer``, at the floor, and of the simpler forms of its effects with another effect: two effects often
-        look like one with many numbers, Coulomb friction and a soft gear like Stribeck friction."""
-        fits = self.fits
-        if (
-            not fits.at_floor(answer)
-            or len(fits.added(answer)) >= self.config.max_effects
-        ):
-            return answer
+        With more effects only if ``answer`` is above the floor, or for no more numbers.
+        """
+        fits, candidates = self.fits, self.fits.problem.candidates
+        room = self.config.max_effects - len(fits.added(answer))
+
+        def numbers(names: Sequence[str]) -> int:
+            return sum(not f.optional for n in names for f in candidates[n].frees)
+
+        pairs = []
         for name in fits.added(answer):
-            for simpler in fits.problem.candidates[name].cls.reduces_to:
-                m = fits.models.get(frozenset({simpler, *answer.names} - {name}))
-                if m is not None and m.full:
-                    fits.children(m, [n for n in self.names if n != name])
-        return best([answer, *self.sound(answer)], self.config)
+            forms = [n for n in simple_forms(candidates[name].cls) if n in self.names]
+            if len(forms) < 2:
+                continue
+            others = [n for n in answer.names if n != name]
+            key = frozenset(others)
+            twins = [
+                n
+                for n in candidates[forms[0]].cls.near_twins
+                if (key, n) in fits.probes and numbers([n]) == 1 and n not in forms
+            ]
+            twins.sort(key=lambda n: -fits.probes[key, n].explained)
+            for dry in (forms[0], *twins[:1]):
+                names = tuple(dict.fromkeys([*others, dry, *forms[1:]]))
+                more = len(names) - len(answer.names)
+                if more <= (0 if fits.at_floor(answer) else room) or (
+                    numbers([dry, *forms[1:]]) <= numbers([name])
+                ):
+                    pairs.append(fits.whole(names, answer.fit.values))
+        sound = [m for m in pairs if not fits.flaw(m)]
+        found = best(sound, self.config) if sound else answer
+        return found if refusal(answer, found, self.config) else answer
 
     def much(self, parent: Model) -> list[Model]:
         """Extensions of ``parent`` that remove much of the fit error, the best first."""
@@ -354,23 +359,21 @@ class Beam:
         return sorted(found, key=lambda m: m.fit.error)[: self.config.width]
 
     def _exchanged(self, answer: Model, further: bool = True) -> Model:
-        """The best of ``answer`` and the models with one effect exchanged, taken away or, if ``further``, added; and again."""
+        """The best of ``answer`` and the models with one effect exchanged, taken away or,
+        if ``further``, added; and again. What was added first may only have been the
+        nearest to two that are missing."""
         fits = self.fits
         for _ in range(EXCHANGES):
             parts = self.parts(answer)
             for _, part in parts if len(parts) > 1 else ():
-                fits.children(part, self.names, PROBED_BESIDE)
-            if (
-                further
-                and not fits.at_floor(answer)
-                and len(parts) < self.config.max_effects
-                and parts
-            ):
+                fits.children(part, self.names, likely=False)
+            open_ = 0 < len(parts) < self.config.max_effects
+            if further and open_ and not fits.at_floor(answer):
                 fits.children(answer, self.names)
-            found = fits.polished(best([answer, *self.sound(answer)], self.config))
+            found = best([answer, *self.sound(answer)], self.config)
             if found.names == answer.names:
                 return found
-            answer = found
+            answer = fits.with_optional(found)
         return answer
 
     def parts(self, model: Model) -> list[tuple[str, Model]]:
@@ -395,10 +398,35 @@ class Beam:
                 found.append(m)
         return found
 
+    def _repeated(self, answer: Model) -> tuple[Model, list[str]]:
+        """``answer`` without effects that gain nothing beside others on fit recordings that
+        the search has not used, though they change the simulation there by as much as
+        would be a gain; and their names."""
+        fits, removed = self.fits, list[str]()
+        unused = [r for r in self.whole.fit_to if r not in fits.fit_to]
+        while unused and len(fits.added(answer)) > 1:
+            own = model_of(fits.problem, answer.fit, unused)
+            gone = []
+            for name, part in self.parts(answer):
+                without = model_of(fits.problem, part.fit, unused)
+                changed = fits.changed_by(answer.fit, part.fit, unused)
+                needed = self.config.min_gain * max(without.squares.mean - 1.0, 1.0)
+                gain = gain_of(own.squares, without.squares)
+                if gain < self.config.min_gain and changed**2 >= needed:
+                    gone.append((gain, name, part))
+            if not gone:
+                break
+            _, name, answer = min(gone, key=lambda item: item[:2])
+            removed.append(name)
+        return answer, removed
+
     def pruned(self, answer: Model) -> tuple[Model, list[str], list[str]]:
-        """The model in its last refit, without effects and optional numbers that are superfluous there; names of the effects that
-        went; remarks on those that stay although their strength is open."""
-        fits, c, removed = self.fits, self.config, []
+        """The model in its last refit, to all fit recordings, without effects and optional
+        numbers that are superfluous there; names of the effects that went; remarks on
+        those that stay although their strength is open."""
+        fits, c = self.whole, self.config
+        answer, removed = self._repeated(answer)
+        answer = fits.whole(answer.names, answer.fit.values)
         plain = {
             f"{x}.{n}": 0.0
             for x in answer.names
@@ -411,7 +439,6 @@ class Beam:
             answer = rigid if better(rigid, answer, c) else answer
         while True:
             last = fits.model_of(fits.finished(answer.fit))
-            fits.models |= {frozenset(last.names): last} if fits.flaw(last) else {}
             parts = [(n, fits.without(last, n, again=True)) for n in fits.added(last)]
             # What is left above the floor widens intervals where no known effect explains it, not where none may be added.
             left_over = len(parts) < c.max_effects
@@ -488,11 +515,14 @@ class Beam:
     def ties(self, answer: Model) -> list[Model]:
         """Fitted models with other effects that the result is not clearly better than."""
         own = set(answer.names)
+        like = self.fits.whole(answer.names, answer.fit.values)
+        if self.fits is self.whole:
+            like = answer
         others = [
-            m for m in self.sound(answer) if own - set(m.names) and set(m.names) - own
+            m for m in self.sound(like) if own - set(m.names) and set(m.names) - own
         ]
         return sorted(
-            (m for m in others if refusal(answer, m, self.config)),
+            (m for m in others if refusal(like, m, self.config)),
             key=lambda m: above_floor(m.squares),
         )
 
@@ -610,7 +640,7 @@ def _offers(
 ) -> list[Offer]:
     """Fits of every part of the added effects, and of those in which an effect that ties with one takes its place: alone, and
     beside all others."""
-    fits = beam.fits
+    fits = beam.whole
     added = fits.added(answer)
     sets = [
         names
@@ -704,7 +734,8 @@ def _described(
     how = (
         ", ".join(model.names) if fits.added(model) else "numbers of the file refitted"
     )
-    for effect in model.effects:
+    described = [copy.copy(effect) for effect in model.effects]
+    for effect in described:
         prefix = f"{effect.name}."
         effect.interval = {
             k.removeprefix(prefix): v
@@ -719,7 +750,7 @@ def _described(
             only = len(test_without) == 1
             without = errors[stage]["test"] if only else test_without[effect.name]
             effect.evidence += f"; test {'' if only else 'without it, '}{of_test(without, errors['after']['test'])}"
-    return list(model.effects)
+    return described
 
 
 def _undetermined(model: Fit) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.fit import residuals
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
 from taccorl.diagnosis.search.identifiable import Known
@@ -90,6 +91,8 @@ class PartFinding:
     """Numbers that the recordings identify; None for parts for which they are not computed."""
     remark: str = ""
     """Text on what the search could not decide; empty if there is nothing."""
+    drifts: tuple[Drift, ...] = ()
+    """Numbers that changed from one recording of a motion to another one."""
 
 
 class Solved(NamedTuple):
@@ -205,6 +208,18 @@ def solved(
         "rows_split": found.rows_split,
     }
     return PartFinding(part=part, recordings=recordings, **stated, **judged)
+
+
+def with_drifts[FindingT: PartFinding](
+    found: FindingT, drifted: Sequence[Drift]
+) -> FindingT:
+    """The finding with numbers that changed between recordings, and a remark on each."""
+    remarks = (*(drift.words for drift in drifted), *found.diagnosis.remarks)
+    return dataclasses.replace(
+        found,
+        drifts=tuple(drifted),
+        diagnosis=dataclasses.replace(found.diagnosis, remarks=remarks),
+    )
 
 
 def _of_loop(

@@ -14,12 +14,10 @@ from scipy.stats import chi2
 
 from taccorl.alignment.measurements.correlation import independent_rows
 from taccorl.diagnosis.search.fit import Fit, residuals
-from taccorl.diagnosis.search.problem import Problem, Recording
+from taccorl.diagnosis.search.problem import LEAST_ROWS, Problem, Recording
 
 CHANCE = 1e-3
 """Probability that noise alone stands out in any regime of any recording of a part. A choice."""
-LEAST_ROWS = 10
-"""Fewer rows of a regime are not judged."""
 
 
 @dataclass(frozen=True, kw_only=True)

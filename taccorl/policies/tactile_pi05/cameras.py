@@ -50,13 +50,20 @@ class NormReLU(nn.GroupNorm):
     2.11 once tuned their gradient into an illegal memory access)."""
 
     compiles: bool = True
+    compiles_updates: bool = False
+    """Also outside training mode where gradients are computed, as in updates of PPO; each size of a batch is compiled anew."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(max(1, channels // _CHANNELS_PER_GROUP), channels)
 
     def forward(self, x: Tensor, beside: Tensor | None = None) -> Tensor:
         """Maps (B, K, R, C), and ``beside`` of the same shape to be added before the ReLU, → maps."""
-        compute = _compiled_norm_relu if self.training and self.compiles else _norm_relu
+        is_compiled = (
+            self.compiles
+            if self.training
+            else self.compiles_updates and torch.is_grad_enabled()
+        )
+        compute = _compiled_norm_relu if is_compiled else _norm_relu
         return compute(x, beside, self.num_groups, self.weight, self.bias)
 
 

@@ -19,6 +19,9 @@ BRISTLE_DAMPING_S = 0.001
 """Damping of bristles over their stiffness [s]: they settle in a physics step."""
 DRY_TIME_S, DRY_SHARE = 0.002, 0.9999
 """Time constant [s] and impedance of MuJoCo's constraint for dry friction."""
+SOFT_SHARE, SOFT_MOST, SOFT_TIME_S = 0.9, 0.95, 0.02
+"""Impedance without a distance and at most, and time constant [s], of MuJoCo's constraint for dry friction by default
+(solimpfriction, solreffriction)."""
 AT_RAD_PER_S = 0.1
 """v₁, the speed at which F of ``power_law_friction`` is stated [rad/s; m/s of a slide]. A choice."""
 
@@ -298,6 +301,34 @@ class QuadraticDrag(JointEffect):
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
             joint.damping[1] += self.drag_nms2_per_rad2
+
+
+@effect("soft_friction", slot="friction", needs="velocity")
+class SoftFriction(JointEffect):
+    """MuJoCo's own dry friction (``frictionloss``), which creeps where Coulomb friction sticks: τ = −S (q̈ + b q̇), at most F
+    either way, with b = 2 / (0.95 T) and S = 9 M, M = 1 / (M⁻¹)ⱼⱼ the inertia about the joint with all others free, at the
+    model's zero pose. A constant torque τ < F moves it at τ / (S b): at 1 mrad/s for τ / M = 1 rad/s².
+
+    0.9 and 0.95 are the impedances of MuJoCo's default ``solimpfriction``, T the time constant of its ``solreffriction``, which
+    MuJoCo does not let below two physics steps; T = 0 stands for the default, 0.02 s. In the twin it is the friction of a tendon
+    about the joint alone, beside any rigid friction of the joint."""
+
+    optional: ClassVar = {"time_constant_s": ""}
+    torque_nm: float = number(
+        "F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True
+    )
+    time_constant_s: float = number(
+        "T", "s", 0, 0.02, (0, 0.5), "MuJoCo's default; 0 stands for it"
+    )
+
+    def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
+        for name in self.acts_on():
+            tendon = spec.add_tendon(name=f"{name}_soft_friction")
+            tendon.wrap_joint(name, 1.0)
+            tendon.frictionloss = self.torque_nm
+            time_s = self.time_constant_s or SOFT_TIME_S
+            tendon.solref_friction = [time_s, 1.0]
+            tendon.solimp_friction = [SOFT_SHARE, SOFT_MOST, 0.001, 0.5, 2.0]
 
 
 @effect("stribeck_friction", slot="friction", needs="velocity")

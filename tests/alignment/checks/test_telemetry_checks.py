@@ -1,6 +1,7 @@
 """Planted faults are caught and named; clean sweeps stay clean, whatever the seed, the friction and the noise."""
 
 import dataclasses
+import itertools
 import math
 import re
 from pathlib import Path
@@ -34,6 +35,7 @@ from taccorl.alignment.checks.first_order import (
     onset_delay,
     pure_shift,
 )
+from taccorl.alignment.checks.motion import check_start
 from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import (
     check_measurement,
@@ -1205,6 +1207,33 @@ def test_not_at_rest_at_the_start(clean):
     assert "not_at_rest" in found(
         m
     ) and "begin the recording a second before the motion" in text_of(m, "not_at_rest")
+
+
+def followed(target: np.ndarray, rate_hz: float, kp: float, kd: float) -> Measurement:
+    """A joint of 0.05 kg·m² at rest that follows ``target`` (T,) from row 0 on, with noise."""
+    step_s, q, v, rows = 1e-4, 0.0, 0.0, []
+    for goal in target.tolist():
+        rows.append(q)
+        for _ in range(round(1.0 / (rate_hz * step_s))):
+            v += step_s * (kp * (goal - q) - kd * v) / 0.05
+            q += step_s * v
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(len(target))
+    return of_signal("made", rate_hz, target, np.array(rows) + noise, "elbow")
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(20.0, 1.5), (150.0, 5.0), (5.0, 0.3)])
+@pytest.mark.parametrize("rate_hz", [50, 100, 200, 500])
+def test_a_jump_of_the_target_in_the_first_rows_is_no_motion_before_row_0(
+    rate_hz, kp, kd
+):
+    rows = np.arange(rate_hz)
+    for row, size in itertools.product((0, 1, 2, 5), (0.02, 0.3)):
+        target = np.where(rows < row, 0.0, size) * (rows < rate_hz // 2)
+        trial = Trial(followed(target, rate_hz, kp, kd))
+        assert not [f for f in check_start(trial) if f.check == "not_at_rest"]
+    whole = followed(0.3 * np.sin(2 * np.pi * rows / rate_hz), rate_hz, kp, kd)
+    trial = Trial(some(whole, slice(rate_hz // 2, None)))
+    assert [f.check for f in check_start(trial)] == ["not_at_rest"]
 
 
 def test_time_that_runs_backwards_or_in_milliseconds_stops_everything_else(clean):

@@ -65,10 +65,12 @@ def test_functions_of_lanes_are_those_of_math() -> None:
 
 
 def test_a_lane_does_not_depend_on_the_others() -> None:
-    """Eleven joints: eight, then three whose other lanes are filled; each with other effects, some without any."""
+    """Fourteen joints: eight, then six whose other lanes are filled; each with other effects, some without any."""
     effects: list[dict[str, float]] = [
         {},
         {"coulomb_friction__torque_nm": 0.5},
+        {"soft_friction__torque_nm": 0.5},
+        {"soft_friction__torque_nm": 0.4, "coulomb_friction__torque_nm": 0.1},
         {"stribeck_friction__torque_nm": 0.5, "stribeck_friction__stiction_share": 0.5},
         {"command_delay__delay_s": 0.0123},
         {"sensor_delay__delay_s": 0.004},

@@ -493,31 +493,20 @@ def drafted(folder: Path, kp_b: float, others: str = "") -> tuple[str, list[str]
     ]
 
 
-def test_motors_on_belts_are_named_with_the_joints_that_they_move_and_their_gains(
+def test_motors_on_belts_are_left_out_with_their_line_joints_and_what_to_write(
     tmp_path: Path,
 ) -> None:
-    # K = 20000 [1 1; 1 1] + 4 · 5000 [1 −1; −1 1]: 40000 N/m at x and y, nothing between; kd 150 + 4 · 150.
-    text, (of_a, of_b, whole, shared) = drafted(tmp_path, 5000.0)
-    assert all(
-        word in of_a for word in ("actuator a ", "tendon belt_a", "x (1), y (1)")
-    )
-    assert all(
-        word in of_b for word in ("actuator b ", "tendon belt_b", "x (2), y (-2)")
-    )
-    assert whole.count("kp 40000, kd 750, not coupled") == 2 and "x, y" in shared
-    assert (
-        text.count("kp: 40000")
-        == text.count("kd: 750")
-        == text.count("of actuator a, b")
-        == 2
-    )
-    # With kp 2500 of motor b, rows and columns x, y: K = 20000 [1 1; 1 1] + 4 · 2500 [1 −1; −1 1] = [30000 10000; 10000 30000]
-    # N/m. 10000 beside the diagonal couples the axes, so the draft has no kp.
-    text, (_, _, whole, _) = drafted(tmp_path, 2500.0)
-    assert (
-        "x: kp 30000, kd 750, and kp 10000 with y" in whole
-        and text.count("kp: TODO") == 2
-    )
+    text, (of_a, of_b, way_out) = drafted(tmp_path, 5000.0)
+    line = GANTRY[: GANTRY.index('name="a"')].count("\n") + 1
+    place = f"(gantry.xml:{line})"
+    for remark, words in (
+        (of_a, ("actuator a ", place, "tendon belt_a", "x (1), y (1)")),
+        (of_b, ("actuator b ", place, "tendon belt_b", "x (2), y (-2)")),
+    ):
+        for word in words:
+            assert word in remark
+    assert "kp and kd" in way_out
+    assert text.count("kp: TODO") == 2
 
 
 def test_actuators_on_anything_but_a_joint_are_named(tmp_path: Path) -> None:
@@ -539,10 +528,6 @@ def test_actuators_on_anything_but_a_joint_are_named(tmp_path: Path) -> None:
         ("glue", "body"),
     )
     assert all(word in said[name] for name, word in (*where, ("wrist", "joint ball")))
-    assert all(
-        said[name].endswith("moves x") for name in ("pull", "rod", "crank")
-    )  # the carriage against the beam
-    assert said["jet"].endswith("moves y, x")
     assert (
         "kp: 70 " in text and "of actuator own" in text
     )  # on a slide jointinparent is joint
@@ -903,3 +888,74 @@ def test_motions_that_a_robot_keeps_are_its_own_and_do_not_travel(
     for empty in (other, pickle.loads(pickle.dumps(one))):
         with pytest.raises(AssertionError):
             empty.motions.of(b"key", unexpected)
+
+
+AXIS_YAML = """kind: axis
+name: slide
+unit: m
+inertia: 40.0
+kp: 40000.0
+kd: 2000.0
+limits: [-0.15, 0.15]
+effects:
+- {effect: coulomb_friction, torque_nm: 3.0}
+"""
+ALONE_YAML = """kind: robot
+joints:
+  slide:
+    {unit: m, inertia: 40.0, kp: 40000.0, kd: 2000.0, limits: [-0.15, 0.15],
+     effects: [{effect: coulomb_friction, torque_nm: 3.0}]}
+"""
+
+
+def test_an_axis_file_is_a_robot_of_one_joint_without_a_model(tmp_path: Path) -> None:
+    for name, text in (("axis", AXIS_YAML), ("alone", ALONE_YAML)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    axis, alone = (load_robot(tmp_path / f"{n}.yaml") for n in ("axis", "alone"))
+    assert axis.config == alone.config and axis.digest() == alone.digest()
+    written = tmp_path / "written.yaml"
+    written.write_text(axis.text(written))
+    assert load_robot(written).config == axis.config
+    assert axis.units == {"slide": "m"}
+    joint = axis.joint("slide")
+    assert joint.known.limits == (-0.15, 0.15) and not joint.has_model
+    assert joint.with_values({"inertia": 50.0}).config.inertia == 50.0
+
+
+def test_joints_without_a_model_do_not_load_each_other(tmp_path: Path) -> None:
+    other = "  wheel: {unit: rad, inertia: 0.02, kp: 10.0, kd: 0.8}\n"
+    (tmp_path / "two.yaml").write_text(ALONE_YAML + other)
+    two = load_robot(tmp_path / "two.yaml")
+    t = np.arange(200) / 200
+    rows = np.column_stack([0.1 * np.sin(9.0 * t), np.sin(9.0 * t)])
+    signals, units = ("slide", "wheel"), ("m", "rad")
+    moving = {"time_s": t, "target": rows, "measured": rows, "effort": 0.0 * rows}
+    m = logged("both", signals, units, **moving)
+    for name, inertia in (("slide", 40.0), ("wheel", 0.02)):
+        joint = two.joint(name)
+        motion = motion_of(joint.whole(m), name, joint)
+        assert not motion.coupling_nm.any()
+        assert joint.rigid(motion, []).inertia == inertia
+    whole = two.joint("wheel").whole(m.only(["wheel"]))
+    assert whole.signals == signals and not whole.target[:, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (ALONE_YAML.replace("unit: m, ", ""), r"bad\.yaml:3: .*'unit' is missing"),
+        (ALONE_YAML.replace("inertia: 40.0, ", ""), "'inertia' is missing"),
+        (ALONE_YAML.replace("40.0, ", "40.0, arm_kg: 1.0, "), "arm_kg: does not apply"),
+        (
+            ROBOT_YAML.replace("effort_limit: 100.0}", "inertia: 2.0}"),
+            r"bad\.yaml:\d+: .*inertia: the model states it",
+        ),
+    ],
+)
+def test_a_model_or_the_file_states_a_joint_s_body(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "arm.xml").write_text(TWO_LINKS)
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(SpecError, match=words):
+        load_robot(tmp_path / "bad.yaml")

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from taccorl.alignment.checks.registry import run
 from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
 from taccorl.alignment.checks.telemetry import check_measurement, one_cause
+from taccorl.alignment.checks.trial import Trial
 from taccorl.alignment.machines.robot_file import JointConfig
 from taccorl.alignment.measurements.registers import Register, find_registers
 from taccorl.alignment.measurements.tables import load_table_spec, read_table
@@ -34,6 +36,8 @@ def logged(register: Register, counts: np.ndarray) -> np.ndarray:
     """The unsigned numbers of signed ``counts``, by the definition of both kinds of registers."""
     if register.key == "sign_bit":
         return np.where(counts < 0, register.value + np.abs(counts), counts)
+    if register.key == "zero":
+        return counts + register.value
     return np.where(counts < 0, register.value + counts, counts)
 
 
@@ -232,3 +236,130 @@ def test_a_load_that_falls_where_its_law_asks_for_more_is_no_reversed_sign(tmp_p
     assert "`changes: {elbow.tau: {sign_bit: 1024}}`" in found.text
     small = dataclasses.replace(m, registers=())
     assert reversed_effort(small, "elbow", 0.05, None)[0].check == "reversed_effort"
+
+
+KP, KD, LIMIT = 60.0, 1.5, 20.0
+LAW = {
+    True: JointConfig(kp=KP, kd=KD, effort_limit=LIMIT),
+    False: JointConfig(kp=KP, kd=KD),
+}
+"""Law with and without a stated limit of the effort."""
+
+
+def driven(seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Columns of a joint that moves, and its effort (T,) [N·m]: that of ``LAW`` at the
+    row before. Its load, which sets the position error, changes sign in two of three
+    seeds, else not."""
+    rng = np.random.default_rng(seed)
+    phase = np.cumsum(2 * np.pi * np.geomspace(0.2, 1.5, len(TIME_S)) / 200)
+    target = 0.4 * np.sin(phase)
+    weight = rng.choice([-6.0, 0.0, 6.0]) + rng.uniform(-1, 1)
+    load = weight + 2.0 * np.sin(phase) + 0.3 * np.tanh(20 * np.cos(phase))
+    late = np.r_[target[:1], target[:-1]]
+    q = late - load / KP + 2e-5 * rng.normal(size=len(phase))
+    made = KP * (late - q) - KD * np.gradient(q, TIME_S) + rng.normal(0, 0.01, len(q))
+    return {"elbow.q": q, "elbow.q_target": target}, made
+
+
+def planted(seed: int) -> tuple[int, str, int, float, int, bool]:
+    """Bits, layout, sign of the register, factor of the logger, counts at 10 N·m, and
+    whether the file states a limit of the effort."""
+    rng = np.random.default_rng(1000 + seed)
+    key = ("sign_bit", "wraps_at", "zero")[seed % 3]
+    usual = [8, 10, 12, 14, 16, 24, 32, 48, 52]
+    bits = int(rng.choice(usual if key == "zero" else [*usual, 9, 11, 40, 63, 64]))
+    loggers = [1.0, -1.0, 0.1, -0.1, 0.00269, 5.0] if bits <= 16 else [1.0, -1.0]
+    counts = int(min(0.85 * 2 ** (bits - 1), rng.choice([700, 3000])))
+    return (
+        bits,
+        key,
+        int(rng.choice([1, -1])),
+        float(rng.choice(loggers)),
+        counts,
+        bool(rng.integers(2)),
+    )
+
+
+def written(number: int, factor: float) -> str:
+    """A register's number as a logger writes it: whole ones with all digits."""
+    if abs(factor) == 1.0:
+        return str(int(factor) * number)
+    return f"{factor * number:.10g}"
+
+
+def of_effort(path: Path, spec: Path, law: JointConfig) -> tuple[list, np.ndarray]:
+    """Findings on the effort, and the effort (T,) as it is read."""
+    m = read_table(path, load_table_spec(spec), UNITS)
+    found = [f for f in run("rows", Trial(m, {}, {})) if f.check == "unsigned_effort"]
+    if not found:
+        found = beyond_effort(law, m, "elbow", "robot.yaml")
+    return found, m.effort[:, 0]
+
+
+@pytest.mark.parametrize("batch", range(6))
+def test_random_registers_are_read_by_the_line_that_is_printed(tmp_path, batch):
+    """72 registers of 8 to 64 bits of a joint whose law is known, above or below 0 in the
+    table: named, and read again with the line."""
+    for seed in range(12 * batch, 12 * batch + 12):
+        case = bits, key, sign, logger, most, has_limit = planted(seed)
+        columns, made = driven(seed)
+        half = 2 ** (bits - 1)
+        counts = [round(sign * most / 10.0 * tau) for tau in made]
+        of = {
+            "sign_bit": [n if n >= 0 else half - n for n in counts],
+            "wraps_at": [n % (2 * half) for n in counts],
+            "zero": [n + half for n in counts],
+        }
+        assert max(of[key]) < 2 * half
+        tau = [written(n, logger) for n in of[key]]
+        rows = zip(TIME_S, *columns.values(), tau, strict=True)
+        text = "\n".join(
+            f"{t:.3f},{q:.6f},{target:.6f},{n}" for t, q, target, n in rows
+        )
+        path, spec = tmp_path / "sweep.csv", tmp_path / "columns.yaml"
+        path.write_text(f"t,elbow.q,elbow.q_target,elbow.tau\n{text}\n")
+        factor = sign * 10.0 / most / logger
+        line = f"tau: {{column: elbow.tau, unit: Nm, factor: {factor:.15g}}}"
+        one = "time: {column: t, unit: s}\nsignals: {elbow: {q: {column: elbow.q, "
+        one += "unit: rad}, q_target: {column: elbow.q_target, unit: rad}, %s}}\n"
+        spec.write_text(one % line)
+        found, _ = of_effort(path, spec, LAW[has_limit])
+        if key != "zero" and min(counts) >= 0:
+            assert not found, (seed, case)  # its numbers are those of a signed column
+            continue
+        assert [f.check for f in found] == ["unsigned_effort"], (seed, case)
+        spec.write_text(one % re.findall("`(.*?)`", found[0].text)[0])
+        found, effort = of_effort(path, spec, LAW[has_limit])
+        signed = sign * 10.0 / most * np.array(counts)
+        assert effort == pytest.approx(signed, abs=1e-6), (seed, case)
+        assert not found, (seed, case)
+
+
+@pytest.mark.parametrize("has_limit", [True, False])
+def test_no_clean_register_is_named(tmp_path, has_limit):
+    """24 signed columns: of both signs, and of a weight that keeps them above or below
+    0 up to near powers of two."""
+    for seed in range(24):
+        columns, made = driven(seed)
+        most = (64, 700, 3000)[seed % 3]
+        counts = np.round(most / 10.0 * (made + (seed % 4) * np.sign(made.mean())))
+        form, step = (("%d", 1.0), ("%.6f", 0.00269))[seed % 2]
+        tau = {"elbow.tau": step * counts}
+        path, spec = table(tmp_path, columns | tau, form), tmp_path / "columns.yaml"
+        line = f"elbow.tau: {{factor: {10.0 / most / step:.12g}}}"
+        spec.write_text(f"changes: {{{line}}}\n")
+        found, effort = of_effort(path, spec, LAW[has_limit])
+        assert effort == pytest.approx(10.0 / most * counts, abs=1e-3)
+        assert not found, seed
+
+
+def test_offset_binary_of_a_joint_is_no_current(tmp_path):
+    """2048 + counts of 0.01 N·m: 20.48 N·m beside the law, within no limit that is
+    stated. One finding before gives the factor, as of any other unit."""
+    columns, made = driven(3)
+    counts = np.round(made / 0.01)
+    path = table(tmp_path, columns | {"elbow.tau": 2048 + counts}, "%d")
+    spec = tmp_path / "columns.yaml"
+    spec.write_text("changes: {elbow.tau: {factor: 0.01}}\n")
+    (found,), _ = of_effort(path, spec, LAW[False])
+    assert "`changes: {elbow.tau: {factor: 0.01, zero: 2048}}`" in found.text

@@ -2,8 +2,6 @@
 
 import dataclasses
 import itertools
-from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,13 +21,7 @@ from taccorl.alignment.measurements.motions import (
 )
 from taccorl.cli.plan_words import words
 from taccorl.diagnosis.experiment_design import motions
-from taccorl.diagnosis.experiment_design.motions import (
-    MOUNTED_SHARE,
-    JointPart,
-    arm_ground,
-    ground_of,
-    rest_pose,
-)
+from taccorl.diagnosis.experiment_design.motions import JointPart, arm_ground, rest_pose
 from taccorl.diagnosis.experiment_design.plan import (
     SAME,
     TELLS,
@@ -39,7 +31,6 @@ from taccorl.diagnosis.experiment_design.plan import (
     plan,
     scored,
 )
-from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.errors import TaccorlError
 from taccorl.report.planned import planned as shown
 from taccorl.robots import ROBOT
@@ -296,22 +287,6 @@ def test_a_plan_has_the_motions_that_its_message_recommends_and_one_for_each_pai
     assert recommended <= expected and bool(recommended) == bool(found.hopeless)
 
 
-LIFT = (
-    "kind: axis\nname: lift\nunit: rad\ninertia: 0.5\nkp: 300.0\nkd: 12.0\npayload_kg: 1.0\nlever_m: 0.3\n"
-    "limits: [-1.0, 1.0]\neffort_limit: 60.0\n"
-)
-
-
-def lift(
-    folder: Path, motion: str, patch: pytest.MonkeyPatch, text: str = LIFT
-) -> JointPart:
-    patch.setattr(motions, "MOTIONS", [m for m in motions.MOTIONS if m.name == motion])
-    (folder / "lift.yaml").write_text(text)
-    return JointPart(
-        ground_of(RobotMachine.load(folder / "lift.yaml"), "lift", speed=1.5), 1e-4
-    )
-
-
 def test_efforts_are_tried_where_positions_separate_nothing(monkeypatch):
     """With K_p and K_d fitted, K_d takes up the viscous friction; the motor's effort shows both."""
     monkeypatch.setattr(motions, "LIBRARY", [m for m in LIBRARY if m.name == "holds"])
@@ -333,71 +308,27 @@ def test_efforts_are_tried_where_positions_separate_nothing(monkeypatch):
     )
 
 
-def test_a_mounted_mass_is_tried_where_neither_positions_nor_efforts_separate(
-    monkeypatch, tmp_path
-):
-    """A drive that is 2 % weak carries less, by more the heavier the load: drag does not."""
-    part, pair = (
-        lift(tmp_path, "wide_triangle", monkeypatch),
-        "torque_scale | viscous_friction",
-    )
-    weak = {"torque_scale": {"torque_scale.factor": 0.98}}
-    weak["viscous_friction"] = {"viscous_friction.damping_nms_per_rad": 5.0}
-    assert scored(part, pair.split(" | "), weak).hopeless == (pair,)
-    found = plan(part, pair.split(" | "), weak)
-    (first,) = found.written(1)
-    assert first.name == "wide_triangle_mounted_mass" and not found.hopeless
-    (kg,) = words(first.part).facts["payload_kg"].values()
-    assert kg == pytest.approx(1.0 + MOUNTED_SHARE * 0.5 / 0.3**2, rel=0.01)
-    assert first.made[0].payload_kg == {"lift": kg} and len(found.tried) == 2, (
-        "efforts first"
-    )
-
-
-def test_an_axis_without_a_lever_says_why_no_mass_was_tried(monkeypatch, tmp_path):
-    text = LIFT.replace("payload_kg: 1.0\nlever_m: 0.3\n", "law: velocity\n").replace(
-        "kp: 300.0\n", ""
-    )
-    found = plan(
-        lift(tmp_path, "holds", monkeypatch, text),
-        ("coulomb_friction", "asymmetric_friction"),
-    )
-    assert found.hopeless and "lever_m" in found.refused["mounted_mass"]
-
-
 @pytest.mark.parametrize(
-    ("others", "names", "hopeless"),
+    ("with_efforts", "names", "hopeless"),
     [
-        (
-            {"pose": (2.0, 0.3), "load": (3.0, 3.5)},
-            {"chirp", "chirp_pose", "chirp_load"},
-            False,
-        ),
-        (
-            {"pose": "it would touch", "load": (3.0, 3.5)},
-            {"chirp", "chirp_load"},
-            False,
-        ),
-        # The load shows no more than the pose; in the last case, the pose separates them, and the load is not tried.
-        ({"pose": (2.0, 0.3), "load": (2.5, 0.4)}, {"chirp", "chirp_pose"}, True),
-        ({"pose": (0.2, 0.3), "load": (0.2, 2.5)}, {"chirp", "chirp_load"}, True),
-        ({"pose": (2.0, 2.0), "load": (9.0, 9.0)}, {"chirp", "chirp_pose"}, False),
+        ((2.0, 0.3), {"chirp", "chirp_with_efforts"}, True),
+        ((3.0, 3.5), {"chirp", "chirp_with_efforts"}, False),
+        ((0.2, 0.3), {"chirp"}, True),
+        (None, {"chirp"}, True),
     ],
 )
-def test_what_shows_only_in_another_pose_or_with_a_load_is_planned_there(
-    others, names, hopeless, monkeypatch
+def test_what_only_efforts_show_is_planned_with_them(
+    with_efforts, names, hopeless, monkeypatch
 ):
-    """a | b: 0.1 floors in the present condition, and in ``others`` those after a refit of b to a's data, and of a to b's."""
+    """a | b: 0.1 floors without efforts; with them those of b fitted to a's data, and of a
+    to b's."""
 
-    def made(label: str, ways: tuple[float, float] | str) -> Any:
-        if isinstance(ways, str):
-            raise TaccorlError(ways)
-        conditions = {k: partial(made, k, of) for k, of in others.items()}
+    def made(label: str, ways: tuple[float, float] | None) -> Any:
         return SimpleNamespace(
             label=label,
-            where=f"in {label}",
+            where=f"{label}, too",
             ways={"a | b": ways},
-            elsewhere=lambda: conditions,
+            with_efforts=lambda: with_efforts and made("with_efforts", with_efforts),
         )
 
     def of(part, rivals, *_) -> Plan:
@@ -408,16 +339,11 @@ def test_what_shows_only_in_another_pose_or_with_a_load_is_planned_there(
 
     monkeypatch.setattr("taccorl.diagnosis.experiment_design.plan.scored", of)
     found = plan(made("", (0.1, 0.1)), ("a", "b"))
-    assert {p.name for p in found.planned} == names and bool(found.hopeless) == hopeless
-    assert {p.name for p in found.written(1)} >= (
-        {p.name for _, _, p, _ in found.one_way()} or {found.planned[0].name}
-    )
-    assert (
-        found.refused == {k: v for k, v in others.items() if isinstance(v, str)}
-        and not found.separates_nothing
-    )
-    assert all(
-        found.tried[f"in {k}"] == {"a | b": min(others[k])}
-        for k in others
-        if f"in {k}" in found.tried
-    )
+    assert {p.name for p in found.planned} == names
+    assert bool(found.hopeless) == hopeless
+    recommended = {p.name for _, _, p, _ in found.one_way()}
+    if not recommended:
+        recommended = {found.planned[0].name}
+    assert {p.name for p in found.written(1)} >= recommended
+    tried = with_efforts and {"with_efforts, too": {"a | b": min(with_efforts)}}
+    assert found.tried == (tried or {})

@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_rows import of_signal
-from simulated_slide import robot_machine
+from simulated_slide import (
+    AXIS,
+    FRICTION_N,
+    KD,
+    KP,
+    MASS_KG,
+    recorded_slide,
+    robot_machine,
+)
 
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements
@@ -112,6 +120,25 @@ def test_a_screw_s_pitch_is_found_on_a_slide_of_a_robot_file(
     assert found.values["cogging.torque_nm"] == pytest.approx(0.5, rel=0.05)
     pitch = 2 * math.pi / found.values["cogging.periods"]
     assert pitch == pytest.approx(pitch_m, rel=1e-3)
+
+
+@pytest.mark.parametrize("has_model", [True, False])
+def test_a_slide_has_the_same_friction_with_a_model_and_without(
+    tmp_path: Path, has_model: bool
+) -> None:
+    """20 N on 100 kg. With the model gains and mass stay, without it they are fitted."""
+    robot = AXIS
+    if has_model:
+        model = MODEL.replace('mass="2"', f'mass="{MASS_KG}"')
+        gains = f"  drive: {{kp: {KP}, kd: {KD}}}\n"
+        file = f"kind: robot\nmodel: arm.xml\njoints:\n{gains}"
+        robot = robot_machine(tmp_path, model.replace('"x"', '"drive"'), file).robot
+    problem = JointProblem(robot, "drive", recorded_slide())
+    assert ("inertia" in [f.name for f in problem.base]) is not has_model
+    start = problem.start | {"coulomb_friction.torque_nm": 10.0}
+    found = best_fit(problem, problem.fit, ("coulomb_friction",), [start], 10)
+    friction = found.values["coulomb_friction.torque_nm"]
+    assert friction == pytest.approx(FRICTION_N, rel=0.05)
 
 
 def test_effects_of_a_slide_may_be_as_large_as_its_motor(tmp_path: Path) -> None:

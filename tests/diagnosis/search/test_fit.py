@@ -22,7 +22,7 @@ from taccorl.diagnosis.search.fit import (
     residuals,
     rms,
 )
-from taccorl.diagnosis.search.problem import Free, free
+from taccorl.diagnosis.search.problem import Free, free, thinned
 from taccorl.diagnosis.search.screen import alike, probe
 
 
@@ -308,3 +308,29 @@ def test_a_number_that_ends_where_its_range_begins_is_no_warning_if_it_began_the
         at_bound=("size",),
     )
     assert tuple(f.name for f in ended.at_an_end) == told
+
+
+@pytest.mark.parametrize(
+    ("settings", "steps", "kept"),
+    [
+        ("a", "n", "0"),
+        ("aa", "nn", "01"),
+        ("aaaa", "nnnn", "02"),
+        ("aaaaaaa", "nnnnnnn", "0246"),
+        ("abab", "nnnn", "012"),
+        ("aaaa", "nynn", "012"),
+    ],
+)
+def test_every_second_recording_is_searched_and_each_setting_and_regime_stays(
+    settings: str, steps: str, kept: str
+):
+    """Letters: the setting of each recording, and whether it has rows of a regime."""
+    every = [
+        dataclasses.replace(
+            record(k),
+            setting=(float(ord(setting)),),
+            regimes={"held_steps": (np.full(2000, step == "y"), 1.0)},
+        )
+        for k, (setting, step) in enumerate(zip(settings, steps, strict=True))
+    ]
+    assert "".join(str(r.data) for r in thinned(every)) == kept

@@ -189,15 +189,15 @@ def made_fit(
     residuals = rng.choice([-1.0, 1.0], len(jacobian))
     layout = (Rows(np.ones((len(jacobian), 1), bool), 200.0),)
     return Fit(
-        tuple(e.name for e in names),
-        values,
-        residuals,
-        layout,
-        jacobian,
-        tuple(frees),
-        (),
-        "",
-        names,
+        names=tuple(e.name for e in names),
+        values=values,
+        residuals=residuals,
+        layout=layout,
+        jacobian=jacobian,
+        frees=tuple(frees),
+        at_bound=(),
+        trouble="",
+        effects=names,
     )
 
 

@@ -310,30 +310,6 @@ def test_an_effect_that_was_fitted_to_nothing_is_not_added():
 
 
 @dataclasses.dataclass(kw_only=True)
-class Both(Squire):
-    """A ripple and a bump in one effect, with two numbers more; without the bump it is a ripple."""
-
-    name: ClassVar = "both"
-    reduces_to: ClassVar = {"ripple": "idle"}
-    still: float = number("j", "1", None, 1.0, (0.5, 2.0), "made up")
-
-    @classmethod
-    def signal(cls, t, seed):
-        return Ripple.signal(t, seed) + 3.0 * Bumps.signal(t, seed)
-
-
-def test_two_simple_effects_are_preferred_to_one_with_more_numbers_that_contains_one_of_them():
-    fit, validation, test = made(Ripple(strength=1.0), Bumps(strength=3.0))
-    found = diagnose(MadeProblem(Ripple, Bumps, Both), fit, validation, test)
-    assert set(found.names) == {"ripple", "bumps"}
-    assert found.status == "at_floor"
-    assert any("both" in others for others in found.rivals.values())
-    assert [name for name, _ in found.steps] == ["", *[r.added for r in found.rounds]]
-    errors = [error for _, error in found.steps]
-    assert errors == sorted(errors, reverse=True)
-
-
-@dataclasses.dataclass(kw_only=True)
 class Between(Squire):
     """What lies between a ripple and bumps, and is neither: a tenth of it is a signal of its own."""
 
@@ -365,7 +341,8 @@ def test_both_effects_between_which_the_first_one_lies_take_its_place_before_oth
         test,
         config=SearchConfig(max_effects=1),
     )
-    assert alone.names == ("between",)
+    # two numbers, as many as the one between them has, which leaves more
+    assert set(alone.names) == {"ripple", "bumps"}
 
 
 class Driven(MadeProblem):
@@ -392,11 +369,7 @@ def test_gains_that_move_by_more_than_twice_are_a_finding_of_their_own(
     )
     assert found.names == ()
     assert found.status == ("gains_moved" if moved else "nothing_missing")
-    assert len(found.remarks) == moved
-    if moved:
-        remark = found.remarks[0]
-        assert remark.startswith("kp ") and f"{stated:.4g}" in remark
-        assert f"{3 / stated:.2g}" in remark and "measurements.yaml" in remark
+    assert found.remarks == ()
 
 
 def test_an_error_that_only_the_fit_recordings_show_is_searched_too():
@@ -465,33 +438,6 @@ def test_a_stopped_search_keeps_the_effects_of_its_rounds():
     assert late.names == ("ripple", "tone"), "nothing more is sought then"
     with pytest.raises(Stopped):
         diagnosed("no effect added")
-
-
-def test_an_effect_of_the_twin_that_another_one_should_replace_is_named_in_a_remark_and_stays():
-    fit, validation, _ = made(Ripple(strength=1.0), Tone(strength=1.0))
-    problem, one = MadeProblem(Ripple, Tone, Mix), SearchConfig(max_effects=1)
-    found = diagnose(problem, fit, validation, present=["mix"], config=one)
-    assert found.names == ("mix", "tone")
-    (remark,) = found.remarks
-    assert remark.startswith("ripple in place of mix") and "2.2" in remark
-    right = diagnose(problem, fit, validation, present=["ripple"], config=one)
-    assert right.names == ("ripple", "tone") and right.remarks == ()
-
-
-def test_a_true_effect_of_the_twin_is_not_to_be_removed_where_a_larger_one_is_missing():
-    """Of 0.4 ripple + tone + 2 square the twin has the ripple, and one effect may be added. The other would leave less in place
-    of the ripple, and 0.4² / 2 / 0.1² = 8 squared floors less still beside it."""
-    fit, validation, _ = made(
-        Ripple(strength=0.4), Tone(strength=1.0), Square(strength=2.0)
-    )
-    problem, one = MadeProblem(Ripple, Tone, Square), SearchConfig(max_effects=1)
-    found = diagnose(problem, fit, validation, present=["ripple"], config=one)
-    assert (
-        len(found.names) == 2
-        and found.status == "too_many"
-        and found.errors["after"]["validation"] > 3.0
-    )
-    assert found.remarks == ()
 
 
 Slow = kind("slow", lambda t, seed: np.sin(40.0 * t))
@@ -753,18 +699,13 @@ Cube = kind("cube", lambda t, seed: drive(t, seed) ** 3, Square)
 """Much like what the gain does."""
 
 
-@pytest.mark.parametrize(("stated", "names"), [(0.05, ("cube",)), (1.0, ())])
-def test_an_effect_is_told_where_a_number_that_went_to_its_end_beside_it_can_as_well_stay(
-    stated, names
-):
+@pytest.mark.parametrize("stated", [0.05, 1.0])
+def test_an_effect_that_drives_a_number_to_the_end_of_its_range_is_not_told(stated):
     """The data have no gain; without the cube it stands for it, with the cube it goes to 0.01."""
     fit, validation = ([record(k, Cube(strength=2.0), gain=0.0)] for k in (0, 1))
     found = diagnose(MadeProblem(Cube), fit, validation, start={"gain": stated})
-    assert found.names == names
-    assert (
-        names
-        or "gain 0.01 at the end of its range" in found.rounds[0].evidence[0].verdict
-    )
+    assert found.names == ()
+    assert "gain 0.01 at the end of its range" in found.rounds[0].evidence[0].verdict
 
 
 def test_a_strength_at_the_end_of_its_range_is_told_where_nothing_is_left_above_the_floor():
@@ -790,3 +731,29 @@ def test_an_effect_that_only_undoes_what_the_refit_made_worse_is_not_added():
     assert row.gain > 0.2 and row.score > 2.0  # of the refitted twin
     assert found.names == () and all(r.added is None for r in found.rounds)
     assert f"{before:.2f}" in found.remarks[0] and f"{fitted:.2f}" in found.remarks[0]
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_an_effect_that_unused_recordings_contradict_is_not_added(everywhere: bool):
+    """The search uses recordings 0 and 2 of the fit; a tone of 0.5 is in these and in the
+    validation recording, and in 1 and 3 only if it is real."""
+    fit = [
+        record(k, Ripple(strength=1.0), Tone(strength=0.5 * (everywhere or k % 2 == 0)))
+        for k in range(4)
+    ]
+    validation = [record(4, Ripple(strength=1.0), Tone(strength=0.5))]
+    found = diagnose(MadeProblem(Ripple, Tone, Square), fit, validation)
+    assert set(found.names) == ({"ripple", "tone"} if everywhere else {"ripple"})
+    assert found.removed == (() if everywhere else ("tone",))
+
+
+def test_an_effect_that_unused_recordings_do_not_show_stays():
+    """Bumps are in the first second, of which recordings 1 and 3 were not measured."""
+    every = [record(k, Bump(strength=3.0)) for k in range(5)]
+    cut = [
+        dataclasses.replace(r, measured=np.where(r.time_s[:, None] < 1.2, np.nan, r.measured))
+        for r in every
+    ]
+    fit = [cut[k] if k % 2 else every[k] for k in range(4)]
+    found = diagnose(MadeProblem(Ripple, Bump, Square), fit, every[4:])
+    assert found.names == ("bump",)
