@@ -94,10 +94,10 @@ class JointConfig(DriveLaw):
     hangs_at_rad: float = 0.0
     """Position at which payload and arm hang straight down [rad]."""
     target_late_s: float = 0.0
-    """Delay from a target's row until it acts in the drive [s]; ``diagnose`` fits it from
-    −2 ms to 0, of a joint without a model to 3 ms; a longer delay is an effect. Below 0: the
-    position of a row is read after its target was sent, or is half a step newer, as MuJoCo's
-    semi-implicit steps give it."""
+    """Delay from a target's row until it acts in the drive [s]. Below 0: the position of a
+    row is read after the row's target was sent, or half a step later, as MuJoCo's
+    semi-implicit steps give it. ``diagnose`` fits −2 ms to 0, of a joint without a model −2
+    to 3 ms; a longer delay is an effect."""
     speed_late_s: float = 0.0
     """Delay of the speed in the loop of a joint without a model beyond that of a difference
     of two samples [s]; minus half a period if the drive measures the speed."""
@@ -138,8 +138,8 @@ class JointConfig(DriveLaw):
             positive=("gear", *positive),
             not_negative=("rotor_inertia", "payload_kg", "lever_m", "arm_kg"),
             finite=(
-                *("position_age_s", "target_late_s"),
-                *("weight_sin", "weight_cos", "hangs_at_rad"),
+                *("position_age_s", "target_late_s", "weight_sin", "weight_cos"),
+                "hangs_at_rad",
             ),
         )
         if has_model:

@@ -430,10 +430,8 @@ class JointProblem(WithoutMaps):
         self, base: Mapping[str, float], effects: Sequence[Effect], joint: RigidJoint
     ) -> Numbers:
         scale, waits_s = base.get(EFFORT_SCALE.name, 1.0), base.get("loop_waits_s", 0.0)
-        at = joint.target_late_s
-        waits_s += (
-            base.get(TARGET_LATE.name, at) - at
-        )  # 0 of an axis, whose joint has it
+        at = joint.target_late_s  # of an axis that of ``base``
+        waits_s += base.get(TARGET_LATE.name, at) - at
         if self.axis is not None:
             return Numbers(joint.gains, effects, waits_s=waits_s, effort_scale=scale)
         lever, half_s = (
