@@ -302,9 +302,7 @@ class RobotMachine(Machine):
                 return ()
         return others
 
-    def _tilt(
-        self, found: JointFinding, measurements: Measurements
-    ) -> Remark | None:
+    def _tilt(self, found: JointFinding, measurements: Measurements) -> Remark | None:
         """By how much the base would have to be tilted so that gravity gives the torque of the effect
         ``unbalance``, in the poses of the fit recordings. None if ``unbalance`` was neither added nor tied with the added
         effect, or if the error is at the floor in poses between which that torque would differ."""

@@ -293,8 +293,6 @@ def test_evidence_in_words(fields: dict, words: str):
     }
     texts = {"name": "touch_lag", "trouble": "", "verdict": ""}
     assert (
-        grade(
-            Evidence(values={}, base={}, at_bound=(), **texts, **numbers | fields)
-        )
+        grade(Evidence(values={}, base={}, at_bound=(), **texts, **numbers | fields))
         == words
     )

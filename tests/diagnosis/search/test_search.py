@@ -753,7 +753,9 @@ def test_an_effect_that_unused_recordings_do_not_show_stays():
     """Bumps are in the first second, of which recordings 1 and 3 were not measured."""
     every = [record(k, Bump(strength=3.0)) for k in range(5)]
     cut = [
-        dataclasses.replace(r, measured=np.where(r.time_s[:, None] < 1.2, np.nan, r.measured))
+        dataclasses.replace(
+            r, measured=np.where(r.time_s[:, None] < 1.2, np.nan, r.measured)
+        )
         for r in every
     ]
     fit = [cut[k] if k % 2 else every[k] for k in range(4)]
