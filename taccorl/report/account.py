@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS, TORQUE_FF
 from taccorl.diagnosis.remark import Remark
+from taccorl.diagnosis.search import plain as plain_fit
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import (
     Changed,
@@ -176,8 +177,9 @@ def _plain(d: Diagnosis) -> list[Fact]:
     if plain is None or not added(d):
         return []
     error, after = plain.errors["validation"], d.errors["after"]["validation"]
-    id = "plain_as_good" if gains_nothing(error, after) else "plain"
-    return [fact(id, error=error)]
+    # A plain fit that leaves as little only agrees with effects that are its own numbers.
+    is_doubted = gains_nothing(error, after) and not {*added(d)} <= {*plain_fit.EFFECTS}
+    return [fact("plain_as_good" if is_doubted else "plain", error=error)]
 
 
 def _missing(of: _Part) -> Iterator[Fact]:

@@ -498,7 +498,15 @@ def _(one, nothing, short):
 
 @case("plain_as_good")
 def _(one, nothing, short):
-    return with_plain(one, 1.01), Seen()
+    stretchy = named(one, "joint_compliance", compliance_rad_per_nm=0.01)
+    return with_plain(stretchy, 1.01), Seen()
+
+
+def test_a_plain_fit_of_what_was_added_speaks_not_against_it(one):
+    """Dry friction is one of its numbers: it leaves as little, and agrees."""
+    ids = [f.id for f in account(PART, with_plain(one, 1.01)).facts]
+    assert "plain" in ids
+    assert "plain_as_good" not in ids
 
 
 @case("drift")
