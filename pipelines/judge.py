@@ -375,7 +375,8 @@ def _shared(case: Case, folder: Path) -> Row:
         change = ("</body>", f'<body pos="{tip}">{mass}</body></body>')
     plant = foreign.Plant(replace(user, joint=joints[0], changes=(change,)))
     middle = np.array([link.middle_rad for link in user.links])
-    targets = [middle + _waves([case.seed, k], len(joints)) for k in range(6)]
+    seeds = [[case.seed, k] for k in range(MOTIONS)]
+    targets = [middle + _waves(seed, len(joints)) for seed in seeds]
     rest = [plant.record(f"motion_{k}", target, k) for k, target in enumerate(targets)]
     again = plant.record("again", targets[0], 9, repeat_of="motion_0")
     made = Measurements((*rest[:3], again), tuple(rest[3:5]), (rest[5],))
@@ -383,6 +384,10 @@ def _shared(case: Case, folder: Path) -> Row:
     row = Recorded(machine, joints, made, folder, began).diagnosed(1, {})
     truth = mass_kg if case.hidden == "payload" else math.degrees(lean)
     return row | _shared_answer(row, case.hidden, float(truth), down)
+
+
+MOTIONS = 6
+"""Motions of a case with several joints: three to fit, two for validation, one for the test."""
 
 
 def _waves(seed: Sequence[int], joints: int) -> np.ndarray:

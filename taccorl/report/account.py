@@ -177,9 +177,11 @@ def _plain(d: Diagnosis) -> list[Fact]:
     if plain is None or not added(d):
         return []
     error, after = plain.errors["validation"], d.errors["after"]["validation"]
-    # A plain fit that leaves as little only agrees with effects that are its own numbers.
-    is_doubted = gains_nothing(error, after) and not {*added(d)} <= {*plain_fit.EFFECTS}
-    return [fact("plain_as_good" if is_doubted else "plain", error=error)]
+    if not gains_nothing(error, after):
+        return [fact("plain", error=error)]
+    # It only agrees with effects that are its own numbers.
+    is_doubted = not {*added(d)} <= {*plain_fit.EFFECTS}
+    return [*when(is_doubted, "plain_as_good", error=error)]
 
 
 def _missing(of: _Part) -> Iterator[Fact]:

@@ -90,17 +90,21 @@ def stuck_taxels(unchanged: np.ndarray) -> int:
     Args:
         unchanged: (rows, columns) bool: the taxel gave one number for some frames.
 
-    Returns: 0 if no row or column stands still, if all do, or if that may be chance:
-    with a share s of the other taxels unchanged, n taxels are so with probability sⁿ.
+    Returns: 0 if no row or column stands still, if all do, or if that may be chance: of N
+    taxels c have changed, and with equal chances none of these c lies in n given ones with
+    probability C(N − n, c) / C(N, c); the lines were not given, any of that number would do.
     """
     rows, columns = np.all(unchanged, axis=1), np.all(unchanged, axis=0)
     lines = np.logical_or.outer(rows, columns)
-    others = unchanged[~lines]
-    if not lines.any() or not others.size:
+    num, count, changed = unchanged.size, int(lines.sum()), int((~unchanged).sum())
+    if not count or not changed:
         return 0
-    count = int(lines.sum())
-    share = max(float(others.mean()), 1 / others.size)
-    return count if -count * math.log(share) > _SURE else 0
+    of_given = math.comb(num - count, changed) / math.comb(num, changed)
+    if of_given == 0.0:  # below the smallest float
+        return count
+    ways = math.comb(len(rows), int(rows.sum()))
+    ways *= math.comb(len(columns), int(columns.sum()))
+    return count if -math.log(of_given) - math.log(ways) > _SURE else 0
 
 
 class Repeats:

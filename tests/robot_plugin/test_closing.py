@@ -320,7 +320,7 @@ def test_ages_that_are_given_are_laid_over_the_defaults(tmp_path: Path) -> None:
     robot.loop(3)
     robot.bench.change_frame = [lambda *_: None]  # the pad falls silent
     robot.loop(5)
-    assert robot.guard.holding.startswith("pad:left")
+    assert "pad:left" in robot.guard.holding
     robot.disconnect()
 
 

@@ -223,6 +223,7 @@ def test_every_joint_effect_of_the_registry_can_be_hidden():
             "power_law_friction",  # hidden in machines of robot files, studies.foreign
             "unbalance",  # of turning axes
             "direction_gain",  # of cylinders
+            "soft_friction",  # of machines that MuJoCo simulates, no candidate on the PiPER
             "presliding",  # of Coulomb friction that a machine's file states
             "position_integral",  # of cascades; in the surrogate's loop it is integral_action
             "pad_compliance",

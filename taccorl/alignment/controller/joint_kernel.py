@@ -29,9 +29,11 @@ import numpy as np
 
 from taccorl.alignment.controller import arriving as _arriving
 from taccorl.alignment.controller import drive_numbers as _drive_numbers
+from taccorl.alignment.controller import dry_friction as _dry_friction
 from taccorl.alignment.controller import lanes as _lanes
 from taccorl.alignment.controller.arriving import arriving, late_speed
 from taccorl.alignment.controller.drive_numbers import FAMILIES, TORQUE, VELOCITY, Drive
+from taccorl.alignment.controller.dry_friction import friction, soft_friction
 from taccorl.alignment.controller.lanes import (
     LANES,
     compiled,
@@ -44,23 +46,10 @@ from taccorl.alignment.controller.lanes import (
     store,
     where,
 )
-from taccorl.sim.effects.friction import (
-    AT_RAD_PER_S,
-    BRISTLE_DAMPING_S,
-    DRY_SHARE,
-    DRY_TIME_S,
-    SOFT_MOST,
-    SOFT_SHARE,
-    SOFT_TIME_S,
-)
+from taccorl.sim.effects.friction import AT_RAD_PER_S, BRISTLE_DAMPING_S
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
 
-_FRICTION_RATE = 2.0 / (
-    DRY_SHARE * DRY_TIME_S
-)  # 1/s, MuJoCo's b = 2 / (d_max · time constant)
-_FRICTION_SOFTNESS = (1.0 - DRY_SHARE) / DRY_SHARE
-_SOFT_MASSES = SOFT_SHARE / (1.0 - SOFT_SHARE)
 _LIMIT_RATE = 2.0 / (LIMIT_SHARE * LIMIT_TIME_S)
 _LIMIT_STIFFNESS = (
     1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE
@@ -69,47 +58,6 @@ _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
 _PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
 _COMMAND, _MIDPOINT, _EFFORT_AFTER, _SENSOR_DELAY = map(Drive._fields.index, _PLACES)
 _fields = fields_as(Drive)
-
-
-@compiled
-def _friction(
-    force: Any, metric: Any, about: Any, v: Any, limit: Any, step_s: float
-) -> Any:
-    """MuJoCo's dry friction within ± ``limit`` on a mass ``metric`` under ``force``; ``about``: MuJoCo's estimate of it."""
-    stiff = about * (1.0 / _FRICTION_SOFTNESS)
-    reference = (-_FRICTION_RATE / (1.0 + step_s * _FRICTION_RATE)) * v
-    return min(
-        max((reference * metric - force) * stiff / (metric + stiff), -limit), limit
-    )
-
-
-@compiled
-def _soft_friction(
-    p: Any,
-    force: Any,
-    metric: Any,
-    about: Any,
-    free: Any,
-    v: Any,
-    limit: Any,
-    ahead_s: float,
-    step_s: float,
-) -> Any:
-    """MuJoCo's soft dry friction f = −S (a + b v), within ± F, on a mass ``metric`` under ``force``
-    beside rigid friction of ``_friction`` within ± ``limit``. S is ``_SOFT_MASSES`` times ``free``,
-    MuJoCo's estimate of the inertia; v is taken ``ahead_s`` later than now."""
-    own_s = p.soft_friction__time_constant_s
-    time_s = where(own_s > 0.0, max(own_s, 2.0 * step_s), SOFT_TIME_S)
-    rate = 2.0 / (SOFT_MOST * time_s)
-    later = 1.0 + ahead_s * rate
-    stiff, reference = _SOFT_MASSES * later * free, -rate / later * v
-    # Unclipped it is an inertia, under which the rigid friction is known. Beyond its limit it is
-    # clipped in the solution as well, since the sum of both frictions falls with the acceleration.
-    force += stiff * reference
-    force += _friction(force, metric + stiff, about, v, limit, step_s)
-    soft = stiff * (reference - force / (metric + stiff))
-    most = p.soft_friction__torque_nm
-    return min(max(soft, -most), most)
 
 
 @compiled
@@ -238,8 +186,8 @@ def _two_masses(
     """Accelerations of motor and gear, M̂ = [[m11, link], [link, m22]] in (q, gear), under forces f1 and f2 and dry friction."""
     metric, pull = m11 - link * link / m22, f1 - link / m22 * f2
     if with_soft:
-        pull += _soft_friction(p, pull, metric, about, free, v, limit, step_s, step_s)
-    pull += _friction(pull, metric, about, v, limit, step_s)
+        pull += soft_friction(p, pull, metric, about, free, v, limit, step_s, step_s)
+    pull += friction(pull, metric, about, v, limit, step_s)
     a1 = pull / metric
     return a1, (f2 - link * a1) / m22
 
@@ -247,7 +195,7 @@ def _two_masses(
 def _sources() -> np.ndarray:
     """() array, an argument whose type is named after the sources of the kernel and the fields of ``Drive``. Numba looks for a
     compiled kernel by the types of its arguments and the date of its own file, not by what it imports."""
-    modules = (_arriving, _drive_numbers, _lanes, *FAMILIES)
+    modules = (_arriving, _drive_numbers, _dry_friction, _lanes, *FAMILIES)
     texts = [
         repr(Drive._fields).encode(),
         *(Path(str(m.__file__)).read_bytes() for m in modules),
@@ -784,9 +732,9 @@ def _simulated(
         if not geared:
             if with_soft:
                 apparent = free_share * (whole_inertia if midpoint else m11)
-                f1 += _soft_friction(p, f1, m11, m11, apparent, v, limit, ahead * h, h)
+                f1 += soft_friction(p, f1, m11, m11, apparent, v, limit, ahead * h, h)
             if rubs:
-                f1 += _friction(f1, m11, m11, v, limit, h)
+                f1 += friction(f1, m11, m11, v, limit, h)
             v_next = v + h * f1 / m11
         else:
             stretch = gear - min(max(gear, -half_play), half_play)

@@ -579,7 +579,10 @@ class _RobotDocument(EffectsDocument[RobotConfig]):
         if "name" not in items:
             raise self.error("", "key 'name' is missing")
         name = self._scalar(str, items.pop("name"), "name")
-        plain_name(name, "axis.name")
+        try:
+            plain_name(name, "name")
+        except TaccorlError as error:
+            raise self.error("name", str(error).removeprefix("name: ")) from error
         del items["kind"]
         values = self._values(JointConfig, [*items.items()], key)
         return RobotConfig(joints={name: JointConfig(**values)})
