@@ -174,14 +174,11 @@ def _error(of: _Part) -> list[Fact]:
 def _plain(d: Diagnosis) -> list[Fact]:
     """What one fit of the usual numbers of a drive leaves, where the search tried it."""
     plain = getattr(d, "plain", None)
-    if plain is None or not added(d):
+    if plain is None or {*added(d)} <= {*plain_fit.EFFECTS}:  # its own numbers: no news
         return []
     error, after = plain.errors["validation"], d.errors["after"]["validation"]
-    if not gains_nothing(error, after):
-        return [fact("plain", error=error)]
-    # It only agrees with effects that are its own numbers.
-    is_doubted = not {*added(d)} <= {*plain_fit.EFFECTS}
-    return [*when(is_doubted, "plain_as_good", error=error)]
+    id = "plain_as_good" if gains_nothing(error, after) else "plain"
+    return [fact(id, error=error)]
 
 
 def _missing(of: _Part) -> Iterator[Fact]:
