@@ -136,6 +136,19 @@ def test_a_delay_that_may_be_none_is_written_as_it_was_fitted(tmp_path: Path) ->
         assert left(scores, use) == pytest.approx(stated, rel=1e-3)
 
 
+def test_the_earliest_speed_of_a_slow_loop_is_written_as_it_was_simulated(
+    tmp_path: Path,
+) -> None:
+    """Half a period earlier than −1.2 ms is beyond the 3 ms of ``speed_delay``."""
+    made(tmp_path, robot)
+    machine = load_machine(tmp_path / "machine.yaml")
+    base = {"speed_delay_s": -1.2e-3, "loop_s": 6e-3}
+    machine.with_additions([Addition("swing", [], base, {})]).save(tmp_path / "w.yaml")
+    joints = yaml.safe_load((tmp_path / "w.yaml").read_text())["joints"]
+    (delay,) = joints["swing"]["effects"]
+    assert delay["delay_s"] == pytest.approx(-3e-3)
+
+
 def test_a_loop_faster_than_the_model_s_steps_is_written_as_it_was_fitted(
     tmp_path: Path,
 ) -> None:
@@ -145,8 +158,8 @@ def test_a_loop_faster_than_the_model_s_steps_is_written_as_it_was_fitted(
     axis = load_machine(tmp_path / "axis.yaml")
     fitted = axis.with_additions([Addition("slide", [], {"loop_s": 8e-5}, {})])
     fitted.save(tmp_path / "fitted.yaml")
-    numbers = yaml.safe_load((tmp_path / "fitted.yaml").read_text())
-    assert numbers["loop_hz"] == pytest.approx(12500.0)
+    joints = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["joints"]
+    assert joints["slide"]["loop_hz"] == pytest.approx(12500.0)
 
 
 def test_a_zero_of_nine_digits_is_written_with_all_of_them(tmp_path: Path) -> None:

@@ -483,13 +483,17 @@ class RobotJoint(DriveJoint):
         """Size of the joint's forces and motions relative to a joint of a small arm, by
         which bounds of effects are multiplied: the file's ``force_unit_n`` and
         ``length_unit_m``. Defaults: 1 of a hinge of a model; else a tenth of
-        ``effort_limit``, or of a slide ``FORCE_OF_MASS`` times its mass, and its stroke."""
+        ``effort_limit``, or of a slide ``FORCE_OF_MASS`` times its mass, and its stroke.
+        The stroke of a slide of a model counts up to 1 m: its damping and drag are those
+        of the model, and bounds fall with the length."""
         c, known = self._config, self.known
         force, length, drive = 1.0, 1.0, 0.0
         if self.unit == "m":
             force = max(1.0, FORCE_OF_MASS * known.inertia)
             if known.limits is not None:
                 length = known.limits[1] - known.limits[0]
+            if self.has_model:
+                length = min(length, 1.0)
         if self.unit == "m" or not self.has_model:
             if c.effort_limit is not None:
                 force = 0.1 * c.effort_limit

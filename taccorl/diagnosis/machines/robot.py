@@ -49,7 +49,7 @@ from taccorl.diagnosis.machines.machine import (
     machines,
     numbers_of,
 )
-from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.problems.joint_problem import SPEED_DELAY, JointProblem
 from taccorl.diagnosis.problems.joints import (
     JointFinding,
     apart,
@@ -788,7 +788,7 @@ class RobotMachine(Machine):
             ]
             if "speed_delay_s" in a.base:  # in the file beyond a whole period
                 half_s = 0.5 * float(a.base.get("loop_s", 0.0))
-                delay_s = float(a.base["speed_delay_s"]) - half_s
+                delay_s = max(a.base["speed_delay_s"] - half_s, -SPEED_DELAY.high)
                 new.append(joint.made("speed_delay", delay_s=delay_s))
             kept = [e for e in config.effects if e.name not in {n.name for n in new}]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]

@@ -9,7 +9,8 @@ mass, a servo with a pendulum. ``JointProblem`` fits them in place of its own.
 | kp, kd | with efforts, within ``GAINS_WITHIN``: an error of a few per cent outweighs the
   friction of a fast drive; unknown ones (``gains: fitted``) within ``UNKNOWN_WITHIN`` |
 | stall torque, back-EMF | of law pwm in place of gains, within ``WINDING_WITHIN`` |
-| target_late_s | where targets are positions: a cycle of the loop shows in the data |
+| target_late_s | where targets are positions: a cycle of the loop shows in the data;
+  below 0 where the file states no loop, as it is simulated by steps then, if at all |
 | speed_late_s, or loop_s | unless both gains and efforts are unknown |
 | effort_scale | held; fitted in place of the inertia where that decides |
 
@@ -127,7 +128,7 @@ def _of_times(config: JointConfig, loop: Free, effort: bool) -> Iterator[Free]:
             name="target_late_s",
             unit="s",
             start=at,
-            low=min(-EARLY_S, at),
+            low=0.0 if config.loop_hz and at >= 0.0 else min(at, -EARLY_S),
             high=max(TIMING_S, at),
             scale=1e-4,
             unless=("command_delay",),

@@ -440,7 +440,7 @@ class JointProblem(WithoutMaps):
         )
         if SPEED_DELAY.name in base:
             # The earliest speed of a loop of the longest period is beyond the effect's range.
-            delay_s = SpeedDelay.clipped("delay_s", base[SPEED_DELAY.name] - half_s)
+            delay_s = max(base[SPEED_DELAY.name] - half_s, -SPEED_DELAY.high)
             effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
@@ -496,8 +496,10 @@ class JointProblem(WithoutMaps):
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
         # lower bound is a little below that value, so that a fit to such a drive does not end at the bound. A loop below 200 Hz
-        # would have a bound that no file may state. MuJoCo damps with the speed at the end of a step, half a step early.
-        newest = max(-0.6 * max(joint.speed_delay_s, EARLY_S), -SPEED_DELAY.high)
+        # would have a bound that no file may state. MuJoCo damps with the speed at the end of a step, half a step early; the
+        # PiPER's twin has no such timing.
+        early_s = max(joint.speed_delay_s, EARLY_S * joint.exact_timing)
+        newest = max(-0.6 * early_s, -SPEED_DELAY.high)
         delay = dataclasses.replace(SPEED_DELAY, low=newest)
         units = Scale(unit=joint.unit)
         if self.axis is not None:
