@@ -440,7 +440,8 @@ class JointProblem(WithoutMaps):
         )
         if SPEED_DELAY.name in base:
             # The earliest speed of a loop of the longest period is beyond the effect's range.
-            delay_s = SpeedDelay.clipped("delay_s", base[SPEED_DELAY.name] - half_s)
+            low_s, high_s = SpeedDelay.accepted(SpeedDelay.parameters()[0])
+            delay_s = min(max(base[SPEED_DELAY.name] - half_s, low_s), high_s)
             effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
         stated_s, (gains, facts) = (
             self.model.joint.stated_age_s,
