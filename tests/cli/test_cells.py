@@ -321,9 +321,10 @@ def test_the_cell_at_fault_is_named_and_no_fit_recording_is_called_sound(
             tmp_path / "presses", name, index__reading=np.where(LOAD_N > 0.5, 1023, 20)
         )
     code, shown = said("compare", "presses", "--twin=taxel.yaml")
-    lines = [line for line in shown.splitlines() if "saturated" in line]
+    lines = [line for line in shown.splitlines() if "saturated:" in line]
     assert code == 1 and len(lines) == 1 and "1 more" in lines[0], shown
     assert "index" in lines[0] and "thumb" not in lines[0]
+    assert shown.count("saturated") == 2 and "--accept=saturated" in shown
     assert not any(line.startswith("ok") for line in shown.splitlines())
 
 

@@ -477,7 +477,7 @@ class RobotJoint(DriveJoint):
                 raise TaccorlError(
                     f"effect {name}: no parameter {key!r}; {nearest(key, known)}"
                 )
-        return (cls if cls is Payload else self.in_units(cls))(**values)
+        return self.in_units(cls)(**values)
 
     def _scale(self) -> Scale:
         """Size of the joint's forces and motions relative to a joint of a small arm, by

@@ -99,7 +99,9 @@ class Cogging(JointEffect):
 
     @classmethod
     def accepted(cls, p: Parameter) -> tuple[float, float]:
-        return (1.0, FINEST_PER_M) if p.name == "periods" else (p.low, p.high)
+        if p.name != "periods":
+            return p.low, p.high
+        return min(p.low, 1.0), max(p.high, FINEST_PER_M)
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
