@@ -523,7 +523,7 @@ def _words(row: Row) -> str:
     if "failed" in row:
         return f"failed ({row['failed'].strip().splitlines()[-1]})"
     errors = [f"{e:.2f}" for use, e in row["errors"]["after"].items() if use != "fit"]
-    size = f", {row['stated']} for {row['true']:.3g}" if "true" in row else ""
+    size = f", {row.get('stated')} for {row['true']}" if "true" in row else ""
     found = "+".join(row["found"]) or "nothing"
     return f"{row['answer']}: {found}{size}, {row['status']}, {'/'.join(errors)} floors"
 
