@@ -4,8 +4,8 @@
     2. While the validation error is above ``floor`` noise floors: each of the ``width``
        best models is extended by one effect. All effects are probed (``screen``), the
        likely ones are fitted together with all numbers (``Fits.children``). If none is
-       accepted at first, those that remove much of the fit error are extended: two
-       effects can hide each other on validation recordings.
+       accepted, those that remove much of the fit error are extended: two effects can
+       hide each other on validation recordings.
     3. A model is better than another one (``fits.better``) if its error on validation
        recordings is clearly lower, by paired differences of half seconds, or if it is
        as good with fewer numbers. Beside a model of several effects all models with one
@@ -56,6 +56,7 @@ from taccorl.diagnosis.search.problem import (
     Recording,
     Stopped,
     Values,
+    chosen,
     never_stopped,
     no_progress,
     thinned,
@@ -305,7 +306,7 @@ class Beam:
                     answer = self._exchanged(answer, further=False)
                 rest += [k for k in more if k.fit.error < answer.fit.error]
                 level = [answer, *rest[: c.width - 1]]
-            elif depth == 0:
+            elif level[0] is answer:
                 level = self.much(answer)
             else:
                 break
@@ -363,8 +364,12 @@ class Beam:
     def _exchanged(self, answer: Model, further: bool = True) -> Model:
         """The best of ``answer`` and the models with one effect exchanged, taken away or,
         if ``further``, added; and again. What was added first may only have been the
-        nearest to two that are missing."""
+        nearest to two that are missing, or to one that needs its optional numbers."""
         fits = self.fits
+        alone = [m for m in fits.models.values() if len(fits.added(m)) == 1]
+        for m in alone if further and not fits.at_floor(answer) else ():
+            if any(c.cls.optional for c in chosen(fits.problem, fits.added(m))):
+                fits.with_optional(fits.whole(m.names, m.fit.values))
         for _ in range(EXCHANGES):
             parts = self.parts(answer)
             for _, part in parts if len(parts) > 1 else ():
