@@ -174,9 +174,14 @@ def _error(of: _Part) -> list[Fact]:
 def _plain(d: Diagnosis) -> list[Fact]:
     """What one fit of the usual numbers of a drive leaves, where the search tried it."""
     plain = getattr(d, "plain", None)
-    if plain is None or {*added(d)} <= {*plain_fit.EFFECTS}:  # its own numbers: no news
+    if plain is None or not added(d):
         return []
     error, after = plain.errors["validation"], d.errors["after"]["validation"]
+    is_better = error < after and not gains_nothing(after, error)
+    if {*added(d)} <= {
+        *plain_fit.EFFECTS
+    } and not is_better:  # its own numbers: no news
+        return []
     id = "plain_as_good" if gains_nothing(error, after) else "plain"
     return [fact(id, error=error)]
 

@@ -697,22 +697,10 @@ def test_friction_of_grease_is_fitted_with_its_power_and_its_share_of_direction(
     )  # torque_ff takes up a part
 
 
-YIELDS = (
-    "since target_late_s is always fitted: 9.23 N, open (95 % 0.011 ... 200 N); "
-    "with target_late_s held the fit ends at 12.5 N"
-)
-
-
 @pytest.mark.parametrize(
     ("exponent", "names", "number", "truth"),
     [
-        pytest.param(
-            0.4,
-            ("power_law_friction",),
-            "power_law_friction.yield_nm",
-            12.0,
-            marks=pytest.mark.xfail(reason=YIELDS, strict=True),
-        ),
+        (0.4, ("power_law_friction",), "power_law_friction.yield_nm", 12.0),
         (
             1.0,
             ("coulomb_friction", "viscous_friction"),
