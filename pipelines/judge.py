@@ -122,7 +122,8 @@ class Case:
 
 
 def sample(patterns: str = "*") -> list[Case]:
-    """Cases whose key or study matches one of the patterns (``robots,*pack``)."""
+    """The cases of the fixed sample that ``patterns`` selects: shell patterns with commas between them, each compared with the
+    name of a case's study and with its key; ``robots,*pack``."""
     words = [
         (name, *word.split()) for name in SAMPLE for word in SAMPLE[name].split(",")
     ]

@@ -21,10 +21,10 @@ class Concepts(NamedTuple):
 
 
 MOST = {
-    "taccorl/alignment": Concepts(11_331, 118, 561),
+    "taccorl/alignment": Concepts(11_322, 118, 561),
     "taccorl/cli": Concepts(3_554, 38, 41),
     "taccorl/data": Concepts(7_020, 77, 223),
-    "taccorl/diagnosis": Concepts(6_940, 82, 196),
+    "taccorl/diagnosis": Concepts(6_938, 82, 196),
     "taccorl/episodes": Concepts(2_722, 65, 53),
     "taccorl/evaluation": Concepts(1_227, 18, 25),
     "taccorl/lerobot_plugin": Concepts(209, 2, 10),

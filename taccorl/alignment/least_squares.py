@@ -97,7 +97,8 @@ class Free:
         return math.log(value) if self.log else value / self.scale
 
     def value(self, coordinate: float) -> float:
-        """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
+        """The number, in its unit, at a coordinate of the solver; the inverse of
+        ``coordinate``. A coordinate beyond a bound gives the bound."""
         if self.log:
             raw = math.exp(min(coordinate, _MOST))
         else:
@@ -236,7 +237,7 @@ def inverse_of(squares: np.ndarray) -> np.ndarray:
 
 
 def rms(residuals: np.ndarray) -> float:
-    """Root mean square of ``residuals`` (n,), in their unit; NaN if there are none."""
+    """Root mean square of ``residuals`` (n,), in the unit of the residuals; NaN if n is 0."""
     return (
         float(np.sqrt(np.mean(np.square(residuals))))
         if len(residuals)
@@ -254,7 +255,6 @@ def minimise(
     most: int = 40,
     step: float = COARSE,
     tolerance: float = TIGHT,
-    prior: Sequence[tuple[float, float]] = (),
 ) -> Solution:
     """Fit the numbers ``frees`` by least squares within their bounds.
 
@@ -268,9 +268,6 @@ def minimise(
         step: step of its finite differences.
         tolerance: relative fall of the squared residuals below which it ends; a tenth of
             it for the step.
-        prior: mean and standard deviation of each coordinate, whose squared distance is
-            added to the squared residuals; none: no prior. It is not part of the result's
-            residuals and derivatives.
     """
     low = np.array([f.coordinate(f.low) for f in frees])
     high = np.array([f.coordinate(f.high) for f in frees])
@@ -320,26 +317,12 @@ def minimise(
             at_bound=(),
             trouble="",
         )
-    means, deviations = np.array(prior).reshape(-1, 2).T
-
-    def with_prior(coordinates: np.ndarray) -> np.ndarray:
-        if not prior:
-            return measured(coordinates)
-        return np.concatenate(
-            [measured(coordinates), (coordinates - means) / deviations]
-        )
-
-    def slopes_with_prior(coordinates: np.ndarray) -> np.ndarray:
-        if not prior:
-            return slopes(coordinates)
-        return np.vstack([slopes(coordinates), np.diag(1.0 / deviations)])
-
     # SciPy's first step is at most as long as the start is far from 0: all coordinates start at 1 there.
     shift = first - 1.0
     found = least_squares(
-        lambda u: with_prior(u + shift),
+        lambda u: measured(u + shift),
         first - shift,
-        jac=lambda u: slopes_with_prior(u + shift),  # pyright: ignore[reportArgumentType]
+        jac=lambda u: slopes(u + shift),  # pyright: ignore[reportArgumentType]
         bounds=(low - shift, high - shift),
         max_nfev=most,
         ftol=tolerance,
@@ -347,12 +330,12 @@ def minimise(
         gtol=1e-9,
     )
     ended = np.clip(found.x + shift, low, high)
-    values, rows = at(ended), len(found.fun) - len(prior)
+    values = at(ended)
     return Solution(
         values=values,
-        residuals=found.fun[:rows],
+        residuals=found.fun,
         layout=tuple(layout),
-        jacobian=found.jac[:rows],
+        jacobian=found.jac,
         frees=tuple(frees),
         at_bound=tuple(f.name for f in frees if f.is_at_end(values[f.name])),
         trouble=""

@@ -146,7 +146,7 @@ def _title(of: _Part) -> list[Fact]:
 
 
 def _placed(d: Diagnosis, name: str) -> str:
-    """Name of an effect, with the body that it acts on."""
+    """``NAME in BODY`` of an effect that acts on one body of the robot, such as a payload in a link; else its name alone."""
     link = next((getattr(e, "link", "") for e in d.effects if e.name == name), "")
     return f"{name} in {link}" if link else name
 

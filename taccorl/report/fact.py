@@ -75,7 +75,7 @@ class Fact:
         return _FORMAT.vformat(texts()[self.id].text, (), self.values)
 
     def as_json(self) -> dict[str, Any]:
-        """Everything a reader of ``report.json`` needs."""
+        """The fact as ``report.json`` stores it: identifier, severity, label, text and values."""
         return {
             "id": self.id,
             "severity": self.severity,
@@ -86,7 +86,7 @@ class Fact:
 
 
 def fact(id: str, **values: Any) -> Fact:
-    """A fact with these values."""
+    """A ``Fact``: one line of a report. ``id``: key of its text in texts.yaml; ``values``: what is put into the text."""
     return Fact(id, values)
 
 

@@ -86,8 +86,9 @@ def _all_of(kind: str, names: Sequence[str]) -> bool:
 
 
 def _deciding(of: Advice) -> list[Fact]:
-    """Of what is not explained: the recording that decides between the nearest effects, or
-    has more of where the error is largest, or shows an effect more clearly."""
+    """What to record next where no effect explains the error: a motion that tells the
+    effects with the lowest errors apart, or one that has more of the condition in which
+    the error is largest, or one that shows an effect more clearly."""
     d, worst = of.d, of.seen.worst
     tried = [e for r in d.rounds[-1:] for e in r.evidence]
     near = [name for name, error in d.nearest if error <= d.standing_out[0].most]

@@ -91,7 +91,6 @@ OFF = Changed(
     after=0.252,
     unit="N·m",
     without=12.3,
-    alone=False,
 )
 
 

@@ -312,7 +312,7 @@ def test_without_a_finite_position_nothing_is_sent(
 def test_a_pad_that_is_stuck_above_0_is_refused_at_connect(
     robot: DrivenRobot, part: Any, level: int
 ) -> None:
-    """Between 0 and 255, which were refused before: each taxel at a number of its own."""
+    """A part of the pad gives constant counts, not the 0 or 255 of a dead pad, and other ones in each taxel."""
 
     def change(bench: Bench, frame: np.ndarray) -> np.ndarray:
         frame[part] = np.minimum(level + bench.rest.astype(int)[part] % 4, 254)

@@ -533,7 +533,9 @@ def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
 
 
 def load_robot(path: Path) -> Robot:
-    """Load a robot file and its model, or an axis file: a robot of one joint without one.
+    """Load a robot file with the MJCF or URDF model that it names. A file without a model,
+    such as a ``kind: axis`` file, states the inertia of each joint itself.
+
     Raises SpecError: the file holds ``TODO``, a wrong key or value, or a joint that the
     model lacks; the message names file and line; TaccorlError: the model cannot be used
     (``load_robot_model``)."""

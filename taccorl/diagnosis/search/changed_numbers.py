@@ -91,7 +91,6 @@ def changed_numbers(fits: Fits, model: Fit) -> tuple[tuple[Changed, ...], Fit]:
                 after=after,
                 unit=unit,
                 without=without,
-                alone=False,
                 instead=instead,
                 ties=ties,
             ),

@@ -273,8 +273,14 @@ class Fits:
         again: bool = False,
         further: Sequence[Values] = (),
     ) -> Model:
-        """The model of exactly these effects, fitted fully from ``start`` and ``further``
-        ones unless it already is; ``again``: in any case."""
+        """The model that has the effects ``names`` and no others, with all its numbers
+        fitted until they converge.
+
+        Args:
+            start: values where a fit begins.
+            further: values where more fits begin; the best fit counts.
+            again: fit it also if such a model was fitted before.
+        """
         there = self.models.get(frozenset(names))
         if there is not None and there.full and not again:
             return there

@@ -143,12 +143,9 @@ class Changed:
     unit: str
     """Unit of both; "1" if dimensionless."""
     without: float
-    """Validation error [floors] with the numbers of its effect as the file has them and the others refitted."""
-    alone: bool
-    """True: that error is without added effects, though the search added some; False: beside them, if there are any."""
+    """Validation error [floors] with this number as the file has it and the others refitted."""
     instead: tuple[str, ...] = ()
-    """Effects of which each explains as much while the number stays as the file has it, those with the fewest numbers first;
-    sought for numbers of the drive where no effect was added."""
+    """``effort_scale``, if a factor on all efforts explains as much as another inertia; else empty."""
     ties: tuple[str, ...] = ()
     """Texts, each of another number of the file and its change that explain as much in place of this one."""
 

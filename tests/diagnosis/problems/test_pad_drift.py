@@ -30,7 +30,8 @@ def again(law: Law = plain) -> Measurement:
 
 
 def found(second: Measurement) -> tuple[bool, list[Drift]]:
-    """Whether the repeats differ by more than noise, and what drifts."""
+    """Whether two recordings of one press differ by more than noise, and which numbers of the
+    pad changed between them."""
     motions = [touch_motion(m, CONFIG, BALL) for m in (press(0), second)]
     return TouchProblem(motions, CONFIG).repeats_differ, drifts_of(motions, CONFIG)
 
