@@ -154,12 +154,12 @@ def _placed(d: Diagnosis, name: str) -> str:
 def _error(of: _Part) -> list[Fact]:
     d = of.d
     before, fitted, after = (d.errors[s] for s in ("before", "fitted", "after"))
-    is_tested = "test" in after
+    id = "error" if "test" in after else "error_untested"
     return [
         *(fact("data_error", text=text) for text in of.seen.errors),
         *when(d.status == "not_converged", "trouble", text=d.trouble),
         fact(
-            "error" if is_tested else "error_untested",
+            "error_rose" if share_gone(d) < 0.0 and not is_explained(d) else id,
             before=before["validation"],
             after=after["validation"],
             share=share_gone(d),

@@ -501,6 +501,11 @@ def _(one, nothing, short):
     return with_plain(stretchy, 1.01), Seen()
 
 
+@case("error_rose")
+def _(one, nothing, short):
+    return with_errors(short, before=2.08, after=2.99), Seen()
+
+
 def test_a_plain_fit_of_what_was_added_speaks_not_against_it(one):
     """Dry friction is one of its numbers: it leaves as little, which is no news."""
     friction = named(one, "coulomb_friction", torque_nm=0.2)
