@@ -63,10 +63,10 @@ def measure_noise(
     plain_BnA = targets(torch.full_like(draws.step_BS, -1))
     if sde.num_stochastic > 1:
         return [noise_of_targets(-1, robot, plain_BnA, targets(draws.step_BS))]
-    noisy = [targets(torch.full_like(draws.step_BS, k)) for k in range(sde.num_steps)]
+    noisy = [targets(torch.full_like(draws.step_BS, k)) for k in sde.steps]
     return [
         noise_of_targets(k, robot, plain_BnA, noisy_BnA)
-        for k, noisy_BnA in enumerate(noisy)
+        for k, noisy_BnA in zip(sde.steps, noisy, strict=True)
     ]
 
 

@@ -10,7 +10,9 @@ with t = 1 read as t_1 in the denominator, so s_0 = level for every K; K = 4, le
 steps have the same marginals as K → ∞. A stochastic step is a Gaussian; its density is the policy's probability in PPO.
 
 Noise is injected, and the density counted, in the scored numbers of a chunk only: executed steps, which are the first ones, and
-real dimensions. Everything else takes Euler steps. Without noise the result is that of the policy's own sampling, bit for bit.
+real dimensions. Everything else takes Euler steps. With ``correlation`` ρ the noise of a dimension has the covariance
+s_k² ((1 − ρ) I + ρ 1 1ᵀ) over its n executed steps: deviation s_k √(1 − ρ) about their mean, s_k √(1 + (n − 1) ρ) along it.
+Without noise the result is that of the policy's own sampling, bit for bit.
 
 Letters in shapes: B batch, H horizon, D padded action, K denoising steps, S stochastic steps (1 or K).
 """
@@ -60,9 +62,11 @@ class FlowSDE:
 
     def __init__(self, settings: FlowSDESettings) -> None:
         self.num_steps, self.level = settings.num_steps, settings.level
-        self.num_stochastic = (
-            settings.num_steps if settings.stochastic_steps == "all" else 1
-        )
+        self.correlation = settings.correlation
+        every = range(settings.num_steps)
+        self.steps = every[-1:] if settings.stochastic_steps == "last" else every
+        """Indices k of the steps that may be stochastic."""
+        self.num_stochastic = len(every) if settings.stochastic_steps == "all" else 1
         # Same operations, in the same order, as lerobot.policies.common.flow_matching.euler_integrate: results are bit-identical.
         self.dt = -1.0 / self.num_steps
         self.times = [1.0 + k * self.dt for k in range(self.num_steps)]
@@ -89,7 +93,9 @@ class FlowSDE:
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
         step = torch.arange(self.num_steps).expand(num_rows, -1)
         if self.num_stochastic == 1:
-            step = torch.randint(self.num_steps, (num_rows, 1), generator=generator)
+            step = torch.randint(
+                self.steps[0], self.num_steps, (num_rows, 1), generator=generator
+            )
         if self.level == 0:
             step = torch.full_like(step, -1)
         return Draws(initial.to(device), noise.to(device), step.to(device))
@@ -130,10 +136,16 @@ class FlowSDE:
                 torch.full((len(x),), k, device=x.device),
             )
             mean, std = self._step(velocity, x, k_B, noisy_BHD)
-            new = torch.where(noisy_BHD, mean + std * draws.noise_BSHD[:, s], mean)
+            noise_BHD = draws.noise_BSHD[:, s]
+            if self.correlation:
+                about, along = self._deviations(scored_HD)
+                noise_BHD = _scaled(noise_BHD, scored_HD, about, along)
+            new = torch.where(noisy_BHD, mean + std * noise_BHD, mean)
             before[:, s] = torch.where(is_noisy_B11, x, before[:, s])
             after[:, s] = torch.where(is_noisy_B11, new, after[:, s])
-            log_prob_B = log_prob_B + _log_density(new, mean, std, noisy_BHD)
+            log_prob_B = log_prob_B + self._log_density(
+                new, mean, std, noisy_BHD, scored_HD
+            )
             x = new
         return Sampled(x, before, after, log_prob_B)
 
@@ -151,7 +163,9 @@ class FlowSDE:
             x, k_B = before_BSHD[:, s], step_BS[:, s]
             noisy_BHD = (k_B >= 0)[:, None, None] & scored_HD
             mean, std = self._step(velocity, x, k_B, noisy_BHD)
-            total_B = total_B + _log_density(after_BSHD[:, s], mean, std, noisy_BHD)
+            total_B = total_B + self._log_density(
+                after_BSHD[:, s], mean, std, noisy_BHD, scored_HD
+            )
         return total_B
 
     def _step(
@@ -160,12 +174,37 @@ class FlowSDE:
         t_B = torch.tensor(self.times, dtype=torch.float32, device=k_B.device)[k_B]
         return self.mean(x_BHD, velocity(x_BHD, t_B), k_B, noisy_BHD)
 
+    def _deviations(self, scored_HD: Tensor) -> tuple[float, Tensor]:
+        """Standard deviations of correlated noise, for s_k = 1: of a step about the mean of its dimension, and (D,) along it."""
+        steps_D = scored_HD.sum(0)
+        along_D = (1 + (steps_D - 1) * self.correlation).clamp(min=1.0).sqrt()
+        return math.sqrt(1 - self.correlation), along_D
 
-def _log_density(
-    x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor
-) -> Tensor:
-    """(B,) sum of Gaussian log-densities of what is counted."""
-    std = std.clamp(min=torch.finfo(x_BHD.dtype).tiny)  # level 0: nothing is counted
-    z = (x_BHD - mean_BHD) / std
-    densities = -0.5 * z * z - std.log() - 0.5 * math.log(2 * math.pi)
-    return torch.where(counted_BHD, densities, 0.0).sum(dim=(1, 2))
+    def _log_density(
+        self,
+        x_BHD: Tensor,
+        mean_BHD: Tensor,
+        std: Tensor,
+        counted_BHD: Tensor,
+        scored_HD: Tensor,
+    ) -> Tensor:
+        """(B,) log-density of what is counted: all ``scored_HD`` of a row, or nothing of it."""
+        # level 0: nothing is counted
+        std = std.clamp(min=torch.finfo(x_BHD.dtype).tiny)
+        z = (x_BHD - mean_BHD) / std
+        wider_B = 0.0
+        if self.correlation:
+            about, along_D = self._deviations(scored_HD)
+            z = _scaled(z, scored_HD, 1 / about, 1 / along_D)
+            others_D = (scored_HD.sum(0) - 1).clamp(min=0)
+            log_det = (others_D * math.log(about) + along_D.log()).sum()
+            wider_B = counted_BHD.any(dim=2).any(dim=1) * log_det
+        densities = -0.5 * z * z - std.log() - 0.5 * math.log(2 * math.pi)
+        return torch.where(counted_BHD, densities, 0.0).sum(dim=(1, 2)) - wider_B
+
+
+def _scaled(z_BHD: Tensor, scored_HD: Tensor, about: float, along_D: Tensor) -> Tensor:
+    """Scale the scored steps of each dimension about their mean, and the mean: the root of a covariance of two values."""
+    z_BHD = z_BHD * scored_HD
+    mean_B1D = z_BHD.sum(1, keepdim=True) / scored_HD.sum(0).clamp(min=1)
+    return about * (z_BHD - mean_B1D) + along_D * mean_B1D

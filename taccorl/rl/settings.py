@@ -86,13 +86,22 @@ class FlowSDESettings:
     level: float = 0.5
     """σ_SDE: standard deviation of the first stochastic step, in normalised actions. 0: no noise."""
     stochastic_steps: str = "one"
-    """Steps of a decision that are stochastic; the others are Euler steps. one: a randomly drawn one (paper); all: every step."""
+    """Steps of a decision that are stochastic; the others are Euler steps. one: a randomly drawn one (paper); all: every step;
+    last: the last one. A policy that is sure of its action undoes the noise of earlier steps, so that decisions with it tell PPO
+    nothing."""
+    correlation: float = 0.0
+    """Correlation of the noise of one joint between the executed actions of a chunk, 0 or more and below 1. 0: each action has
+    noise of its own (paper), which the arm averages out; near 1: the whole chunk is displaced."""
 
     def __post_init__(self) -> None:
         _at_least("noise.", self, num_steps=1, level=0)
+        if not 0 <= self.correlation < 1:
+            raise TaccorlError(
+                f"--noise.correlation={self.correlation:g}: 0 or more, and below 1"
+            )
         if not math.isfinite(self.level):
             raise TaccorlError(f"--noise.level={self.level:g}: is not finite")
-        _one_of("noise.stochastic_steps", self.stochastic_steps, ("one", "all"))
+        _one_of("noise.stochastic_steps", self.stochastic_steps, ("one", "all", "last"))
 
 
 @dataclass(kw_only=True)

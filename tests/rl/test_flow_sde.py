@@ -14,9 +14,16 @@ H, D = 4, 3
 ALL = torch.ones(H, D, dtype=torch.bool)
 
 
-def sde(num_steps: int = 4, level: float = 0.5, steps: str = "one") -> FlowSDE:
+def sde(
+    num_steps: int = 4, level: float = 0.5, steps: str = "one", correlation: float = 0.0
+) -> FlowSDE:
     return FlowSDE(
-        FlowSDESettings(num_steps=num_steps, level=level, stochastic_steps=steps)
+        FlowSDESettings(
+            num_steps=num_steps,
+            level=level,
+            stochastic_steps=steps,
+            correlation=correlation,
+        )
     )
 
 
@@ -115,9 +122,12 @@ def test_marginals_converge_to_the_data_at_first_order(level: float) -> None:
     assert propagated(0.7, 0.2, 4, level)[0] == pytest.approx(0.7, abs=1e-9)
 
 
-@pytest.mark.parametrize("steps", ["one", "all"])
-def test_scoring_gives_the_log_probability_of_sampling(steps: str) -> None:
-    sampler = sde(4, 0.5, steps)
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+@pytest.mark.parametrize("steps", ["one", "all", "last"])
+def test_scoring_gives_the_log_probability_of_sampling(
+    steps: str, correlation: float
+) -> None:
+    sampler = sde(4, 0.5, steps, correlation)
     given = draws(sampler, 64)
     sampled = sampler.sample(smooth, given, ALL)
     order = torch.randperm(64, generator=torch.Generator().manual_seed(3))
@@ -141,6 +151,8 @@ def test_steps_are_drawn_per_sample_and_evenly() -> None:
     counts = draws(sde(), 4000).step_BS.flatten().bincount(minlength=4)
     assert (counts - 1000).abs().max() < 4 * math.sqrt(4000 * 0.25 * 0.75)
     assert draws(sde(steps="all"), 5).step_BS.tolist() == [[0, 1, 2, 3]] * 5
+    assert draws(sde(steps="last"), 5).step_BS.tolist() == [[3]] * 5
+    assert draws(sde(level=0.0, steps="last"), 5).step_BS.tolist() == [[-1]] * 5
 
 
 def test_only_scored_numbers_get_noise_and_are_counted() -> None:
@@ -162,7 +174,43 @@ def test_only_scored_numbers_get_noise_and_are_counted() -> None:
     torch.testing.assert_close(sampled.log_prob_B, by_hand, atol=1e-4, rtol=0)
 
 
+def test_correlated_noise_has_the_stated_covariance_and_density() -> None:
+    """Three of four steps are scored: s² ((1 − ρ) I + ρ 1 1ᵀ) with s = 0.144, ρ = 0.8, in each scored dimension."""
+    scored = torch.zeros(H, D, dtype=torch.bool)
+    scored[:3, :2] = True
+    sampler = sde(steps="last", correlation=0.8)
+    given = draws(sampler, 20_000)
+    sampled = sampler.sample(smooth, given, scored)
+    euler = euler_integrate(smooth, given.initial_BHD, 4)
+    assert torch.equal(sampled.chunk_BHD[:, ~scored], euler[:, ~scored])
+    mean, std = sampler.mean(
+        sampled.before_BSHD[:, 0],
+        smooth(sampled.before_BSHD[:, 0], torch.full((20_000,), 0.25)),
+        given.step_BS[:, 0],
+        scored.expand(20_000, H, D),
+    )
+    stated = std[0].item() ** 2 * (0.2 * torch.eye(3) + 0.8 * torch.ones(3, 3))
+    noise = (sampled.chunk_BHD - mean)[:, :3, :2]
+    log_prob = torch.zeros(20_000)
+    normal = torch.distributions.MultivariateNormal(torch.zeros(3), stated)
+    for d in range(2):
+        found = noise[:, :, d].T.cov()
+        assert (found / stated - 1).abs().max() < 0.05
+        log_prob += normal.log_prob(noise[:, :, d])
+    torch.testing.assert_close(sampled.log_prob_B, log_prob, atol=1e-3, rtol=0)
+    between = noise[:, 0, 0] @ noise[:, 0, 1] / (20_000 * std[0].item() ** 2)
+    assert abs(between) < 0.03  # dimensions stay independent
+
+
+def test_correlation_counts_rows_with_noise_only() -> None:
+    sampler = sde(level=0.0, steps="last", correlation=0.8)
+    assert sampler.sample(smooth, draws(sampler, 5), ALL).log_prob_B.tolist() == [0] * 5
+
+
 def test_settings_out_of_range_are_named() -> None:
+    for correlation in (-0.1, 1.0, math.nan):
+        with pytest.raises(TaccorlError, match=r"--noise\.correlation="):
+            FlowSDESettings(correlation=correlation)
     with pytest.raises(TaccorlError, match=r"--noise\.stochastic_steps=every"):
         FlowSDESettings(stochastic_steps="every")
     for level in (-1, math.inf, math.nan):  # without a density
