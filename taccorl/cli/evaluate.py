@@ -414,9 +414,8 @@ def _score_share(
         import torch
 
         if policy.checkpoint.config.device == "cuda":
-            policy.checkpoint.config.device = (
-                f"cuda:{(worker_number() or 0) % torch.cuda.device_count()}"
-            )
+            # For the weights and for the processors, whose device is a setting of their own.
+            torch.cuda.set_device((worker_number() or 0) % torch.cuda.device_count())
         torch.set_num_threads(
             threads or torch.get_num_threads()
         )  # its share of the cores, as for the physics
