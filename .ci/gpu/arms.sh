@@ -11,24 +11,7 @@ now() { echo $(($(date +%s) - $(cat /dev/shm/t0))); }
 since() { echo "$1 $(now)" >>/dev/shm/times; }
 trap 'touch ${DONE:-/dev/shm/done}' EXIT
 since start
-start=$(python3 - <<'P'
-import sys
-import tarfile
-from pathlib import Path
-
-import zstandard
-
-folder = Path("/dev/shm/start")
-(archive,) = folder.glob("*.tgz")
-tarfile.open(archive).extractall(folder, filter="data")
-(config,) = folder.rglob("pretrained_model/config.json")
-parts = sorted(p for p in folder.iterdir() if p.suffix[1:].isdigit())
-data = b"".join(p.read_bytes() for p in parts)
-weights = zstandard.ZstdDecompressor().stream_reader(data).read()
-(config.parent / "model.safetensors").write_bytes(weights)
-print(config.parent)
-P
-)
+start=$(python3 .ci/gpu/carried.py)
 twin=/dev/shm/twin_of_20_steps.yaml
 python3 - "$twin" <<'P'
 import sys
