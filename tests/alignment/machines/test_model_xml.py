@@ -249,23 +249,14 @@ def test_an_encoding_that_is_not_read_is_named(encoding: str, tmp_path: Path):
         load_robot_model(path)
 
 
-@pytest.mark.parametrize("suffix", ["urdf", "xml"])
-def test_names_in_another_encoding_than_utf_8_are_refused(
-    suffix: str, tmp_path: Path
-) -> None:
+def test_names_in_another_encoding_than_utf_8_are_refused(tmp_path: Path) -> None:
     """MuJoCo keeps the bytes of a name as they are."""
-    path = tmp_path / f"arm.{suffix}"
-    if suffix == "urdf":
-        text = f"<robot name='r'>{link('a')}{link('b')}{joint('jé', 'a', 'b')}</robot>"
-    else:
-        body = BODY.format("").replace('"j"', '"jé"')
-        text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
-    text = f"<?xml version='1.0' encoding='latin-1'?>{text}"
-    path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(TaccorlError, match=rf"arm\.{suffix}: .*save it as UTF-8"):
-        load_robot_model(path)
-    path.write_text(text.replace("latin-1", "utf-8"))
-    assert list(load_robot_model(path).joints) == ["jé"]
+    body = BODY.format("").replace('"j"', '"jé"')
+    text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    stated = f"<?xml version='1.0' encoding='latin-1'?>{text}"
+    (tmp_path / "arm.xml").write_bytes(stated.encode("latin-1"))
+    with pytest.raises(TaccorlError, match=r"arm\.xml: .*save it as UTF-8"):
+        load_robot_model(tmp_path / "arm.xml")
 
 
 def test_the_memory_that_a_model_asks_for_is_not_taken(tmp_path: Path):
