@@ -22,8 +22,6 @@ from taccorl.alignment.measurements.correlation import (
 
 FAR = 1e5
 """Residual [floors] of a simulation that ended in NaN, and largest one of a row."""
-MANY_BLOCKS = 20
-"""Least number of blocks of time for an estimate from the scatter between blocks."""
 MANY_RECORDINGS = 4
 """Least number of recordings for an estimate from the scatter between recordings."""
 WIDE, COARSE, FINE = 0.1, 1e-3, 1e-4
@@ -42,13 +40,6 @@ ENTRIES_LEFT_OVER = 4
 rows it has: unlike noise it does not average out. On 27 simulated joints with one effect
 fitted and another one missing, intervals of the fitted strength held the truth in 23
 cases; in 17 without this, in 18 with 36 entries, in 24 with 1."""
-_OPEN = 1e-14
-"""Directions that move the residuals, squared, so little of the strongest one count as
-this: open."""
-_AT_BOUND = 1e-3
-"""Share of a number's range from its end that counts as being there."""
-_MOST = 700.0
-"""Its exp is the largest number that there is."""
 
 Values = dict[str, float]
 """Name of a number, ``kp`` or ``coulomb_friction.torque_nm`` → value in its unit."""
@@ -84,7 +75,8 @@ class Free:
     def is_at_end(self, value: float) -> bool:
         """Whether ``value`` is at one of the bounds, or beyond it."""
         here, low, high = map(self.coordinate, (value, self.low, self.high))
-        return bool(min(here - low, high - here) < _AT_BOUND * (high - low))
+        # A thousandth of the range from its end counts as being there.
+        return bool(min(here - low, high - here) < 1e-3 * (high - low))
 
     def within(self, value: float) -> float:
         """``value`` clipped to the bounds."""
@@ -100,7 +92,7 @@ class Free:
         """The number, in its unit, at a coordinate of the solver; the inverse of
         ``coordinate``. A coordinate beyond a bound gives the bound."""
         if self.log:
-            raw = math.exp(min(coordinate, _MOST))
+            raw = math.exp(min(coordinate, 700.0))  # the largest float
         else:
             raw = float(coordinate * self.scale)
         return self.within(raw)
@@ -180,7 +172,8 @@ class Solution:
         variances = np.diag(plain)
         pull = self.jacobian * self.residuals[:, None]
         pulls = block_sums(pull, self.layout)
-        if len(pulls) >= max(MANY_BLOCKS, 2 * p):
+        # The scatter between blocks of time is known from about 20 of them on.
+        if len(pulls) >= max(20, 2 * p):
             variances = np.maximum(variances, np.diag(sandwich(pulls, inverse, p)))
         if (count := len(self.layout)) >= MANY_RECORDINGS:
             ends = np.cumsum([int(rows.measured.sum()) for rows in self.layout])
@@ -209,6 +202,20 @@ class Solution:
             for f, m, s in zip(self.frees, middle, spread, strict=True)
         }
 
+    def estimates(self) -> dict[str, Estimate]:
+        """Parameter → its estimate, in its unit."""
+        ends = self.intervals()
+        return {
+            f.name: Estimate(
+                value=self.values[f.name],
+                low=ends[f.name][0],
+                high=ends[f.name][1],
+                unit=f.unit,
+                at_bound=f.name in self.at_bound,
+            )
+            for f in self.frees
+        }
+
     @property
     def quantile(self) -> float:
         """Half width of a 95 % interval in standard errors: Student's t, with the number of blocks of time minus that of fitted
@@ -233,7 +240,9 @@ def sandwich(pulls: np.ndarray, inverse: np.ndarray, used: int) -> np.ndarray:
 def inverse_of(squares: np.ndarray) -> np.ndarray:
     """Inverse (p, p) of ``squares`` JᵀJ (p, p); directions that are open count as hardly seen."""
     strengths, ways = np.linalg.eigh(squares)
-    return ways / np.maximum(strengths, _OPEN * strengths.max(initial=1e-300)) @ ways.T
+    # A direction that moves the residuals, squared, less than 1e-14 of what the strongest
+    # one does is open, and counts as that.
+    return ways / np.maximum(strengths, 1e-14 * strengths.max(initial=1e-300)) @ ways.T
 
 
 def rms(residuals: np.ndarray) -> float:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.measurements.noise_floor import Estimate, SignalFloor
+from taccorl.alignment.measurements.noise_floor import NoiseEstimate, SignalFloor
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace
 
@@ -16,7 +16,7 @@ ORIGIN = Origin(text="made by arithmetic, not a robot")
 def floor(
     value: float = FLOOR_RAD, kind: str = "position", *, lower_bound: bool = False
 ) -> SignalFloor:
-    used = Estimate("repeats", value, value, value, 100)
+    used = NoiseEstimate("repeats", value, value, value, 100)
     return SignalFloor("left_joint5", kind, "rad", used, (used,), lower_bound)  # pyright: ignore[reportArgumentType]
 
 

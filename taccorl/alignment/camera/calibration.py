@@ -22,7 +22,7 @@ import numpy as np
 from taccorl.alignment.camera.edges import twin_edges
 from taccorl.alignment.camera.fit import (
     Level,
-    Solution,
+    PoseFit,
     distances,
     levels,
     match,
@@ -41,14 +41,11 @@ from taccorl.sim.twin import TwinConfig
 
 FEWEST_FRAMES = 4  # Least number of frames of a calibration
 _HOLD_OUT = 4  # one frame in so many is kept out of the fit
-_FEWEST_OUTLINES = 60  # points a frame: less is a fingertip
 _REACH_PX = 6.0  # a held-out outline without an edge within this counts as this far off
 _FOUND, _FAR = (
     0.5,
     3.0,
 )  # of a fit that may be believed: share of held-out outlines with an edge, mean distance [px]
-_ONE_POSE_RAD = 0.02  # joints that move less in all frames show one pose
-_VAGUE = 10.0  # times ``WANTED``, 3° or 40 mm: wider than the errors that calibration is to find
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +169,8 @@ def calibrate_camera(
             levels(list(inside[rows]), view.intrinsics) for rows in (~held, held)
         )
         drawn = outlines(view, frames.joints[~held], view.start, view.intrinsics)
-        if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
+        # Fewer points in a frame are a fingertip.
+        if len(drawn.points) < 60 * (~held).sum():
             raise TaccorlError(
                 f"camera {camera}: at its pose in the twin, the camera hardly shows the arms in {frames.name}: "
                 f"{len(drawn.points)} points of their outlines in {(~held).sum()} frames. Record the arms in the middle of the "
@@ -241,7 +239,7 @@ def _judge(
 
 def _problems(
     frames: CameraFrames,
-    solution: Solution,
+    solution: PoseFit,
     sure: Covariance | None,
     before: tuple[float, float],
     after: tuple[float, float],
@@ -268,12 +266,12 @@ def _problems(
         )
     width, direction = sure.worst()
     spread = float(np.ptp(frames.joints, axis=0).max())
-    if spread < _ONE_POSE_RAD:
+    if spread < 0.02:  # rad, m: one pose
         found.append(
             f"not identifiable: all {len(frames.joints)} frames show one pose, so no error of the twin averages out and none is "
             f"held out; worst known: {direction}. Record poses that differ"
         )
-    elif width > _VAGUE:
+    elif width > 10.0:  # 3° or 40 mm, wider than the errors to be found
         found.append(
             f"not identifiable: {direction} can hardly be told; record poses that differ more"
         )

@@ -19,9 +19,6 @@ from taccorl.sim.cameras import Intrinsics
 NUM_DIRECTIONS = 8
 """Number of directions into which edges are sorted; a match is searched among edges within 180° / 8 = 22.5° of the nearest of
 them."""
-_JUMP_M = 0.01  # of depth within one body: one of its shapes stands before another
-_STEEP = 3.0  # such a jump is so many times the steps beside it, else it is a face seen at a slant
-_SMOOTH_PX = 1.0  # of a picture before its edges are looked for
 _STRONG, _LEAST = (
     6.0,
     30.0,
@@ -59,11 +56,13 @@ def twin_edges(
         first_m, second_m = (_side(near_depth, axis, k) for k in (0, 1))
         with np.errstate(invalid="ignore"):
             step = np.nan_to_num(np.abs(first_m - second_m), posinf=np.inf)
+        # A jump of 10 mm within one body: one of its shapes stands before another. Where
+        # it is less than three times the steps beside it, it is a face at a slant.
         jump = (
             (first == second)
             & (first > 0)
-            & (step > _JUMP_M)
-            & (step > _STEEP * _beside(step, axis))
+            & (step > 0.01)
+            & (step > 3.0 * _beside(step, axis))
         )
         v, u = np.nonzero((first != second) | jump)
         one, other = first_m[v, u], second_m[v, u]
@@ -108,9 +107,7 @@ class PictureEdges:
     """Edges of a picture (rows, columns, 3) uint8, with a lookup of the nearest edge of a given direction."""
 
     def __init__(self, picture: np.ndarray) -> None:
-        gray = cv2.GaussianBlur(
-            cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), _SMOOTH_PX
-        )
+        gray = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
         dx, dy = (cv2.Sobel(gray, cv2.CV_16S, k, 1 - k, ksize=3) for k in (1, 0))
         size = np.hypot(dx, dy, dtype=np.float32)
         noise = (

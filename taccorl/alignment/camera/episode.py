@@ -16,10 +16,6 @@ from taccorl.robots import ROBOT
 from taccorl.sim.robot import link_poses
 
 PICTURE = "observation.images."
-_SLOW = 0.5  # share of the rows, the slowest, that are taken from
-_GRIPPER_RAD = (
-    0.5 / ROBOT.opening_max_m
-)  # a gripper from end to end counts as half a radian
 
 
 def camera_frames(
@@ -88,9 +84,10 @@ def stage_rows(joints: np.ndarray) -> dict[str, int]:
 
 def _different(joints: np.ndarray, num_frames: int) -> list[int]:
     """Rows among the slower ones, each as far as can be from those before it."""
-    scaled = joints * ROBOT.per_action(1.0, _GRIPPER_RAD)
+    # A gripper that moves from end to end counts as half a radian.
+    scaled = joints * ROBOT.per_action(1.0, 0.5 / ROBOT.opening_max_m)
     speed = np.linalg.norm(np.gradient(scaled, axis=0), axis=1)
-    slow = np.flatnonzero(speed <= np.quantile(speed, _SLOW))
+    slow = np.flatnonzero(speed <= np.quantile(speed, 0.5))
     chosen = [int(slow[0])]
     distance = np.full(len(slow), np.inf)
     for _ in range(min(num_frames, len(slow)) - 1):

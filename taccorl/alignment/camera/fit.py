@@ -17,13 +17,11 @@ from taccorl.alignment.camera.view import TwinView
 from taccorl.sim.cameras import Intrinsics
 
 _POINTS = 800  # of a frame, drawn at random from its outlines
-_SMALLEST_ROWS = 100  # of a picture in which edges are looked for
 _REACH_PX = (
     (16.0, 12.0, 8.0, 6.0),
     (6.0, 5.0, 4.0),
     (4.0, 3.0, 3.0, 3.0),
 )  # coarse to fine, render by render
-_MATCHES = 3  # times that points are matched anew between two renders
 _AROUND = np.r_[
     np.full(3, np.deg2rad(3.0)), np.full(3, 0.03)
 ]  # of the start, searched before the first step
@@ -36,8 +34,6 @@ _SAME = np.r_[
     np.full(3, np.deg2rad(0.4)), np.full(3, 0.004)
 ]  # poses closer than this will end in one
 _FAR_PX = 6.0  # a point further from its edge counts no more
-_STEPS = 2  # of least squares between two matchings
-_SOFT_PX = 1.0  # residuals beyond it count less (soft L1)
 
 
 class Level(NamedTuple):
@@ -65,7 +61,7 @@ class Matches(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Solution:
+class PoseFit:
     """Result of the least squares: pose and misfit."""
 
     offset: np.ndarray  # (6,) estimated pose: rotation vector [rad] and translation [m] relative to the nominal mount
@@ -83,7 +79,7 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
             round(intrinsics.rows / factor),
             round(intrinsics.columns / factor),
         )
-        if _SMALLEST_ROWS <= rows <= 480:
+        if 100 <= rows <= 480:
             small = [
                 cv2.resize(p, (columns, rows), interpolation=cv2.INTER_AREA)
                 for p in pictures
@@ -190,7 +186,7 @@ def moved(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 def solve(
     view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray
-) -> Solution:
+) -> PoseFit:
     """Fit the pose (6,) at which the outlines of the arms at ``joints`` (F, 14) [rad, m] coincide with the edges in ``levels``.
     ``start``: (6,) pose [rad, m]; many poses within 3° and 30 mm of it along each axis are compared first."""
     reaches = (
@@ -214,9 +210,9 @@ def solve(
     return tried[0]
 
 
-def _distinct(tried: list[Solution]) -> list[Solution]:
+def _distinct(tried: list[PoseFit]) -> list[PoseFit]:
     """The best few of solutions, best first, that are not one and the same: many starts end in one place."""
-    chosen: list[Solution] = []
+    chosen: list[PoseFit] = []
     for solution in tried:
         if all(
             (np.abs(solution.offset - other.offset) > _SAME).any() for other in chosen
@@ -254,13 +250,13 @@ def _descend(
     level: Level,
     reaches_px: Sequence[float],
     start: np.ndarray,
-) -> Solution:
+) -> PoseFit:
     """Draw, match, move; the reach of matches shrinks from one drawing to the next."""
     offset = before = start
     for reach_px in reaches_px:
         before = offset
         drawn = outlines(view, joints, offset, level.intrinsics)
-        for _ in range(_MATCHES):
+        for _ in range(3):  # matchings between two renderings
             seen = seen_from(view, offset, drawn.points)
             offset = moved(
                 offset,
@@ -268,12 +264,12 @@ def _descend(
             )
     drawn = outlines(view, joints, offset, level.intrinsics)
     matches = match(drawn, seen_from(view, offset, drawn.points), level, reaches_px[-1])
-    return Solution(offset, offset - before, drawn, matches)
+    return PoseFit(offset, offset - before, drawn, matches)
 
 
 def weights(apart: np.ndarray) -> np.ndarray:
     """Weights (M,), at most 1, of residuals ``apart`` (M,) [px] under the soft L1 loss; close to 1 for small residuals."""
-    return 1 / np.sqrt(1 + (apart / _SOFT_PX) ** 2)
+    return 1 / np.sqrt(1 + apart**2)  # residuals beyond 1 px count less
 
 
 def _step(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
@@ -283,7 +279,7 @@ def _step(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
     step = np.zeros(6)
     if matches.found.sum() < 50:
         return step
-    for _ in range(_STEPS):
+    for _ in range(2):  # steps between two matchings
         there = Rotation.from_rotvec(-step[:3]).apply(seen - step[3:])
         apart, jacobian = distances(there, matches, at), slopes(there, matches, at)
         weighted = weights(apart)[:, None] * jacobian

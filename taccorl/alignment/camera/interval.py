@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.alignment.camera.fit import (
     Level,
-    Solution,
+    PoseFit,
     distances,
     moved,
     seen_from,
@@ -44,7 +44,6 @@ differ by so much."""
 JOINT_RAD = 0.002  # Standard deviation of the error of a joint's zero [rad]. A choice: 1 mm at half a metre.
 WANTED = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 0.004)]
 """Requested accuracy of each number: 0.3°, 4 mm. It is used only to compare angles with lengths."""
-_SHARE = 0.35  # of the longest component: an axis that has less is not named
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,9 @@ class Covariance:
         components."""
         values, vectors = np.linalg.eigh(self.total / np.outer(WANTED, WANTED))
         along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
+        # An axis with less than a third of the longest component is not named.
         named = [
-            k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE
+            k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= 0.35
         ]
         width = 1.96 * float(np.sqrt(values[-1]))
         half = [
@@ -88,7 +88,7 @@ class Covariance:
 
 
 def covariance(
-    view: TwinView, joints: np.ndarray, level: Level, solution: Solution
+    view: TwinView, joints: np.ndarray, level: Level, solution: PoseFit
 ) -> Covariance | None:
     """Covariance of ``solution`` from the frames with joints (F, 14); None if the edges do not determine all six numbers."""
     seen = seen_from(view, solution.offset, solution.outlines.points)

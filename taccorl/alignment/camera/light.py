@@ -24,7 +24,6 @@ _BLURS_PX = (1.0, 2.0)  # s₁, s₂
 _FROM_EDGE_PX = (
     4  # pixels closer to an edge of the twin are not compared: the fit is not perfect
 )
-_BINS = 24  # of the twin's grey values
 _FEWEST = 200  # pixels in a bin that counts
 _USED = (6.0, 249.0)  # grey values that are neither cut off nor noise alone
 _LEAST_STEP = 15.0  # grey values across an edge whose width is measured
@@ -108,7 +107,7 @@ def _joined(
 
 def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
     """Gain and gamma from grey values of the twin and of the pictures."""
-    bin_of = np.digitize(x, np.linspace(0, 255, _BINS + 1))
+    bin_of = np.digitize(x, np.linspace(0, 255, 24 + 1))
     rows = []
     for k in np.unique(bin_of):
         mine = bin_of == k

@@ -28,9 +28,7 @@ _ROWS, _CELL = (
     60,
     10,
 )  # pixels of the small pictures that are compared, and of the cells in which they are
-_BLOCK_S = 0.7  # of the bootstrap: longer than a movement's rise
 _DRAWS = 200
-_ALIKE = 0.5  # correlation below which two curves do not show the same motion
 _FEWEST_S = 3.0
 
 
@@ -90,7 +88,8 @@ def camera_latency(
     moments = _Moments((other * one).sum(2), (other**2).sum(2), (one**2).sum(1))
     agree = _correlation(moments, np.ones(int(kept.sum())))
     best = int(np.argmax(agree))
-    drawn = _bootstrap(moments, max(1, round(_BLOCK_S / period_s)), shifts)
+    # Blocks of 0.7 s, longer than a movement's rise.
+    drawn = _bootstrap(moments, max(1, round(0.7 / period_s)), shifts)
     low, high = np.quantile(drawn, [0.025, 0.975])
     return LatencyFit(
         latency_s=float(shifts[best]),
@@ -179,7 +178,7 @@ def _problems(
 ) -> tuple[str, ...]:
     if np.ptp(twin, axis=0).max() < 0.5:
         return ("the arms hardly move in this view: record them going to and fro",)
-    if agree[best] < _ALIKE:
+    if agree[best] < 0.5:  # the curves do not show the same motion
         return (
             f"the pictures change otherwise than the arms move (correlation {agree[best]:.2f}): another camera's pictures, a "
             f"clock that is off by more than {LATEST_S:g} s, or something else moves in view",

@@ -26,8 +26,6 @@ from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.rendering import Renderer, style
 from taccorl.sim.twin import TwinConfig, empty_bench
 
-_BAR = 24  # counts: JPEG and video leave black bars this dark
-
 
 class TwinView:
     """The twin's camera ``name`` in pictures of ``size`` (rows, columns), which may be letterboxed as ingest does it.
@@ -143,7 +141,8 @@ class TwinView:
             & np.roll(bars, 2, 1)
             & np.roll(bars, -2, 1)
         )
-        if bars.any() and np.percentile(pictures[:, bars], 95) > _BAR:
+        # JPEG and video leave black bars as dark as 24.
+        if bars.any() and np.percentile(pictures[:, bars], 95) > 24:
             stream = self.camera.recording_size
             raise TaccorlError(
                 f"camera {self.camera.name}: pictures of {self.size[0]}×{self.size[1]} are not pictures of a "

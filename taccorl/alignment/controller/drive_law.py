@@ -18,8 +18,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from taccorl.alignment.controller.drive_numbers import POSITION, TORQUE, VELOCITY
-from taccorl.alignment.controller.joint_motion import Surroundings
-from taccorl.alignment.controller.rigid_joint import Gains, RigidJoint
+from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
@@ -38,9 +37,6 @@ NEEDED: Mapping[Law, tuple[str, ...]] = {
 }
 """Law → fields of ``DriveLaw`` that it requires."""
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4  # Range of the physics step [s]
-OF_LOOP_S = 2.5e-4  # For loops with shorter periods the step is this [s]: a choice that limits the time of a simulation
-STEP_SHARE = 0.05
-"""Physics step as a share of inertia / K_d. Steps are of second order: a PWM servo's step of 0.8 rad is then off by 0.1 mrad."""
 WINDING_WITHIN = 3.0
 """Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's; data sheets are no better."""
 GAIN_UNITS: Mapping[Law, tuple[str, str]] = {
@@ -259,11 +255,14 @@ class DriveLaw:
         damping = (
             self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
         )
+        # Steps are of second order: with 5 % of inertia / K_d a PWM servo's step of 0.8 rad
+        # is off by 0.1 mrad.
         wanted = min(
-            LONGEST_STEP_S,
-            max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)),
+            LONGEST_STEP_S, max(SHORTEST_STEP_S, 0.05 * inertia / max(damping, 1e-9))
         )
-        wanted = min(wanted, max(1.0 / loop_hz, OF_LOOP_S)) if loop_hz else wanted
+        # Loops of a shorter period get a step of 0.25 ms, which limits the time of a
+        # simulation. A choice.
+        wanted = min(wanted, max(1.0 / loop_hz, 2.5e-4)) if loop_hz else wanted
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def allows_effect(self, effect: str) -> bool:
@@ -361,53 +360,6 @@ class DriveLaw:
                 f"{m.name}: a supply voltage of {signal} is stated, but law {self.law} does not use it; remove it"
             )
         return np.nan_to_num(np.append(volts[1:], volts[-1]) / self.supply_v, nan=1.0)
-
-
-class DriveJoint(RigidJoint):
-    """A joint whose drive has the law of a file."""
-
-    follows_line: ClassVar[bool] = True
-    keeps_times: ClassVar[bool] = True
-
-    def __init__(
-        self,
-        law: DriveLaw,
-        signal: str,
-        unit: Literal["rad", "m"],
-        loop_hz: float | None,
-        command_hz: float | None,
-    ) -> None:
-        self.law, self.signal, self.unit, self.gains = law, signal, unit, law.following
-        self.gain_names, self.target_kind, self.known_names = (
-            law.gain_names,
-            law.target_kind,
-            law.known,
-        )
-        self.command_hz = math.inf if law.law == "effort" else command_hz or 0.0
-        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
-        # the output that a row shows before its own target acts. After it acts, the output is new.
-        loop_s = self.loop_s = 1.0 / loop_hz if loop_hz else 0.0
-        self.facts = law.facts | {
-            "effort_age": (-0.5 if law.effort_after_target else 0.5) * loop_s
-        }
-        self.position_age_s, self.speed_delay_s = 0.5 * loop_s, loop_s
-
-    def gain_scales(self, m: Measurement) -> tuple[float, float]:
-        return self.law.gain_scales(self.signal, m)
-
-    def surroundings(self, m: Measurement) -> Surroundings:
-        """What the recording states of the drive: known load, added torque, the motor's supply, and whether it is on. Raises
-        TaccorlError: there is a supply voltage that the law does not use."""
-        on, added = (
-            values[:, m.column(self.signal)] if values.size else None
-            for values in (m.enabled, m.torque_ff)
-        )
-        known = {
-            "supply": self.law.supply(self.signal, m),
-            "on": on,
-            "torque_ff_nm": added,
-        }
-        return Surroundings(coupling_nm=-m.known_load(self.signal), **known)
 
 
 def with_gains(m: Measurement, laws: Mapping[str, DriveLaw]) -> Measurement:

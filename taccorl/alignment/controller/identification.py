@@ -39,10 +39,6 @@ PAPER_BOUNDS = {"kp": (10.0, 1e5), "kd": (1.0, 1e3), "torque_ff": (-8.0, 8.0)}
 """Bounds of K_p, K_d and T_ref [N·m/rad, N·m·s/rad, N·m] (App. B.1)."""
 REFERENCE = Gains(500.0, 50.0, 0.0)
 """Gains of the paper's reference simulator, at which a search starts."""
-_LATE = Free(name="late", unit="s", start=0.0, low=-0.5, high=0.5, scale=0.01)
-_LEAST_MOTION = 5e-3  # rad, m
-_LEAST_SECONDS = 2.0
-_ROUNDS = 4  # of weighing positions and torques against each other
 _STEPS = 100  # of the solver
 _DIVERGED = 1e3
 
@@ -119,11 +115,7 @@ def identify_controller(
     else:
         found, remarks = _by_spsa(fits, spsa_rng)
     estimates, ridge = _estimates(fits, found)
-    late = fits.fit(found.values, late=True)
-    low, high = late.intervals()["late"]
-    estimates["late"] = Estimate(
-        value=late.values["late"], low=low, high=high, unit="s"
-    )
+    estimates["late"] = fits.fit(found.values, late=True).estimates()["late"]
     unfinished = []
     if found.trouble:
         unfinished.append(f"{_STEPS} steps of the solver were not enough")
@@ -269,11 +261,11 @@ def _check_usable(motion: JointMotion, model: JointModel) -> None:
     )
     seen = np.isfinite(motion.measured)
     advice = "record a sweep of this joint: ± 0.2 rad, 0.1 to 2 Hz, 10 s"
-    if seconds < _LEAST_SECONDS:
+    if seconds < 2.0:
         raise TaccorlError(
             f"{motion.name}: {seconds:.2f} s of {signal} are too short for K_p, K_d and T_ref; {advice}"
         )
-    if span < _LEAST_MOTION:
+    if span < 5e-3:
         raise TaccorlError(
             f"{motion.name}: the targets of {signal} move by {span:.2g} {unit} only, which does not determine the gains; "
             f"{advice}"
@@ -388,7 +380,10 @@ class _GainFits:
         """
         numbers = self._numbers()
         if late:
-            numbers = (*numbers, _LATE)
+            delay = Free(
+                name="late", unit="s", start=0.0, low=-0.5, high=0.5, scale=0.01
+            )
+            numbers = (*numbers, delay)
         return minimise(
             lambda cases: np.concatenate(
                 [self._residuals(motion, cases) for motion in self.motions], axis=1
@@ -408,7 +403,8 @@ class _GainFits:
         found = min(map(self.fit, starts), key=lambda one: one.error)
         rounds, channels = 1, 1
         if all(np.isfinite(motion.effort).any() for motion in self.motions):
-            rounds, channels = _ROUNDS, 2
+            # Positions and torques are weighed against each other.
+            rounds, channels = 4, 2
         for _ in range(rounds):
             self.weigh(found.values, channels)
             found = self.fit(found.values)

@@ -33,9 +33,6 @@ SAME_RATE = 0.02
 """Largest share by which the rates of received and logged targets may differ to count as equal: stamps are rounded."""
 KEPT, KEPT_ROWS = 12, 200_000
 """Simulated responses to each recording that a model keeps, as fits ask for some again; and most rows of them in all."""
-GEAR_STEP_S = 2.5e-4
-"""Longest physics step [s] of a joint with play or a spring in its gear (``Drive.midpoint``): an implicit step h damps a swing
-with ω by h ω / 2. At 71 Hz the damping ratio is 0.22 too large with steps of 1 ms, 0.06 with these."""
 ENDS_S = 0.1
 """Time from either end of a recording in which a model of law effort is not judged [s]: the position is smoothed there from one
 side, and the model settles in 1 / ``drive_law.FOLLOW_HZ``."""
@@ -60,16 +57,14 @@ class PayloadLever(NamedTuple):
     cos_m: float = 0.0  # Coefficient c [m]
 
 
-AT_ITS_PLACE = PayloadLever()  # No correction: the payload is where the twin has it
-
-
 class Numbers(NamedTuple):
     """Gains, effects and corrections of one simulation."""
 
     gains: Gains  # Gains of a recording with ``kp_scale`` = 1
     effects: Sequence[Effect] = ()
     """Effects in addition to those of the machine file; one with the name of an effect of the file replaces it."""
-    lever: PayloadLever = AT_ITS_PLACE  # Correction of the payload's weight
+    lever: PayloadLever = PayloadLever()
+    """Correction of the payload's weight; none: it is where the twin has it."""
     age_s: float = (
         0.0  # Additional age of the measured position when the drive's torque acts
     )
@@ -240,13 +235,13 @@ class JointModel:
             self.joint.command_hz if self.joint.command_hz < math.inf else 1.0 / step_s
         )
         parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
-        late_s = max(self.joint.target_late_s, 0.0) * self.joint.follows_line
+        late_s = max(self.joint.target_late_s, 0.0) * self.joint.keeps_times
         own_times = late_s > 0.0 or motion.command_s is not None
-        if self.joint.follows_line:
+        if self.joint.keeps_times:
             parts = round(steps) if own_times else min(parts, round(steps))
         while round(steps) % parts:
             parts -= 1
-        if self.joint.follows_line and (own_times or received > 1):
+        if self.joint.keeps_times and (own_times or received > 1):
             held = (
                 0.0 if self.joint.target_kind == "effort" else 0.5 / received
             )  # no drive holds what was measured
@@ -315,7 +310,12 @@ def _side_by_side(
         # A target that acts before its row does so by a delay below 0, a later one by ``_sent``.
         drive["command_delay__delay_s"] += case.waits_s + min(late_s, 0.0)
         drive["effort_age"] -= case.waits_s
-        if any(drive[f"{name}__rate_per_s"] > 0.0 for name in INTEGRALS):
+        # An integral holds what acts on a joint at rest with any effort within the dry
+        # friction.
+        if any(
+            drive[f"{name}__rate_per_s"] > 0.0
+            for name in ("integral_action", "position_integral")
+        ):
             drive["start_nm"] = motion.start_nm / case.effort_scale
         if (
             held := motion.held_nm_per_rad
@@ -340,8 +340,11 @@ def _side_by_side(
             drive["backlash__play_rad"] > 0.0
             or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
         )
+        # Of a joint with play or a spring in its gear, steps of 0.25 ms (``Drive.midpoint``):
+        # an implicit step h damps a swing with ω by h ω / 2. At 71 Hz the damping ratio is
+        # 0.22 too large with steps of 1 ms, 0.06 with these.
         finer = (
-            math.ceil(step_s / GEAR_STEP_S - 1e-9)
+            math.ceil(step_s / 2.5e-4 - 1e-9)
             if geared and drive["midpoint"] > 0.0
             else 1
         )

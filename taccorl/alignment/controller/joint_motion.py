@@ -28,9 +28,6 @@ _LEFT_HZ = (5.0, *_BANDS_HZ)
 _FAST_S, _FAST_TIMES = 0.05, 4.0
 """Motion between two of these frequencies is kept only where its mean square over ``_FAST_S`` [s] exceeds ``_FAST_TIMES`` times
 that of white noise, whose level is the median of the fastest band, because steps are rare. Choices."""
-STEP_FROM_START = 0.05
-"""Least share of the way to a target that never changes by which a joint moves in the first tenth of a second if it started away
-from it. A choice."""
 Position = tuple[float, float, float]  # x, y, z [m]
 AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """Position in link 6's frame [m]: the middle between the pads, where the PiPER's gripper holds its payload."""
@@ -153,7 +150,9 @@ def steps_at_once(m: Measurement, j: int) -> bool:
         or not np.isfinite(rows).all()
     ):
         return False
-    return bool(np.ptp(rows) > STEP_FROM_START * abs(m.target[0, j] - rows[0]) > 0.0)
+    # A joint that starts away from its target moves by 5 % of the way in the first tenth
+    # of a second. A choice.
+    return bool(np.ptp(rows) > 0.05 * abs(m.target[0, j] - rows[0]) > 0.0)
 
 
 def _planned(m: Measurement, j: int) -> np.ndarray:

@@ -105,12 +105,10 @@ class RigidJoint(ABC):
     """Whether the age of the position is fitted if gains are commanded: at 3.7 rad/s half a millisecond makes 18 noise floors of
     0.1 mrad."""
 
-    follows_line: ClassVar[bool] = False
-    """Target between two rows. True: interpolated linearly. False: held at the value of the later row, as in a replay."""
     keeps_times: ClassVar[bool] = False
-    """True: a recording may begin in motion, and targets of rows with jitter act at
-    their own arrival times. False: it begins at rest, and they act at the times of
-    their rows."""
+    """True: a recording may begin in motion, targets of rows with jitter act at their own
+    arrival times, and between two rows on the line. False: it begins at rest, and a target
+    is held from the time of its row, as in a replay."""
     target_late_s: float = 0.0
     """Delay from a target's arrival (see ``keeps_times``) until it acts in the controller [s]."""
 

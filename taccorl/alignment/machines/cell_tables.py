@@ -34,13 +34,18 @@ from taccorl.alignment.measurements.table_files import (
     read_columns,
     table_origin,
 )
-from taccorl.alignment.measurements.tables import POSITION, TIME_S, Column, ColumnsFile
+from taccorl.alignment.measurements.tables import (
+    POSITION,
+    TIME_S,
+    Column,
+    ColumnsFile,
+    stated_columns,
+)
 from taccorl.data.finding import Finding, listed
 from taccorl.data.strict_yaml import Document, Rules
 from taccorl.errors import RecordingError, nearest
 
 _PLACE = re.compile(r"\{(\w*)\}")
-PLACES = ({"row", "column"}, {"index"})  # Placeholders of a pattern: one of these sets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +182,7 @@ def _rules_of_array(array: ArrayColumns, config: CellsConfig) -> Rules:
             continue
         where, found = f"array/{key}/column", _PLACE.findall(column.column)
         text = f"{column.column!r}: a pattern has {{index}} once, or {{row}} and {{column}} once each, in quotes"
-        wrong = len(found) != len(set(found)) or set(found) not in PLACES
+        wrong = sorted(found) not in (["column", "row"], ["index"])
         yield wrong, where, f'{text}: "t{{index}}", "taxel_{{row}}_{{column}}"'
         of_grid = "{row} and {column} are of a grid, but the cells file gives names: write {index}"
         yield "row" in found and config.cells, where, of_grid
@@ -376,7 +381,13 @@ def read_cell_table(
             return own_cell_columns(path, header, config)
         return columns_of_cells(path, header, spec, config)
 
-    header, columns = read_columns(path, lambda header: _wanted(stated(header)), spec)
+    def wanted(header: list[str]) -> list[str]:
+        own = stated(header)
+        names = [column.column for column in stated_columns(own)]
+        names += [own.temperature.column] if own.temperature else []
+        return list(dict.fromkeys(names))
+
+    header, columns = read_columns(path, wanted, spec)
     own = stated(header)
     time_s = own.time.quantity(columns[own.time.column]) * TIME_S[own.time.unit]
     if len(time_s) < 2:
@@ -422,18 +433,6 @@ def read_cell_table(
         position_mm=np.column_stack(position) if position else np.empty(0),
     )
     return _even(found)
-
-
-def _wanted(spec: CellTableSpec) -> list[str]:
-    names = [spec.time.column, *(c.reading.column for c in spec.cells.values())]
-    names += [
-        c.column
-        for c in (spec.load, *(cell.load for cell in spec.cells.values()))
-        if c is not None
-    ]
-    names += [spec.temperature.column] if spec.temperature else []
-    names += [spec.position.x.column, spec.position.y.column] if spec.position else []
-    return list(dict.fromkeys(names))
 
 
 def _even(m: CellMeasurement) -> CellMeasurement:

@@ -36,33 +36,33 @@ _PREFIXES = {
 }
 
 
-def _units(**prefixes: str) -> dict[str, tuple[str, float]]:
-    """Unit, and the unit with each of these prefixes → the unit and the factor to it."""
+def _units(quantity: str = "", **prefixes: str) -> dict[str, tuple[str, float]]:
+    """Unit, and the unit with each of these prefixes → ``quantity``, or the unit, and the
+    factor to it."""
     return {
-        f"{p}{unit}": (unit, _PREFIXES[p])
+        f"{p}{unit}": (quantity or unit, _PREFIXES[p])
         for unit, some in prefixes.items()
         for p in ("", *some)
     }
 
 
-_QUANTITIES = {"N": "force_n", "Pa": "pressure_pa", "m": "depth_m"}
 LOADS: dict[str, tuple[str, float]] = {
-    unit: (_QUANTITIES[own], factor)
-    for unit, (own, factor) in _units(N="mk", Pa="hkM", m="muµ").items()
-}
-LOADS |= {
+    **_units("force_n", N="mk"),
+    **_units("pressure_pa", Pa="hkM"),
+    **_units("depth_m", m="muµ"),
     "gf": ("force_n", 9.80665e-3),
     "kgf": ("force_n", 9.80665),
     "lbf": ("force_n", 4.4482216),
-}
-LOADS |= {
     "mbar": ("pressure_pa", 1e2),
     "bar": ("pressure_pa", 1e5),
     "psi": ("pressure_pa", 6894.757),
 }
 """Unit of a load → its column in tables without a columns file, and the factor to that column's unit."""
-READINGS = _units(count="", V="muµ", ohm="kM", S="muµ", F="npf", A="muµ", N="m", Pa="k")
-READINGS |= {"Ω": ("ohm", 1.0), "kΩ": ("ohm", 1e3)}
+READINGS: dict[str, tuple[str, float]] = {
+    **_units(count="", V="muµ", ohm="kM", S="muµ", F="npf", A="muµ", N="m", Pa="k"),
+    "Ω": ("ohm", 1.0),
+    "kΩ": ("ohm", 1e3),
+}
 """Unit of a reading → the quantity's own unit and the factor to it."""
 READINGS_OF_RATED = 10.0
 """Reading of the rated load in the unit ``reading``. Touch effects have bounds for readings of this size."""

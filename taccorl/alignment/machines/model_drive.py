@@ -67,13 +67,9 @@ class Actuator:
         return self.kind in ("position", "velocity") or self.supply_v > 0.0
 
 
-@dataclass(frozen=True)
-class Part:
-    """Share of a coefficient of a joint, and the fields of the model that state it."""
-
-    source: StatedFields
-    fields: tuple[str, ...]
-    value: float  # At the joint [N·m·s/rad or N·m·s²/rad²; of a slide N and m]
+Share = tuple[StatedFields, tuple[str, ...], float]
+"""Who states a share of a coefficient of a joint, in which of its fields, and its value at
+the joint [N·m·s/rad or N·m·s²/rad²; of a slide N and m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,15 +105,14 @@ class JointDraft:
         else:
             source.take(*taken)
 
-    def add_sum(self, parts: Sequence["Part"], name: str, parameter: str) -> None:
-        """Add one effect whose parameter is what ``parts`` add up to."""
-        stated = [part for part in parts if part.value]
-        total = sum(part.value for part in stated)
-        for part in stated:
-            if name in self.effects:
-                part.source.take(*part.fields)
-            else:
-                self.add(part.source, part.fields, name, **{parameter: total})
+    def add_sum(self, shares: Sequence[Share], name: str, parameter: str) -> None:
+        """Add one effect whose parameter is what ``shares`` add up to."""
+        total = sum(value for _, _, value in shares)
+        for source, taken, value in shares:
+            if value and name in self.effects:
+                source.take(*taken)
+            elif value:
+                self.add(source, taken, name, **{parameter: total})
 
     def limit(
         self, source: StatedFields, switch: str, range_: str, scale: float
@@ -447,13 +442,12 @@ def _passive(draft: JointDraft, every: Sequence[Actuator]) -> None:
         ("damping", "viscous_friction", "damping_nms_per_rad"),
         ("dampingpoly[0]", "quadratic_drag", "drag_nms2_per_rad2"),
     ):
-        parts = [Part(joint, (f"dof_{name}",), joint.get(f"dof_{name}"))]
-        for a in every:
-            own = f"actuator_{name}"
-            parts += [Part(a.fields, (own,), a.gear**2 * a.fields.get(own))]
+        own = f"actuator_{name}"
+        shares = [(joint, (f"dof_{name}",), joint.get(f"dof_{name}"))]
+        shares += [(a.fields, (own,), a.gear**2 * a.fields.get(own)) for a in every]
         if name == "damping":
-            parts += [_braking(a) for a in every if a.kind == "passive"]
-        draft.add_sum(parts, effect, parameter)
+            shares += [_braking(a) for a in every if a.kind == "passive"]
+        draft.add_sum(shares, effect, parameter)
     if (friction := joint.get("dof_frictionloss")) > 0.0:
         if joint.get("dof_solref[0]") == DRY_TIME_S:  # as stiff as the twin's own
             joint.take("dof_solref", "dof_solimp")
@@ -472,13 +466,13 @@ def spring(draft: JointDraft, rest: float) -> None:
         draft.add(draft.joint, ("jnt_stiffness",), "cable_spring", **values)
 
 
-def _braking(one: Actuator) -> Part:
+def _braking(one: Actuator) -> Share:
     """Damping by the back-EMF of a motor whose terminals are connected, K² / R."""
     resistance, constant = _winding_of(one.fields)
     if constant == 0.0:
         one.fields.take("actuator_gainprm[0]")  # no current flows
     braking = (one.gear * constant) ** 2 / resistance
-    return Part(one.fields, ("actuator_gainprm[0]", "actuator_gainprm[1]"), braking)
+    return one.fields, ("actuator_gainprm[0]", "actuator_gainprm[1]"), braking
 
 
 def _of_device(draft: JointDraft, a: Actuator) -> None:

@@ -19,28 +19,24 @@ import numpy as np
 from taccorl.errors import TaccorlError, plain_name
 
 MOST_BYTES = 1 << 24  # Largest model file that is read
-MOST_DEEP = 200  # Most elements, or links of a chain, within one another
+MOST_DEEP = 200  # Most elements within one another
 MOST_ELEMENTS = 20_000
-"""Most elements of a file, also after ``<replicate>`` and with parts of a ``<composite>`` or ``<flexcomp>``. MuJoCo takes
-minutes for ten times as many."""
+"""Most elements of a file. MuJoCo takes minutes for ten times as many."""
 MOST_MADE = 5000
-"""Most elements that ``<replicate>``, ``<composite>`` and ``<flexcomp>`` make. MuJoCo
-4.0 takes a time that grows with their square: 7 s for 15 000."""
+"""Most elements that ``<replicate>`` and attributes ``count`` make. MuJoCo 4.0 takes a
+time that grows with their square: 7 s for 15 000."""
 MOST_JOINTS = 1000  # Most joints of a robot
 MOST_VALUES = 4_000_000
-"""Most values of all height fields together, of a texture, and of the other arrays whose sizes attributes state."""
+"""Most values of an array whose size attributes state, and of all arrays of ``<size>``."""
 MOST_FILES = 20  # Most files that a model includes
-MESH_VALUES = 12  # Numbers in a quadrilateral of a mesh that MuJoCo builds
-BALANCE = '<mujoco><compiler balanceinertia="true"/></mujoco>'
-_SIZES = ("nrow", "ncol", "width", "height", "size", "dim")
-_BODIES = ("body", "worldbody")
-_NAMED = {
-    "joint": "joint",
-    "freejoint": "joint",
-    "body": "body",
-    "link": "body",
-    "actuator": "actuator",
+_SIZES = {
+    "hfield": ("nrow", "ncol"),
+    "texture": ("width", "height"),
+    "numeric": ("size",),
+    "mesh": ("params",),
 }
+"""Tag → its attributes whose product is the number of values that it holds."""
+_NAMED = {"joint": "joint", "freejoint": "joint", "body": "body", "link": "body"}
 
 
 @dataclass(eq=False)
@@ -52,8 +48,6 @@ class Element:
     path: Path  # File in which it is
     line: int  # Line of that file, from 1
     parent: "Element | None"
-    begin: int = 0  # Byte at which it begins
-    end: int = 0  # Byte at which its closing tag begins, or it itself if it has none
     children: "list[Element]" = field(default_factory=list)
 
     def iterate(self) -> Iterator["Element"]:
@@ -77,6 +71,12 @@ class Element:
         return self.attributes.get(key, default)
 
     @property
+    def is_there(self) -> bool:
+        """Whether a joint or body is part of the tree; others only refer to one."""
+        around = ("robot", "body", "worldbody", "frame", "replicate")
+        return self.parent is not None and self.parent.tag in around
+
+    @property
     def place(self) -> str:
         """File and line."""
         return f"{self.path}:{self.line}"
@@ -87,21 +87,19 @@ class Element:
         return f"{self.path.name}:{self.line}"
 
 
-def read_model(path: Path) -> tuple[Element, bytes]:
-    """Read and check a model file, with all files that it includes. Returns its root, and its bytes. Raises TaccorlError: it
+def read_model(path: Path) -> Element:
+    """Read and check a model file, with all files that it includes. Returns its root. Raises TaccorlError: it
     cannot be read, is not XML, is too large or nested too deeply, or two joints or links have one name; the message names file
     and line."""
-    root, content = _parsed(path)
-    if root.tag == "robot":
-        _refuse_long_chains(root)
-    else:
+    root = _parsed(path)
+    if root.tag != "robot":
         _include(root)
     _refuse_large(root)
     _refuse_names(root)
-    return root, content
+    return root
 
 
-def _parsed(path: Path) -> tuple[Element, bytes]:
+def _parsed(path: Path) -> Element:
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
@@ -122,14 +120,7 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         parent = inside[-1] if inside else None
-        one = Element(
-            tag,
-            attributes,
-            path,
-            parser.CurrentLineNumber,
-            parent,
-            parser.CurrentByteIndex,
-        )
+        one = Element(tag, attributes, path, parser.CurrentLineNumber, parent)
         if len(inside) >= MOST_DEEP:
             raise TaccorlError(
                 f"{one.place}: <{tag}> is nested deeper than {MOST_DEEP} elements; is it a model file?"
@@ -143,10 +134,8 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
         (parent.children if parent is not None else top).append(one)
         inside.append(one)
 
-    def end(tag: str) -> None:
-        inside.pop().end = parser.CurrentByteIndex
-
-    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda tag: inside.pop()
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
@@ -157,7 +146,13 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
         raise TaccorlError(
             f"{path}:1: the encoding that it states is not read: {error}; save it as UTF-8, and state that or none"
         ) from error
-    return top[0], content
+    try:
+        content.decode("utf-8")  # as which MuJoCo takes it, whatever it states
+    except UnicodeDecodeError as error:
+        raise TaccorlError(
+            f"{path}: is not a text in UTF-8: {error}; save it as UTF-8"
+        ) from error
+    return top[0]
 
 
 def _include(root: Element) -> None:
@@ -175,7 +170,7 @@ def _include(root: Element) -> None:
             )
         try:
             # MuJoCo looks beside the first file.
-            included, _ = _parsed(root.path.parent / one.get("file"))
+            included = _parsed(root.path.parent / one.get("file"))
         except TaccorlError as error:
             raise TaccorlError(f"{one.place}: <{one.tag}>: {error}") from error
         one.children.append(included)
@@ -185,68 +180,31 @@ def _include(root: Element) -> None:
 
 def _refuse_large(root: Element) -> None:
     """Refuse what MuJoCo would expand without end, by the numbers that the file states."""
-    total = made = joints = values = 0
-    sizes: list[Element] = []
+    made = joints = 0
     waiting = [(root, 1)]
     while waiting:
         one, times = waiting.pop()
-        own = {key: _whole(value) for key, value in one.attributes.items()}
-        counts = [max(n, 1) for n in own.get("count", ())]
-        parts = times
-        if one.tag == "replicate":
-            times *= max(1, *counts, 1)
-        elif counts:
-            parts *= math.prod(counts)
-        total += parts
-        made += parts if parts > 1 else 0
-        if one.tag in ("joint", "freejoint", "composite", "flexcomp"):
-            joints += parts
-        if total > MOST_ELEMENTS or made > MOST_MADE or joints > MOST_JOINTS:
+        counted = times * _product(one, "count")
+        times = counted if one.tag == "replicate" else times
+        made += counted if counted > 1 else 0
+        joints += counted if one.tag in ("joint", "freejoint", "composite") else 0
+        values = _product(one, *_SIZES.get(one.tag, ())) * times
+        if one.tag == "size":  # of each element, or of each joint in a key
+            values = MOST_JOINTS * max(_product(one, k) for k in ("", *one.attributes))
+        if made > MOST_MADE or joints > MOST_JOINTS or values > MOST_VALUES:
             raise TaccorlError(
-                f"{one.place}: <{one.tag}> makes more than {MOST_ELEMENTS:,} elements, {MOST_MADE:,} by counts, or "
-                f"{MOST_JOINTS:,} joints of this file; is it one robot? Give the model that it makes, or smaller counts"
+                f"{one.place}: <{one.tag}> makes more than {MOST_MADE:,} elements by "
+                f"counts, {MOST_JOINTS:,} joints of this file or {MOST_VALUES:,} values; "
+                "is it one robot? Give the model that it makes, or smaller numbers"
             )
-        stated = [max(n, 1) for key in _SIZES for n in own.get(key, ())]
-        held = math.prod(stated) * times
-        if one.tag == "mesh" and one.get("builtin"):
-            held = MESH_VALUES * math.prod(max(n, 1) for n in own.get("params", ()))
-        if one.tag in ("hfield", "numeric", "mesh"):
-            values += held
-            held = values
-        if one.tag in ("hfield", "texture", "numeric", "mesh") and held > MOST_VALUES:
-            raise TaccorlError(
-                f"{one.place}: <{one.tag}>: {held:,} values up to here, more than {MOST_VALUES:,}; it is not used: remove it"
-            )
-        sizes += [one] if one.tag == "size" else []
         waiting += [(child, times) for child in one.children]
-    for one in sizes:
-        for key, value in one.attributes.items():
-            # Of each element, or of each joint in a key.
-            each = total if key == "nkey" or key.startswith("nuser_") else 1
-            if key != "memory" and any(n * each > MOST_VALUES for n in _whole(value)):
-                raise TaccorlError(
-                    f'{one.place}: <size {key}="{value}">: more than {MOST_VALUES:,} values; remove it'
-                )
 
 
-def _whole(text: str) -> list[int]:
-    """Whole numbers of an attribute; others are left to MuJoCo."""
-    return [int(word[:19]) for word in text.split() if re.fullmatch(r"\+?\d+", word)]
-
-
-def _refuse_long_chains(root: Element) -> None:
-    above = {ends[1]: ends[0] for one in root.all("joint") if all(ends := ends_of(one))}
-    deep: dict[str, int] = {}
-    for link in above:
-        chain = [link]
-        while chain[-1] in above and chain[-1] not in deep and len(chain) <= MOST_DEEP:
-            chain.append(above[chain[-1]])
-        length = deep.get(chain[-1], 0)
-        for k, one in enumerate(reversed(chain)):
-            deep[one] = length + k
-        if deep[link] > MOST_DEEP:
-            chain_of = f"{root.path}: link {link} hangs on a chain of more than {MOST_DEEP} links"
-            raise TaccorlError(f"{chain_of}; is it a robot?")
+def _product(one: Element, *keys: str) -> int:
+    """Product of the whole numbers of attributes; others are left to MuJoCo."""
+    words = [word for key in keys for word in one.get(key).split() if key != "memory"]
+    whole = [int(w[:19]) for w in words if re.fullmatch(r"\+?\d+", w)]
+    return math.prod(max(number, 1) for number in whole)
 
 
 def ends_of(joint: Element) -> tuple[str, str]:
@@ -259,7 +217,7 @@ def ends_of(joint: Element) -> tuple[str, str]:
     while one is not None and len(around) < 2:
         around += [
             "world" if one.tag == "worldbody" else one.get("name") or "(no name)"
-        ] * (one.tag in _BODIES)
+        ] * (one.tag in ("body", "worldbody"))
         one = one.parent
     return (
         (around[1] if len(around) > 1 else "world", around[0]) if around else ("", "")
@@ -270,14 +228,7 @@ def joints_of(root: Element) -> dict[str, Element]:
     """Name → element of the joints, without those of ``<default>``, ``<equality>`` and other sections that only refer to one."""
     found = {}
     for one in root.all("joint"):
-        around = one.parent.tag if one.parent is not None else ""
-        if one.get("name") and around in (
-            "robot",
-            "body",
-            "worldbody",
-            "frame",
-            "replicate",
-        ):
+        if one.get("name") and one.is_there:
             found.setdefault(one.get("name"), one)
     return found
 
@@ -318,15 +269,8 @@ def _refuse_names(root: Element) -> None:
         if not name:
             continue
         plain_name(name, f"{one.place}: <{one.tag}>")
-        around = one.parent.tag if one.parent is not None else ""
         kind = _NAMED.get(one.tag)
-        if kind is None or around not in (
-            "robot",
-            "body",
-            "worldbody",
-            "frame",
-            "replicate",
-        ):
+        if kind is None or not one.is_there:
             continue
         first = seen.setdefault((kind, name), one)
         if first is one:
@@ -339,30 +283,6 @@ def _refuse_names(root: Element) -> None:
         raise TaccorlError(
             f"{one.place}: two <{one.tag}> have the name {name!r}, {between}; rename one"
         )
-
-
-def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
-    """Text of a URDF in which visual and collision shapes are blanks, so that every line stays where it is, and how many there
-    were. Raises TaccorlError: the text is not UTF-8."""
-    text, shapes = bytearray(content), 0
-    for link in root.all("link"):
-        for k, shape in enumerate(link.children):
-            if shape.tag not in ("visual", "collision"):
-                continue
-            shapes += 1
-            later = (
-                link.children[k + 1].begin if k + 1 < len(link.children) else link.end
-            )
-            end = content.index(b">", shape.end) + 1 if shape.end < later else later
-            text[shape.begin : end] = bytes(
-                b if b in b"\r\n" else 0x20 for b in text[shape.begin : end]
-            )
-    try:
-        return text.decode("utf-8-sig"), shapes
-    except UnicodeDecodeError as error:
-        raise TaccorlError(
-            f"{root.path}: is not a text in UTF-8: {error}; save it as UTF-8"
-        ) from error
 
 
 def unbalanced(root: Element) -> str:
@@ -383,7 +303,8 @@ def unbalanced(root: Element) -> str:
         numbers = ", ".join(f"{x:.4g}" for x in moments)
         return (
             f"{inertia.place}: link {name}: no body has the principal inertias {numbers} kg·m²: each must be above 0, and the "
-            f"largest at most the sum of the others, {moments[0] + moments[1]:.4g}. Correct the number, or write {BALANCE} "
-            "inside <robot>: MuJoCo then takes their mean for all three"
+            f"largest at most the sum of the others, {moments[0] + moments[1]:.4g}. Correct the number, or write "
+            '<mujoco><compiler balanceinertia="true"/></mujoco> inside <robot>: MuJoCo then '
+            "takes their mean for all three"
         )
     return ""

@@ -44,8 +44,6 @@ from taccorl.sim.twin_file import EffectsDocument, effect_entry
 TODO = "TODO"  # Placeholder for a value that only the user knows; a file that contains it is rejected
 REMOVABLE = 0.95
 """Largest share of a body's mass that a ``payload`` below 0 may remove. A choice: what is left must be above 0."""
-_LEAST_REACH_M = 0.05
-_HINGE = mujoco.mjtJoint.mjJNT_HINGE
 MOST_EARLY_S = 0.01
 """``position_age_s`` and ``target_late_s`` of a file must be above minus this value [s]. A
 choice: longer than the period of any drive's loop."""
@@ -284,14 +282,16 @@ class Robot:
     def last_body(self, signal: str) -> int:
         """Id of the body in which the joint's ``payload`` is that states no ``link``: the one with the most bodies between it and
         the joint; of several the one with the lowest id."""
-        model = self.rigid.model
-        far = model.joint(signal).bodyid[0]
-        depth = {int(far): 0}
-        for body in range(int(far) + 1, model.nbody):
-            parent = int(model.body_parentid[body])
-            if parent in depth:
-                depth[body] = depth[parent] + 1
-        return max(depth, key=lambda body: (depth[body], -body))
+        chains = map(self.chain, range(self.rigid.model.nbody))
+        own = self.rigid.model.joint(signal).bodyid[0]
+        return max((c for c in chains if own in c), key=lambda c: (len(c), -c[0]))[0]
+
+    def chain(self, body: int) -> list[int]:
+        """Ids of the bodies from ``body`` to the world."""
+        parents, found = self.rigid.model.body_parentid, [body]
+        while found[-1] != 0:
+            found.append(int(parents[found[-1]]))
+        return found
 
     def body_of(self, signal: str, payload: Payload) -> int:
         """Id of the body in which a payload of the joint is."""
@@ -307,22 +307,14 @@ class Robot:
 
     def links_before(self, body: int) -> dict[str, int]:
         """Name → id of the bodies with joints between the base and a body."""
-        model, found = self.rigid.model, dict[str, int]()
-        while (body := int(model.body_parentid[body])) != 0:
-            found |= (
-                {model.body(body).name: body}
-                if model.body(body).name and model.body_jntnum[body]
-                else {}
-            )
-        return found
+        model = self.rigid.model
+        before = [one for one in self.chain(body)[1:-1] if model.body_jntnum[one]]
+        names = {model.body(one).name: one for one in before}
+        return {name: one for name, one in names.items() if name}
 
     def moves_body(self, signal: str, body: int) -> bool:
         """True if the joint moves the body with this id."""
-        model = self.rigid.model
-        own = int(model.joint(signal).bodyid[0])
-        while body > own:
-            body = int(model.body_parentid[body])
-        return body == own
+        return self.rigid.model.joint(signal).bodyid[0] in self.chain(body)
 
     def along_chain(self, signal: str) -> tuple[str, ...]:
         """Joints whose positions change what weight the joint carries: those behind it, to the tip, then those before it."""
@@ -413,11 +405,9 @@ class Robot:
         from_joint = np.linalg.norm(
             model.body_ipos[body] - model.jnt_pos[model.body_jntadr[body]]
         )
-        chain = float(np.linalg.norm(model.body_ipos[body]))
-        while model.body_parentid[body] != 0:
-            chain += float(np.linalg.norm(model.body_pos[body]))
-            body = int(model.body_parentid[body])
-        return max(0.5 * chain, 2.0 * float(from_joint), _LEAST_REACH_M)
+        lengths = np.linalg.norm(model.body_pos[self.chain(body)[:-2]], axis=1)
+        chain = float(np.linalg.norm(model.body_ipos[body]) + lengths.sum())
+        return max(0.5 * chain, 2.0 * float(from_joint), 0.05)
 
     def idle_axes(self, signal: str, last: int | None = None) -> tuple[int, ...]:
         """Axes 0, 1, 2 of the body ``last`` (default: the joint's last body) along which the joint does not feel the payload's
@@ -428,16 +418,12 @@ class Robot:
             return (0, 1, 2)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        body = last
-        while body != model.jnt_bodyid[own]:
-            for j in range(
-                model.body_jntadr[body],
-                model.body_jntadr[body] + model.body_jntnum[body],
-            ):
-                hinge = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
-                if hinge and abs(data.xaxis[j] @ data.xaxis[own]) < _ALONG:
-                    return ()
-            body = int(model.body_parentid[body])
+        chain = self.chain(last)
+        between = chain[: chain.index(model.jnt_bodyid[own])]
+        turning = np.isin(model.jnt_bodyid, between)
+        turning &= model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+        if (np.abs(data.xaxis[turning] @ data.xaxis[own]) < _ALONG).any():
+            return ()
         along = np.abs(data.xmat[last].reshape(3, 3).T @ data.xaxis[own])
         return (int(np.argmax(along)),) if along.max() > _ALONG else ()
 
@@ -504,8 +490,8 @@ def robot_of(joints: Mapping[str, JointConfig], path: Path) -> Robot:
         unit, inertia = config.unit or "rad", config.inertia or 1.0
         body = spec.worldbody.add_body(mass=inertia, inertia=[inertia] * 3)
         body.explicitinertial = True
-        kind = mujoco.mjtJoint.mjJNT_SLIDE if unit == "m" else _HINGE
-        body.add_joint(name=name, type=kind, axis=[0.0, 0.0, 1.0])
+        kinds = {"m": mujoco.mjtJoint.mjJNT_SLIDE, "rad": mujoco.mjtJoint.mjJNT_HINGE}
+        body.add_joint(name=name, type=kinds[unit], axis=[0.0, 0.0, 1.0])
         facts[name] = JointFacts(
             name=name,
             unit=unit,

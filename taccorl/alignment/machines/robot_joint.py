@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from taccorl.alignment.controller.drive_law import DriveJoint, with_gains
+from taccorl.alignment.controller.drive_law import with_gains
 from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2, JointModel
 from taccorl.alignment.controller.joint_motion import (
     JointMotion,
@@ -29,6 +29,7 @@ from taccorl.alignment.controller.rigid_joint import (
     MassTorque,
     PointMass,
     Rigid,
+    RigidJoint,
     mass_torque_along,
     rates,
     rigid_terms,
@@ -56,20 +57,11 @@ _GIVES = (
     "dry_friction",
 )
 """Words of ``Effect.needs`` for what the one-joint model can compute: an effect that needs another one cannot act in it."""
-FINE_S = 1e-3
-"""Largest time step of the positions from which the torques of moving joints on each other are computed [s]. Of a simulated arm
-of four joints, whose targets change every 10 ms, it leaves an error of 1.06 noise floors of the efforts; 2 ms leave 1.24."""
-SWEEPS = 4
-"""Gauss–Seidel sweeps over the joints in ``moved_together``. A choice: each sweep removes two thirds of the error."""
 MOST_KEPT, MOST_NUMBERS = 1_000_000, 50_000_000
 """Largest number of positions in ``KeptMotions``, and of entries of mass matrices."""
-_STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
 FORCE_OF_MASS = 0.1
 """Force unit of a slide without ``effort_limit`` over its mass [N/kg]. A choice: dry
 friction is searched up to 20 times this, a friction coefficient of 0.2."""
-LEAST_INERTIA = 0.01
-"""Least inertia of a joint with a ``payload`` of negative mass, as a share of its inertia in the model. A choice: a search may
-try places of the mass that would make the inertia negative."""
 PAYLOAD_AT = (
     "x_m",
     "y_m",
@@ -108,11 +100,12 @@ def acts_on_joint(
     )
 
 
-class RobotJoint(DriveJoint):
+class RobotJoint(RigidJoint):
     """One joint of a robot file. A pose holds the model's ``qpos``."""
 
     effort_holds_weight: ClassVar[bool] = True
     exact_timing: ClassVar[bool] = True
+    keeps_times: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -139,20 +132,27 @@ class RobotJoint(DriveJoint):
 
     def _use(self, config: "JointConfig") -> None:
         """Take the numbers of the drive from ``config``."""
-        signal, unit = self.signal, self._robot.rigid.joints[self.signal].unit
-        super().__init__(config, signal, unit, config.loop_hz, config.command_hz)
         self._config = config
+        self.unit = self._robot.rigid.joints[self.signal].unit
+        self.gains, self.gain_names = config.following, config.gain_names
+        self.target_kind, self.known_names = config.target_kind, config.known
+        is_effort = config.law == "effort"
+        self.command_hz = math.inf if is_effort else config.command_hz or 0.0
+        # Of a sampled loop the output is held, on average half a period; a difference of
+        # two samples is as old again, and so is the output that a row shows before its own
+        # target acts. After it acts, the output is new.
+        loop_s = self.loop_s = 1.0 / config.loop_hz if config.loop_hz else 0.0
+        age_s = (-0.5 if config.effort_after_target else 0.5) * loop_s
+        self.facts = config.facts | {"effort_age": age_s}
         self.stated_age_s = config.position_age_s
-        self.position_age_s += config.position_age_s
+        self.position_age_s = 0.5 * loop_s + config.position_age_s
+        self.speed_delay_s = loop_s
         self.target_late_s = config.target_late_s
         if not self.has_model:
             late_s = config.speed_late_s if config.loop_hz and config.kd else 0.0
-            self.facts = {
-                **self.facts,
-                "speed_age": self.speed_delay_s,
-                "speed_delay__delay_s": late_s,
-            }
-            self.speed_delay_s = self.speed_delay_s + late_s if config.kd else 0.0
+            late = {"speed_age": loop_s, "speed_delay__delay_s": late_s}
+            self.facts = {**self.facts, **late}
+            self.speed_delay_s = loop_s + late_s if config.kd else 0.0
 
     @property
     def config(self) -> "JointConfig":
@@ -197,6 +197,9 @@ class RobotJoint(DriveJoint):
             "back_emf": values["back_emf"],
         }
 
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self._config.gain_scales(self.signal, m)
+
     def timestep_s(self, motion: JointMotion) -> float:
         c = self._config
         inertia = c.inertia or self.known.inertia + c.armature
@@ -208,8 +211,9 @@ class RobotJoint(DriveJoint):
             return self._stated_rigid(motion, self._config.inertia)
         masses = self._every_mass(bodies)
         terms = self._terms(motion.pose, masses)
-        # A mass below 0 that a search tries far from its body's centre would leave the joint no inertia.
-        least = LEAST_INERTIA * self.known.inertia
+        # A mass below 0 that a search tries far from its body's centre would leave the
+        # joint no inertia: a hundredth stays, a choice.
+        least = 0.01 * self.known.inertia
         inertia = max(terms.inertia, least) + self._config.armature
         return terms._replace(
             inertia=inertia,
@@ -341,7 +345,7 @@ class RobotJoint(DriveJoint):
         pose, along = self.pose(m), self._along or moved_together(self._stated, m)
         coupling, carrying = self._coupling(m, pose, along)
         rows = np.arange(len(coupling)) * m.num_rows / len(coupling)
-        drive = super().surroundings(m)
+        drive = self._drive(m)
         coupling = coupling + np.interp(rows, np.arange(m.num_rows), drive.coupling_nm)
         positions = None if along is None else along.positions
         return dataclasses.replace(
@@ -350,6 +354,18 @@ class RobotJoint(DriveJoint):
             carrying_nm=carrying,
             pose=pose,
             positions=positions,
+        )
+
+    def _drive(self, m: Measurement) -> Surroundings:
+        """What the recording states of the drive: known load, added torque, the motor's
+        supply, and whether it is on. Raises TaccorlError: there is a supply voltage that
+        the law does not use."""
+        j = m.column(self.signal)
+        return Surroundings(
+            coupling_nm=-m.known_load(self.signal),
+            supply=self._config.supply(self.signal, m),
+            on=m.enabled[:, j] if m.enabled.size else None,
+            torque_ff_nm=m.torque_ff[:, j] if m.torque_ff.size else None,
         )
 
     def _mounted(self, m: Measurement) -> Surroundings:
@@ -373,7 +389,7 @@ class RobotJoint(DriveJoint):
         if self.unit == "rad":
             mounted = payload * lever**2 + arm * lever**2 / 3.0
         return dataclasses.replace(
-            super().surroundings(m),
+            self._drive(m),
             payload_kg=payload,
             payload_at_known=True,
             moment_kgm=payload * lever + 0.5 * arm * lever,
@@ -652,7 +668,9 @@ class KeptMotions:
 
 def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
     model, laws = robot.rigid.model, robot.config.joints
-    angles = moved_by_others(m, list(robot.rigid.joints), _STILL)
+    # Soft joints near the base give way to a wrist that swings; less than 1 mrad or 1 mm
+    # costs it nothing.
+    angles = moved_by_others(m, list(robot.rigid.joints), 1e-3)
     driven = [
         n
         for n in angles
@@ -664,7 +682,9 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         if len(angles) > 1 and np.isfinite(m.target[:, m.column(n)]).all()
     ]
     most = MOST_NUMBERS // (m.num_rows * model.nv**2)
-    fine = max(1, min(math.ceil(m.period_s / FINE_S - 1e-6), most)) if driven else 1
+    # Of a simulated arm of four joints, whose targets change every 10 ms, steps of 1 ms
+    # leave an error of 1.06 noise floors of the efforts; 2 ms leave 1.24.
+    fine = max(1, min(math.ceil(m.period_s / 1e-3 - 1e-6), most)) if driven else 1
     rows, times = np.arange(m.num_rows), np.arange(m.num_rows * fine) / fine
     q = np.tile(RobotJoint(robot, next(iter(laws))).pose(m), (len(times), 1))
     for name, values in angles.items():
@@ -675,7 +695,8 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
     found = Along(frozenset(angles), q, needed, carried)
     models = {name: JointModel(RobotJoint(robot, name, along=found)) for name in driven}
     motions = {name: motion_of(m, name, one.joint) for name, one in models.items()}
-    for name in driven * SWEEPS:
+    # Four Gauss–Seidel sweeps, a choice: each removes two thirds of the error.
+    for name in driven * 4:
         one, moved, joint = models[name], motions[name], model.joint(name)
         coupling, carrying = RobotJoint(robot, name)._coupling(m, moved.pose, found)
         coupling = coupling + one.joint.moving_masses_nm(moved, one.joint.effects(()))

@@ -34,11 +34,9 @@ from taccorl.alignment.machines.model_xml import (
     joints_of,
     read_model,
     unbalanced,
-    without_shapes,
 )
-from taccorl.alignment.machines.omitted_actuators import leave_out
 from taccorl.alignment.machines.stated_fields import StatedFields, remarks_on_rest
-from taccorl.alignment.machines.unmodelled import remarks_on_unmodelled
+from taccorl.alignment.machines.unmodelled import leave_out, remarks_on_unmodelled
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import Effect
@@ -59,17 +57,6 @@ _REMOVED = (
     "lights",
     "cameras",
 )
-
-
-_NOT_RIGID = (
-    "dof_damping",
-    "dof_frictionloss",
-    "dof_armature",
-    "jnt_stiffness",
-    "actuator_armature",
-    "actuator_damping",
-)
-"""Fields that the rigid-body model lacks, because the robot file has them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,10 +97,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     spec, root, remarks, mimics = _spec(path)
     spec.memory = -1  # of contacts, which are not computed
     _refuse_closed_chains(path, spec)
-    try:
-        remarks += leave_out(spec, root)
-    except TaccorlError as error:
-        raise TaccorlError(f"{path}: {error}") from error
+    remarks += leave_out(spec, root)
     remarks += remarks_on_unmodelled(spec, root)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
@@ -144,7 +128,15 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     model.opt.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
     )
-    for field in _NOT_RIGID:
+    # Fields that the rigid-body model lacks, because the robot file has them.
+    for field in (
+        "dof_damping",
+        "dof_frictionloss",
+        "dof_armature",
+        "jnt_stiffness",
+        "actuator_armature",
+        "actuator_damping",
+    ):
         getattr(model, field)[:] = 0.0
     # MuJoCo stores the inertia of a body on one slide when it compiles, with the armature.
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -156,7 +148,7 @@ def _spec(
 ) -> tuple[mujoco.MjSpec, Element, list[str], dict[str, tuple[str, float]]]:
     """The model, the file's elements, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic> or an MJCF's
     <equality>."""
-    root, content = read_model(path)
+    root = read_model(path)
     if root.tag not in ("mujoco", "robot"):
         hint = (
             "; expand it first: xacro robot.urdf.xacro > robot.urdf"
@@ -173,33 +165,32 @@ def _spec(
             f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf"
         )
     try:
-        if root.tag == "mujoco":
-            spec = mujoco.MjSpec.from_file(str(path))
-            # MuJoCo moves the model for minutes to find the range of a muscle.
-            spec.compiler.LRopt.mode = int(mujoco.mjtLRMode.mjLRMODE_NONE)
-            tied = (
-                e
-                for e in spec.equalities
-                if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active and e.name2
-            )
-            mimics = {e.name1: (e.name2, float(e.data[1])) for e in tied}
-            return spec, root, [], mimics
-        text, shapes = without_shapes(root, content)
-        remarks = [
-            f"{shapes} visual and collision shapes of the URDF are not used"
-        ] * bool(shapes)
+        spec = mujoco.MjSpec.from_file(str(path))
         mimics = {
             joint.get("name"): (mimic.get("joint"), float(mimic.get("multiplier", "1")))
             for joint in root.all("joint")
             if (mimic := joint.child("mimic")) is not None
         }
-        spec = mujoco.MjSpec.from_string(text)
-        remarks += _with_one_limit(spec, root)
-        return spec, root, remarks, mimics
     except (ValueError, mujoco.FatalError) as error:
         raise TaccorlError(
             f"{_placed(path, error)}: MuJoCo cannot read it: {_one_line(error)}"
         ) from error
+    if root.tag == "mujoco":
+        # MuJoCo moves the model for minutes to find the range of a muscle.
+        spec.compiler.LRopt.mode = int(mujoco.mjtLRMode.mjLRMODE_NONE)
+        tied = (
+            e
+            for e in spec.equalities
+            if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active and e.name2
+        )
+        return spec, root, [], {e.name1: (e.name2, float(e.data[1])) for e in tied}
+    for geom in list(spec.geoms):  # no link has its inertia from them
+        spec.delete(geom)
+    remarks = _with_one_limit(spec, root)
+    if shapes := len(root.all("visual", "collision")):
+        text = f"{shapes} visual and collision shapes of the URDF are not used"
+        remarks.insert(0, text)
+    return spec, root, remarks, mimics
 
 
 def _with_one_limit(spec: mujoco.MjSpec, root: Element) -> list[str]:

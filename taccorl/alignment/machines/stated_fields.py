@@ -13,7 +13,6 @@ import numpy as np
 from mujoco.introspect.ast_nodes import StructFieldDecl
 from mujoco.introspect.structs import STRUCTS
 
-_PREFIXES = {"joint": ("jnt_", "dof_"), "actuator": ("actuator_",)}
 _ROWS = {
     "njnt": lambda model, k: [k],
     "nv": lambda model, k: [model.jnt_dofadr[k]],
@@ -22,11 +21,8 @@ _ROWS = {
     "nout": lambda model, k: _block(model.actuator_outadr, model.actuator_outnum, k),
 }
 """Size of a field's first dimension → its rows that belong to joint or actuator k."""
-_LABELS = ("id", "adr", "num", "group", "user")
-"""Ends of the names of fields that are addresses or labels."""
-_KEPT = ("jnt_type", "jnt_pos", "jnt_axis", "actuator_trntype", "actuator_cranklength")
-"""Fields of the tree, which the twin keeps, and of the transmission."""
-_DERIVED = (
+_OTHERS = (
+    *("jnt_type", "jnt_pos", "jnt_axis", "actuator_trntype", "actuator_cranklength"),
     "dof_invweight0",
     "dof_M0",
     "dof_length",
@@ -36,7 +32,8 @@ _DERIVED = (
     "actuator_history",
     "actuator_actearly",
 )
-"""Fields that the compiler computes from others, or of the order of a physics step."""
+"""Fields of the tree, which the twin keeps, and of the transmission; fields that the
+compiler computes from others, or of the order of a physics step."""
 _PARAMETERS = ("actuator_gainprm", "actuator_dynprm", "actuator_biasprm")
 """Fields whose meaning depends on the actuator's type, so that a default of 1 says nothing:
 numbers other than 0 are stated."""
@@ -54,8 +51,6 @@ _TYPES = {
     "actuator_gaintype": mujoco.mjtGain,
     "actuator_biastype": mujoco.mjtBias,
 }
-_EMPTY = """<mujoco><worldbody><body><joint name="j"/><geom size="1"/></body></worldbody>
-<actuator><general joint="j"/></actuator></mujoco>"""
 
 
 class StatedFields:
@@ -132,6 +127,8 @@ def _numbers(model: mujoco.MjModel, kind: str, k: int) -> Iterator[tuple[str, fl
 @cache
 def _fields(kind: str) -> tuple[tuple[str, str], ...]:
     """Fields of joints or actuators that matter, each with the name of its first size."""
+    prefixes = ("actuator_",) if kind == "actuator" else ("jnt_", "dof_")
+    labels = ("id", "adr", "num", "group", "user")  # ends of the names of addresses
     arrays = [
         (field.name, str(field.array_extent[0]))
         for field in STRUCTS["mjModel"].fields
@@ -140,9 +137,9 @@ def _fields(kind: str) -> tuple[tuple[str, str], ...]:
     return tuple(
         (name, size)
         for name, size in arrays
-        if name.startswith(_PREFIXES[kind])
-        and not name.endswith(_LABELS)
-        and name not in (*_KEPT, *_DERIVED)
+        if name.startswith(prefixes)
+        and not name.endswith(labels)
+        and name not in _OTHERS
     )
 
 
@@ -160,4 +157,6 @@ def _value(name: str, value: float) -> str:
 
 @cache
 def _defaults(kind: str) -> dict[str, float]:
-    return dict(_numbers(mujoco.MjModel.from_xml_string(_EMPTY), kind, 0))
+    empty = """<mujoco><worldbody><body><joint name="j"/><geom size="1"/></body></worldbody>
+    <actuator><general joint="j"/></actuator></mujoco>"""
+    return dict(_numbers(mujoco.MjModel.from_xml_string(empty), kind, 0))

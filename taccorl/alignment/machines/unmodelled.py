@@ -1,90 +1,86 @@
-"""Parts of an MJCF file besides its joints and their actuators that a robot file does not
-state: remarks with the line of each."""
-
-from collections.abc import Iterator
+"""Parts of an MJCF file that a robot file does not state, besides its joints and the
+actuators of one joint: remarks that quote each with its line. A robot file gives each
+joint a drive of its own, so actuators on anything else are left out."""
 
 import mujoco
-import numpy as np
 
 from taccorl.alignment.machines.model_xml import Element
+from taccorl.errors import printable
 
-_DISABLED = ("DAMPER", "SPRING", "CLAMPCTRL", "FRICTIONLOSS", "ACTUATION")
-"""Flags of MuJoCo that switch off what acts on a joint."""
-_MEDIUM = ("density", "viscosity", "wind")
-_OF_TENDON = ("stiffness", "damping", "frictionloss", "armature", "range")
+WAY_OUT = (
+    "a robot file gives each joint a drive of its own: write the kp and kd that each joint "
+    "feels while the others rest, and as its efforts the forces at the joint"
+)
+_MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_TENDONS = "MuJoCo simulates this, and a robot file has no tendons"
+_OF_TENDONS = ("stiffness", "damping", "frictionloss", "armature", "range")
+_UNMODELLED = {
+    "body": (
+        ("gravcomp",),
+        "MuJoCo carries this share of the weight; here gravity_compensation says what the "
+        "controller carries",
+    ),
+    "tendon": (_OF_TENDONS, _TENDONS),
+    "fixed": (_OF_TENDONS, _TENDONS),
+    "spatial": (_OF_TENDONS, _TENDONS),
+    "option": (("density", "viscosity", "wind"), "forces of a medium are not modelled"),
+    "flag": (
+        ("damper", "spring", "clampctrl", "frictionloss", "actuation"),
+        "a switch of MuJoCo, which a robot file does not have",
+    ),
+}
+"""Tag → attributes that act on joints, and what that means for a robot file."""
 
 
 def remarks_on_unmodelled(spec: mujoco.MjSpec, root: Element) -> list[str]:
-    """Remarks on what ``spec`` states of weight compensation, tendons, equalities of
-    one joint, and options. ``root``: the elements of its file."""
-    parts = (_bodies, _tendons, _held_joints, _options)
-    return [remark for part in parts for remark in part(spec, root)]
-
-
-def _place(root: Element, key: str, value: str, *tags: str) -> str:
-    """Line of the first element with one of these tags and this attribute, in brackets;
-    empty if there is none."""
-    found = (one for one in root.all(*tags) if one.get(key) == value)
-    return next((f" ({one.near})" for one in found), "")
-
-
-def _bodies(spec: mujoco.MjSpec, root: Element) -> Iterator[str]:
-    places: dict[float, list[str]] = {}
-    for body in spec.bodies:
-        if body.gravcomp:
-            place = _place(root, "name", body.name, "body")
-            places.setdefault(float(body.gravcomp), []).append(f"{body.name}{place}")
-    for share, where in places.items():
-        yield (
-            f"body {', '.join(where)}: gravcomp {share:g}: MuJoCo carries this share of "
-            "the weight; here gravity_compensation says what the controller carries"
-        )
-
-
-def _tendons(spec: mujoco.MjSpec, root: Element) -> Iterator[str]:
-    for tendon in spec.tendons:
-        stated = {name: np.ravel(getattr(tendon, name)) for name in _OF_TENDON}
-        texts = [
-            f"{name} {_numbers(values)}"
-            for name, values in stated.items()
-            if values.any()
+    """Remarks on weight compensation, tendons, options, and equalities of one joint.
+    ``root``: the elements of the file of ``spec``."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for one in root.all(*_UNMODELLED):
+        keys, meaning = _UNMODELLED[one.tag]
+        stated = [
+            f"{key} {value}"
+            for key in keys
+            if (value := one.get(key)) and not {*value.split()} <= {"0", "enable"}
         ]
-        if texts:
-            place = _place(root, "name", tendon.name, "fixed", "spatial")
-            yield (
-                f"tendon {tendon.name}{place}: {', '.join(texts)}: MuJoCo simulates "
-                "this, and a robot file has no tendons"
+        if stated:
+            name = " ".join(filter(None, (one.tag, one.get("name"))))
+            places.setdefault((", ".join(stated), meaning), []).append(
+                f"{name} ({one.near})"
             )
-
-
-def _held_joints(spec: mujoco.MjSpec, root: Element) -> Iterator[str]:
+    remarks = [
+        f"{', '.join(where)}: {stated}: {meaning}"
+        for (stated, meaning), where in places.items()
+    ]
     for one in spec.equalities:
         if one.type == mujoco.mjtEq.mjEQ_JOINT and one.active and not one.name2:
-            place = _place(root, "joint1", one.name1, "joint")
-            yield (
-                f"joint {one.name1}{place}: an <equality> holds it at {one.data[0]:g}; "
-                "remove it from the robot file"
+            lines = [e.near for e in root.all("joint") if e.get("joint1") == one.name1]
+            remarks.append(
+                f"joint {one.name1} ({', '.join(lines)}): an <equality> holds it at "
+                f"{one.data[0]:g}; remove it from the robot file"
             )
+    return remarks
 
 
-def _options(spec: mujoco.MjSpec, root: Element) -> Iterator[str]:
-    for name in _MEDIUM:
-        value = np.ravel(getattr(spec.option, name))
-        if value.any():
-            places = [one.near for one in root.all("option") if one.get(name)]
-            yield (
-                f"option {name} {_numbers(value)} ({', '.join(places)}): forces of a "
-                "medium are not modelled"
-            )
-    for name in _DISABLED:
-        if spec.option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"):
-            flag = name.lower()
-            places = [one.near for one in root.all("flag") if one.get(flag)]
-            yield (
-                f"flag {flag} ({', '.join(places)}): disabled in MuJoCo, not in the "
-                "robot file"
-            )
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(f"{x:g}" for x in values)
+def leave_out(spec: mujoco.MjSpec, root: Element) -> list[str]:
+    """Remove actuators that do not act on one hinge or slide from ``spec``. Returns a remark
+    on each, which quotes its element, and what to write instead."""
+    elements = [one for section in root.all("actuator") for one in section.children]
+    has_lines = len(elements) == len(spec.actuators)  # not of replicated ones
+    remarks: list[str] = []
+    for k, actuator in reversed(list(enumerate(spec.actuators))):
+        joint = spec.joint(actuator.target)
+        kind = actuator.trntype.name.removeprefix("mjTRN_").lower()
+        # Of one joint; for hinges and slides both kinds are the same.
+        on_joint = kind in ("joint", "jointinparent")
+        if on_joint and (joint is None or joint.type in _MOVING):
+            continue
+        text = f"actuator {actuator.name or f'{k} (no name)'}"
+        stated = ""
+        if has_lines:
+            numbers = (f"{n} {v}" for n, v in elements[k].attributes.items())
+            text, stated = f"{text} ({elements[k].near})", f": {', '.join(numbers)}"
+        where = f"it acts on {kind} {actuator.target}, not on one joint"
+        remarks.insert(0, printable(f"{text} is left out: {where}{stated}"))
+        spec.delete(actuator)
+    return [*remarks, WAY_OUT] if remarks else []

@@ -27,11 +27,6 @@ GAP = 1.5  # A step longer than this [periods] has lost rows
 MOST_JITTER = 0.5  # Largest jitter [periods] of 95 % of the steps that are no gaps
 LONGEST_GAP_S = 0.25  # Longest gap of a table that is resampled [s]
 MOST_LOST = 0.1  # Largest share of lost rows of a table that is resampled
-RATE_TOLERANCE = 0.02
-"""Largest relative difference from a rate with a whole number of physics steps at which the rate is set to it."""
-AT_ROW = (
-    0.1  # A row this near to a grid row beside a gap [periods] counts as being at it
-)
 
 
 def even_rows(m: Measurement) -> Measurement:
@@ -103,7 +98,8 @@ def _grid(time_s: np.ndarray) -> tuple[float, float]:
     period = float(np.polyfit(number, time_s, 1)[0])
     step_s = PhysicsConfig().timestep_s
     whole = max(1, round(period / step_s)) * step_s
-    period = whole if abs(period / whole - 1) < RATE_TOLERANCE else period
+    # A rate within 2 % of a whole number of physics steps is set to it.
+    period = whole if abs(period / whole - 1) < 0.02 else period
     return float(np.median(time_s - number * period)), period
 
 
@@ -147,7 +143,8 @@ def _between(
     around[around] = whole
     line[around] = _cubic(grid[around], time_s, values, k[whole])
     nearer = np.where(share < 0.5, before, after)
-    exact = np.abs(grid - time_s[nearer]) < AT_ROW * period
+    # Beside a gap, a row within a tenth of a period of a grid row counts as being at it.
+    exact = np.abs(grid - time_s[nearer]) < 0.1 * period
     return np.where(
         (width <= GAP * period)[:, None],
         line,

@@ -537,13 +537,7 @@ def _read(
     if empty:
         raise EmptyColumns(empty, f"{path}: ")
     left: list[str] = []
-    try:
-        found += _read_recordings(path, spec, left)
-    except _NoRecording as error:
-        if not found:
-            raise RecordingError(
-                f"{error}, and there are no tables ({', '.join(SUFFIXES)}) or datasets"
-            ) from error
+    found += _read_recordings(path, spec, left, is_needed=not found)
     read = {p.name for p in (*datasets, *tables)} | {INDEX}
     read |= {
         p.name for p in children if p.suffix in (".yaml", ".yml")
@@ -552,18 +546,18 @@ def _read(
     return found
 
 
-class _NoRecording(RecordingError):
-    """A folder without recordings, which may still hold tables."""
-
-
 def _read_recordings(
-    path: Path, spec: str | Path | RecordingSpec | None, skipped: list[str]
+    path: Path,
+    spec: str | Path | RecordingSpec | None,
+    skipped: list[str],
+    is_needed: bool = True,
 ) -> list[Measurement]:
     loaded = (
         spec
         if isinstance(spec, RecordingSpec) or spec is None
         else load_recording_spec(spec)
     )
+    none = f"{path}: no recording here"
     try:
         found = find_sources(
             path,
@@ -572,11 +566,13 @@ def _read_recordings(
             skipped=skipped if path.is_dir() else None,
         )
     except RecordingError as error:
-        raise _NoRecording(str(error)) from error
+        found, none = [], str(error)
     # Datasets were read before; find_sources lists them as recordings, too.
     found = [(reader, source) for reader, source in found if reader != "lerobot"]
-    if not found:
-        raise _NoRecording(f"{path}: no recording here")
+    if is_needed and not found:
+        if path.is_dir():
+            none += f", and there are no tables ({', '.join(SUFFIXES)}) or datasets"
+        raise RecordingError(none)
     measurements = []
     for reader, source in found:
         own = loaded or _only_spec(path, reader)

@@ -34,9 +34,6 @@ SPEED_RAD_PER_S = 3.0  # Highest speed of targets [rad/s]; the arm's slowest joi
 TORQUE_NM = (25.0, 25.0, 25.0, 10.0, 10.0, 10.0)
 """Largest torque of each joint, weight and motion together [N·m]: a choice, no rating is published."""
 MARGIN_RAD = 0.05  # Distance that is kept from the joint's limits [rad]
-SWEEP_RAD = 0.35  # Amplitude of the chirp, if speed and torque allow it [rad]
-SMALL_RAD = 0.02  # Amplitude of the small chirp, for play and dead bands [rad]
-SLOW_HZ, FAST_HZ = SWEEP_HZ
 KNOWN_KG = 0.3  # Mass of the weighed payload that is gripped in one recording [kg]
 OPENING_M = 0.02  # Opening of the gripper in all motions [m]
 REST_POSE = (
@@ -58,14 +55,6 @@ POSES = (
 )
 """Joint angles of the arm while joint 1, 2, … is under test, in the middle of its range [rad]: over the wide range nothing is
 touched."""
-WIDE_RAD = (
-    1.1,
-    0.9,
-    0.9,
-    1.1,
-    0.95,
-    1.2,
-)  # Half of the range of the wide triangle [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +81,8 @@ class Room:
     wide_rad: float  # Half of the range of the wide triangle [rad]
     sweep_rad: float  # Amplitude of the slow part of the chirp [rad]
     speed_rad_per_s: float = SPEED_RAD_PER_S  # Highest speed of targets [rad/s]
-    small_rad: float = SMALL_RAD  # Amplitude of the small chirp [rad]
+    small_rad: float = 0.02
+    """Amplitude of the small chirp, for play and dead bands [rad]."""
 
     @classmethod
     def of(
@@ -101,14 +91,15 @@ class Room:
         """Range of motion of joint 1 to 6 of the PiPER about ``middle_rad``: within its limits, and with a sweep whose torque is
         within ``TORQUE_NM`` for this inertia and weight."""
         low, high = ROBOT.links[joint - 1].range_rad
+        # Half of the range of the wide triangle of joint 1 to 6.
         wide = min(
-            WIDE_RAD[joint - 1],
+            (1.1, 0.9, 0.9, 1.1, 0.95, 1.2)[joint - 1],
             middle_rad - low - MARGIN_RAD,
             high - middle_rad - MARGIN_RAD,
         )
         left_nm = max(TORQUE_NM[joint - 1] - abs(weight_nm), 0.2 * TORQUE_NM[joint - 1])
         sweep = min(
-            SWEEP_RAD, left_nm / (inertia_kgm2 * (2 * math.pi * FAST_HZ) ** 2 * 0.6)
+            0.35, left_nm / (inertia_kgm2 * (2 * math.pi * SWEEP_HZ[1]) ** 2 * 0.6)
         )
         return cls(
             middle_rad=middle_rad, wide_rad=wide, sweep_rad=min(sweep, 0.6 * wide)
@@ -209,7 +200,7 @@ def _steps(
 
 
 CHIRP = between_rests(
-    "chirp", lambda r: chirp(SWEEP_S, SLOW_HZ, FAST_HZ, r.sweep_rad, r.speed_rad_per_s)
+    "chirp", lambda r: chirp(SWEEP_S, *SWEEP_HZ, r.sweep_rad, r.speed_rad_per_s)
 )
 AGAIN = dataclasses.replace(CHIRP, name="chirp_again", repeat_of="chirp")
 WIDE_TRIANGLE = between_rests("wide_triangle", lambda r: triangle(14.0, r.wide_rad))

@@ -37,8 +37,6 @@ Kind = Literal[
 ]  # Quantity of a signal whose noise is estimated
 Method = Literal["repeats", "cycles", "rest", "residue", "quantisation", "number"]
 """How the noise was estimated, a row of the table above; ``number``: the least floor allowed, ``NUMBER`` or ``EXACT``."""
-BLOCK_S = 0.25  # Duration of a block [s]. Estimates are made per block, and their scatter gives the interval.
-BLOCK_ROWS = 24  # Least number of rows in a block: 0.8 s at 30 rows per second
 SETTLE_S = 1.5
 """Time after the last command until a joint counts as at rest [s]: with time constants of about 0.1 s, exp(−15) of the motion
 remains."""
@@ -68,7 +66,7 @@ EXACT = 1e-3
 
 
 @dataclass(frozen=True)
-class Estimate:
+class NoiseEstimate:
     """One estimate of the noise of one signal, in the signal's unit."""
 
     method: Method  # How it was estimated
@@ -91,8 +89,8 @@ class SignalFloor:
     signal: str
     kind: Kind  # Quantity: position, velocity or effort
     unit: str  # Unit of the quantity, such as rad/s
-    used: Estimate  # Estimate that is the floor
-    estimates: tuple[Estimate, ...]  # All estimates that could be made
+    used: NoiseEstimate  # Estimate that is the floor
+    estimates: tuple[NoiseEstimate, ...]  # All estimates that could be made
     lower_bound: bool  # True without repeats and equal cycles: the robot's own variation is then not included
 
     @property
@@ -178,7 +176,7 @@ def noise_floor(
         if step > 0:
             rounding = step / math.sqrt(12)
             found.append(
-                Estimate(
+                NoiseEstimate(
                     "quantisation",
                     rounding,
                     rounding,
@@ -192,11 +190,11 @@ def noise_floor(
                 EXACT * (kind == "effort") * np.nanstd(values),
             )
         )
-        used = _chosen(found, bool(unexplained)) or Estimate(
+        used = _chosen(found, bool(unexplained)) or NoiseEstimate(
             "number", last, last, last, 0
         )
         if used.value < last:
-            used = Estimate("number", last, last, last, used.n)
+            used = NoiseEstimate("number", last, last, last, used.n)
         name = {"position": unit, "velocity": UNITS[unit][0], "effort": UNITS[unit][1]}[
             kind
         ]
@@ -302,7 +300,7 @@ def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
     )
 
 
-def _chosen(found: list[Estimate], is_smoothed: bool) -> Estimate | None:
+def _chosen(found: list[NoiseEstimate], is_smoothed: bool) -> NoiseEstimate | None:
     """Repeats; else the surer one of rest and residue, unless the other lies above its interval, or cycles if these are larger;
     never below rounding, nor below noise of rows if repeats are ``is_smoothed``."""
     by = {e.method: e for e in found}
@@ -449,7 +447,9 @@ def motion_hz(m: Measurement) -> np.ndarray:
 
 
 def _block_rows(rate_hz: float) -> int:
-    return max(BLOCK_ROWS, round(BLOCK_S * rate_hz))
+    """Rows in a block of a quarter of a second, or of 24 rows: 0.8 s at 30 rows per
+    second. Estimates are made per block, and their scatter gives the interval."""
+    return max(24, round(0.25 * rate_hz))
 
 
 def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
@@ -467,13 +467,13 @@ def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
 
 def _estimate(
     method: Method, blocks: list[_Blocks], num_signals: int, kind: Kind
-) -> list[Estimate | None]:
+) -> list[NoiseEstimate | None]:
     """One estimate per signal over the blocks of all recordings; None where there are none."""
     blocks = [b for b in blocks if len(b.mean_squares)]
     if not blocks:
         return [None] * num_signals
     rows, freedom = min(b.rows for b in blocks), min(b.freedom for b in blocks)
-    found: list[Estimate | None] = []
+    found: list[NoiseEstimate | None] = []
     for j in range(num_signals):
         parts = [
             (b.name, own[np.isfinite(own)])
@@ -504,7 +504,7 @@ def _estimate(
         pairs = (len(parts) - len(odd)) * (method == "repeats")
         ends = value / spread, value * spread
         found.append(
-            Estimate(
+            NoiseEstimate(
                 method, value, *ends, len(own) * rows, bursts, (*odd.items(),), pairs
             )
         )

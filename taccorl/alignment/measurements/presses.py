@@ -12,12 +12,11 @@ from taccorl.alignment.measurements.folder import PressedNote
 from taccorl.alignment.measurements.motions import RATE_HZ
 
 RADIUS_M = {"sphere": 0.012, "rod": 0.008}  # Shape of the object → its radius [m]
-ROD_LENGTH_M = 0.04  # Length of the rod [m]
 AWAY_M = (
     -1e-3
 )  # Penetration while nothing is pressed [m]: a distance of a millimetre at each pad
 FRAME_S = 0.01  # Time between two frames of the pads [s]
-REST_S = 2.5  # Rest before and after the presses of pads [s]
+PRESS_REST_S = 2.5  # Rest before and after the presses of pads [s]
 SMOOTH_ROWS = 13  # Number of rows over which corners are rounded (65 ms), because fingers have inertia
 
 Knots = tuple[tuple[float, float], ...]
@@ -50,9 +49,9 @@ def pad_presses(
     rises_s: tuple[float, ...],
     hold_s: float,
     *,
-    before_s: float = REST_S,
+    before_s: float = PRESS_REST_S,
     between_s: float = 0.5,
-    after_s: float = REST_S,
+    after_s: float = PRESS_REST_S,
 ) -> Knots:
     """Corners of presses to each of ``depths_m`` [m] within each of ``rises_s`` [s], each held for ``hold_s`` [s]. ``before_s``,
     ``between_s``, ``after_s``: rest before the first press, between two, after the last [s]."""
@@ -90,7 +89,7 @@ class Press:
             return PressedNote(shape="sphere", **place)
         return PressedNote(
             shape="rod",
-            length_m=ROD_LENGTH_M,
+            length_m=0.04,
             rpy_rad=(0.0, round(math.pi / 2, 4), 0.0),
             **place,
         )

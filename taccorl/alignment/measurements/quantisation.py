@@ -2,13 +2,6 @@
 
 import numpy as np
 
-SAME = 0.05
-"""A difference counts as a whole number of steps if it deviates from one by less than this share of a step. Readings stored as
-32-bit numbers deviate by up to 1 % of 0.001°."""
-MANY = 8  # Least number of differences that must be whole multiples; by chance it happens once in 10⁸ (0.1⁸)
-REPEATS = 10.0
-"""If there are fewer levels than that, each must occur so often: noise without steps never gives the same reading twice."""
-
 
 def find_quantum(values: np.ndarray) -> float:
     """Step q of readings ``values`` (T,), in their unit; 0 if they show none (or have only one level). NaN are ignored.
@@ -25,7 +18,9 @@ def find_quantum(values: np.ndarray) -> float:
     apart = np.diff(levels) > 1e-12 * max(1.0, float(np.abs(levels).max()))
     levels = levels[np.concatenate([[True], apart])]
     steps = np.diff(levels)
-    if len(steps) == 0 or (len(steps) < MANY and len(values) < REPEATS * len(levels)):
+    # Eight differences are whole multiples by chance once in 10⁸ (0.1⁸). Of fewer levels
+    # each must occur ten times: noise without steps never gives one reading twice.
+    if len(steps) == 0 or (len(steps) < 8 and len(values) < 10.0 * len(levels)):
         return 0.0
     quantum = float(steps.min())
     near = steps[
@@ -34,10 +29,12 @@ def find_quantum(values: np.ndarray) -> float:
     quantum = float(near.sum() / np.round(near / quantum).sum())
     counts = np.round(steps / quantum)
     quantum = float(steps.sum() / counts.sum())
+    # A difference that deviates from a whole number of steps by less than 5 % of one
+    # counts as such: readings stored as 32-bit numbers deviate by up to 1 % of 0.001°.
     return (
         quantum
         if (
-            np.abs(steps / quantum - counts) < SAME * np.maximum(1.0, counts * 1e-3)
+            np.abs(steps / quantum - counts) < 0.05 * np.maximum(1.0, counts * 1e-3)
         ).all()
         else 0.0
     )

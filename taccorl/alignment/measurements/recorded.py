@@ -39,13 +39,6 @@ from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
 TACTILE = "observation.tactile"  # Begin of the keys of touch
-NO_SENSOR = (
-    "no `sensor` in the dataset spec states its pads, so that it is not compared"
-)
-RATE_TOLERANCE = 0.02
-"""Largest relative difference of a channel's median rate from the spec's at which the spec's rate is used; the clock drifts."""
-LONGEST_LINE = 3.0
-"""Longest gap [periods] across which values are interpolated: a driver occasionally loses one or two samples."""
 _EXTRA = {"effort": ("effort",), "velocity": ("qvel", "velocity")}
 """What lies beside a position: the message's field of that name, or (HDF5) a neighbouring array so named."""
 
@@ -63,7 +56,13 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
             if d.lost
         ]
         found += [
-            Finding("touch_not_read", "note", key, f"{key}: {NO_SENSOR}")
+            Finding(
+                "touch_not_read",
+                "note",
+                key,
+                f"{key}: no `sensor` in the dataset spec states its pads, so that it "
+                "is not compared",
+            )
             for key in spec.features
             if key.startswith(TACTILE) and key not in spec.target.sensors
         ]
@@ -290,7 +289,8 @@ class _Rows:
             )
         name, rate_hz = max(rates.items(), key=lambda item: item[1])
         said = self.cutter.nominal_hz(name)
-        return said if abs(rate_hz / said - 1) < RATE_TOLERANCE else rate_hz
+        # Within 2 % it is the spec's rate: the clock drifts.
+        return said if abs(rate_hz / said - 1) < 0.02 else rate_hz
 
     def _time_ns(self, channel: str) -> np.ndarray:
         return self.cutter.clocks[channel].time_ns
@@ -352,7 +352,8 @@ class _Rows:
         after = np.minimum(before + 1, len(time_ns) - 1)
         step = np.maximum(time_ns[after] - time_ns[before], 1)
         past = np.clip(self.grid_ns - time_ns[before], 0, None)
-        long = (step > LONGEST_LINE * self.period_ns) & (past > 0)
+        # A driver occasionally loses one or two samples.
+        long = (step > 3.0 * self.period_ns) & (past > 0)
         # A command after a long silence: in force until one period before the next, then on the line to it.
         late = np.clip(1 - (time_ns[after] - self.grid_ns) / self.period_ns, 0.0, 1.0)
         share = np.where(long, late if held else np.nan, past / step)

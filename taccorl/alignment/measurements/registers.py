@@ -28,13 +28,9 @@ import numpy as np
 from taccorl.alignment.measurements.quantisation import find_quantum
 
 LEAST_BITS, MOST_BITS = 8, 64  # Widths of registers that are looked for
-JUMP = 4.0
-"""At a change of sign the column jumps at least so many times as far as between other rows (99 of 100). A choice."""
 CONTINUES, NEARLY = 1.5, 0.05
 """At a change of sign the decoded column moves at most so many times as far as between other rows, or by this share of the
 least number that means a value below 0. Choices."""
-TIGHT = 0.25
-"""Share of the changes of sign at which it must: where a target steps, an effort changes its sign within a row. A choice."""
 LEAST_CHANGES = (
     2  # Changes of sign that must be seen: one jump may be a motor that is turned on
 )
@@ -196,8 +192,12 @@ def _continuity(register: Register, numbers: np.ndarray) -> tuple[int, int, floa
         float(np.quantile(others, 0.99)), float(np.diff(np.unique(numbers)).min())
     )
     bound = max(CONTINUES * usual, NEARLY * register.least_negative)
-    tight = np.sort(moves[at])[: max(LEAST_CHANGES, math.ceil(TIGHT * len(at)))]
-    is_jump = np.median(jumps[at]) > max(JUMP * usual, 0.5 * register.least_negative)
+    # At a quarter of the changes of sign it must: where a target steps, an effort changes
+    # its sign within a row. A choice.
+    tight = np.sort(moves[at])[: max(LEAST_CHANGES, math.ceil(0.25 * len(at)))]
+    # At a change of sign the column jumps four times as far as between 99 of 100 other
+    # rows. A choice.
+    is_jump = np.median(jumps[at]) > max(4.0 * usual, 0.5 * register.least_negative)
     varies = np.ptp(signed[~upper]) > 0.0 and np.ptp(signed[upper]) > 0.0
     if not (is_jump and varies and tight[-1] <= bound):
         return 0, 0, math.inf

@@ -14,11 +14,6 @@ from taccorl.errors import TaccorlError
 
 SAME_SHARE = 0.01
 """Largest difference of the commands, after alignment, as a share of the motion, for recordings of one motion."""
-SAME_QUANTA = 1e-4  # Difference of commands that is always accepted [rad, m]: rounding
-COMMON_SHARE = (
-    0.5  # Least common part of the motion, as a share of the shorter recording's motion
-)
-AFTER_S = 0.5  # The motion lasts from its first command to so long after its last [s]
 
 
 @dataclass(frozen=True)
@@ -64,8 +59,9 @@ def overlay(
     share, lag = _refine(a.target, b.target, lag)
     rows, start = _common(a.num_rows, b.num_rows, lag)
     target = _shifted(b.target, start, share, len(rows)) - a.target[rows]
+    # The motion lasts from its first command to half a second after its last.
     moving, whole = (
-        _moving(a.target[rows], round(AFTER_S * rate_hz)),
+        _moving(a.target[rows], round(0.5 * rate_hz)),
         _moving(a.target, 0).sum(),
     )
     rms = float(np.sqrt(np.mean(target[moving] ** 2))) if moving.any() else 0.0
@@ -74,8 +70,10 @@ def overlay(
     jitter_s = max(
         np.median(np.abs(np.diff(m.time_s) - m.period_s)) for m in (first, second)
     )  # that of their stamps
-    alike = max(same_share * motion, SAME_QUANTA, 2.0 * jitter_s * speed)
-    if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > alike:
+    # Commands may differ by 0.1 mrad or 0.1 mm: rounding.
+    alike = max(same_share * motion, 1e-4, 2.0 * jitter_s * speed)
+    # At least half of the shorter recording's motion must be common.
+    if not moving.any() or moving.sum() < 0.5 * whole or rms > alike:
         loop = "; torques of an outer loop never repeat: then remove it" * (
             "torque" in first.target_kinds
         )
@@ -157,12 +155,6 @@ def _moving(target: np.ndarray, after: int) -> np.ndarray:
 
 
 SAME = 1e-6  # Largest difference of equal targets, as a share of their range: rounding of logged numbers. A choice.
-EVEN = 0.01
-"""Largest difference of the rows' periods, as a share of the period: targets of rows that jitter act at other times in each
-cycle."""
-MOVES = 0.5
-"""Least range of each target within the equal cycles, as a share of its range in the recording: a hold is equal at any period."""
-MOST_PERIODS = 20  # Number of periods that are tried, the shortest first. A choice.
 
 
 @dataclass(frozen=True)
@@ -192,7 +184,8 @@ def cycles(m: Measurement) -> Cycles | None:
         or any(kind != "position" for kind in m.target_kinds)
     ):
         return None
-    if np.ptp(period_s) > EVEN * float(np.median(period_s)):
+    # Targets of rows that jitter act at other times in each cycle.
+    if np.ptp(period_s) > 0.01 * float(np.median(period_s)):
         return None
     columns = np.nan_to_num(
         np.column_stack([m.target, *(getattr(m, name) for name in m.extra_columns)])
@@ -210,14 +203,16 @@ def cycles(m: Measurement) -> Cycles | None:
         alike[:-1] & (np.abs(columns[1:] - columns[at + 1]) <= SAME).all(axis=1)
     )
     periods = np.unique(np.abs(alike - at))
-    for period in periods[(periods > 0) & (periods <= third)][:MOST_PERIODS].tolist():
+    # The shortest twenty are tried. A choice.
+    for period in periods[(periods > 0) & (periods <= third)][:20].tolist():
         same = np.asarray(
             (np.abs(columns[period:] - columns[:-period]) <= SAME).all(axis=1)
         )
         first, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
+        # Each target must move by half of its range: a hold is equal at any period.
         if (
             end - first >= 2 * period
-            and (np.ptp(columns[first:end], axis=0) >= MOVES).all()
+            and (np.ptp(columns[first:end], axis=0) >= 0.5).all()
         ):
             return Cycles(period, first + period, end)
     return None

@@ -28,7 +28,6 @@ MARKS = {
     codecs.BOM_UTF16_BE: "utf-16",
 }
 """First bytes of a CSV file that state its encoding (byte order marks) → that encoding, for Python's codecs."""
-LONGEST_LINE = 1000  # Most characters of a line that states an origin
 _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
 _CUT_OFF = "cut off while it was written? Remove the row, or copy the file again"
 _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S:g} s of them follow each other"
@@ -175,7 +174,7 @@ def _stated(path: Path, encoding: str) -> list[tuple[str, str]]:
     """(key, value) of each line at the begin of a CSV file that states its origin."""
     found = []
     with path.open(encoding=encoding) as file:
-        while match := _ORIGIN_LINE.match(file.readline(LONGEST_LINE)):
+        while match := _ORIGIN_LINE.match(file.readline(1000)):
             found.append((match[1], match[2]))
     return found
 

@@ -28,7 +28,7 @@ file may state others: ``separator: semicolon``, ``decimal: comma``, ``encoding:
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,35 +57,26 @@ from taccorl.errors import RecordingError, nearest
 from taccorl.robots import ROBOT
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
-TIME_S = {
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "µs": 1e-6,
-    "ns": 1e-9,
-    "min": 60.0,
-}  # Unit of time → seconds
+TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+"""Unit of time → seconds."""
 POSITION = {
     "rad": ("rad", 1.0),
     "mrad": ("rad", 1e-3),
     "deg": ("rad", _DEG),
     "mdeg": ("rad", 1e-3 * _DEG),
-}
-POSITION |= {
     "rev": ("rad", _TURN),
     "m": ("m", 1.0),
     "cm": ("m", 1e-2),
     "mm": ("m", 1e-3),
+    "um": ("m", 1e-6),
+    "µm": ("m", 1e-6),
 }
-POSITION |= {"um": ("m", 1e-6), "µm": ("m", 1e-6)}
 """Unit of a position → (rad or m, factor to it)."""
 VELOCITY = {
     "rad/s": ("rad", 1.0),
     "mrad/s": ("rad", 1e-3),
     "deg/s": ("rad", _DEG),
     "rpm": ("rad", _TURN / 60),
-}
-VELOCITY |= {
     "rev/s": ("rad", _TURN),
     "m/s": ("m", 1.0),
     "cm/s": ("m", 1e-2),
@@ -98,8 +89,6 @@ EFFORT = {
     "Ncm": ("rad", 1e-2),
     "Nmm": ("rad", 1e-3),
     "mNm": ("rad", 1e-3),
-}
-EFFORT |= {
     "kgcm": ("rad", 0.0980665),
     "N": ("m", 1.0),
     "kN": ("m", 1e3),
@@ -113,35 +102,28 @@ _CONVERSIONS = {
     "qd": VELOCITY,
     "tau": EFFORT,
     "load": EFFORT,
-}
-_CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
-_CONVERSIONS |= {
+    "qd_target": VELOCITY,
+    "tau_target": EFFORT,
     "torque_ff": EFFORT,
     "supply": {"V": ("", 1.0), "mV": ("", 1e-3)},
     "enabled": {"1": ("", 1.0)},
 }
-_TICKS = "; write `unit: rad` with `factor:` in rad a tick"
 _CURRENT = "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column"
 _HINTS: dict[str, str] = {
-    **dict.fromkeys(("ticks", "tick", "counts", "count"), _TICKS),
+    **dict.fromkeys(
+        ("ticks", "tick", "counts", "count"),
+        "; write `unit: rad` with `factor:` in rad a tick",
+    ),
     "A": _CURRENT,
     "mA": _CURRENT,
 }
-REGISTERS = ("q", "q_target", "tau")  # Columns that may be registers without their sign
-UNITS_OF_OWN = (
-    "rad",
-    "m",
-    "Nm",
-    "N",
-)  # Units of such columns in a table with own names
-_SIGNS = (("sign_bit", None), ("wraps_at", None))  # Keys of registers, not given
-TARGETS = ("q_target", "qd_target", "tau_target")
-"""Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
-_KINDS: dict[str, TargetKind] = {
+TARGETS: dict[str, TargetKind] = {
     "q_target": "position",
     "qd_target": "velocity",
     "tau_target": "torque",
 }
+"""Column of a target → what it states; a signal has one of them. Without any, its effort ``tau`` is the input of the model
+(law ``effort``)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,21 +304,20 @@ def _rules(spec: TableSpec) -> Rules:
 
 
 def _used_twice(spec: TableSpec) -> str:
-    names = [
-        c.column
-        for c in (
-            spec.time,
-            *(c for s in spec.signals.values() for _, c in _columns_of(s)),
-        )
-    ]
-    return next(
-        (
-            f"column {name!r} is used twice"
-            for name in sorted(names)
-            if names.count(name) > 1
-        ),
-        "",
-    )
+    names = [column.column for column in stated_columns(spec)]
+    twice = sorted(name for name in names if names.count(name) > 1)
+    return f"column {twice[0]!r} is used twice" if twice else ""
+
+
+def stated_columns(of: Any) -> Iterator[Column]:
+    """All columns that a columns file, or a part of it, states, in its order."""
+    if isinstance(of, Column):
+        yield of
+    elif isinstance(of, Mapping):
+        for part in of.values():
+            yield from stated_columns(part)
+    elif is_dataclass(of):
+        yield from stated_columns({f.name: getattr(of, f.name) for f in fields(of)})
 
 
 def _resolved(
@@ -532,7 +513,7 @@ def measurement_of_columns(
         units.append(POSITION[signal.q.unit][0])
         for key, column in _columns_of(signal):
             if key in TARGETS:
-                kinds.append(_KINDS[key])
+                kinds.append(TARGETS[key])
             read = (
                 columns[column.column]
                 if column.column in columns
@@ -540,7 +521,7 @@ def measurement_of_columns(
             )
             if column.register is not None:
                 _check_register(path, column, read)
-            elif key in REGISTERS and column.zero == 0.0:
+            elif key in ("q", "q_target", "tau") and column.zero == 0.0:
                 registers += _unsigned(
                     own_names, list(spec.signals)[j], key, column, read
                 )
@@ -630,10 +611,18 @@ def _unsigned(
         new = replace(column, **{register.key: side * register.value})
         stated = [
             f"{name}: {as_text(value)}"
-            for name, usual in (("factor", 1.0), ("zero", 0.0), *_SIGNS)
+            for name, usual in {
+                "factor": 1.0,
+                "zero": 0.0,
+                "sign_bit": None,
+                "wraps_at": None,
+            }.items()
             if (value := getattr(new, name)) != usual
         ]
-        unit = [] if column.unit in UNITS_OF_OWN else [f"unit: {column.unit}"]
+        # A table with own names has these units.
+        unit = (
+            [] if column.unit in ("rad", "m", "Nm", "N") else [f"unit: {column.unit}"]
+        )
         moved = [f"column: {column.column}"] * (column.column != f"{signal}.{key}")
         line = f"changes: {{{signal}.{key}: {{{', '.join([*moved, *unit, *stated])}}}}}"
         if not own_names:
@@ -645,8 +634,8 @@ def _unsigned(
 
 def wanted_columns(spec: TableSpec, header: list[str]) -> list[str]:
     """Columns to read of a table with this ``header``: all of ``spec`` but those that may be missing and are."""
-    columns = [
-        spec.time,
-        *(c for s in spec.signals.values() for _, c in _columns_of(s)),
+    return [
+        column.column
+        for column in stated_columns(spec)
+        if column.if_missing is None or column.column in header
     ]
-    return [c.column for c in columns if c.if_missing is None or c.column in header]

@@ -9,7 +9,6 @@ k_n and the sensor's gain (counts for a reading of 1) cannot be separated by cou
 Letters in shapes: T frames, P pads, R × C taxels.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,15 +23,6 @@ from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
-
-QUANTILE = 0.999  # Share of the readings without contact that lie below λ_noise
-MIN_FRAMES = (
-    50  # Least number of frames without contact for a noise level: half a second
-)
-_NEAR_M = 3e-4  # taxels that the object comes so near to take part in the fit
-_MIN_IN_CONTACT = 20  # frames
-_K_N = Free(name="k_n", unit="1/m", start=1.0, low=1.0, high=1e6, log=True)
-_K_D = Free(name="k_d", unit="s/m", start=0.0, low=0.0, high=1e4)
 
 
 @dataclass(frozen=True)
@@ -76,10 +66,9 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
         for p in range(len(pads))
     ]
     frames = [np.concatenate(of_pad) for of_pad in still]
+    # A noise level takes half a second without contact.
     for short in (
-        pad
-        for pad, of_pad in zip(pads, frames, strict=True)
-        if len(of_pad) < MIN_FRAMES
+        pad for pad, of_pad in zip(pads, frames, strict=True) if len(of_pad) < 50
     ):
         raise TaccorlError(
             f"touch calibration: pad {short} has {min(map(len, frames))} frames without contact in {_names(motions)}; record "
@@ -100,7 +89,7 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
         mean_count=means,
         std_count=np.maximum(std, 1 / math.sqrt(12)),
         threshold_count=float(
-            np.quantile(np.concatenate([f.ravel() for f in frames]), QUANTILE)
+            np.quantile(np.concatenate([f.ravel() for f in frames]), 0.999)
         ),
     )
 
@@ -118,12 +107,12 @@ def calibrate_touch(
     model = TouchModel(config)
     noise = noise_level(fit)
     in_contact = [int(motion.near(0.0).any(axis=(1, 2, 3)).sum()) for motion in fit]
-    if sum(in_contact) < _MIN_IN_CONTACT:
+    if sum(in_contact) < 20:
         raise TaccorlError(
             f"touch calibration: {sum(in_contact)} frames in contact in {_names(fit)}; record presses of known depth"
         )
     found = _least_squares(fit, noise, model)
-    stiffness, damping = (_estimate(found, f) for f in found.frees)
+    stiffness, damping = found.estimates().values()
     own = model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m
     threshold = noise.threshold_count
     simulated = [
@@ -154,12 +143,13 @@ def _least_squares(
     motions: Sequence[TouchMotion], noise: NoiseLevel, model: TouchModel
 ) -> Solution:
     """Fit k_n and k_d to the counts of all taxels that come near the object."""
-    taxels = [np.asarray(motion.near(_NEAR_M).any(axis=0)) for motion in motions]
+    # Taxels that the object comes within 0.3 mm of take part in the fit.
+    taxels = [np.asarray(motion.near(3e-4).any(axis=0)) for motion in motions]
     k_n, k_d = model.sensor.normal_stiffness_per_m, model.sensor.normal_damping_s_per_m
     scale = max(k_d, 0.005 * k_n, 1e-3)
     numbers = [
-        dataclasses.replace(_K_N, start=k_n),
-        dataclasses.replace(_K_D, start=k_d, scale=scale),
+        Free(name="k_n", unit="1/m", start=k_n, low=1.0, high=1e6, log=True),
+        Free(name="k_d", unit="s/m", start=k_d, low=0.0, high=1e4, scale=scale),
     ]
 
     def residuals(values: Values) -> np.ndarray:
@@ -181,18 +171,11 @@ def _least_squares(
     )
 
 
-def _estimate(found: Solution, number: Free) -> Estimate:
-    low, high = found.intervals()[number.name]
-    return Estimate(
-        value=found.values[number.name], low=low, high=high, unit=number.unit
-    )
-
-
 def _trouble(found: Solution, stiffness: Estimate, damping: Estimate) -> str:
     said = []
     if found.trouble:
         said.append("not converged: still improving when it was stopped")
-    if _K_N.name in found.at_bound:
+    if stiffness.at_bound:
         said.append(
             f"k_n is at its bound, {stiffness.value:g}: the taxels hardly read what depth says; check object and pose"
         )

@@ -22,10 +22,6 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
 
-_TAXELS_AT_ONCE = (
-    64 * ROBOT.num_taxels
-)  # 0.4 MB: a core's cache holds what is being worked on
-
 
 class TouchModel:
     """The pads of a twin. ``config``: configuration of the twin, whose effects always act; those of ``simulate`` act in addition.
@@ -69,7 +65,8 @@ class TouchModel:
         dt_s = np.diff(time_s, prepend=time_s[0])
         memories = [_memory(effect, motion) for effect in acting]
         seen = np.empty(depth.shape, np.float32)
-        at_once = _TAXELS_AT_ONCE // (len(ROBOT.pads) * math.prod(shape))
+        # 0.4 MB, which a core's cache holds.
+        at_once = 64 * ROBOT.num_taxels // (len(ROBOT.pads) * math.prod(shape))
         for start in range(0, len(time_s), at_once):
             some = slice(start, start + at_once)
             law = normal_reading(

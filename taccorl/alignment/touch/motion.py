@@ -36,12 +36,7 @@ from taccorl.sim.shapes import Capsule, Solid, add_geom
 from taccorl.sim.touch_kernel import depth_in_body
 from taccorl.sim.twin import TwinConfig
 
-SMOOTH_S, SMOOTH_ORDER = 0.045, 3
-"""Savitzky–Golay window [s] and order for openings and joints: 9 rows at 200 Hz. It reduces an opening's noise of 10 µm to 6 µm
-and 0.5 mm/s."""
 _STEP_S = 5e-4  # of central differences of the pads' poses, along splines through the smoothed rows
-_KEPT = 4  # depths of a motion with its pads moved: what a fit asks for again and again
-_DISTURBED_M = 3e-4  # an object this near to a pad may touch it
 _NEAR_M = 1e-3  # a pad that never comes so near to the object takes no part
 
 
@@ -91,7 +86,7 @@ class TouchMotion:
         if not any(any(offset) for offset in offsets_m):
             offsets_m = ()
         if offsets_m not in self._known:
-            while len(self._known) >= _KEPT:
+            while len(self._known) >= 4:  # what a fit asks for again and again
                 del self._known[next(iter(self._known))]
             self._known[offsets_m] = self._depth(offsets_m)
         return self._known[offsets_m]
@@ -161,7 +156,8 @@ class TouchMotion:
 
     def undisturbed(self, after_s: float = 1.0) -> np.ndarray:
         """(T, P) bool: nothing is near the pad, and nothing touched it during the last ``after_s`` [s]."""
-        near = self.near(_DISTURBED_M).any(axis=(2, 3))
+        # An object within 0.3 mm of a pad may touch it.
+        near = self.near(3e-4).any(axis=(2, 3))
         last = np.where(near, self.time_s, -np.inf)
         return self.time_s - np.maximum.accumulate(last, axis=0) > after_s
 
@@ -294,9 +290,9 @@ class _Fingers:
                 f"{measurement.name}: {', '.join(names)} were measured in only {there.mean():.0%} of the rows; depths cannot "
                 "be computed without them"
             )
-        window = (
-            max(SMOOTH_ORDER + 2, round(SMOOTH_S * measurement.rate_hz)) // 2 * 2 + 1
-        )
+        # Savitzky–Golay of third order over 45 ms, 9 rows at 200 Hz: an opening's noise of
+        # 10 µm falls to 6 µm and 0.5 mm/s.
+        window = max(5, round(0.045 * measurement.rate_hz)) // 2 * 2 + 1
         if there.sum() < window:
             raise TaccorlError(
                 f"{measurement.name}: {there.sum()} measured rows are too few; {window} are needed"
@@ -305,9 +301,7 @@ class _Fingers:
         even = np.column_stack(
             [np.interp(time_s, time_s[there], column[there]) for column in rows.T]
         )
-        self._rows = CubicSpline(
-            time_s, savgol_filter(even, window, SMOOTH_ORDER, axis=0)
-        )
+        self._rows = CubicSpline(time_s, savgol_filter(even, window, 3, axis=0))
         self._pressed, self._robot = pressed, robot
         self.opening_m = even[:, 0]
 

@@ -459,10 +459,10 @@ def test_what_a_model_states_beside_its_joints_is_named_with_its_line(
     path.write_text(REST)
     text, robot = robot_draft(path, tmp_path / "robot.yaml")
     for words in (
-        ("option density 1.2", "arm.xml:1"),
-        ("flag spring", "arm.xml:1"),
+        ("option (arm.xml:1)", "density 1.2"),
+        ("flag (arm.xml:1)", "spring disable"),
         ("body b (arm.xml:2)", "gravcomp 0.5"),
-        ("tendon t (arm.xml:5)", "damping 3"),
+        ("fixed t (arm.xml:5)", "damping 3"),
         ("actuator a", "forcerange -5 5", "delay 0.1", "dampratio 1"),
         ("joint j (arm.xml:9)", "0.3"),
     ):

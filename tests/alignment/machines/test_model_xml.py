@@ -19,7 +19,8 @@ INERTIA = 'ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"'
 def link(name: str, inertia: str = INERTIA) -> str:
     return (
         f'<link name="{name}">\n<visual>\n<!-- a\ncomment -->\n<geometry><box size="1 1 1"/></geometry></visual>\n'
-        f'<collision/><inertial><origin xyz="0 0 0.1"/><mass value="1"/><inertia {inertia}/></inertial></link>\n'
+        '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+        f'<inertial><origin xyz="0 0 0.1"/><mass value="1"/><inertia {inertia}/></inertial></link>\n'
     )
 
 
@@ -194,7 +195,7 @@ def test_models_that_would_never_end_or_steer_are_refused_at_once_in_one_line(
 
 
 GEOM = "<body><geom size='1'/></body>"
-HFIELD = "<hfield name='{}' nrow='6' ncol='6' size='1 1 1 1'/>"
+HFIELD = "<hfield name='h' nrow='6' ncol='6' size='1 1 1 1'/>"
 LIMITS = {
     "elements": ("MOST_ELEMENTS", 20, "<site/>" * 30, ""),
     "sites": ("MOST_MADE", 20, "<replicate count='30'><site/></replicate>", ""),
@@ -211,15 +212,10 @@ LIMITS = {
         f"<replicate count='30'>{GEOM.replace('<geom', '<joint/><geom')}</replicate>",
         "",
     ),
-    "hfields": (
-        "MOST_VALUES",
-        100,
-        "",
-        f"<asset>{''.join(map(HFIELD.format, 'abc'))}</asset>",
-    ),
+    "hfield": ("MOST_VALUES", 30, "", f"<asset>{HFIELD}</asset>"),
     "mesh": (
         "MOST_VALUES",
-        100,
+        80,
         "",
         "<asset><mesh name='m' builtin='plate' params='9 9'/></asset>",
     ),
@@ -251,6 +247,16 @@ def test_an_encoding_that_is_not_read_is_named(encoding: str, tmp_path: Path):
     path.write_text(f"<?xml version='1.0' encoding='{encoding}'?>{text}")
     with pytest.raises(TaccorlError, match=r"arm\.urdf:1: .*encoding.*UTF-8"):
         load_robot_model(path)
+
+
+def test_names_in_another_encoding_than_utf_8_are_refused(tmp_path: Path) -> None:
+    """MuJoCo keeps the bytes of a name as they are."""
+    body = BODY.format("").replace('"j"', '"jé"')
+    text = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    stated = f"<?xml version='1.0' encoding='latin-1'?>{text}"
+    (tmp_path / "arm.xml").write_bytes(stated.encode("latin-1"))
+    with pytest.raises(TaccorlError, match=r"arm\.xml: .*save it as UTF-8"):
+        load_robot_model(tmp_path / "arm.xml")
 
 
 def test_the_memory_that_a_model_asks_for_is_not_taken(tmp_path: Path):

@@ -7,7 +7,7 @@ import pytest
 from made_press import ball_at, press
 
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.alignment.measurements.presses import REST_S
+from taccorl.alignment.measurements.presses import PRESS_REST_S
 from taccorl.diagnosis.experiment_design import presses
 from taccorl.diagnosis.experiment_design.plan import TELLS, Plan, plan
 from taccorl.errors import TaccorlError
@@ -101,7 +101,7 @@ def test_every_press_of_the_library_keeps_the_twin_s_limits_and_rests_at_both_en
         ), p.name
         assert 0 < p.penetration_m().max() < presses.travel_m(RobotConfig()), p.name
         assert force.max() <= 40.0, p.name
-        rest = round((REST_S - 0.1) * 200)
+        rest = round((PRESS_REST_S - 0.1) * 200)
         assert np.ptp(opening[:rest]) < 1e-12 and np.ptp(opening[-rest:]) < 1e-12, (
             p.name
         )
@@ -109,7 +109,7 @@ def test_every_press_of_the_library_keeps_the_twin_s_limits_and_rests_at_both_en
 
 def test_commands_lie_below_the_opening_by_what_the_gripper_yields():
     """A pad of 20 kN/m pressed in by 0.8 mm pushes back with 16 N: a gripper of 2 kN/m yields by 8 mm."""
-    hold, middle = OF_NAME["long_hold"], round((REST_S + 4.0) * 200)
+    hold, middle = OF_NAME["long_hold"], round((PRESS_REST_S + 4.0) * 200)
     force, target = presses.grip(RobotConfig(), hold)
     assert force[middle] == pytest.approx(16.0)
     assert hold.opening_m()[middle] == pytest.approx(2 * (0.012 - 0.0008))
