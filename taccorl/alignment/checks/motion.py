@@ -67,9 +67,9 @@ STICK_ERRORS = 1.5
 rows: beyond it the friction would have given way. A choice."""
 
 
-REPEATED_STEPS, REPEATED_LEAST = 4.0, (10, 0.02)
-"""A row repeats the one before if the steps on both sides are more than so many of the encoder's; least number of such rows and
-least share of the rows in motion. Choices."""
+REPEATED = 10, 0.02
+"""Least number of rows that repeat the one before, with more than ``STICK_STEPS`` steps of the encoder on both sides, and least
+share of the rows in motion. Choices."""
 FILLER, FILLER_LEAST = 5.0, 0.02
 """A position of one row is no measurement if the way to it is so many times the longest way between other rows, and so long [rad,
 m], while the target stays. Choices: a joint that breaks free does not come back in the next row."""
@@ -413,11 +413,11 @@ def check_repeated_rows(t: Trial) -> Iterator[Finding]:
     shares: dict[str, float] = {}
     for j in t.moving:
         step = np.diff(m.measured[:, j])
-        fast = np.abs(step) > REPEATED_STEPS * max(float(m.quantum[j]), 1e-12)
+        fast = np.abs(step) > STICK_STEPS * max(float(m.quantum[j]), 1e-12)
         around = fast[:-2] & fast[2:] & (np.sign(step[:-2]) == np.sign(step[2:]))
         count = int((around & (step[1:-1] == 0.0)).sum())
         share = count / max(int(around.sum()), 1)
-        if count >= REPEATED_LEAST[0] and share > REPEATED_LEAST[1]:
+        if count >= REPEATED[0] and share > REPEATED[1]:
             shares[m.signals[j]] = share
     if shares:
         each = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import fftconvolve, lfilter
 
+from taccorl.alignment.checks.first_order import FAR_S
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import MOVED, Trial, place, scale, without, write
 from taccorl.alignment.measurements.measurement import Measurement, other_arm, unit_of
@@ -31,11 +32,9 @@ GAIN = (
     0.2,
     5.0,
 )  # Gain above which neither controller nor physics can explain the motion
-TURN_S, TURN_LAG_S, LONGEST_LAG_S, TURNED = 1.5, 0.03, 2.0, (3, 0.9)
-"""Window of the correlation by which a sign that turns within a recording is found, lag about that of all rows, and longest lag
-[s]; least number of windows, a quarter of ``TURN_S`` apart, and least correlation. Choices."""
-AT_LIMIT = 0.1
-"""Positions in degrees may exceed the limits by so much [rad]. A choice."""
+TURN_S, TURNED = 1.5, (3, 0.9)
+"""Window of the correlation by which a sign that turns within a recording is found [s]; least number of windows, a quarter of
+``TURN_S`` apart, and least correlation. Choices."""
 AT_TARGET = 0.3
 """A column lies at the target if their difference (RMS) is below this share of the target's range, and of the other column's
 difference. A choice."""
@@ -62,8 +61,6 @@ VELOCITY_FACTORS = {
     -1.0: "the other sign",
 }
 """Ratio of reported velocity to the slope of the position → unit in which the velocity probably is."""
-SPEED_IN_RAD = (np.pi / 180) ** 0.5
-"""Ratio of velocity to slope below which the velocity is in rad/s beside positions in degrees."""
 VELOCITY_GAIN = (0.8, 1.25)  # Range of that ratio that is accepted
 
 
@@ -187,18 +184,19 @@ def check_turns(t: Trial) -> Iterator[Finding]:
     """A target or a position whose sign turns within the recording: the correlation of velocities in windows of ``TURN_S``.
     The lag is that of the speeds without their signs, so that a late or a fast motion is not taken for a turned one."""
     m, even = t.m, t.even
-    rows, about = (round(seconds / even.period_s) for seconds in (TURN_S, TURN_LAG_S))
+    rows, about = (round(seconds / even.period_s) for seconds in (TURN_S, SMOOTH_S))
     for j in t.moving:
         way, own = (
             _velocity(values[:, [j]], even.period_s)[:, 0]
             for values in (even.target, even.measured)
         )
-        most = min(round(LONGEST_LAG_S / even.period_s), even.num_rows // 4)
+        most = min(round(FAR_S / even.period_s), even.num_rows // 4)
         after, before = (abs(x) - abs(x).mean() for x in (own, way))
-        same = fftconvolve(after, before[::-1])[even.num_rows - 1 :][:most]
-        lags = int(np.argmax(same)) + np.array([-about, 0, about])
-        lags = np.maximum(lags, 0)
-        starts = np.arange(lags[-1], even.num_rows - rows, max(rows // 4, 1))
+        same = fftconvolve(after, before[::-1])
+        same = same[even.num_rows - 1 - most : even.num_rows + most]
+        lags = int(np.argmax(same)) - most + np.array([-about, 0, about])
+        first, last = max(lags[-1], 0), even.num_rows - rows + min(lags[0], 0)
+        starts = np.arange(first, last, max(rows // 4, 1))
         likeness = np.array(
             [[_alike(way, own, at, rows, lag) for lag in lags] for at in starts]
         ).reshape(len(starts), len(lags))
@@ -358,8 +356,8 @@ def all_in_degrees(
         n for n in far if known[n].max() > limits[n][1] or known[n].min() < limits[n][0]
     ]
     fits = all(
-        limits[n][0] - AT_LIMIT < np.radians(q.min())
-        and np.radians(q.max()) < limits[n][1] + AT_LIMIT
+        limits[n][0] - BEYOND["rad"] < np.radians(q.min())
+        and np.radians(q.max()) < limits[n][1] + BEYOND["rad"]
         for n, q in known.items()
     )
     if len(far) < 2 or 2 * len(far) < len(known) or not fits:
@@ -438,10 +436,9 @@ def _velocity_unit(m: Measurement, even: Measurement, j: int) -> Iterator[Findin
 def speed_as_position(m: Measurement, name: str) -> bool:
     """Whether the velocity of a joint whose positions are in degrees was recorded, in degrees a second as far as it shows."""
     j = m.column(name)
-    gain = velocity_gain(m, j, j)
-    return bool(
-        np.isfinite(m.velocity[:, j]).any() and (gain is None or gain > SPEED_IN_RAD)
-    )
+    gain = velocity_gain(m, j, j)  # 1 in degrees a second, π / 180 in rad/s
+    in_rad = gain is not None and gain < np.sqrt(np.pi / 180)
+    return bool(np.isfinite(m.velocity[:, j]).any()) and not in_rad
 
 
 def velocity_gain(even: Measurement, j: int, k: int) -> float | None:
