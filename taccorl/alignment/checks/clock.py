@@ -85,7 +85,11 @@ USUAL_TAU_S = 0.12
 least step · period / τ."""
 
 
-@check("error", "measured_before_command", explains=("effort_time",))
+@check(
+    "error",
+    "measured_before_command",
+    explains=("effort_time", "other_gains", "reversed_effort", "wrong_inertia"),
+)
 @check("error", EXCHANGED_COLUMNS, explains=FOLLOWS_FROM)
 @check("note", "late_answer", needs="clock")
 def check_clock(t: Trial) -> Iterator[Finding]:

@@ -13,7 +13,6 @@ Letters in shapes: T rows, R of every few rows, J signals.
 import copy
 import dataclasses
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.checks.registry import find
+from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
 from taccorl.alignment.checks.wiring import velocity_gain
 from taccorl.alignment.machines.robot_file import Robot
@@ -46,6 +45,9 @@ SMOOTH_S = 0.1
 """Window of the quadratics whose slopes are velocity and acceleration [s]."""
 MOST_ROWS = 200
 """Rows of one recording at which the model is evaluated."""
+NO_WEIGHT = 0.2
+"""Efforts lack the carried weight if what they lack is a multiple of it that is within so much of 1, with a correlation above 1
+less so much. A choice."""
 COLUMNS = ("measured", "target", "velocity", "effort")
 """Arrays (T, J) of a measurement that hold a joint's columns."""
 EXCHANGES = (COLUMNS, COLUMNS[:-1], ("effort",))
@@ -63,6 +65,8 @@ class _Torques(NamedTuple):
     effort: np.ndarray
     drive: np.ndarray
     links: np.ndarray
+    carried: np.ndarray
+    """Weight that the controller carries, a part of ``drive``."""
     position: np.ndarray
     speed: np.ndarray
 
@@ -79,6 +83,11 @@ class _Exchange(NamedTuple):
     """Their disagreement with columns exchanged over that without; mean of both joints."""
 
 
+@check(
+    "error",
+    "effort_without_weight",
+    explains=("effort_time", "other_gains", "other_scale", "wrong_inertia"),
+)
 def check_columns(
     robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]
 ) -> None:
@@ -104,8 +113,43 @@ def check_columns(
         if not named & {*one.pair}:
             named |= {*one.pair}
             _tell(one, found)
-    if off:
+    bare = [
+        name
+        for name in recordings
+        if name not in named and _without_weight(list(as_is.values()), known, name)
+    ]
+    if bare:
+        text = (
+            f"efforts of {', '.join(bare)} lack the weight that the controller carries (`gravity_compensation` of "
+            f"{robot.path.name}): without it they are those of kp and kd. Log the torque with it, or leave the efforts out"
+        )
+        for m in recordings[bare[0]]:
+            found[m.name].append(find("effort_without_weight", bare[0], text))
+    elif off:
         _turned(robot, recordings, known, as_is, found)
+
+
+def _without_weight(
+    torques: Sequence[_Torques], known: Sequence[Measurement], name: str
+) -> bool:
+    """Whether efforts of joint ``name``, beside friction, are those of its drive and those of links and rotors, both less the
+    weight that the drive carries."""
+    lacks = np.zeros(
+        (2, 3)
+    )  # of drive and links: products of the difference and the weight
+    for own, m in zip(torques, known, strict=True):
+        j = m.column(name)
+        speed = own.speed[:, j]
+        others = np.column_stack([_friction(own, j)[:, :2], np.gradient(speed)])
+        weight = _beside(own.carried[:, j], others)
+        for k, whole in enumerate((own.drive, own.links)):
+            rest = _beside(whole[:, j] - own.effort[:, j], others)
+            lacks[k] += [rest @ weight, rest @ rest, weight @ weight]
+    cross, rest, weight = lacks.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share, likeness = cross / weight, cross / np.sqrt(rest * weight)
+    near = (np.abs(share - 1.0) < NO_WEIGHT) & (likeness > 1.0 - NO_WEIGHT)
+    return bool(near.all())
 
 
 def _exchanged(
@@ -133,10 +177,12 @@ def _exchanged(
         new = np.array([_disagreements(swapped, torques, n) for n in pair])
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios = new / old
-        for compared, (first, second) in zip(PAIRS, ratios.T, strict=True):
-            mean = math.sqrt(first * second)
+            means = np.sqrt(ratios.prod(axis=0))  # NaN: a torque is not known
+        for compared, mean, largest in zip(
+            PAIRS, means.tolist(), ratios.max(axis=0).tolist(), strict=True
+        ):
             least = BETTER if best is None else best.ratio
-            if mean < least and max(first, second) < 1.0:
+            if mean < least and largest < 1.0:
                 best = _Exchange(pair, own, columns, compared, mean)
     return best
 
@@ -260,7 +306,8 @@ def _torques(robot: Robot, m: Measurement) -> _Torques | None:
         drive[:, j] += torque_ff + robot.config.gravity_compensation * weight[:, j]
         if law.effort_limit is not None:
             drive[:, j] = np.clip(drive[:, j], -law.effort_limit, law.effort_limit)
-    return _Torques(smooth(m.effort), drive, links, state[0], state[1])
+    carried = robot.config.gravity_compensation * weight
+    return _Torques(smooth(m.effort), drive, links, carried, state[0], state[1])
 
 
 def _links(

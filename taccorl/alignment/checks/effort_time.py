@@ -50,12 +50,13 @@ ALONE_LEFT, APART, MOVED = 0.15, 1.5, 2.0
 """Choices for gains that are fitted to each recording alone: largest residual of such a fit, as a share of the RMS effort; ratio
 of the gains of two recordings from which on they are of two machines (one of 7 effects made at most 1.34); and, where efforts are
 computed from accelerations, least ratio of the fitted K_p to the stated one that is reported."""
-LAGS_S, DELAYS_S = (
-    (0.0, 0.01, 0.03),
-    np.linspace(0.0, 0.025, 6),
-)  # Lags and delays of targets that are tried
+LAGS_S, DELAYS_S = (0.0, 0.02), (0.0, 0.01, 0.02)
+"""Lags and delays of targets that are tried [s]; the share r stands for a row more or less."""
 ALIKE = 1e-3
 """Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
+
+
+_Equations = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @check("error", "effort_time", "other_gains")
@@ -75,17 +76,15 @@ def check_effort_time(
     that states the law. ``inertia``: that of the joint in a recording [kg·m²]; its accelerations stand for efforts."""
     if law.law == "effort":  # there is no drive
         return
-    of_it = ("effort_unit", signal, "")
     wrong = {
-        n
-        for n, own in found.items()
+        name
+        for name, own in found.items()
         for f in own
-        if f.severity == "error" and {f.check, f.feature} & {*of_it}
+        if f.severity == "error"
+        and (f.check == "effort_unit" or f.feature in (signal, ""))
     }
     every = [m for m in recordings if m.name not in wrong]
-    used = [
-        m for m in every if all(signal in getattr(m, gain) for gain in law.gain_names)
-    ]
+    used = [m for m in every if all(signal in getattr(m, k) for k in law.gain_names)]
 
     def tell(
         check: str,
@@ -203,36 +202,36 @@ def _other_gains(
     def near(fit: LawFit) -> bool:
         return all(1 / GAINS_OFF < gain < GAINS_OFF for gain in times(fit))
 
-    first = law_fit(law, recordings, signal)
+    fit = first = law_fit(law, recordings, signal)
     if first is None or (first.left <= GAINS_LEFT and near(first)):
         return None
-    fit = first
-    for delay_s in DELAYS_S:
-        later = law_fit(law, [_late(m, delay_s) for m in recordings], signal)
-        fit = (
-            later
-            if later is not None and later.left < min(fit.left, EARLY * first.left)
-            else fit
-        )
+    stated = math.inf
+    for delay_s, lag_s in itertools.product(DELAYS_S, LAGS_S):
+        late = [_late(m, delay_s, lag_s) for m in recordings]
+        found = _all_equations(law, late, signal, smooth=True)
+        if found is None:
+            return None
+        stated = min(stated, _stated_left(found, unseen))
+        later = None if lag_s else _law_fit(found)
+        if later is not None and later.left < min(fit.left, EARLY * first.left):
+            fit = later
     sure = min(fit.kp - 10 * fit.sd[0], fit.kd - 10 * fit.sd[1]) > 0.0
     if (
         not sure
         or fit.left > GAINS_LEFT
         or near(fit)
         or not SHARES[0] < fit.share / fit.kp < SHARES[1]
+        or stated < STATED_LEFT[unseen] * fit.left
     ):
         return None
     m, (kp, kd) = recordings[0], times(fit)
     if unseen and (max(kp, 1 / kp) < MOVED or max(kp / kd, kd / kp) < GAINS_OFF):
         return None
-    if _stated_left(law, recordings, signal, unseen) < STATED_LEFT[unseen] * fit.left:
-        return None
-    stated = m.kp[signal], m.kd[signal]
     text = (
         f"{'acceleration times inertia' if unseen else 'effort'} of {signal} is that of its law with "
-        f"`kp: {stated[0] * kp:.3g}` and `kd: {stated[1] * kd:.3g}` ({kp:.2f} and {kd:.2f} times the stated ones, which leaves "
-        f"{fit.left:.0%} of it). If the stated gains are a guess, write what the drive runs into {file} or measurements.yaml, or "
-        f"these and `gains: fitted` into {file}, which fits them"
+        f"`kp: {m.kp[signal] * kp:.3g}` and `kd: {m.kd[signal] * kd:.3g}`: {kp:.2f} and {kd:.2f} times the stated ones, which "
+        f"leaves {fit.left:.0%} of it. If the stated gains are a guess, write what the drive runs into {file} or "
+        f"measurements.yaml, or these and `gains: fitted` into {file}, which fits them"
     )
     if law.law == "impedance" and max(kp / kd, kd / kp) < ALIKE_GAINS:
         text += f"; else the effort's unit is off, `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing"
@@ -255,63 +254,54 @@ def _late(m: Measurement, delay_s: float, lag_s: float = 0.0) -> Measurement:
     )
 
 
-def _stated_left(
-    law: DriveLaw, recordings: Sequence[Measurement], signal: str, unseen: bool
-) -> float:
+def _stated_left(found: _Equations, unseen: bool) -> float:
     """Share of the effort that the stated gains leave beside any b and integral of the position error and any r (0.5 for
-    accelerations, ``unseen``), with the delay and lag of targets at which they leave least."""
-    least = math.inf
-    for delay_s, lag_s in itertools.product(DELAYS_S, LAGS_S):
-        if found := _all_equations(
-            law, [_late(m, delay_s, lag_s) for m in recordings], signal, smooth=True
-        ):
-            columns, effort, *_ = found
-            more, left = (
-                columns[:, [0, 2, 4][unseen:]],
-                effort - columns[:, 3] + columns[:, 1],
-            )
-            left = left - 0.5 * unseen * columns[:, 0]
-            left = left - more @ np.linalg.lstsq(more, left, rcond=None)[0]
-            least = min(
-                least,
-                float(
-                    np.linalg.norm(left) / max(float(np.linalg.norm(effort)), 1e-300)
-                ),
-            )
-    return least
+    accelerations, ``unseen``)."""
+    columns, effort, *_ = found
+    more = columns[:, [2, 4] if unseen else [0, 2, 4]]
+    rest = effort - columns[:, 3] + columns[:, 1]
+    if unseen:
+        rest = rest - 0.5 * columns[:, 0]
+    rest = rest - more @ np.linalg.lstsq(more, rest, rcond=None)[0]
+    return float(np.linalg.norm(rest)) / max(float(np.linalg.norm(effort)), 1e-300)
 
 
 def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str:
     """Text if efforts are recorded one or more rows before the position and target that produced them, which no effect of a drive
-    can imitate; else empty."""
-
-    def left(rows: int, law: DriveLaw = law) -> float:
-        own = []
-        for m in recordings:
-            effort = np.concatenate(
-                [np.repeat(m.effort[:1], rows, axis=0), m.effort[: m.num_rows - rows]]
-            )
-            own.append(law_left(law, dataclasses.replace(m, effort=effort), signal))
-        known = np.square([x for x in own if x is not None] or [(1.0, 1.0)]).sum(axis=0)
-        return math.sqrt(known[0] / max(known[1], 1e-300))
-
-    as_is = min(
-        left(0),
-        left(
-            0, dataclasses.replace(law, effort_after_target=not law.effort_after_target)
-        ),
-    )
-    best = min(range(MOST_EARLY + 1), key=left)
-    if best == 0 or left(best) > min(EARLY * as_is, SIGN_SURE):
+    can imitate; else empty. Rows are tried one after the other, as long as the law leaves less of the efforts."""
+    left = [_law_left(law, recordings, signal, 0)]
+    while len(left) <= MOST_EARLY and (len(left) < 2 or left[-1][0] < left[-2][0]):
+        left.append(_law_left(law, recordings, signal, len(left)))
+    as_is, best = min(left[0]), int(np.argmin([stated for stated, _ in left]))
+    least = left[best][0]
+    if best == 0 or least > min(EARLY * as_is, SIGN_SURE):
         return ""
-    rows = (
-        f"{best} row{'s' * (best > 1)} ({best * recordings[0].period_s * 1e3:.3g} ms)"
-    )
+    rows_ms = best * recordings[0].period_s * 1e3
     return (
-        f"effort of {signal} stands {rows} too early: its law leaves {as_is:.0%} of it at position and target of its row, and "
-        f"{left(best):.0%} at those {rows} later. Move the column {signal}.tau by as much, or leave it out; "
-        "effort_after_target is no remedy: it moves the target alone"
+        f"effort of {signal} stands {best} row{'' if best == 1 else 's'} ({rows_ms:.3g} ms) too early: its law leaves "
+        f"{as_is:.0%} of it at position and target of its row, and {least:.0%} so much later. Move the column {signal}.tau by "
+        "as much, or leave it out; effort_after_target is no remedy: it moves the target alone"
     )
+
+
+def _law_left(
+    law: DriveLaw, recordings: Sequence[Measurement], signal: str, rows: int
+) -> tuple[float, float]:
+    """Share (RMS) of the efforts of ``rows`` rows before that the numbers of ``law`` leave, whatever weight is carried, with the
+    target as stated and as not stated; 1 if the recordings do not determine it."""
+    squares = np.zeros(3)
+    for m in [] if law.law == "torque" else recordings:
+        late = [np.repeat(m.effort[:1], rows, axis=0), m.effort[: m.num_rows - rows]]
+        late = dataclasses.replace(m, effort=np.concatenate(late))
+        if (found := _equations(law, late, signal)) is None:
+            continue
+        columns, effort, *_ = found
+        rest = effort - columns[:, 3] + columns[:, 1]
+        parts = (rest, rest - columns[:, 0], effort)
+        squares += [float(np.mean(part**2)) for part in parts]
+    before, after, size = np.sqrt(squares).tolist()
+    pair = (after, before) if law.effort_after_target else (before, after)
+    return (pair[0] / size, pair[1] / size) if size else (1.0, 1.0)
 
 
 def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) -> float:
@@ -346,21 +336,6 @@ def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) ->
     )
 
 
-def law_left(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
-    """RMS [unit of the effort] of what the numbers of ``law`` leave of the effort in ``m``, whatever weight is carried, and of
-    the effort; None if the recording does not determine them."""
-    if law.law == "torque" or (found := _equations(law, m, signal)) is None:
-        return None
-    columns, effort, _, _ = found
-    left = (
-        effort
-        - columns[:, 3]
-        - float(law.effort_after_target) * columns[:, 0]
-        + columns[:, 1]
-    )
-    return float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(effort**2)))
-
-
 def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
     """(T,) whether the drive is on, and below its limit."""
     rows = np.ones(m.num_rows, dtype=bool)
@@ -378,7 +353,7 @@ def target_share(
         return None
     columns, effort, *more = found
     solved = _solved(columns[:, :3], effort - columns[:, 3], *more)
-    return None if solved is None else (float(solved[0][0]), float(solved[1][0]))
+    return None if solved is None else (float(solved[0, 0]), float(solved[1, 0]))
 
 
 class LawFit(NamedTuple):
@@ -406,29 +381,22 @@ def law_fit(
     law: DriveLaw, recordings: Sequence[Measurement], signal: str
 ) -> LawFit | None:
     """The law of recorded efforts, by the equation of the module with K_p free and b = 0; None if they do not determine it."""
-    if (found := _all_equations(law, recordings, signal, smooth=True)) is None:
-        return None
+    found = _all_equations(law, recordings, signal, smooth=True)
+    return None if found is None else _law_fit(found)
+
+
+def _law_fit(found: _Equations) -> LawFit | None:
     columns, effort, *more = found
     columns = columns[:, [0, 1, 3]]
     size, solved = np.linalg.norm(columns, axis=0), _solved(columns, effort, *more)
-    if (
-        solved is None
-        or not size.all()
-        or np.linalg.svd(columns / size, compute_uv=False)[-1] < ALIKE
-    ):
+    if solved is None or not size.all():
         return None
-    solution, sd = solved
-    share = float(
-        np.linalg.norm(effort - columns @ solution)
-        / max(float(np.linalg.norm(effort)), 1e-300)
-    )
-    return LawFit(
-        float(solution[2]),
-        -float(solution[1]),
-        (float(sd[2]), float(sd[1])),
-        share,
-        float(solution[0]),
-    )
+    if np.linalg.svd(columns / size, compute_uv=False)[-1] < ALIKE:
+        return None
+    solution, sd = solved.tolist()
+    rest = np.linalg.norm(effort - columns @ solution)
+    share = float(rest / max(float(np.linalg.norm(effort)), 1e-300))
+    return LawFit(solution[2], -solution[1], (sd[2], sd[1]), share, solution[0])
 
 
 def law_of_all(
@@ -442,9 +410,6 @@ def law_of_all(
     alone = [fit for m in recordings if (fit := law_fit(law, [m], signal)) and fit.sign]
     reversed_ = len(alone) > 1 and all(fit.sign < 0 for fit in alone)
     return min(alone, key=lambda fit: fit.left) if reversed_ else whole
-
-
-_Equations = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def _all_equations(
@@ -473,8 +438,8 @@ def _all_equations(
 
 def _solved(
     columns: np.ndarray, left: np.ndarray, noise: np.ndarray, blocks: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Least-squares solution (n,) for the (N, n) ``columns``, and its standard errors, by the scatter between half seconds."""
+) -> np.ndarray | None:
+    """(2, n) least-squares solution for the (N, n) ``columns``, and its standard errors, by the scatter between half seconds."""
     scale = np.linalg.norm(columns, axis=0)
     if scale[0] == 0.0:
         return None
@@ -492,7 +457,7 @@ def _solved(
     count = int(number.max()) + 1
     of_blocks = np.array([np.bincount(number.ravel(), own) for own in moves.T])
     variance = np.square(of_blocks).sum(axis=1) * count / max(count - 1, 1)
-    return solution / scale, np.sqrt(variance) / scale
+    return np.array([solution, np.sqrt(variance)]) / scale
 
 
 def _equations(

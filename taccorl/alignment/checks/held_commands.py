@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import lfilter
 
 from taccorl.alignment.checks.first_order import beside
 from taccorl.alignment.measurements.measurement import Measurement
@@ -266,11 +266,9 @@ def _fitted(
             drive,
             left=drive[0] * (x[2] <= 0),
         )
-        omega, zeta = math.exp(x[0]), math.exp(x[1])
-        numerator, denominator, _ = cont2discrete(
-            ([omega**2], [1.0, 2.0 * zeta * omega, omega**2]), period_s
+        return np.asarray(
+            lfilter(*_held(math.exp(x[0]), math.exp(x[1]), period_s), late)
         )
-        return np.asarray(lfilter(np.ravel(numerator), denominator, late))
 
     def residual(x: np.ndarray) -> np.ndarray:
         return beside(measured[seen], answer(x, u)[seen])[0]
@@ -298,6 +296,20 @@ def _fitted(
     return measured - commanded @ solution, solution[0] * answer(best, impulse)[
         LEAD_ROWS:
     ]
+
+
+def _held(omega: float, zeta: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator (3,) and denominator (3,), by powers of q⁻¹, of the lag ω² / (s² + 2 ζ ω s + ω²) behind held values."""
+    root = np.sqrt(complex(zeta**2 - 1.0)) or 1e-5
+    poles = omega * (np.array([root, -root]) - zeta)
+    once, twice = (np.exp(poles * period_s * k) for k in (1, 2))
+    denominator = np.array([1.0, -once.sum().real, once.prod().real])
+    step = [
+        1.0 + ((poles[::-1] * own) @ [1, -1] / (poles[0] - poles[1])).real
+        for own in (once, twice)
+    ]
+    second = step[1] + denominator[1] * step[0] - step[0]
+    return np.array([0.0, step[0], second]), denominator
 
 
 def _whitening(left: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from taccorl.alignment.checks.trial import (
     without,
     write,
 )
-from taccorl.alignment.checks.wiring import in_other_unit
+from taccorl.alignment.checks.wiring import FOLLOWS_FROM, in_other_unit
 from taccorl.alignment.controller.joint_motion import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
@@ -67,6 +67,9 @@ STICK_ERRORS = 1.5
 rows: beyond it the friction would have given way. A choice."""
 
 
+REPEATED = 10, 0.02
+"""Least number of rows that repeat the one before, with more than ``STICK_STEPS`` steps of the encoder on both sides, and least
+share of the rows in motion. Choices."""
 FILLER, FILLER_LEAST = 5.0, 0.02
 """A position of one row is no measurement if the way to it is so many times the longest way between other rows, and so long [rad,
 m], while the target stays. Choices: a joint that breaks free does not come back in the next row."""
@@ -78,7 +81,9 @@ def _filled(values: np.ndarray, target: np.ndarray) -> int | None:
     if last < 3 or not np.isfinite(way).all():
         return None
     k = int(way.argmax())
-    row = 0 if k == 0 else last if k == last - 1 else k + 1
+    inner = k + 1 if k == 0 or way[min(k + 1, last - 1)] > way[k - 1] else k
+    row = 0 if k == 0 and way[1] < 0.5 * way[0] else inner
+    row = last if k == last - 1 and way[k - 1] < 0.5 * way[k] else row
     around = slice(max(row - 1, 0), row + 1)
     others = float(np.delete(way, range(*around.indices(last))).max())
     moved = float(np.ptp(target[max(row - 3, 0) : row + 2]))
@@ -86,6 +91,13 @@ def _filled(values: np.ndarray, target: np.ndarray) -> int | None:
     return row if apart > max(FILLER * others, FILLER_LEAST, 2.0 * moved) else None
 
 
+def _unwrap(name: str) -> str:
+    """Text: the lines of a columns file that unwrap an angle."""
+    lines = ", ".join(f"{name}.{key}: {{unwrap: true}}" for key in ("q", "q_target"))
+    return f"Write `changes: {{{lines}}}` into a columns file; in one with signals: `unwrap: true` there"
+
+
+@check("error", "wrapped", explains=(*FOLLOWS_FROM, "unit", "reversed"))
 @check("error", "not_finite", "lost_samples", needs="rows")
 def check_values(t: Trial) -> Iterator[Finding]:
     """Find targets that are no numbers, angles that jump by a full turn, values that fill a row (a logger's zeros), and rows
@@ -108,9 +120,9 @@ def check_values(t: Trial) -> Iterator[Finding]:
         if len(turns):
             text = (
                 f"{name} jumps by a full turn in {len(turns)} rows, first after row {turns[0]} ({m.time_s[turns[0]]:.3f} s): its "
-                f"angle is wrapped. Unwrap the columns {name}.q and {name}.q_target (numpy.unwrap)"
+                f"angle is wrapped. {write(m, _unwrap(name), 'Unwrap it (numpy.unwrap) before it is logged')}"
             )
-            yield find("unit", name, text, (int(turns[0]), int(turns[0]) + 2))
+            yield find("wrapped", name, text, (int(turns[0]), int(turns[0]) + 2))
         elif (row := _filled(values, m.target[:, m.column(name)])) is not None:
             text = (
                 f"{name} is at {values[row]:.4g} {unit} in row {row} ({m.time_s[row]:.3f} s) alone, {FILLER:g} times as far from "
@@ -361,6 +373,62 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
     return f"goes on from there ({jump:.2g} {m.units[j]} to the next row)"
 
 
+@check("error", "frozen_target", needs="position", explains=FOLLOWS_FROM)
+def check_frozen_targets(t: Trial) -> Iterator[Finding]:
+    """Targets that stand for far longer than elsewhere while the joint goes on to and fro."""
+    m = t.m
+    answer = round(SETTLED_S / m.period_s)
+    for j in t.moving:
+        name, least = m.signals[j], FROZEN_MOVE / scale(m, j)
+        least = max(least, REST_SHARE * float(np.ptp(m.target[:, j])))
+        holds = runs(np.diff(m.target[:, j]) == 0)
+        inner = [r for r in holds if r[0] > 0 and r[1] < m.num_rows - 1]
+        inner.sort(key=lambda r: r[0] - r[1])
+        if not inner:
+            continue
+        first, end = inner[0]
+        others = max((stop - start for start, stop in inner[1:]), default=0)
+        if (end - first) * m.period_s < FROZEN_S or 3 * others > end - first:
+            continue
+        if _to_and_fro(m.measured[first + answer : end, j]) > least:
+            text = (
+                f"{name}: its target stands at {m.target[first, j]:.4g} {m.units[j]} in {place(m, first, end + 1)}, while the "
+                f"joint goes on to and fro: its logger repeated an old target; {without(m, first)}"
+            )
+            yield find("frozen_target", name, text, (first, end + 1))
+
+
+def _to_and_fro(values: np.ndarray) -> float:
+    """The smaller one of the longest ways up and down in (T,) ``values``; NaN are left out."""
+    known = values[np.isfinite(values)]
+    up = (known - np.minimum.accumulate(known)).max(initial=0.0)
+    down = (np.maximum.accumulate(known) - known).max(initial=0.0)
+    return float(min(up, down))
+
+
+@check("warning", "repeated_rows", needs="position")
+def check_repeated_rows(t: Trial) -> Iterator[Finding]:
+    """Single rows in which a joint in motion reads the number of the row before: a driver that was polled too early."""
+    m = t.m
+    shares: dict[str, float] = {}
+    for j in t.moving:
+        step = np.diff(m.measured[:, j])
+        fast = np.abs(step) > STICK_STEPS * max(float(m.quantum[j]), 1e-12)
+        around = fast[:-2] & fast[2:] & (np.sign(step[:-2]) == np.sign(step[2:]))
+        count = int((around & (step[1:-1] == 0.0)).sum())
+        share = count / max(int(around.sum()), 1)
+        if count >= REPEATED[0] and share > REPEATED[1]:
+            shares[m.signals[j]] = share
+    if shares:
+        each = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
+        text = (
+            f"rows repeat the reading of the row before while the joint moves ({each} of its rows in motion): they were polled "
+            "faster than the driver measures. Log only new readings with the driver's stamps, or leave repeated rows out: gaps "
+            "of a table are bridged"
+        )
+        yield find("repeated_rows", next(iter(shares)), text)
+
+
 @check("warning", "not_at_rest", "start_offset", needs="position")
 def check_start(t: Trial) -> Iterator[Finding]:
     """Signals that were not at rest near their command at the start, as the twin is."""
@@ -478,19 +546,10 @@ def _frozen_effort(m: Measurement, j: int) -> Iterator[Finding]:
     inside = inside[np.isfinite(inside)]
     at_limit = abs(effort[first]) == np.nanmax(np.abs(effort))
     outside = np.delete(same, np.s_[first:end])
-    rises, falls = (
-        inside - np.minimum.accumulate(inside),
-        np.maximum.accumulate(inside) - inside,
-    )
     short = end - first < FROZEN_EFFORT_S / m.period_s
     move = FROZEN_MOVE / scale(m, j)
     coarse = outside.size and outside.mean() > 0.5
-    if (
-        at_limit
-        or short
-        or coarse
-        or min(rises.max(initial=0.0), falls.max(initial=0.0)) < move
-    ):
+    if at_limit or short or coarse or _to_and_fro(inside) < move:
         return
     text = (
         f"{name}: its effort reads {effort[first]:.4g} in all of {place(m, first, end + 1)}, while the joint goes to and fro by "

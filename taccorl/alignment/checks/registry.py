@@ -8,7 +8,7 @@ end in an error, and what a check explains is removed beside its finding.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,6 +63,23 @@ def find(
 ) -> Finding:
     """Finding of a check in the list, with the severity that stands there if none is given."""
     return Finding(name, severity or CHECKS[name].severity, feature, text, rows, topic)
+
+
+def without_explained(
+    found: Mapping[str, Sequence[Finding]], causes: Sequence[Finding]
+) -> dict[str, list[Finding]]:
+    """``found`` (recording → findings) without what ``causes`` explain: findings about the same signal in any recording, or
+    about any signal if the cause has none."""
+    explained = {(e, f.feature) for f in causes for e in CHECKS[f.check].explains}
+    everywhere = {check for check, feature in explained if not feature}
+    return {
+        name: [
+            f
+            for f in own
+            if f.check not in everywhere and (f.check, f.feature) not in explained
+        ]
+        for name, own in found.items()
+    }
 
 
 def check_names(accept: Sequence[str]) -> None:

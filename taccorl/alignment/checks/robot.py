@@ -11,7 +11,7 @@ from taccorl.alignment.checks.effort_time import SIGN_SURE, LawFit, law_fit
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
 from taccorl.alignment.checks.unsigned import unsigned_register
-from taccorl.alignment.checks.wiring import velocity_gain
+from taccorl.alignment.checks.wiring import all_in_degrees, speed_as_position
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -67,13 +67,15 @@ def check_robot(
     found = pose_unknown(
         lacking if robot.config.model else [], "at the model's zero pose"
     )
+    limits = {n: robot.rigid.joints[n].limits for n in robot.config.joints}
+    hinges = {n: own for n, own in limits.items() if own and robot.units[n] == "rad"}
+    if degrees := all_in_degrees(m, hinges):
+        return [*found, *degrees]
     factors: dict[str, float] = {}
     of_efforts: list[Finding] = []
     for name in robot.config.joints:
         if name in m.signals:
-            wrong = beyond_limits(
-                m, name, robot.rigid.joints[name].limits, robot.rigid.path.name
-            )
+            wrong = beyond_limits(m, name, limits[name], robot.rigid.path.name)
             fit = fits[name] if name in moved else None
             known = None
             if robot.config.model:  # else gains are fitted, or suspected
@@ -162,12 +164,15 @@ def beyond_limits(
     row = int(np.argmax(beyond))
     if limits is None or beyond[row] <= BEYOND * (high - low):
         return []
-    if unit == "rad" and abs(q[row]) > 2 * np.pi:
-        speed = velocity_gain(m, j, j)
-        has_speed = np.isfinite(m.velocity[:, j]).any() and (
-            speed is None or speed > DEGREES**0.5
+    turns = float(np.round(np.nanmean(q - 0.5 * (low + high)) / (2 * np.pi)))
+    within = np.nanmax(np.abs(q - 2 * np.pi * turns - 0.5 * (low + high)))
+    if unit == "rad" and turns and within < (0.5 + BEYOND) * (high - low):
+        way_out = (
+            f"All of it lies {turns:g} full turns off: write `zero: {2 * np.pi * turns:.6g}` (in rad) for {name}.q, and for "
+            f"{name}.q_target if it is as far off, in a columns file"
         )
-        qd = f" (`deg/s` for {name}.qd)" * bool(has_speed)
+    elif unit == "rad" and abs(q[row]) > 2 * np.pi:
+        qd = f" (`deg/s` for {name}.qd)" if speed_as_position(m, name) else ""
         way_out = f"Write `unit: deg` for {name}.q and {name}.q_target{qd} in a columns file; of ticks, rad of one as `factor:`"
     else:
         way_out = f"Write the `unit:` of {name}.q and {name}.q_target in a columns file, `factor: -1` if their sign is reversed"

@@ -32,6 +32,7 @@ from taccorl.alignment.checks.registry import (
     check_names,
     find,
     run,
+    without_explained,
 )
 from taccorl.alignment.checks.trial import MOVED, Trial, least_motion
 from taccorl.alignment.checks.unrepeated import check_repeatability
@@ -292,16 +293,7 @@ def one_cause(
     that any other error of the signal explains.
     ``found``: name of a recording → its findings. ``rates``: as in ``Trial``."""
     every = [f for own in found.values() for f in own if f.severity == "error"]
-    explained = {
-        (e, f.feature)
-        for f in every
-        if f.check not in CORRECTED
-        for e in CHECKS[f.check].explains
-    }
-    result = {
-        name: [f for f in own if (f.check, f.feature) not in explained]
-        for name, own in found.items()
-    }
+    result = without_explained(found, [f for f in every if f.check not in CORRECTED])
     wrong = {
         f.feature
         for own in result.values()
@@ -340,7 +332,7 @@ def one_cause(
             name for name, f in again if f.severity == "error" and f.check in follow
         }
         if cause == "reversed" and any(
-            "reversed_effort" in own for own in errors.values()
+            (f.check, f.feature) == ("reversed_effort", signal) for f in every
         ):
             more = f". Its effort pushes against its acceleration as well: it is {signal}.q"
             errors[of[cause][0]][cause] = dataclasses.replace(

@@ -7,16 +7,18 @@ Letters in shapes: T rows, J signals.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter
+from scipy.signal import fftconvolve, lfilter
 
+from taccorl.alignment.checks.first_order import FAR_S
 from taccorl.alignment.checks.registry import check, find
-from taccorl.alignment.checks.trial import MOVED, Trial, scale, write
-from taccorl.alignment.measurements.measurement import Measurement, other_arm
+from taccorl.alignment.checks.trial import MOVED, Trial, place, scale, without, write
+from taccorl.alignment.measurements.measurement import Measurement, other_arm, unit_of
 from taccorl.data.finding import Finding, listed
+from taccorl.data.timing import runs
 from taccorl.robots import ROBOT
 
 USUAL_LAG_S = 0.1  # Lag of a joint behind its command that is assumed here [s]
@@ -30,6 +32,12 @@ GAIN = (
     0.2,
     5.0,
 )  # Gain above which neither controller nor physics can explain the motion
+TURN_S, TURNED = 1.5, (3, 0.9)
+"""Window of the correlation by which a sign that turns within a recording is found [s]; least number of windows, a quarter of
+``TURN_S`` apart, and least correlation. Choices."""
+AT_TARGET = 0.3
+"""A column lies at the target if their difference (RMS) is below this share of the target's range, and of the other column's
+difference. A choice."""
 SAME_FACTOR = 1.5
 """A joint that hardly moves is in another unit if it follows its command and its gain is a known factor, within so many times of
 it either way: a lag other than ``USUAL_LAG_S`` changes gains. A choice."""
@@ -62,6 +70,8 @@ FOLLOWS_FROM = (
         "reversed_effort",
         "wrong_inertia",
         "effort_time",
+        "other_gains",
+        "other_scale",
         "sticking_joint",
         "blocked",
     ),
@@ -90,7 +100,7 @@ OF_ANOTHER_JOINT = (
 """Checks whose findings about a signal may also follow from a column that is another joint's."""
 
 
-@check("error", "reversed", explains=FOLLOWS_FROM)
+@check("error", "copied_target", "reversed", explains=FOLLOWS_FROM)
 @check(
     "error",
     "swapped_joints",
@@ -100,6 +110,13 @@ OF_ANOTHER_JOINT = (
 def check_wiring(t: Trial) -> Iterator[Finding]:
     """Swapped joints and arms, reversed signs, and wrong units."""
     m, even = t.m, t.even
+    usual = zip(ROBOT.action_low, ROBOT.action_high, strict=True)
+    limits = dict(zip(ROBOT.action_names, usual, strict=True))
+    if found := all_in_degrees(
+        m, {n: own for n, own in limits.items() if unit_of(n) == "rad"}
+    ):
+        yield from found
+        return
     yield from (beyond := list(_beyond_range(m)))
     commanded = [
         j
@@ -126,6 +143,13 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             other is not None and not backwards[j] > follows[other, j]
         ):  # else target and position are exchanged
             swapped[name] = m.signals[other]
+        elif (of := _copied(m, follows, j)) is not None:
+            text = (
+                f"{name}: its command is that of {m.signals[of]}, number for number, which {m.signals[of]} follows and {name} "
+                f"does not (correlation {own:.2f} over {m.time_s[-1]:.1f} s): one was logged for both. "
+                f"{write(m, f'Give {name}.q_target its own column', 'Correct the channel of its command')}, or leave {name} out"
+            )
+            yield find("copied_target", name, text)
         elif own < REVERSED:
             way_out = write(
                 m,
@@ -143,6 +167,86 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
         if not is_named and (follows[j, j] > FOLLOWS_NOT or in_other_unit(t, j)):
             yield from _gain(m, even, lagged, j)
             yield from _velocity_unit(m, even, j)
+
+
+def _copied(m: Measurement, follows: np.ndarray, j: int) -> int | None:
+    """Another joint with the command of ``j``, which it follows; None if there is none, or if joint ``j`` rests."""
+    alike = (
+        i
+        for i in range(len(m.signals))
+        if i != j and follows[i, i] > FOLLOWS and np.isfinite(follows[j, j])
+    )
+    return next((i for i in alike if (m.target[:, i] == m.target[:, j]).all()), None)
+
+
+@check("error", "turned_midway", needs="position", explains=FOLLOWS_FROM)
+def check_turns(t: Trial) -> Iterator[Finding]:
+    """A target or a position whose sign turns within the recording: the correlation of velocities in windows of ``TURN_S``.
+    The lag is that of the speeds without their signs, so that a late or a fast motion is not taken for a turned one."""
+    m, even = t.m, t.even
+    rows, about = (round(seconds / even.period_s) for seconds in (TURN_S, SMOOTH_S))
+    for j in t.moving:
+        way, own = (
+            _velocity(values[:, [j]], even.period_s)[:, 0]
+            for values in (even.target, even.measured)
+        )
+        most = min(round(FAR_S / even.period_s), even.num_rows // 4)
+        after, before = (abs(x) - abs(x).mean() for x in (own, way))
+        same = fftconvolve(after, before[::-1])
+        same = same[even.num_rows - 1 - most : even.num_rows + most]
+        lags = int(np.argmax(same)) - most + np.array([-about, 0, about])
+        first, last = max(lags[-1], 0), even.num_rows - rows + min(lags[0], 0)
+        starts = np.arange(first, last, max(rows // 4, 1))
+        likeness = np.array(
+            [[_alike(way, own, at, rows, lag) for lag in lags] for at in starts]
+        ).reshape(len(starts), len(lags))
+        follows = likeness.max(axis=1) > TURNED[1]
+        against = (likeness.max(axis=1) < 0) & (likeness.min(axis=1) < -TURNED[1])
+        for first, end in runs(against):
+            if end - first >= TURNED[0] and follows.any():
+                begin, until = int(starts[first]), int(starts[end - 1]) + rows
+                text = (
+                    f"{m.signals[j]} moves against its command in {place(m, begin, until)} and with it elsewhere: the sign of "
+                    f"one of the two turns within the recording; {without(m, begin)}"
+                )
+                yield find("turned_midway", m.signals[j], text, (begin, until))
+                break
+
+
+def _alike(way: np.ndarray, own: np.ndarray, at: int, rows: int, lag: int) -> float:
+    """Correlation of two (T,) velocities in ``rows`` from row ``at`` on, ``way`` that of ``lag`` rows before; 0 of one that
+    rests."""
+    pair = way[at - lag : at - lag + rows], own[at : at + rows]
+    return float(np.corrcoef(*pair)[0, 1]) if all(np.ptp(x) > 0 for x in pair) else 0.0
+
+
+@check(
+    "error",
+    "exchanged_effort",
+    needs="position",
+    explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT),
+)
+def check_exchanged_effort(t: Trial) -> Iterator[Finding]:
+    """A column of efforts that lies at the target, where the column of positions does not."""
+    m = t.m
+    for j, name in enumerate(m.signals):
+        target, effort = m.target[:, j], m.effort[:, j]
+        span = float(np.ptp(target)) if np.isfinite(target).all() else 0.0
+        if span * scale(m, j) < MOVED["rad"] or not np.isfinite(effort).all():
+            continue
+        near = float(np.sqrt(np.mean((effort - target) ** 2)))
+        far = float(np.sqrt(np.nanmean((m.measured[:, j] - target) ** 2)))
+        if near < min(AT_TARGET * span, AT_TARGET * far):
+            changes = (
+                f"{name}.q: {{column: {name}.tau}}, {name}.tau: {{column: {name}.q}}"
+            )
+            file = f"Write `changes: {{{changes}}}` into a columns file; in one with signals: exchange the two there"
+            where = write(m, file, "Exchange the two in the recording spec")
+            text = (
+                f"{name}: its effort lies within {near:.2g} of the target (RMS), its position {far:.2g} from it: the columns of "
+                f"position and effort are exchanged. {where}"
+            )
+            yield find("exchanged_effort", name, text)
 
 
 def in_other_unit(t: Trial, j: int) -> bool:
@@ -240,7 +344,37 @@ def _unit_way_out(m: Measurement, *columns: str) -> str:
     return f"{where}; if other recordings are right, convert this one"
 
 
-@check("error", "unit")
+def all_in_degrees(
+    m: Measurement, limits: Mapping[str, tuple[float, float]]
+) -> list[Finding]:
+    """One finding if the positions of all joints with ``limits`` [rad] are in degrees: as degrees they are within the limits,
+    and at least half of them, and two, are more than a turn beyond these as they are."""
+    known = {n: m.measured[:, m.column(n)] for n in limits if n in m.signals}
+    known = {n: q[np.isfinite(q)] for n, q in known.items() if np.isfinite(q).any()}
+    far = [n for n, q in known.items() if np.abs(q).max() > 2 * np.pi]
+    far = [
+        n for n in far if known[n].max() > limits[n][1] or known[n].min() < limits[n][0]
+    ]
+    fits = all(
+        limits[n][0] - BEYOND["rad"] < np.radians(q.min())
+        and np.radians(q.max()) < limits[n][1] + BEYOND["rad"]
+        for n, q in known.items()
+    )
+    if len(far) < 2 or 2 * len(far) < len(known) or not fits:
+        return []
+    lines = [f"{n}.{key}: {{unit: deg}}" for n in known for key in ("q", "q_target")]
+    lines += [f"{n}.qd: {{unit: deg/s}}" for n in known if speed_as_position(m, n)]
+    file = f"Write `changes: {{{', '.join(lines)}}}` into a columns file, in one with signals `unit: deg` at each"
+    each = ", ".join(f"{n} at {known[n][np.abs(known[n]).argmax()]:.4g}" for n in far)
+    text = (
+        f"all positions look like degrees, read as rad: {each} is beyond its limits, in degrees all are within them. "
+        f"{write(m, file, 'State `scale: 0.0174533` of the channels in the recording spec')}"
+    )
+    return [find("degrees", "", text)]
+
+
+@check("error", "degrees", explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT))
+@check("error", "unit", explains=("start_offset", "beyond_limits", "effort_unit"))
 def _beyond_range(m: Measurement) -> Iterator[Finding]:
     """Positions where the robot cannot be: another unit."""
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
@@ -297,6 +431,14 @@ def _velocity_unit(m: Measurement, even: Measurement, j: int) -> Iterator[Findin
         f"{f' ({near[0]}?)' if near else ''}. {_unit_way_out(m, f'{m.signals[j]}.qd')}, or leave it out"
     )
     yield find("velocity_unit", m.signals[j], text)
+
+
+def speed_as_position(m: Measurement, name: str) -> bool:
+    """Whether the velocity of a joint whose positions are in degrees was recorded, in degrees a second as far as it shows."""
+    j = m.column(name)
+    gain = velocity_gain(m, j, j)  # 1 in degrees a second, π / 180 in rad/s
+    in_rad = gain is not None and gain < np.sqrt(np.pi / 180)
+    return bool(np.isfinite(m.velocity[:, j]).any()) and not in_rad
 
 
 def velocity_gain(even: Measurement, j: int, k: int) -> float | None:

@@ -141,6 +141,9 @@ class Column:
     """Number of the sign bit of a register in sign and magnitude, such as 1024 of bit 10: 1033 is −9."""
     wraps_at: float | None = None
     """Number of values of a register in two's complement, such as 65536 of 16 bits: 65527 is −9."""
+    unwrap: bool = False
+    """True of an angle that jumps by a full turn where it passes ± half a turn: the turns are added, and the target is
+    that within half a turn of the position. Of ``q`` and ``q_target`` of a hinge."""
     if_missing: float | None = (
         None  # Value for files without the column; if not given, such a file is rejected
     )
@@ -183,6 +186,7 @@ class Change:
     zero: float | None = None
     sign_bit: float | None = None
     wraps_at: float | None = None
+    unwrap: bool | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,6 +285,11 @@ def _rules(spec: TableSpec) -> Rules:
                 where,
                 f"factor {column.factor:g}; give a finite number other than 0",
             )
+            yield (
+                column.unwrap and not _is_angle(key, column),
+                f"{place}/{key}/unwrap",
+                "is of q and q_target of a hinge; remove it here",
+            )
             wrong = column.wrong_register()
             yield (
                 wrong,
@@ -301,6 +310,11 @@ def _rules(spec: TableSpec) -> Rules:
             )
     twice = _used_twice(spec)
     yield twice, "signals", twice
+
+
+def _is_angle(key: str, column: Column) -> bool:
+    """Whether a column is an angle, which may be wrapped."""
+    return key in ("q", "q_target") and POSITION[column.unit][0] == "rad"
 
 
 def _used_twice(spec: TableSpec) -> str:
@@ -346,6 +360,10 @@ def _resolved(
         is_alike = new.unit in kinds and kinds[new.unit][0] == kinds[old.unit][0]
         if wrong := new.wrong_register():
             raise RecordingError(f"{path}: changes: {column}: {wrong}")
+        if is_alike and new.unwrap and not _is_angle(key, new):
+            raise RecordingError(
+                f"{path}: changes: {column}: unwrap is of q and q_target of a hinge; remove it here"
+            )
         if (
             not is_alike
             or not math.isfinite(new.zero)
@@ -526,7 +544,13 @@ def measurement_of_columns(
                     own_names, list(spec.signals)[j], key, column, read
                 )
             numbers = column.quantity(read) * _CONVERSIONS[key][column.unit][1]
+            if column.unwrap:
+                numbers = np.unwrap(numbers)
             values["q_target" if key in TARGETS else key][:, j] = numbers
+        if signal.q_target is not None and signal.q_target.unwrap:
+            off = np.nanmedian(values["q_target"][:, j] - values["q"][:, j])
+            if np.isfinite(off):
+                values["q_target"][:, j] -= _TURN * np.round(off / _TURN)
         if not any(
             getattr(signal, key) for key in TARGETS
         ):  # the model is held where this was measured

@@ -1300,10 +1300,11 @@ def test_times_that_are_all_equal_stop_everything_else(clean, time_s):
 def test_a_wrapped_angle_is_named_and_a_fast_joint_is_not(clean):
     turned = clean.measured[:, 4] + np.pi - clean.measured[:, 4].mean()
     m = with_column(clean, clean.signals[4], (turned + np.pi) % (2 * np.pi) - np.pi)
-    assert "jumps by a full turn" in text_of(m, "unit") and "numpy.unwrap" in text_of(
-        m, "unit"
-    )
-    assert "unit" not in found(clean)
+    assert found(m)["wrapped"] == ["left_joint5"]
+    table = dataclasses.replace(m, source=Path("a.csv"))
+    lines = "left_joint5.q: {unwrap: true}, left_joint5.q_target: {unwrap: true}"
+    assert f"`changes: {{{lines}}}`" in text_of(table, "wrapped")
+    assert "wrapped" not in found(clean)
 
 
 @pytest.mark.parametrize("row", [0, 700, -1])
