@@ -171,6 +171,8 @@ class WarpBatch(Batch):
             name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size
         }
         self._time_s = self.bind("time")
+        self._moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] > 0)
+        """Geoms that may move. The others keep the poses of MuJoCo C: the device has another table (``_for_warp``)."""
         self._world: _Worlds | None = None
         self._lost = np.ones(nsim, dtype=bool)
         """(N,) bool: the device has another state than the simulation."""
@@ -464,6 +466,8 @@ class WarpBatch(Batch):
     ) -> None:
         for name, parts in fields.items():
             values = self._bound[name]
+            if parts is None and name.startswith("geom_"):
+                parts = self._moving
             values.flags.writeable = True
             worlds.read(worlds.tensor(name), rows, values, parts)
             values.flags.writeable = False

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.pad import KINEMATIC_FIELDS
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import PhysicsConfig, TwinConfig
 from taccorl.sim.warp_batch import WarpBatch, WarpSettings, _for_warp, _Worlds
-from tests.sim.expert_episode import MIDDLE, expert_episode, together
+from tests.sim.expert_episode import MIDDLE, SEED, expert_episode, together
 
 ON_CPU = "warp:device=cpu"
 
@@ -62,6 +64,32 @@ def test_parts_in_hands_move_as_in_mujoco_c(warp):
     assert c.touch().max() > 50
     free, mating_nm = np.abs(ours.effort() - c.effort()).max(1)
     assert free < 1e-3 and mating_nm < 0.1
+
+
+@pytest.mark.slow
+def test_pads_near_the_table_feel_what_they_do_in_mujoco_c(warp):
+    """The device's table is a plane at the height of the box's face; pads feel the box where it was."""
+    sim = Simulation(tasks.get("assembly_1")())
+    sim.reset([SEED])
+    actions, lowest = expert_episode().actions, (np.inf, sim.snapshot(), 0)
+    pads = [sim.model.site(pad).id for pad in ROBOT.pads]
+    for k, action in enumerate(actions[:MIDDLE]):
+        sim.step(action[None])
+        height = sim.batch.site_xpos[0, pads, 2].min()
+        if height < lowest[0]:
+            lowest = height, sim.snapshot(), k + 1
+    height, state, k = lowest
+    assert height < 0.04  # of their middles: edges within the half thickness, 0.02
+    ours = Simulation(sim.task, physics=ON_CPU)
+    ours.reset([SEED])
+    for one in (ours, sim):
+        one.restore(state)
+        one.step(actions[k][None])
+    for name in KINEMATIC_FIELDS:
+        np.testing.assert_allclose(
+            getattr(ours.batch, name), getattr(sim.batch, name), rtol=0, atol=1e-4
+        )
+    np.testing.assert_allclose(ours.touch(), sim.touch(), rtol=0, atol=3)
 
 
 @pytest.mark.slow
