@@ -574,7 +574,9 @@ def write_sweeps(plant: Plant, folder: Path) -> None:
             lines.append(
                 f"  {m.name}.csv: {{use: {use}{f', repeat_of: {m.repeat_of}.csv' * bool(m.repeat_of)}}}"
             )
-            keys = {"q": m.measured, "q_target": m.target, "tau": m.effort}
+            keys = {"q": m.measured, "q_target": m.target}
+            if plant.case.effort:
+                keys["tau"] = m.effort
             header = ["t", *(f"{name}.{key}" for name in m.signals for key in keys)]
             rows = [
                 m.time_s,

@@ -210,7 +210,9 @@ def test_the_stated_error_is_that_of_the_file_where_joints_load_each_other(
     few = ("coulomb_friction", "stribeck_friction", "viscous_friction")
     without = f"--without=[{','.join(name for name in effects if name not in few)}]"
     given = ("sweeps", f"--twin={file}", f"--joints=[{plant.case.joint}]")
-    said("diagnose", *given, "--out=found", without, "--until=noise_floor")
+    words = ("--out=found", without, "--until=noise_floor")
+    code, text = said("diagnose", *given, *words)
+    assert code < 2, text
     (d,) = json.loads(Path("found/report.json").read_text())["diagnoses"].values()
     assert d["effects"][0]["effect"] == "stribeck_friction"
     said("compare", *given, f"--against=found/{file.name}", "--out=compared")
