@@ -152,7 +152,7 @@ def run(config: DiagnoseConfig) -> int:
         return 128 + stopped_by
     explained = all(
         is_explained(f.diagnosis) and accounts[f.part].kind != "data_first"
-        for f in found
+        for f in report.found
     )
     return int(not explained or bool(disagree or refused))
 
@@ -230,21 +230,26 @@ def _report(
     measurements: "Measurements",
     mended: "Machine",
 ) -> "Report":
-    """With the comparisons that show what refitted numbers removed, and what effects did."""
+    """With the comparisons that show what refitted numbers removed, and what effects did,
+    and the errors of these files in the findings."""
+    from taccorl.diagnosis.machines.machine import as_written
     from taccorl.report.evidence import added
     from taccorl.report.report import Report
 
     some = any(
         added(f.diagnosis) for f in found
     )  # else the twin as it was is the reference
+    refitted = machine.refitted(found) if some else None
+    later = {
+        "fitted": refitted and refitted.compare(measurements, name="refitted twin"),
+        "after": mended.compare(measurements, name="corrected twin"),
+    }
     return Report(
         title=_title(config, machine),
         comparison=beside.comparison,
-        refitted=machine.refitted(found).compare(measurements, name="refitted twin")
-        if some
-        else None,
-        after=mended.compare(measurements, name="corrected twin"),
-        found=found,
+        refitted=later["fitted"],
+        after=later["after"],
+        found=as_written(found, beside.comparison, later),
         options=[
             shlex.quote(word)
             for word in (f"--measurements={config.measurements}", *_given(config))
