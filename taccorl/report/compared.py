@@ -178,8 +178,8 @@ def where(
         worst = worst_regime(cells, signal, kind)
         if worst is not None:
             lines.append(
-                f"{signal} {kind}: worst {worst.regime}, {worst.ratio:.3g} × floor; {worst.share_of_error:.0%} of its squared "
-                f"error in {worst.share_of_time:.0%} of its time"
+                f"{signal} {kind}: largest in the regime “{worst.regime}”, {worst.ratio:.3g} × floor; "
+                f"{worst.share_of_error:.0%} of the squared error in {worst.share_of_time:.0%} of the time"
             )
     text = (
         [f"The first map is of the {c.twin}, the second of the {after.twin}."]

@@ -178,7 +178,7 @@ def texts() -> dict[str, Text]:
 
 
 class _Format(string.Formatter):
-    """``str.format`` with ``floors``, ``share`` and ``number`` as specifications, and
+    """``str.format`` with ``floors``, ``share``, ``percent`` and ``number`` as specifications, and
     several names as a list."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
@@ -189,6 +189,8 @@ class _Format(string.Formatter):
         if format_spec == "share":  # never 100 % of what is not gone entirely
             digits = 1 if value >= 0.99 else 0
             return f"{100.0 * min(max(value, 0.0), 0.999):.{digits}f} %"
+        if format_spec == "percent":
+            return f"{100.0 * value:.2g} %"
         if format_spec == "number":
             return f"{value:.4g}"
         return super().format_field(value, format_spec)

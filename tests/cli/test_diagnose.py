@@ -396,7 +396,7 @@ def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: P
         (
             ["check", "dataset", "--pictures=false"],
             0,
-            "whether LeRobot loads it not judged: needs lerobot",
+            "whether LeRobot loads it could not be checked: needs lerobot",
         ),
         (
             ["ingest", "inspect", "recordings"],

@@ -53,6 +53,11 @@ class RegimeError:
     """RMS residual [noise floors]."""
     n: int
 
+    @property
+    def place(self) -> str:
+        """Recording and regime as text."""
+        return f"{self.recording}, {self.regime}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
