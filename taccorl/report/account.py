@@ -169,7 +169,6 @@ def _error(of: _Part) -> list[Fact]:
             test_before=before.get("test"),
             test_after=after.get("test"),
         ),
-        *when(of.seen.size, "size", **(of.seen.size or {})),
         *when(added(d) and _refit_helps(d), "refit", error=fitted["validation"]),
         *_plain(d),
     ]
@@ -266,6 +265,7 @@ def _remains(of: _Part) -> Iterator[Fact]:
     if of.is_short or max(after, fit) > SearchConfig().floor:
         is_much = of.is_short and share_gone(d) < NEARLY_ALL
         yield fact("remains_much" if is_much else "remains", error=after)
+        yield from when(of.seen.size, "size", **(of.seen.size or {}))
         if worst is not None and not d.standing_out:
             yield fact("worst", error=worst.error, place=worst.place)
     for out in d.standing_out[:1]:

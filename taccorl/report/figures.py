@@ -26,6 +26,7 @@ from taccorl.report.figure_style import (
     robust_limit,
     tidy,
 )
+from taccorl.report.section import floors
 
 TWINS = ("twin", "twin with effect")
 """Default names of the twin before and after."""
@@ -108,7 +109,7 @@ def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
     floor_band(axes, first.floor.value, first.unit)
     for trace, color, name in twins:
         rmse = float(np.sqrt(np.nanmean(trace.residual**2)))
-        label = f"{name}: RMSE {rmse * factor:.3g} {unit}, {rmse / trace.floor.value:.3g} × floor"
+        label = f"{name}: RMSE {rmse * factor:.3g} {unit}, {floors(rmse / trace.floor.value)} × floor"
         axes.plot(
             trace.time_s, trace.residual * factor, color=color, lw=0.9, label=label
         )

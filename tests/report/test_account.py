@@ -327,7 +327,7 @@ def _(one, nothing, short):
 @case("size")
 def _(one, nothing, short):
     size = {"kind": "position", "before": "2 mrad", "after": "1 mrad", "nrmse": 4e-4}
-    return one, Seen(size=size)
+    return with_errors(one, before=10.0, after=2.0), Seen(size=size)
 
 
 @case("gains")
