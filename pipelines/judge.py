@@ -39,6 +39,8 @@ from pipelines.studies import foreign, pairs, robots  # noqa: E402
 from pipelines.studies import joints_and_pads as study  # noqa: E402
 from pipelines.studies import servo as servos  # noqa: E402
 from taccorl.alignment.measurements.folder import Measurements  # noqa: E402
+from taccorl.diagnosis.comparison.result import Comparison  # noqa: E402
+from taccorl.diagnosis.machines import machine as machine_module  # noqa: E402
 from taccorl.diagnosis.machines.cells import CellsMachine  # noqa: E402
 from taccorl.diagnosis.machines.load import load_machine  # noqa: E402
 from taccorl.diagnosis.machines.machine import Machine, diagnose_parts  # noqa: E402
@@ -244,30 +246,53 @@ class Recorded:
             row["numbers"][name].append(truth[name])
         try:
             self.machine.mended(found)[0].save(path)
-            after = load_machine(path).compare(self.measurements)
             row["file"] = yaml.safe_load(path.read_text(encoding="utf-8"))
-            scores = after.scores() if after.traces else after.pad_scores()
-            row["written"] = {f.part: _errors(scores, f.part) for f in found}
+            before, after = (
+                machine.compare(self.measurements)
+                for machine in (self.machine, load_machine(path))
+            )
+            row["written"] = {f.part: _errors(after, f.part) for f in found}
+            restated = getattr(machine_module, "as_written", lambda all_, *_: all_)
+            row["stated"] = {
+                f.part: f.diagnosis.errors["after"]
+                for f in restated(found, before, {"after": after})
+            }
         except Exception as error:
             row["written_failed"] = f"{type(error).__name__}: {error}"
         row["recording_cpu_s"] = recorded - self.began
         return row | {"cpu_s": done - recorded}
 
 
-def _errors(scores: Sequence[Any], part: str) -> dict[str, list[float]]:
-    """Use → errors of the corrected file [floors]: of positions alone, with efforts."""
+def _errors(after: Comparison, part: str) -> dict[str, list[float]]:
+    """Use → errors of the corrected file [floors]: of positions alone, with efforts, and
+    of all rows, each in the floors of its own recording."""
+    scores = after.scores() if after.traces else after.pad_scores()
     own = [s for s in scores if part in (s.signal, "") or s.kind == "touch"]
     return {
         use: [
-            math.sqrt(
-                np.mean(
-                    [s.ratio**2 for s in own if s.use == use and s.kind != left_out]
+            *(
+                math.sqrt(
+                    np.mean(
+                        [s.ratio**2 for s in own if s.use == use and s.kind != left_out]
+                    )
                 )
-            )
-            for left_out in ("effort", "")
+                for left_out in ("effort", "")
+            ),
+            _of_rows(after, part, use),
         ]
         for use in dict.fromkeys(s.use for s in own)
     }
+
+
+def _of_rows(after: Comparison, part: str, use: str) -> float:
+    """RMS of the residuals of all rows or readings, each over its noise floor."""
+    rows = [
+        (t.residual / t.floor.value).ravel()
+        for t in after.traces
+        if t.signal == part and t.use == use
+    ]
+    rows += [(t.residual / t.floor).ravel() for t in after.touches if t.use == use]
+    return float(np.sqrt(np.nanmean(np.concatenate(rows) ** 2)))
 
 
 KEYS = {
@@ -436,7 +461,7 @@ RUNS: dict[str, Callable[[Case, Path], Row]] = {
 
 GOOD = ("exact", "named", "silent", "said")
 AS_STATED = 0.05
-"""Largest share by which an error may differ: compare pools efforts and cells apart."""
+"""Largest share by which an error may differ from what is stated."""
 
 
 def read(path: Path) -> dict[str, Row]:
@@ -466,7 +491,7 @@ def _as_stated(rows: Sequence[Row]) -> str:
 
 def _is_as_stated(row: Row) -> bool:
     pairs_ = [
-        (row["parts"][part]["errors"]["after"].get(use, math.nan), errors)
+        (_stated(row, part).get(use, math.nan), errors)
         for part, of in row.get("written", {}).items()
         for use, errors in of.items()
     ]
@@ -474,6 +499,11 @@ def _is_as_stated(row: Row) -> bool:
         min(abs(e - stated) for e in errors) <= AS_STATED * stated
         for stated, errors in pairs_
     )
+
+
+def _stated(row: Row, part: str) -> dict[str, float]:
+    """Use → error that a report states of a part; rows of earlier builds have the fit's."""
+    return row.get("stated", {}).get(part) or row["parts"][part]["errors"]["after"]
 
 
 def _right(rows: Sequence[Row]) -> str:

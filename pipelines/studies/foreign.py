@@ -556,11 +556,18 @@ def write_example(folder: Path) -> Plant:
     plant = Plant(case)
     if folder.exists():
         raise TaccorlError(f"{folder}: already exists; name a new folder")
-    (folder / "sweeps").mkdir(parents=True)
+    folder.mkdir(parents=True)
     text = f"Everything here is simulated: {ORIGIN}. No robot was near.\n"
     (folder / "SIMULATED.txt").write_text(text, encoding="utf-8")
     (folder / "arm.xml").write_text(_mjcf(case.links), encoding="utf-8")
+    write_sweeps(plant, folder)
+    return plant
+
+
+def write_sweeps(plant: Plant, folder: Path) -> None:
+    """Write all recordings into ``folder``/sweeps as tables."""
     made = recordings(plant)
+    (folder / "sweeps").mkdir()
     lines = ["recordings:"]
     for use, side in (("fit", made.fit), ("validation", made.validation)):
         for m in side:
@@ -588,7 +595,6 @@ def write_example(folder: Path) -> Plant:
     (folder / "sweeps" / "measurements.yaml").write_text(
         "\n".join(lines) + "\n", encoding="utf-8"
     )
-    return plant
 
 
 def main(argv: Sequence[str]) -> int:

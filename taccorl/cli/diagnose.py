@@ -33,6 +33,7 @@ from taccorl.report.section import Section
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.cli.measured import Replayed
+    from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Finding, Machine
     from taccorl.report.fact import Fact
     from taccorl.report.report import Report
@@ -213,14 +214,22 @@ def _with_results(
     measurements: "Measurements",
     mended: "Machine",
 ) -> "Report":
-    """With the comparisons that show what refitted numbers removed, and what effects did."""
+    """With the comparisons that show what refitted numbers removed, and what effects did,
+    and the errors of these files in the findings."""
+    from taccorl.diagnosis.machines.machine import as_written
     from taccorl.report.evidence import added
 
-    refitted = None  # the twin as it was is the reference
-    if any(added(f.diagnosis) for f in found):
-        refitted = machine.refitted(found).compare(measurements, name="refitted twin")
-    after = mended.compare(measurements, name="corrected twin")
-    return dataclasses.replace(report, refitted=refitted, after=after, found=found)
+    later: dict[str, Comparison | None] = {"fitted": None}
+    if any(added(f.diagnosis) for f in found):  # else as it was is the reference
+        refitted = machine.refitted(found)
+        later["fitted"] = refitted.compare(measurements, name="refitted twin")
+    later["after"] = mended.compare(measurements, name="corrected twin")
+    return dataclasses.replace(
+        report,
+        refitted=later["fitted"],
+        after=later["after"],
+        found=as_written(found, report.comparison, later),
+    )
 
 
 def _saved(

@@ -9,11 +9,12 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from made_problem import Added, Bump, MadeProblem, Ripple, Square, Squire, record
-from made_traces import comparison, trace
+from made_traces import FLOOR_RAD, comparison, floor, trace
 
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.changed_findings import without_numbers
+from taccorl.diagnosis.machines.machine import as_written
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
@@ -973,3 +974,30 @@ def test_an_effect_whose_simpler_near_twin_does_nearly_all_may_be_two_effects(
     d = changed(of_two(one, gain), rivals={name: rivals} if rivals else {})
     assert bool(simpler_twin(d)) == doubted
     assert account("slide", d).values("may_be_two", "share") == [gain] * doubted
+
+
+def test_errors_are_those_of_the_files_that_are_compared_and_written(one):
+    """A fit of 2 floors whose file is off by 3; without a comparison its own 8 stay. Where
+    no motion was repeated and the file as it was has 5 floors in place of 10, the fit had
+    other floors: all stays."""
+    position = np.sin(np.arange(400) / 30)
+    uses = ("fit", "validation")
+
+    def replay(floors, **of_floor):
+        off, noise = np.full(len(position), floors * FLOOR_RAD), floor(**of_floor)
+        return comparison(
+            *(trace(off, position, use=u, recording=u, floor=noise) for u in uses)
+        )
+
+    stated = {"before": 10.0, "fitted": 8.0, "after": 2.0}
+    errors = {stage: dict.fromkeys(uses, error) for stage, error in stated.items()}
+    f = dataclasses.replace(found(changed(one, errors=errors)), part="left_joint5")
+    later = {"fitted": None, "after": replay(3.0)}
+    (own,) = as_written([f], replay(10.0), later)
+    for stage, error in (("before", 10.0), ("fitted", 8.0), ("after", 3.0)):
+        assert own.diagnosis.errors[stage] == pytest.approx(dict.fromkeys(uses, error))
+    (own,) = as_written([f], replay(5.0), later)
+    assert own.diagnosis.errors["before"]["fit"] == pytest.approx(5.0)
+    assert as_written([f], replay(5.0, lower_bound=True), later) == [f]
+    split = dataclasses.replace(f, rows_split=True)
+    assert as_written([split], replay(10.0), later) == [split]

@@ -258,6 +258,17 @@ class Comparison:
             ]
         return [s for s in found if s is not None]
 
+    def error(self, signal: str, use: Use) -> float | None:
+        """RMS residual of one signal's position and effort together [noise floors], each
+        row in those of its own recording, as a diagnosis states it. None without traces."""
+        rows = [
+            t.residual / t.floor.value
+            for t in self.traces
+            if t.signal == signal and t.use == use
+        ]
+        seen = np.concatenate([r[np.isfinite(r)] for r in rows] or [np.zeros(0)])
+        return float(np.sqrt(np.mean(seen**2))) if seen.size else None
+
     @property
     def pads(self) -> list[str]:
         """Names of the pads, in the order of ``ROBOT.pads``; others follow."""

@@ -6,6 +6,7 @@ kind a file describes from its key ``kind:``; a file without that key is a ``twi
 A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under ``@machines.register("kind")``.
 """
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -18,7 +19,7 @@ from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.data.finding import listed
-from taccorl.diagnosis.comparison.result import Comparison
+from taccorl.diagnosis.comparison.result import USES, Comparison
 from taccorl.diagnosis.problems.joints import each
 from taccorl.diagnosis.search.problem import Progress, Stopped, no_progress
 from taccorl.diagnosis.search.result import SearchConfig
@@ -385,6 +386,55 @@ machines: Registry[type[Machine]] = Registry(
     "kind of machine", "taccorl.diagnosis.machines"
 )
 """Kinds of machines, by the word after ``kind:`` in a file."""
+
+
+SAME_ERROR = 0.05
+"""Largest relative difference of the errors of one file with the same noise floors."""
+
+
+def as_written(
+    findings: Sequence[Finding],
+    before: Comparison,
+    later: Mapping[str, Comparison | None],
+) -> list[Finding]:
+    """``findings`` with the errors of the files that are compared and written.
+
+    A fit simulates how joints load each other by the drives of the file as it is, and may
+    free numbers that no file states, such as the scale of reported efforts.
+
+    Args:
+        before: comparison of the file as it is.
+        later: "fitted", "after" → comparison of that file, or None if it was not compared.
+            A part keeps the errors of its fit if it is
+            no joint, if rows were split off for validation, or if its fit had other noise
+            floors, as that of an axis whose motions were never repeated.
+    """
+    return [_as_written(f, before, {"before": before, **later}) for f in findings]
+
+
+def _as_written(
+    f: Finding, before: Comparison, replays: Mapping[str, Comparison | None]
+) -> Finding:
+    errors = f.diagnosis.errors
+    own = {
+        stage: {
+            use: error
+            for use in USES
+            if use in errors[stage] and (error := c.error(f.part, use)) is not None
+        }
+        for stage, c in replays.items()
+        if c is not None
+    }
+    first, bounds = own["before"], before.of(f.part)
+    compared = first.keys() == errors["before"].keys()
+    other_floors = any(t.floor.lower_bound for t in bounds) and any(
+        abs(error - errors["before"][use]) > SAME_ERROR * error
+        for use, error in first.items()
+    )
+    if f.rows_split or not compared or other_floors:
+        return f
+    diagnosis = dataclasses.replace(f.diagnosis, errors={**errors, **own})
+    return dataclasses.replace(f, diagnosis=diagnosis)
 
 
 def diagnose_parts(

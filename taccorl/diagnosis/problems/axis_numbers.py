@@ -20,12 +20,15 @@ noise floor (``DRIVE_IS_STATED``): a fit would use them for what the joint lacks
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from taccorl.alignment.controller.drive_law import WINDING, WINDING_WITHIN
 from taccorl.alignment.controller.joint_model import GRAVITY_M_PER_S2
 from taccorl.alignment.machines.robot_file import JointConfig
 from taccorl.alignment.machines.robot_joint import RobotJoint
+from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.search.identifiable import EARLY_S, TIMING_S
 from taccorl.diagnosis.search.problem import Free
 
@@ -64,10 +67,16 @@ def no_candidates(joint: RobotJoint, effort: bool) -> tuple[str, ...]:
     return NO_CANDIDATES
 
 
-def of_motor(joint: RobotJoint, effort: bool) -> tuple[Free, ...]:
+def of_motor(
+    joint: RobotJoint, effort: bool, measurements: Sequence[Measurement]
+) -> tuple[Free, ...]:
     """Numbers of the motor of law pwm, one of which explains as much as stall torque and
-    back-EMF where no efforts were recorded (``Problem.of_file``)."""
+    back-EMF where no efforts were recorded (``Problem.of_file``). The file's supply is none
+    where a recording has its own, which is then the supply."""
     known = {*joint.config.known}
+    for m in measurements:
+        if m.supply_v.size and np.isfinite(m.supply_v[:, m.column(joint.signal)]).any():
+            known.add("supply_v")
     if joint.config.law != "pwm" or effort or {"stall_nm", "back_emf"} & known:
         return ()
     return tuple(

@@ -254,7 +254,7 @@ class JointProblem(WithoutMaps):
         )
         self.base, kd = self._base(), self.model.gains.kd
         if self.axis is not None:
-            self.of_file = of_motor(self.axis, self.effort)
+            self.of_file = of_motor(self.axis, self.effort, everything)
         alone = self.commanded and not (
             self.effort or joint.winding or joint.facts.get("commands_speed")
         )

@@ -240,3 +240,17 @@ def test_touch_of_an_unknown_object_is_not_compared_and_says_so(presses):
     found = compare(TwinConfig(), Measurements((mixed,)))
     assert any("what was pressed is not known" in line for line in found.left_out)
     assert found.touches == ()
+
+
+def test_the_error_of_a_part_counts_each_row_in_floors_of_its_own_recording():
+    """Rows of 2 floors and of 1 floor, twice as many: √((2² · 200 + 1² · 400) / 600) = √2."""
+    _, one = swing(1.0)
+    _, other = swing(2.0)
+    coarse = floor(10 * FLOOR_RAD)
+    c = comparison(
+        trace(np.full(len(one), 2 * FLOOR_RAD), one),
+        trace(np.full(len(other), 10 * FLOOR_RAD), other, recording="b", floor=coarse),
+    )
+    assert c.error("left_joint5", "validation") == pytest.approx(2**0.5)
+    assert c.error("left_joint5", "fit") is None
+    assert c.error("right_joint5", "validation") is None

@@ -1129,6 +1129,29 @@ def of_a_servo(name: str, high_hz: float, seed: int, *, supply_v=7.4, resistance
     return of_signal(name, 100.0, goals, measured, "servo")
 
 
+def test_the_supply_of_a_servo_s_file_is_not_fitted_where_recordings_have_their_own():
+    """The file's is then not used: a fit that scales the recorded one is no file's."""
+    axis = axis_of(
+        name="servo",
+        unit="rad",
+        inertia=0.006,
+        law="pwm",
+        kp=6.0,
+        kd=0.15,
+        supply_v=7.4,
+        resistance_ohm=4.0,
+        torque_nm_per_a=0.8,
+    )
+    plain = of_a_servo("one", 1.0, 1)
+    volts = dataclasses.replace(plain, supply_v=np.full((plain.num_rows, 1), 7.2))
+    with_volts, without = (
+        [f.name for f in problem_of(axis, Measurements((m,))).of_file]
+        for m in (volts, plain)
+    )
+    assert "supply_v" in without
+    assert with_volts == [name for name in without if name != "supply_v"]
+
+
 WRONG = {
     "supply_v": 5.2,
     "torque_nm_per_a": 0.6,
