@@ -88,6 +88,7 @@ def main(argv: list[str]) -> int:
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
     from taccorl.diagnosis.problems.joints import SIGNALS
+    from taccorl.report.report import plain
     from taccorl.report.terminal import show
     from taccorl.sim.twin_file import save_twin
 
@@ -132,7 +133,7 @@ def main(argv: list[str]) -> int:
         "twin": str(config.twin) if config.twin else "nominal twin",
         "twin, SHA-256": machine.digest(),
         "not written": disagree,
-        "parts": [one.record() for one in found],
+        "parts": plain([one.record() for one in found]),
     }
     config.out.mkdir(parents=True, exist_ok=True)
     (config.out / REPORT).write_text(
