@@ -25,12 +25,14 @@ from taccorl.data.origin import Origin
 PAGE = Path("docs/diagnosis.md")
 OTHERS = "<!-- Other machines: the tables below are printed by the command that their section names. -->"
 """What follows this line in the page stays."""
+STUDY = "<!-- Study: python -m pipelines.diagnosis_study --page writes what follows, up to the next such line. -->"
+"""What precedes this line in the page stays."""
 ORIGIN = [Origin("surrogate", "simulated robots; nothing was measured on a robot")]
 SIGNAL_BINS = (0.1, 0.5, 0.75, 1.1, 1.6, 2.4, 4.0, 8.0, 16.0, 64.0)
 RUN = (
     "pack chirp pairs none loop outside removed dropped touch touch_none touch_outside"
 )
-HEAD = f"""# Is the search for missing effects right?
+HEAD = f"""## How often the search is right
 
 **Every case is a surrogate robot, simulated**, written apart from the twin (finer steps, dynamics of its own, bristle friction,
 noise, quantisation, jitter, disturbances). Known effects are hidden in one joint or the pads of one arm; the search (94553cfb)
@@ -206,12 +208,11 @@ def write_page(rows: list[dict]) -> None:
         ]
         if own:
             lines += _single(own, f"Effects of {title}")
-    kept = (
-        PAGE.read_text(encoding="utf-8").partition(OTHERS)
-        if PAGE.exists()
-        else ("", "", "")
-    )
-    PAGE.write_text("\n".join(lines) + "\n" + "".join(kept[1:]), encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
+    before = page.partition(STUDY)[0] if STUDY in page else ""
+    after = "".join(page.partition(OTHERS)[1:])
+    written = "\n".join([before + STUDY, *lines, after])
+    PAGE.write_text(written, encoding="utf-8")
     print(PAGE)
 
 

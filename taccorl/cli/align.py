@@ -12,8 +12,9 @@ import itertools
 import json
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -83,9 +84,11 @@ def main(argv: list[str]) -> int:
         raise TaccorlError(
             f"--out={config.out}: {held}; nothing was changed: give another folder"
         )
-    from taccorl.diagnosis.align import aligned
+    from taccorl.diagnosis.align import align_parts, aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
+    from taccorl.diagnosis.problems.joints import SIGNALS
+    from taccorl.report.report import plain
     from taccorl.report.terminal import show
     from taccorl.sim.twin_file import save_twin
 
@@ -95,16 +98,33 @@ def main(argv: list[str]) -> int:
             f"{config.twin}: describes another machine than the PiPER; its numbers are fitted by taccorl diagnose "
             "--until=noise_floor, which writes them into a new file"
         )
-    _check_cameras(config, machine)
+    _check_cameras(config.cameras, machine, config.measurements, config.spec)
     check_writable(config.out)
-    found = (
-        _joints_and_pads(config, machine)
-        if config.joints or config.pads or not config.cameras
-        else []
-    )
-    if found is None:
-        return 1
-    found += _cameras(config, machine)
+    found: list[Alignment] = []
+    if config.joints or config.pads or not config.cameras:
+        measurements = config.read(machine)
+        every = machine.parts(measurements)
+        selected = machine.select(every, config.joints, config.pads)
+        spsa_seed = config.seed if config.method == "spsa" else None
+        if spsa_seed is not None and not {*selected} & {*SIGNALS}:
+            raise TaccorlError(NO_JOINT)
+        fit = partial(
+            align_parts,
+            selected,
+            machine.config,
+            measurements,
+            fit_kp=config.fit_kp or spsa_seed is not None,
+            spsa_seed=spsa_seed,
+            workers=config.workers,
+        )
+        only = selected if config.joints and not config.pads else ()
+        aligned_parts = _joints_and_pads(
+            machine, measurements, selected, config.accept, only, fit
+        )
+        if aligned_parts is None:
+            return 1
+        found += aligned_parts
+    found += _cameras(config.cameras, machine, config.measurements, config.spec)
     twin, disagree = aligned(machine.config, found)
     show(*map(_section, found), Section(text=[disagree] * bool(disagree)))
     good = [one.part for one in found if not one.trouble]
@@ -113,7 +133,7 @@ def main(argv: list[str]) -> int:
         "twin": str(config.twin) if config.twin else "nominal twin",
         "twin, SHA-256": machine.digest(),
         "not written": disagree,
-        "parts": [one.record() for one in found],
+        "parts": plain([one.record() for one in found]),
     }
     config.out.mkdir(parents=True, exist_ok=True)
     (config.out / REPORT).write_text(
@@ -155,21 +175,20 @@ def main(argv: list[str]) -> int:
 
 
 def _joints_and_pads(
-    config: AlignConfig, machine: "PiperTwin"
+    machine: "PiperTwin",
+    measurements: "Measurements",
+    selected: Sequence[str],
+    accept: Sequence[str],
+    only: Sequence[str],
+    fit: "Callable[..., list[Alignment]]",
 ) -> "list[Alignment] | None":
-    """None if the measurements have errors."""
+    """Alignments of the parts ``selected`` by ``fit``; None if the measurements have errors.
+    ``accept``, ``only``: as of ``replayed``."""
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.cli.progress import Bars
-    from taccorl.diagnosis.align import align_parts
-    from taccorl.diagnosis.problems.joints import SIGNALS, of_joints
+    from taccorl.diagnosis.problems.joints import of_joints
 
-    measurements = config.read(machine)
-    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
-    spsa_seed = config.seed if config.method == "spsa" else None
-    if spsa_seed is not None and not set(selected) & set(SIGNALS):
-        raise TaccorlError(NO_JOINT)
-
-    judged = () if SHIFTED in config.accept else selected
+    judged = () if SHIFTED in accept else selected
     shifted: list[str] = []
 
     def replay() -> "Comparison":
@@ -186,25 +205,17 @@ def _joints_and_pads(
         machine,
         measurements,
         "not aligned",
-        config.accept,
+        accept,
         replay,
         "changes every gain",
-        only=config.asked(machine, measurements),
+        only=only,
     )
     if beside is None:
         return None
     before = beside.comparison
     with Bars(len(selected), f"fitting {len(selected)} parts") as bars:
         count = itertools.count(1)
-        found = align_parts(
-            selected,
-            machine.config,
-            measurements,
-            fit_kp=config.fit_kp or spsa_seed is not None,
-            spsa_seed=spsa_seed,
-            workers=config.workers,
-            done=lambda part: bars.update(part, next(count), len(selected)),
-        )
+        found = fit(done=lambda part: bars.update(part, next(count), len(selected)))
     if shifted:
         found = _beside_fitted(machine, found, of_joints(measurements, shifted))
     floors = {
@@ -308,40 +319,44 @@ def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
     return dataclasses.replace(one, floors_left=left, remarks=(remark, *one.remarks))
 
 
-def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
-    """Raises TaccorlError: the twin has no such camera, or the measurements have no episode with pictures."""
-    if not config.cameras:
+def _check_cameras(
+    cameras: Sequence[str], machine: "PiperTwin", path: Path, spec: str | None
+) -> None:
+    """Raises TaccorlError: the twin has no such camera, or the recording at ``path`` has no episode with pictures."""
+    if not cameras:
         return
     from taccorl.cli.view import opened_episode
 
     known = [camera.name for camera in machine.config.cameras]
-    for name in config.cameras:
+    for name in cameras:
         if name not in known:
             raise TaccorlError(
                 f"--cameras={name}: the twin has no such camera; {nearest(name, known)}"
             )
     try:
-        with opened_episode(config.measurements, 0, config.spec, "--spec"):
+        with opened_episode(path, 0, spec, "--spec"):
             pass
     except TaccorlError as error:
         raise TaccorlError(
-            f"--cameras={','.join(config.cameras)} needs one recording or dataset: {error}"
+            f"--cameras={','.join(cameras)} needs one recording or dataset: {error}"
         ) from error
 
 
-def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
-    if not config.cameras:
+def _cameras(
+    cameras: Sequence[str], machine: "PiperTwin", path: Path, spec: str | None
+) -> "list[Alignment]":
+    if not cameras:
         return []
     from taccorl.cli.progress import Bars
     from taccorl.cli.view import opened_episode
     from taccorl.diagnosis.align import align_camera
 
-    found, num = [], len(config.cameras)
+    found, num = [], len(cameras)
     with (
-        opened_episode(config.measurements, 0, config.spec, "--spec") as episode,
+        opened_episode(path, 0, spec, "--spec") as episode,
         Bars(num, "reading pictures") as bars,
     ):
-        for k, name in enumerate(config.cameras):
+        for k, name in enumerate(cameras):
             bars.update(name, k, num)
             found.append(align_camera(name, machine.config, episode))
     return found

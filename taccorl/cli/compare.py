@@ -7,7 +7,7 @@ of every recording are simulated in the twin. Faults of the data are printed fir
 """
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -19,7 +19,7 @@ from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
-    from taccorl.data.finding import Finding
+    from taccorl.alignment.measurements.pressed import PressedObject
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Machine
 
@@ -44,6 +44,12 @@ class PressedConfig:
     frame: Literal["tcp", "world"] = "tcp"
     """tcp: the object is fixed relative to the hand. world: it is fixed to the bench."""
 
+    def made(self) -> "PressedObject | None":
+        """The object; None if there is nothing."""
+        from taccorl.alignment.measurements.pressed import indenter
+
+        return None if self.shape == "nothing" else indenter(**vars(self))
+
 
 @dataclass(kw_only=True)
 class CompareConfig(MeasuredConfig):
@@ -65,161 +71,144 @@ class CompareConfig(MeasuredConfig):
 def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""
-    _check_outputs(config)
-    from taccorl.diagnosis.comparison.result import origin_words
+    from taccorl.diagnosis.comparison.result import only, origin_words
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.diagnosis.problems.joints import of_joints
-    from taccorl.report.compared import (
-        cell_numbers,
-        how_far,
-        not_compared,
-        pad_matches,
-        where,
-    )
+    from taccorl.report import compared
+    from taccorl.report.report import Report, check_folder, write_report
     from taccorl.report.terminal import show
 
-    twins = [
-        load_machine(path)
-        for path in (config.twin, config.against)[: 1 + (config.against is not None)]
-    ]
+    if config.out is not None:  # before any work is done
+        check_folder(config.out, config.measurements)
+    if config.rerun is not None:
+        _check_rerun(config.rerun)
+    paths = [config.twin, *([] if config.against is None else [config.against])]
+    twins = [load_machine(path) for path in paths]
     measurements = config.read(twins[0], fit_needed=False)
-    signals = sorted({signal for m in measurements.all for signal in m.signals})
-    for name in config.joints:  # before the replays, which take minutes
-        if name not in signals:
-            raise TaccorlError(
-                f"--joints: {name!r} is in no recording; {nearest(name, signals)}"
-            )
-    kin = twins[0].of_joints == twins[-1].of_joints
-    for name in (
-        s
-        for s in signals
-        if not kin or (s in twins[0].units and s not in twins[-1].units)
-    ):
-        own = f"is of another machine: it has no {name!r}, which {config.twin or 'the nominal twin'} has and recordings move"
-        raise TaccorlError(
-            f"--against={config.against}: {own}; give a file of the same machine"
-        )
-    moved = of_joints(
-        measurements, config.joints
-    )  # what is wrong with recordings of others holds nothing up
-    measurements = moved if moved.all else measurements
+    measurements = _of_joints(measurements, config.joints)
+    _check_same_machine(twins, paths, measurements)
+    words, labels = command("compare", config, "measurements"), _labels(twins, paths)
+    solid = config.pressed.made()
     comparisons: list[Comparison] = []
 
     def replay() -> "Comparison":
-        comparisons.extend(_compared(config, twins, measurements))
+        for twin, label in zip(twins, labels, strict=True):
+            comparisons.append(_replayed(twin, label, measurements, solid))
+        if config.joints:
+            comparisons[:] = [only(c, config.joints) for c in comparisons]
         return comparisons[0]
 
-    only = config.joints
     beside = replayed(
-        twins[0], measurements, "not compared", config.accept, replay, only=only
+        twins[0],
+        measurements,
+        "not compared",
+        config.accept,
+        replay,
+        only=config.joints,
     )
     if beside is None:
         return 1
-    first, last = comparisons[0], comparisons[-1]
+    first, *rest = comparisons
     show(
-        how_far(*comparisons),
-        *pad_matches(*comparisons),
-        where(first, ()),
-        cell_numbers(last),
-        not_compared(first),
+        compared.how_far(*comparisons),
+        *compared.pad_matches(*comparisons),
+        compared.where(first, ()),
+        compared.cell_numbers(comparisons[-1]),
+        compared.not_compared(first),
     )
-    off = far_off(last, twins[-1].fitted_gains, beside.findings)
-    show(
-        Section(text=[origin_words(first.origins), *off]),
-        *_write(config, comparisons, beside.findings, twins),
-    )
-    return 0
-
-
-def _check_outputs(config: CompareConfig) -> None:
-    """Before any work is done: is there a place for what was asked for?"""
+    off = far_off(comparisons[-1], twins[-1].fitted_gains, beside.findings)
+    show(Section(text=[origin_words(first.origins), *off]))
+    after = rest[0] if rest else None
     if config.out is not None:
-        from taccorl.report.report import check_folder
-
-        check_folder(config.out, config.measurements)
-    if config.rerun is not None:
-        from taccorl.extras import require
-        from taccorl.views.outputs import check_free
-
-        require("lerobot")
-        if config.rerun.suffix != ".rrd":
-            raise TaccorlError(f"--rerun={config.rerun}: must end in .rrd")
-        check_free(config.rerun)
-
-
-def _compared(
-    config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements"
-) -> list["Comparison"]:
-    from taccorl.alignment.measurements.pressed import indenter
-    from taccorl.cli.progress import Bars
-    from taccorl.diagnosis.comparison.result import only
-
-    pressed = (
-        None if config.pressed.shape == "nothing" else indenter(**vars(config.pressed))
-    )
-    found = []
-    for twin, label in zip(twins, _labels(config, twins), strict=True):
-        with Bars(len(measurements.all)) as bars:
-            found.append(
-                twin.compare(
-                    measurements,
-                    name=label,
-                    pressed=pressed,
-                    progress=lambda recording, *at, name=label: bars.update(
-                        f"{name}: {recording}", *at
-                    ),
-                )
-            )
-    return [only(c, config.joints) for c in found] if config.joints else found
-
-
-def _labels(config: CompareConfig, twins: "Sequence[Machine]") -> list[str]:
-    """Name of each twin in tables and reports: that of its file, with as many folders as distinguish two files of one name."""
-    names = [twin.name for twin in twins]
-    if config.twin is None or config.against is None or len(set(names)) == len(names):
-        return names
-    parts = [path.with_suffix("").parts for path in (config.twin, config.against)]
-    depth = next(
-        (
-            k
-            for k in range(1, max(map(len, parts)) + 1)
-            if parts[0][-k:] != parts[1][-k:]
-        ),
-        1,
-    )
-    return ["/".join(own[-depth:]) for own in parts]
-
-
-def _write(
-    config: CompareConfig,
-    comparisons: "Sequence[Comparison]",
-    findings: dict[str, list["Finding"]],
-    twins: "Sequence[Machine]",
-) -> Iterator[Section]:
-    first, after = comparisons[0], comparisons[1] if len(comparisons) > 1 else None
-    if config.out is not None:
-        from taccorl.report.report import Report, write_report
-
-        provenance = {"command": shlex.join(command("compare", config, "measurements"))}
-        for twin, label in zip(twins, _labels(config, twins), strict=True):
-            provenance[f"{label}, SHA-256"] = twin.digest()
-        title = f"{first.twin} beside {config.measurements.name}" + (
-            f", and {after.twin}" if after else ""
-        )
+        digests = {
+            f"{name}, SHA-256": t.digest()
+            for name, t in zip(labels, twins, strict=True)
+        }
         report = Report(
-            title=title,
+            title=", and ".join(
+                [f"{labels[0]} beside {config.measurements.name}", *labels[1:]]
+            ),
             comparison=first,
             after=after,
-            findings=findings,
-            provenance=provenance,
+            findings=beside.findings,
+            provenance={"command": shlex.join(words), **digests},
         )
-        yield write_report(report, config.out)
+        show(write_report(report, config.out))
     if config.rerun is not None:
         from taccorl.views.compare_view import save_comparison
 
         save_comparison(first, config.rerun, after)
-        yield Section(
-            text=[
-                f"wrote {config.rerun}: look at it with rerun {shlex.quote(str(config.rerun))}"
-            ]
-        )
+        look = f"look at it with rerun {shlex.quote(str(config.rerun))}"
+        show(Section(text=[f"wrote {config.rerun}: {look}"]))
+    return 0
+
+
+def _check_rerun(path: Path) -> None:
+    """Raises TaccorlError: no Rerun file can be written there."""
+    from taccorl.extras import require
+    from taccorl.views.outputs import check_free
+
+    require("lerobot")
+    if path.suffix != ".rrd":
+        raise TaccorlError(f"--rerun={path}: must end in .rrd")
+    check_free(path)
+
+
+def _of_joints(measurements: "Measurements", joints: Sequence[str]) -> "Measurements":
+    """Recordings that move ``joints``; all, if none does. What is wrong with those of others
+    holds nothing up. Raises TaccorlError: a joint is in no recording."""
+    from taccorl.diagnosis.problems.joints import of_joints
+
+    signals = sorted({signal for m in measurements.all for signal in m.signals})
+    for name in joints:  # before the replays, which take minutes
+        if name not in signals:
+            raise TaccorlError(
+                f"--joints: {name!r} is in no recording; {nearest(name, signals)}"
+            )
+    moved = of_joints(measurements, joints)
+    return moved if moved.all else measurements
+
+
+def _check_same_machine(
+    twins: "Sequence[Machine]",
+    paths: Sequence[Path | None],
+    measurements: "Measurements",
+) -> None:
+    """Raises TaccorlError: the second machine lacks a signal that the first one has."""
+    first, last = twins[0], twins[-1]
+    kin = first.of_joints == last.of_joints
+    for name in sorted({signal for m in measurements.all for signal in m.signals}):
+        if not kin or (name in first.units and name not in last.units):
+            raise TaccorlError(
+                f"--against={paths[-1]}: is of another machine: it has no {name!r}, which "
+                f"{paths[0] or 'the nominal twin'} has and recordings move; give a file of "
+                "the same machine"
+            )
+
+
+def _replayed(
+    twin: "Machine",
+    label: str,
+    measurements: "Measurements",
+    pressed: "PressedObject | None",
+) -> "Comparison":
+    """The comparison with one machine, with a bar that shows how far it is."""
+    from taccorl.cli.progress import Bars
+
+    with Bars(len(measurements.all)) as bars:
+
+        def update(recording: str, done: int, total: int) -> None:
+            bars.update(f"{label}: {recording}", done, total)
+
+        return twin.compare(measurements, name=label, pressed=pressed, progress=update)
+
+
+def _labels(twins: "Sequence[Machine]", paths: Sequence[Path | None]) -> list[str]:
+    """Name of each twin in tables and reports: that of its file, with as many folders as distinguish two files of one name."""
+    names = [twin.name for twin in twins]
+    if None in paths or len(set(names)) == len(names):
+        return names
+    parts = [path.with_suffix("").parts for path in paths if path is not None]
+    most = max(map(len, parts))
+    tails = ([own[-k:] for own in parts] for k in range(1, most + 1))
+    different = (tail for tail in tails if tail[0] != tail[1])
+    return ["/".join(tail) for tail in next(different, [own[-1:] for own in parts])]

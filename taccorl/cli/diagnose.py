@@ -13,7 +13,7 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from taccorl.report.section import Section
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.cli.measured import Replayed
+    from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Finding, Machine
     from taccorl.report.fact import Fact
     from taccorl.report.report import Report
@@ -61,63 +62,62 @@ def run(config: DiagnoseConfig) -> int:
     missing, or at least half of the squared error is gone in each part; 1: little of it is,
     or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM
     ended the search, and what it had found was written."""
-    from taccorl.report.report import check_folder
-
-    before = check_folder(config.out, config.measurements)
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.report.account import is_explained
+    from taccorl.diagnosis.machines.machine import diagnose_parts
+    from taccorl.diagnosis.search.result import SearchConfig
     from taccorl.report.compared import not_compared
-    from taccorl.report.diagnosed import account_section, next_section
-    from taccorl.report.report import write_report
+    from taccorl.report.report import Report, check_folder
     from taccorl.report.terminal import show
     from taccorl.sim.effects import effects
 
+    replaced = check_folder(config.out, config.measurements)
     machine = load_machine(config.twin)
     for name in config.without:
         effects.get(name)
     measurements = config.read(machine)
     if machine.of_joints:
         refuse_long(measurements)
-    compare = partial(machine.compare, measurements)
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
     beside = replayed(
         machine,
         measurements,
         "not diagnosed",
         config.accept,
-        compare,
+        partial(machine.compare, measurements),
         clocks=False,
-        only=config.asked(machine, measurements),
+        only=selected if config.joints and not config.pads else (),
     )
     if beside is None:
         return 1
-    off = {
-        f.feature: f.text
-        for own in beside.findings.values()
-        for f in own
-        if f.check == OTHER_GAINS
-    }
-    parts = [
-        part for part in selected if part not in off or OTHER_GAINS in config.accept
-    ]  # else an effect stands in
-    way = f"--accept={OTHER_GAINS} diagnoses it with the stated ones"
-    refused = [
-        f"{part}: not diagnosed: {off[part]}. {way}"
-        for part in selected
-        if part not in parts
-    ]
-    show(
-        Section(
-            text=[
-                *far_off(beside.comparison, machine.fitted_gains, beside.findings),
-                *refused,
-            ]
-        ),
-        not_compared(beside.comparison),
-    )
-    if not parts:
+    off = {} if OTHER_GAINS in config.accept else _other_gains(beside)
+    refused = [f"{part}: {off[part]}" for part in selected if part in off]
+    far = far_off(beside.comparison, machine.fitted_gains, beside.findings)
+    show(Section(text=[*far, *refused]), not_compared(beside.comparison))
+    if not (parts := [part for part in selected if part not in off]):
         return 1
-    found, stopped_by = _diagnosed(config, machine, parts, measurements)
+    words = command("diagnose", config, "measurements")
+    report = Report(
+        title=_title(config.twin, config.measurements, machine.name),
+        comparison=beside.comparison,
+        options=_options(config.twin, config.out, config.measurements),
+        findings=beside.findings,
+        provenance={
+            "command": shlex.join(words),
+            "twin": str(config.twin) if config.twin else "nominal twin",
+            "twin, SHA-256": machine.digest(),
+        },
+    )
+    search = partial(
+        diagnose_parts,
+        machine,
+        parts,
+        measurements,
+        gains=config.gains,
+        search=SearchConfig(max_effects=1) if config.until == "one" else SearchConfig(),
+        without=config.without,
+        workers=config.workers,
+    )
+    found, stopped_by = _searched(search, report, parts, config.out)
     left = [part for part in parts if part not in {f.part for f in found}]
     refused += [f"{part}: stopped before an effect was found" for part in left]
     if not found and stopped_by == signal.SIGTERM:
@@ -126,107 +126,91 @@ def run(config: DiagnoseConfig) -> int:
     if not found:
         raise KeyboardInterrupt
     mended, disagree = machine.mended(found)
-    report = _report(config, machine, found, beside, measurements, mended)
+    report = _with_results(report, machine, found, measurements, mended)
     if stopped_by:
-        words = "This diagnosis is not finished: it was stopped."
-        report = dataclasses.replace(report, stopped=" ".join([words, *refused]))
-    step = _next(config, report, machine)
+        stopped = "This diagnosis is not finished: it was stopped."
+        report = dataclasses.replace(report, stopped=" ".join([stopped, *refused]))
+    file = config.out / machine.file_name if config.until == "noise_floor" else None
+    step = _next(report, machine, words, config.twin, file)
     report = dataclasses.replace(report, next=step)
-    accounts = report.accounts()
-    show(*map(account_section, accounts.values()))
-    if step and len(accounts) > 1:
-        show(next_section(step))
-    clocks = [
-        f"{f.part}: {beside.unjudged[f.part]}"
-        for f in found
-        if f.part in beside.unjudged and _of_time(f)
-    ]
-    written = write_report(report, config.out, before)
-    lines = [disagree] if disagree else []
-    if config.until == "noise_floor":
-        mended.save(path := config.out / mended.file_name)
-        whole = ", ".join([*machine.changes_as_a_whole(found), mended.saved_words])
-        lines = [f"wrote {path}: {whole}", *lines]
-    show(Section(text=[*refused, *clocks]), written, Section(text=lines))
+    lines = _saved(report, config.out, replaced, mended, file)
+    lines += [disagree] if disagree else []
+    show(Section(text=[*refused, *_open_clocks(beside, found)]), Section(text=lines))
     if stopped_by == signal.SIGTERM:
         return 128 + stopped_by
-    explained = all(
-        is_explained(f.diagnosis) and accounts[f.part].kind != "data_first"
-        for f in report.found
-    )
-    return int(not explained or bool(disagree or refused))
+    return int(not _is_explained(report) or bool(disagree or refused))
 
 
-def _diagnosed(
-    config: DiagnoseConfig,
-    machine: "Machine",
+def _other_gains(beside: "Replayed") -> dict[str, str]:
+    """Part whose efforts have other gains than the file's → why it is not diagnosed: an
+    effect would stand in for them."""
+    way = f"--accept={OTHER_GAINS} diagnoses it with the stated ones"
+    every = itertools.chain(*beside.findings.values())
+    own = {f.feature: f.text for f in every if f.check == OTHER_GAINS}
+    return {part: f"not diagnosed: {text}. {way}" for part, text in own.items()}
+
+
+def _searched(
+    search: "Callable[..., list[Finding]]",
+    report: "Report",
     parts: Sequence[str],
-    measurements: "Measurements",
+    folder: Path,
 ) -> "tuple[list[Finding], int]":
-    """Findings, and the signal that stopped the search, or 0. What was found before anything ended it is in ``config.out``."""
+    """Findings, and the signal that stopped the search, or 0. What was found before anything
+    ended it is in ``folder``."""
     from taccorl.cli.progress import Bars, Steps
-    from taccorl.diagnosis.machines.machine import diagnose_parts
-    from taccorl.diagnosis.search.result import SearchConfig
     from taccorl.report.interim import Interim
 
-    search = (
-        SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-    )
     with (
         Bars(len(parts), f"diagnosing {len(parts)} parts") as bars,
         tempfile.TemporaryDirectory() as kept,
     ):
         count, steps = itertools.count(1), Steps()
         steps.interim = Interim(
-            folder=config.out,
+            folder=folder,
             kept=Path(kept),
-            title=_title(config, machine),
-            provenance=_provenance(config, machine),
+            title=report.title,
+            provenance=report.provenance,
         )
+
+        def done(part: str) -> None:
+            bars.update(part, next(count), len(parts))
+
         try:
             with steps.until_interrupted():
-                found = diagnose_parts(
-                    machine,
-                    parts,
-                    measurements,
-                    gains=config.gains,
-                    search=search,
-                    without=config.without,
-                    workers=config.workers,
-                    done=lambda part: bars.update(part, next(count), len(parts)),
-                    progress=steps,
-                )
-                return found, steps.stopped_by
+                return search(done=done, progress=steps), steps.stopped_by
         except BaseException:
             if some := steps.interim.parts:
                 steps.interim.write()
                 print(
-                    f"\nnot finished; {config.out}/report.json has what was found at {', '.join(some)}",
+                    f"\nnot finished; {folder}/report.json has what was found at "
+                    f"{', '.join(some)}",
                     file=sys.stderr,
                     flush=True,
                 )
             raise
 
 
-def _title(config: DiagnoseConfig, machine: "Machine") -> str:
+def _title(twin: Path | None, measurements: Path, name: str) -> str:
     """The machine and the folder, with as much of their paths as tells them apart."""
-    twin = Path(*config.twin.parts[-2:]) if config.twin else machine.name
-    return f"{twin}: what it lacks, by {Path(*config.measurements.parts[-2:])}"
+    shown = Path(*twin.parts[-2:]) if twin else name
+    return f"{shown}: what it lacks, by {Path(*measurements.parts[-2:])}"
 
 
-def _provenance(config: DiagnoseConfig, machine: "Machine") -> dict[str, str]:
-    return {
-        "command": shlex.join(command("diagnose", config, "measurements")),
-        "twin": str(config.twin) if config.twin else "nominal twin",
-        "twin, SHA-256": machine.digest(),
-    }
+def _options(
+    twin: Path | None, out: Path, measurements: Path | None = None
+) -> list[str]:
+    """Options that lead further commands to the recordings, the twin and the report."""
+    given = {"measurements": measurements, "twin": twin}
+    given["diagnosis"] = out if out != Path("diagnosis") else None
+    words = [f"--{name}={path}" for name, path in given.items() if path is not None]
+    return [shlex.quote(word) for word in words]
 
 
-def _report(
-    config: DiagnoseConfig,
+def _with_results(
+    report: "Report",
     machine: "Machine",
     found: "Sequence[Finding]",
-    beside: "Replayed",
     measurements: "Measurements",
     mended: "Machine",
 ) -> "Report":
@@ -234,29 +218,56 @@ def _report(
     and the errors of these files in the findings."""
     from taccorl.diagnosis.machines.machine import as_written
     from taccorl.report.evidence import added
-    from taccorl.report.report import Report
 
-    some = any(
-        added(f.diagnosis) for f in found
-    )  # else the twin as it was is the reference
-    refitted = machine.refitted(found) if some else None
-    later = {
-        "fitted": refitted and refitted.compare(measurements, name="refitted twin"),
-        "after": mended.compare(measurements, name="corrected twin"),
-    }
-    return Report(
-        title=_title(config, machine),
-        comparison=beside.comparison,
+    later: dict[str, Comparison | None] = {"fitted": None}
+    if any(added(f.diagnosis) for f in found):  # else as it was is the reference
+        refitted = machine.refitted(found)
+        later["fitted"] = refitted.compare(measurements, name="refitted twin")
+    later["after"] = mended.compare(measurements, name="corrected twin")
+    return dataclasses.replace(
+        report,
         refitted=later["fitted"],
         after=later["after"],
-        found=as_written(found, beside.comparison, later),
-        options=[
-            shlex.quote(word)
-            for word in (f"--measurements={config.measurements}", *_given(config))
-        ],
-        findings=beside.findings,
-        provenance=_provenance(config, machine),
+        found=as_written(found, report.comparison, later),
     )
+
+
+def _saved(
+    report: "Report", folder: Path, replaced: str, mended: "Machine", file: Path | None
+) -> list[str]:
+    """Print and write the report, and the corrected machine as ``file`` if that is given;
+    the lines that say so."""
+    from taccorl.report.diagnosed import account_section, next_section
+    from taccorl.report.report import write_report
+    from taccorl.report.terminal import show
+
+    accounts = report.accounts()
+    show(*map(account_section, accounts.values()))
+    if report.next and len(accounts) > 1:
+        show(next_section(report.next))
+    lines = [*map(str, write_report(report, folder, replaced).text)]
+    if file is not None:
+        mended.save(file)
+        whole = [*mended.changes_as_a_whole(report.found), mended.saved_words]
+        lines.append(f"wrote {file}: {', '.join(whole)}")
+    return lines
+
+
+def _is_explained(report: "Report") -> bool:
+    """Whether nothing is missing, or most of the error is gone, in each part."""
+    from taccorl.report.account import is_explained
+
+    accounts = report.accounts()
+    return all(
+        is_explained(f.diagnosis) and accounts[f.part].kind != "data_first"
+        for f in report.found
+    )
+
+
+def _open_clocks(beside: "Replayed", found: "Sequence[Finding]") -> list[str]:
+    """What nothing judged of clocks that may have a part in the result."""
+    own = [f.part for f in found if f.part in beside.unjudged and _of_time(f)]
+    return [f"{part}: {beside.unjudged[part]}" for part in own]
 
 
 def _of_time(found: "Finding") -> bool:
@@ -269,33 +280,30 @@ def _of_time(found: "Finding") -> bool:
     )
 
 
-def _given(config: DiagnoseConfig) -> list[str]:
-    """Options that lead further commands to the twin and the report."""
-    out = [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
-    return [f"--twin={config.twin}"] * (config.twin is not None) + out
-
-
-def _next(config: DiagnoseConfig, report: "Report", machine: "Machine") -> "list[Fact]":
-    """The next command, with all parts together; nothing that this run has done."""
+def _next(
+    report: "Report",
+    machine: "Machine",
+    words: list[str],
+    twin: Path | None,
+    file: Path | None,
+) -> "list[Fact]":
+    """The next command, with all parts together; nothing that this run has done.
+    ``words``: its own command. ``file``: where it writes the corrected machine, if it does."""
     from taccorl.diagnosis.search.problem import EFFORT_SCALE
     from taccorl.report.account import moved
     from taccorl.report.evidence import added
     from taccorl.report.fact import fact
 
-    accounts, found = report.accounts(), report.found
-    own = command("diagnose", config, "measurements")
-    if any(a.kind == "data_first" for a in accounts.values()):
+    found = report.found
+    if any(a.kind == "data_first" for a in report.accounts().values()):
         return [fact("next_data")]
-    if config.until == "noise_floor":
-        path = config.out / machine.file_name
+    if file is not None:
         parts = [f.part for f in found]
-        return [fact("next", command=compare_words(own, parts, config.twin, path))]
-    whole = dataclasses.replace(config, until="noise_floor")
+        return [fact("next", command=compare_words(words, parts, twin, file))]
     if machine.changes_as_a_whole(found) or any(
         f.diagnosis.status == "too_many" for f in found
     ):
-        words = command("diagnose", whole, "measurements")
-        return [fact("next", command=shlex.join(words))]
+        return [fact("next", command=shlex.join([*words, "--until=noise_floor"]))]
     names: dict[str, list[str]] = {}
     largest_first = sorted(
         found, key=lambda f: -f.diagnosis.errors["fitted"]["validation"]
@@ -309,5 +317,6 @@ def _next(config: DiagnoseConfig, report: "Report", machine: "Machine") -> "list
         return []
     first = next(iter(names.values()))
     together = [name for name, options in names.items() if options == first]
-    words = ["taccorl", "add-effect", ",".join(together), *first, *_given(config)]
-    return [fact("next", command=shlex.join(words))]
+    own = shlex.join(["taccorl", "add-effect", ",".join(together), *first])
+    where = report.options[1:]  # without the recordings
+    return [fact("next", command=" ".join([own, *where]))]

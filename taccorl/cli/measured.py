@@ -89,14 +89,6 @@ class PartsConfig(MeasuredConfig):
         if self.workers < 1:
             raise TaccorlError(f"--workers={self.workers}: at least 1")
 
-    def asked(
-        self, machine: "Machine", measurements: "Measurements"
-    ) -> tuple[str, ...]:
-        """Names of the joints that --joints names; none: all, and pads, which depend on all."""
-        if self.pads or not self.joints:
-            return ()
-        return machine.select(machine.parts(measurements), self.joints, [])
-
     def read(self, machine: "Machine", **how: bool) -> "Measurements":
         """The measurements of the named joints: recordings of others, and what is wrong with them, hold nothing up."""
         from taccorl.diagnosis.problems.joints import of_joints

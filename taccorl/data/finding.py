@@ -145,7 +145,11 @@ def recompute_statistics(root: Path, *words: str) -> str:
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
     """Note that a check could not examine ``what``. ``topic``: as in ``Finding``; ``what`` if empty."""
     return Finding(
-        "not_judged", "note", feature, f"{what} not judged: {why}", topic=topic or what
+        "not_judged",
+        "note",
+        feature,
+        f"{what} could not be checked: {why}",
+        topic=topic or what,
     )
 
 

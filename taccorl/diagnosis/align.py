@@ -97,7 +97,7 @@ class Alignment:
     """For a camera: stage → picture with the outlines before and after, (rows, columns, 3) uint8 RGB."""
 
     def record(self) -> dict[str, Any]:
-        """The result as JSON values, for a report; NaN becomes None. Pictures and the twin are left out."""
+        """The result for a report, without pictures and the twin."""
         values = {
             f.name: getattr(self, f.name)
             for f in dataclasses.fields(self)
@@ -114,7 +114,7 @@ class Alignment:
                     ("before", "after"), self.touch_matches, strict=True
                 )
             }
-        return _plain(values)
+        return values
 
 
 _NOT_STORED = ("numbers", "effects", "touch_matches", "twin", "overlays")
@@ -498,11 +498,3 @@ def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig,
         except TaccorlError as error:
             why = f"the pads are as they were: {error}"
     return config, why
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value

@@ -45,6 +45,9 @@ GONE = 0.2
 DIFFER = 1.3
 """Ratio of the errors on fit and validation recordings from which on they disagree: more
 than the noise of another motion causes."""
+LOOP = "loop_s"
+"""Period of a drive's loop, of which the file has the rate, ``loop_hz``."""
+GAINS = ("kp", "kd")
 NEAR = 0.05
 """Least share of the squared error that the nearest effect would take away."""
 
@@ -65,7 +68,7 @@ def moved(d: Diagnosis) -> dict[str, Quantity]:
         return {}
     units = {f.name: f.unit for f in d.after.frees}
     ends = {name: d.intervals.get(name, (-math.inf, math.inf)) for name in d.start}
-    listed = {*OF_RECORDINGS, *(c.name for c in d.changed)}
+    listed = {*OF_RECORDINGS, LOOP, *(c.name for c in d.changed)}
     return {
         name: Quantity.of(d.base[name], units[name], ends[name])
         for name in d.base
@@ -222,6 +225,8 @@ def _changed(of: _Part) -> Iterator[Fact]:
     d = of.d
     for name, after in moved(d).items():
         yield fact("changed", name=name, before=d.start[name], after=after)
+    if gains := _kept_gains(d):
+        yield fact("gains", gains=gains)
     for c in d.changed:
         ends = d.intervals.get(c.name)
         if c.name == "loop_hz":
@@ -241,20 +246,30 @@ def _changed(of: _Part) -> Iterator[Fact]:
         yield from when(c.name == TORQUE_FF.name, "tie_weight")
 
 
+def _kept_gains(d: Diagnosis) -> list[str]:
+    """Fitted gains of which no line says that they change: value, interval, and the value
+    of the file."""
+    units = {f.name: f.unit for f in d.after.frees if not f.held}
+    listed = {*moved(d), *(c.name for c in d.changed)}
+    return [
+        f"{name} {Quantity.of(d.base[name], units[name], d.intervals.get(name))}, "
+        f"in the file {d.start[name]:.4g}"
+        for name in GAINS
+        if name in {*units} & {*d.base} & {*d.start} - listed
+    ]
+
+
 def _remains(of: _Part) -> Iterator[Fact]:
     d, worst = of.d, of.seen.worst
     after, fit = (d.errors["after"][use] for use in ("validation", "fit"))
-    place = f"{worst.recording}, {worst.regime}" if worst else "no single regime"
-    if d.standing_out:
-        place = d.standing_out[0].words()
-    is_much = of.is_short and share_gone(d) < NEARLY_ALL
-    yield from when(
-        of.is_short or max(after, fit) > SearchConfig().floor,
-        "remains_much" if is_much else "remains",
-        error=after,
-        place=place,
-    )
+    if of.is_short or max(after, fit) > SearchConfig().floor:
+        is_much = of.is_short and share_gone(d) < NEARLY_ALL
+        yield fact("remains_much" if is_much else "remains", error=after)
+        yield from when(of.seen.size, "size", **(of.seen.size or {}))
+        if worst is not None and not d.standing_out:
+            yield fact("worst", error=worst.error, place=worst.place)
     for out in d.standing_out[:1]:
+        place = out.words()
         yield fact("stands_out", error=out.error, place=place, most=out.most)
         for name, error in d.nearest[:1]:
             is_near = error < (1.0 - NEAR) ** 0.5 * out.error

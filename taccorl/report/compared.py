@@ -8,12 +8,13 @@ from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.cell_numbers import cell_lines
 from taccorl.diagnosis.comparison.localise import (
+    REGIMES,
     WHERE_NOT_WHY,
     Cell,
     heat_map,
     worst_regime,
 )
-from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
+from taccorl.diagnosis.comparison.localise_touch import PHASES, touch_heat_map
 from taccorl.diagnosis.comparison.result import (
     FELT_FLOORS,
     Comparison,
@@ -25,9 +26,11 @@ from taccorl.diagnosis.comparison.result import (
 )
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.report.section import Cell as Styled
-from taccorl.report.section import Picture, Section, Value, change
+from taccorl.report.section import Picture, Section, Value, change, floors
 from taccorl.report.touch_match import touch_match_section
 
+DEFINITIONS = {r.name: r.words for r in REGIMES} | PHASES
+"""Regime → its definition for readers."""
 USES: tuple[Use, ...] = ("validation", "test", "fit")
 """Uses in the order in which a recording is looked for as an example."""
 
@@ -146,12 +149,12 @@ def verdict(c: Comparison, after: Comparison | None) -> Section:
         s = next(own[use] for use in USES if use in own)
         now = later.get((signal, kind, s.use))
         words = (
-            f" with {c.twin}, {now.ratio:.3g} with {after.twin}"
+            f" with {c.twin}, {floors(now.ratio)} with {after.twin}"
             if now is not None and after is not None
             else ""
         )
         lines.append(
-            f"{signal} {kind}: {s.ratio:.3g} noise floors off{words} ({s.use})"
+            f"{signal} {kind}: {floors(s.ratio)} noise floors off{words} ({s.use})"
         )
     worst = max((s.ratio for s in (after or c).scores()), default=0.0)
     return Section(
@@ -162,10 +165,7 @@ def verdict(c: Comparison, after: Comparison | None) -> Section:
 def _errors(s: Score) -> list[Value]:
     low, high = (f"{x * shown_unit(s.unit)[0]:.3g}" for x in s.interval)
     grade = "good" if s.ratio <= SearchConfig().floor else "bad"
-    return [
-        f"{shown(s.rmse, s.unit)} ({low} … {high})",
-        Styled(f"{s.ratio:.3g}", grade),
-    ]
+    return [f"{shown(s.rmse, s.unit)} ({low} … {high})", Styled(floors(s.ratio), grade)]
 
 
 def where(
@@ -177,9 +177,11 @@ def where(
     for signal, kind in dict.fromkeys((cell.signal, cell.kind) for cell in cells):
         worst = worst_regime(cells, signal, kind)
         if worst is not None:
+            meaning = DEFINITIONS.get(worst.regime, "rows of the pad")
             lines.append(
-                f"{signal} {kind}: worst {worst.regime}, {worst.ratio:.3g} × floor; {worst.share_of_error:.0%} of its squared "
-                f"error in {worst.share_of_time:.0%} of its time"
+                f"{signal} {kind}: largest in the regime “{worst.regime}” ({meaning}), "
+                f"{floors(worst.ratio)} × floor; "
+                f"{worst.share_of_error:.0%} of the squared error in {worst.share_of_time:.0%} of the time"
             )
     text = (
         [f"The first map is of the {c.twin}, the second of the {after.twin}."]

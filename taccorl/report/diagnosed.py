@@ -1,20 +1,19 @@
 """Sections of a diagnosed part: its facts, errors, numbers, effects, evidence, and what its
 recordings cannot tell."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.cell_numbers import summarised
 from taccorl.diagnosis.comparison.regimes import ALL, AT_FLOOR, RegimeErrors
 from taccorl.diagnosis.comparison.result import USES
-from taccorl.diagnosis.machines.machine import Finding
+from taccorl.diagnosis.machines.machine import Finding, numbers_of
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
 from taccorl.report.evidence import added, effect_class, grade
-from taccorl.report.fact import Account, Fact, Quantity, clean, unit_words
-from taccorl.report.section import Cell, Picture, Section, Value, change
+from taccorl.report.fact import Account, Fact, Quantity, unit_words
+from taccorl.report.section import Cell, Picture, Section, Value, change, floors
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
@@ -63,12 +62,11 @@ def diagnosed(
 
 def _values(e: Effect) -> str:
     """All numbers of an effect, with its symbols."""
-    found = []
-    for p in e.parameters():
-        low, high = e.interval.get(p.name, (math.nan, math.nan))
-        own = Quantity(value=getattr(e, p.name), unit=p.unit, low=low, high=high)
-        found.append(f"{p.name} {p.symbol} = {own}")
-    return ", ".join(found)
+    return ", ".join(
+        f"{p.name} {p.symbol} = "
+        f"{Quantity.of(getattr(e, p.name), p.unit, e.interval.get(p.name))}"
+        for p in e.parameters()
+    )
 
 
 LEGEND = (
@@ -87,8 +85,8 @@ def _errors(f: Finding) -> Section:
         if use in d.errors["after"]:
             stages = ("before", "fitted", "after")
             before, fitted, after = (d.errors[stage][use] for stage in stages)
-            floors = map(_floors, (before, fitted, after))
-            rows.append([use, *floors, change(fitted, after)])
+            own = map(floors, (before, fitted, after))
+            rows.append([use, *own, change(fitted, after)])
     judged = ", ".join(f.recordings.get("validation", ()))
     if f.rows_split:
         judged = "the last rows of each"
@@ -115,10 +113,6 @@ def _errors(f: Finding) -> Section:
     )
 
 
-def _floors(error: float) -> str:
-    return f"{error:.2f}" if error >= 1.0 else f"{error:.3f}"
-
-
 def _waterfall(part: str, d: Diagnosis, origins: Sequence[Origin]) -> Picture:
     def draw() -> object:
         from taccorl.report.figures import Step, waterfall
@@ -132,27 +126,12 @@ def _waterfall(part: str, d: Diagnosis, origins: Sequence[Origin]) -> Picture:
     return Picture(draw, "validation error over the noise floor; down is better")
 
 
-def _interval(
-    intervals: Mapping[str, Sequence[float]], name: str, none: str = "not fitted"
-) -> str:
-    low, high = intervals.get(name, (math.nan, math.nan))
-    return (
-        " … ".join(clean(end, high - low) for end in (low, high))
-        if math.isfinite(high - low)
-        else none
-    )
-
-
 def _identified(known: Known) -> Section:
     """The primary numbers, and what pins the others."""
-    rows = [
-        [
-            n.name,
-            f"{clean(n.value, n.high - n.low)}{unit_words(n.unit)}",
-            _interval({n.name: (n.low, n.high)}, n.name),
-        ]
-        for n in known.identifiable
-    ]
+    rows = []
+    for n in known.identifiable:
+        number = Quantity.of(n.value, n.unit, (n.low, n.high))
+        rows.append([n.name, number.shown, number.ends])
     note = f"The scale of the torques is fixed by {' and '.join(known.pinned_by)}."
     if not known.pinned_by:
         note = (
@@ -171,32 +150,17 @@ def _identified(known: Known) -> Section:
 
 def _numbers(d: Diagnosis, known: Known | None) -> Section:
     """The always fitted ones and those of the effects, with intervals: what the twin's file holds."""
-    values = d.base | {
-        f"{e.name}.{p.name}": getattr(e, p.name)
-        for e in d.effects
-        for p in e.parameters()
-    }
-    units = {
-        f"{e.name}.{p.name}": unit_words(p.unit)
-        for e in d.effects
-        for p in e.parameters()
-    }
-    units |= (
-        {n.name: unit_words(n.unit) for n in known.absolute}
-        if known is not None
-        else {}
-    )
+    values, units = dict(d.base), {f.name: f.unit for f in d.after.frees}
+    for name, (value, unit) in numbers_of(d.effects).items():
+        values[name], units[name] = value, unit
     rows = []
     for name, value in summarised(values)[0].items():
-        words = (
-            f"{name} (of the recordings, not in the twin)"
-            if name in OF_RECORDINGS
-            else name
-        )
+        of_recordings = " (of the recordings, not in the twin)"
+        words = name + of_recordings if name in OF_RECORDINGS else name
         start = f"{d.start[name]:.4g}" if name in d.start else ""
-        low, high = d.intervals.get(name, (0.0, 0.0))
-        fitted = f"{clean(value, high - low)}{units.get(name, '')}"
-        rows.append([words, start, fitted, _interval(d.intervals, name, "")])
+        ends = d.intervals.get(name)
+        number = Quantity.of(value, units.get(name, "1"), ends)
+        rows.append([words, start, number.shown, number.ends])
     notes = []
     if known is not None and not known.pinned_by and "kp" in d.base:
         notes = [
@@ -233,9 +197,7 @@ def _regimes(found: RegimeErrors) -> Section:
         own = [cells.get((use, recording, regime)) for regime in regimes]
         n = cells[use, recording, ALL].n if (use, recording, ALL) in cells else 0
         ratios = [
-            Cell(f"{r.error:.3g}", "good" if r.error <= AT_FLOOR else "bad")
-            if r
-            else ""
+            Cell(floors(r.error), "good" if r.error <= AT_FLOOR else "bad") if r else ""
             for r in own
         ]
         rows.append([use, recording or Cell("all of them", "bold"), f"{n:,}", *ratios])
@@ -331,7 +293,7 @@ def _evidence_row(e: Evidence, mark: str) -> list[Value]:
     bounds = f"at bound: {', '.join(e.at_bound)}" if e.at_bound else ""
     numbers = [
         fitted,
-        _floors(e.validation_error),
+        floors(e.validation_error),
         f"{round(e.gain, 2) + 0.0:.0%}",
         f"{e.score:.1f}",
     ]

@@ -51,6 +51,10 @@ class Seen:
     """Text on a noise floor that is not known; empty if it is."""
     short: Mapping[str, Sequence[str]] | None = None
     """fit, validation → variables in which the other ones reach further, if known."""
+    has_effort: bool = False
+    """Efforts of the part were recorded."""
+    size: Mapping[str, Any] | None = None
+    """Error in units: ``kind``, ``before``, ``after`` and ``nrmse``, if it is known."""
     worst: RegimeError | None = None
     """Recording and regime with the largest error after the fit, if known."""
     plans: bool = True

@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args
 import yaml
 
 from taccorl.data.finding import listed
+from taccorl.report.section import floors
 
 Severity = Literal["error", "warning", "note"]
 """``error``: the result may be wrong; ``warning``: something speaks against it."""
@@ -43,13 +44,22 @@ class Quantity:
         low, high = ends or (math.nan, math.nan)
         return cls(value=float(value), unit=unit, low=low, high=high)
 
+    @property
+    def shown(self) -> str:
+        """The number with its unit: ``0.0285 N·m``."""
+        return f"{clean(self.value, self.high - self.low)}{unit_words(self.unit)}"
+
+    @property
+    def ends(self) -> str:
+        """The interval: ``0.0278 … 0.0292``; empty if it was not fitted."""
+        width = self.high - self.low
+        if math.isnan(width):
+            return ""
+        return f"{clean(self.low, width)} … {clean(self.high, width)}"
+
     def __str__(self) -> str:
         """Such as ``0.0285 N·m (0.0278 … 0.0292)``."""
-        width = self.high - self.low
-        shown = f"{clean(self.value, width)}{unit_words(self.unit)}"
-        if math.isnan(width):
-            return shown
-        return f"{shown} ({clean(self.low, width)} … {clean(self.high, width)})"
+        return f"{self.shown} ({self.ends})" if self.ends else self.shown
 
 
 @dataclass(frozen=True)
@@ -178,17 +188,19 @@ def texts() -> dict[str, Text]:
 
 
 class _Format(string.Formatter):
-    """``str.format`` with ``floors``, ``share`` and ``number`` as specifications, and
+    """``str.format`` with ``floors``, ``share``, ``percent`` and ``number`` as specifications, and
     several names as a list."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, list | tuple):
             return listed(list(map(str, value)), most=MOST_NAMES)
         if format_spec == "floors":
-            return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+            return floors(value)
         if format_spec == "share":  # never 100 % of what is not gone entirely
             digits = 1 if value >= 0.99 else 0
             return f"{100.0 * min(max(value, 0.0), 0.999):.{digits}f} %"
+        if format_spec == "percent":
+            return f"{100.0 * value:.2g} %"
         if format_spec == "number":
             return f"{value:.4g}"
         return super().format_field(value, format_spec)

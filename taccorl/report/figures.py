@@ -26,6 +26,7 @@ from taccorl.report.figure_style import (
     robust_limit,
     tidy,
 )
+from taccorl.report.section import floors
 
 TWINS = ("twin", "twin with effect")
 """Default names of the twin before and after."""
@@ -50,30 +51,19 @@ def joint_response(
         [(after, AFTER, names[1])] if after is not None else []
     )
     time_s, factor, unit = before.time_s, *shown_unit(before.unit)
+    curves = [(before.measured, MEASURED, 2.4, "measured")]
+    curves += [(trace.replayed, color, 1.0, name) for trace, color, name in twins]
+    for values, color, lw, name in curves:
+        axes[0].plot(time_s, values, color=color, lw=lw, label=name)
+        if not effort:
+            error = (values - before.target) * factor
+            axes[1].plot(time_s, error, color=color, lw=lw, label=name)
+    axes[0].set_ylabel(f"{before.kind} [{before.unit}]", fontsize=8)
     if not effort:
         axes[0].plot(
             time_s, before.target, color=COMMAND, lw=1.0, ls="--", label="command"
         )
-        axes[1].plot(
-            time_s,
-            (before.measured - before.target) * factor,
-            color=MEASURED,
-            lw=2.4,
-            label="measured",
-        )
         axes[1].set_ylabel(f"tracking error\nq − q* [{unit}]", fontsize=8)
-    axes[0].plot(time_s, before.measured, color=MEASURED, lw=2.4, label="measured")
-    axes[0].set_ylabel(f"{before.kind} [{before.unit}]", fontsize=8)
-    for trace, color, name in twins:
-        axes[0].plot(time_s, trace.replayed, color=color, lw=1.0, label=name)
-        if not effort:
-            axes[1].plot(
-                time_s,
-                (trace.replayed - trace.target) * factor,
-                color=color,
-                lw=1.0,
-                label=name,
-            )
     _residuals(axes[-1], twins)
     for axis in axes:
         tidy(axis)
@@ -108,7 +98,7 @@ def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
     floor_band(axes, first.floor.value, first.unit)
     for trace, color, name in twins:
         rmse = float(np.sqrt(np.nanmean(trace.residual**2)))
-        label = f"{name}: RMSE {rmse * factor:.3g} {unit}, {rmse / trace.floor.value:.3g} × floor"
+        label = f"{name}: RMSE {rmse * factor:.3g} {unit}, {floors(rmse / trace.floor.value)} × floor"
         axes.plot(
             trace.time_s, trace.residual * factor, color=color, lw=0.9, label=label
         )

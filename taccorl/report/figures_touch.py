@@ -41,14 +41,9 @@ def touch_histogram(
     axes = figure.subplots()
     least = FELT_FLOORS * float(np.median(before[0].floor))
     series = [
-        (np.concatenate([t.measured.ravel() for t in before]), MEASURED, "measured")
+        (np.concatenate([getattr(t, field).ravel() for t in traces]), color, name)
+        for field, color, traces, name in _series(before, after, names)
     ]
-    series += [(np.concatenate([t.replayed.ravel() for t in before]), BEFORE, names[0])]
-    series += (
-        [(np.concatenate([t.replayed.ravel() for t in after]), AFTER, names[1])]
-        if after
-        else []
-    )
     top = max(float(values.max()) for values, _, _ in series)
     edges = np.linspace(least, max(top, 2 * least), BINS).tolist()
     axes.axvspan(
@@ -176,11 +171,6 @@ def touch_over_time(
     axes, below = rows[::2, 0], rows[1::2, 0]
     for p, pad in enumerate(before.pads):
         _error_over_time(below[p], before, after, p)
-        sums = [
-            (before.measured, MEASURED, "measured"),
-            (before.replayed, BEFORE, names[0]),
-        ]
-        sums += [(after.replayed, AFTER, names[1])] if after is not None else []
         floor = 2 * float(np.sqrt((before.floor[p] ** 2).sum()))
         axes[p].axhspan(
             -floor,
@@ -190,10 +180,11 @@ def touch_over_time(
             lw=0,
             label=f"noise floor ± {floor:.3g}",
         )
-        for values, color, name in sums:
+        later = [] if after is None else [after]
+        for field, color, (trace,), name in _series([before], later, names):
             axes[p].plot(
                 before.time_s[:, p],
-                values[:, p].sum(axis=(1, 2)),
+                getattr(trace, field)[:, p].sum(axis=(1, 2)),
                 color=color,
                 lw=1.1,
                 label=name,
@@ -227,12 +218,7 @@ def reading_over_load(
         _origins(before),
     )
     axes = figure.subplots()
-    series = [
-        ("measured", MEASURED, before, "measured"),
-        ("replayed", BEFORE, before, names[0]),
-    ]
-    series += [("replayed", AFTER, after, names[1])] if after else []
-    for field, color, traces, name in series:
+    for field, color, traces, name in _series(before, after, names):
         for k, t in enumerate(traces):
             assert t.load is not None
             load, reading = t.load[:, *cell], getattr(t, field)[:, *cell]
@@ -266,6 +252,19 @@ def _error_over_time(
             axes.plot(trace.time_s[:, pad], error, color=color, lw=0.9)
     axes.set_ylim(bottom=0)
     tidy(axes, y=f"RMS error of\n{felt.sum()} cells [{before.unit}]")
+
+
+def _series(
+    before: Sequence[TouchTrace], after: Sequence[TouchTrace], names: tuple[str, str]
+) -> list[tuple[str, str, Sequence[TouchTrace], str]]:
+    """Field of the traces, colour, traces and name of each curve: measured, and replayed by
+    the one or two twins."""
+    found = [
+        ("measured", MEASURED, before, "measured"),
+        ("replayed", BEFORE, before, names[0]),
+        ("replayed", AFTER, after, names[1]),
+    ]
+    return [one for one in found if one[2]]
 
 
 def _origins(traces: Sequence[TouchTrace]) -> list[Origin]:

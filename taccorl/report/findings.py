@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from taccorl.data.finding import Finding
+from taccorl.data.finding import Finding, listed
 from taccorl.report.section import Cell, Section
 
 SEVERITIES = ("error", "warning", "note")
@@ -18,7 +18,8 @@ def found_in(name: str, findings: Sequence[Finding]) -> Section:
     unjudged = sum(f.check == "not_judged" for f in findings) if worst == "ok" else 0
     head = (
         f"{worst:9s}{name}"
-        + f" ({unjudged} check{'s' * (unjudged > 1)} not judged)" * bool(unjudged)
+        + f" ({unjudged} check{'s' * (unjudged > 1)} could not be made)"
+        * bool(unjudged)
     )
     lines = [
         Cell(f"  {f.severity:8s}{f.check}: {f.text}", f.severity) for f in findings
@@ -56,7 +57,7 @@ def found_in_recordings(found: Mapping[str, Sequence[Finding]]) -> list[Section]
         if all(f.severity == "note" for f in findings)
     ]
     if sound:
-        sections.append(found_in(f"{len(sound)} recordings: {', '.join(sound)}", []))
+        sections.append(found_in(f"{len(sound)} recordings: {listed(sound)}", []))
     lines = []
     for same in (
         of

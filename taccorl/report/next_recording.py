@@ -123,7 +123,8 @@ def _apart(of: Advice) -> Iterator[Fact]:
     for other in (o for o in d.rivals[name] if o not in apart):
         same = nested(d, name, other)
         if same is None:
-            yield fact("record_efforts", effect=name, other=other)
+            id = "record_either" if of.seen.has_effort else "record_efforts"
+            yield fact(id, effect=name, other=other)
         else:
             yield fact("record_simpler", **same._asdict())
     yield from _other_pose(of) if apart and d.one_pose else ()

@@ -21,7 +21,7 @@ from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.cell_numbers import cell_errors
 from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell
 from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
-from taccorl.diagnosis.comparison.result import Comparison, origin_words
+from taccorl.diagnosis.comparison.result import Comparison, origin_words, shown
 from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.search.result import Diagnosis, may_go_on
 from taccorl.errors import TaccorlError
@@ -117,6 +117,8 @@ class Report:
                 short={use: own.short(use, other) for use, other in _PAIRS}
                 if own
                 else None,
+                has_effort=bool(self.comparison.of(f.part, "effort")),
+                size=self._size(f.part),
                 worst=own.worst if own else None,
                 plans=not self._is_input(f.part),
                 options=self.options,
@@ -128,6 +130,22 @@ class Report:
                 for part, a in found.items()
             }
         return found
+
+    def _size(self, part: str) -> dict[str, Any] | None:
+        """Validation error of the part's position, or of its effort if the position is its
+        input, in units and as a share of the motion; None if it is neither."""
+        kind = "effort" if self._is_input(part) else "position"
+        before, after = (
+            c.score(part, kind, "validation") for c in (self.comparison, self.last)
+        )
+        if before is None or after is None:
+            return None
+        return {
+            "kind": kind,
+            "before": shown(before.rmse, before.unit),
+            "after": shown(after.rmse, after.unit),
+            "nrmse": after.nrmse,
+        }
 
     def _is_input(self, part: str) -> bool:
         """Whether the part's position is its input (law effort), so that only its effort is compared."""

@@ -63,6 +63,11 @@ def cell(value: Value) -> Cell:
     return value if isinstance(value, Cell) else Cell(value)
 
 
+def floors(error: float) -> str:
+    """An error in noise floors as text: three digits, all before the point."""
+    return f"{error:.3g}" if error < 1000.0 else f"{error:.0f}"
+
+
 def change(before: float, after: float) -> str:
     """Change from ``before`` to ``after`` as text: ``-92%`` of ``before``; ``+0%`` if it is less than half a percent."""
     return f"{round(after / before - 1, 2) + 0.0:+.0%}"

@@ -65,7 +65,7 @@ def test_table_says_how_far_off_and_where(folder, said):
     assert ratio == pytest.approx(
         error / 0.2, rel=0.1
     )  # made with 0.2 mrad of noise; the floor is from the repeat
-    assert f"{SIGNAL} position: worst " in text
+    assert f"{SIGNAL} position: largest in " in text
     assert row(text, f"{SIGNAL} effort", "fit")[5] == "N·m"
     assert "ok" in text and "4 recordings" in text, "the checks come first"
     assert text.index("4 recordings") < text.index("RMSE")

@@ -152,11 +152,11 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(
     )
     assert code == 0
     own = facts(out, SIGNAL)
-    assert {"ties", "error_untested", "tie", "record_efforts", "next"} <= {*own}
+    assert {"ties", "error_untested", "tie", "record_either", "next"} <= {*own}
     assert own["tie"] == [
         {"other": "asymmetric_friction", "effect": "coulomb_friction"}
     ]
-    assert own["record_efforts"][0]["other"] == "asymmetric_friction"
+    assert own["record_either"][0]["other"] == "asymmetric_friction"
     assert own["missing"][0]["numbers"][0].startswith("torque_nm 0.028")
     assert "taccorl excite" not in text
     lines = text.split(f"{SIGNAL} lacks ", 1)[1].partition("\nwrote ")[0].splitlines()
@@ -396,7 +396,7 @@ def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: P
         (
             ["check", "dataset", "--pictures=false"],
             0,
-            "whether LeRobot loads it not judged: needs lerobot",
+            "whether LeRobot loads it could not be checked: needs lerobot",
         ),
         (
             ["ingest", "inspect", "recordings"],

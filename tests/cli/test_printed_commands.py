@@ -49,6 +49,14 @@ CASES = [
         ["compare"],
         marks=pytest.mark.slow,
     ),
+    pytest.param(
+        GAINS_OFF,
+        0.0,
+        ("--out=my report",),
+        "numbers_off",
+        ["add-effect"],
+        marks=pytest.mark.slow,
+    ),
     pytest.param(RIGHT, 0.0, (), "nothing_missing", [], marks=pytest.mark.slow),
     pytest.param(RIGHT, 0.1, (), "effects", ["add-effect"], marks=pytest.mark.slow),
 ]
@@ -61,11 +69,13 @@ def test_each_printed_command_does_what_it_says(
     """Those that follow from a command are run, too: add-effect prints a comparison."""
     bench(tmp_path, file, friction)
     code, text = said("diagnose", "bench", "--twin=robot.yaml", FEW, *words)
-    own = facts(Path("diagnosis"), "swing")
+    out = [word.removeprefix("--out=") for word in words if word.startswith("--out=")]
+    folder = Path(*out or ["diagnosis"])
+    own = facts(folder, "swing")
     assert (code, next(iter(own))) == (0, kind), text
     assert "replaced" not in text, "its own report of what was found so far"
     printed = commands(text)
-    assert {*of_page(Path("diagnosis/report.html"))} == {*printed}
+    assert {*of_page(folder / "report.html")} == {*printed}
     assert [c.split()[1] for c in printed if c.split()[1] != "excite"] == verbs
     assert not words or not [c for c in printed if words[0] in c], "it was done"
     while printed:

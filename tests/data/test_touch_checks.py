@@ -210,7 +210,7 @@ def test_soft_part_felt_while_the_gripper_still_closes_gives_nothing() -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("no baselines", "saturation not judged"),
+        ("no baselines", "saturation could not be checked"),
         ("grippers hold together", "swapped pads"),
     ],
 )

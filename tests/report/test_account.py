@@ -273,6 +273,12 @@ def _(one, nothing, short):
     return changed(friction, rivals=tied, base={"torque_ff": 0.01}), Seen()
 
 
+@case("record_either")
+def _(one, nothing, short):
+    d, _ = CASES["record_efforts"](one, nothing, short)
+    return d, Seen(has_effort=True)
+
+
 @case("may_be_two")
 def _(one, nothing, short):
     return of_two(one, gain=0.88), Seen()
@@ -313,10 +319,38 @@ def _(one, nothing, short):
     return moved_gains(nothing), Seen()
 
 
-@case("some_numbers_off", "remains", "record_regime", "record_repeat")
+@case("some_numbers_off", "remains", "worst", "record_regime", "record_repeat")
 def _(one, nothing, short):
     d = moved_gains(nothing, "something_else")
     return with_errors(d, before=100.0, after=2.41), Seen(worst=WORST)
+
+
+@case("size")
+def _(one, nothing, short):
+    size = {"kind": "position", "before": "2 mrad", "after": "1 mrad", "nrmse": 4e-4}
+    return with_errors(one, before=10.0, after=2.0), Seen(size=size)
+
+
+@case("gains")
+def _(one, nothing, short):
+    d = moved_gains(nothing)
+    return changed(d, start={"kp": 241.5}, errors=nothing.errors), Seen()
+
+
+def test_fitted_gains_stand_in_one_line_with_those_of_the_file(nothing):
+    """They are listed once: among the numbers that change, or here."""
+    kept = changed(moved_gains(nothing), start={"kp": 241.5}, errors=nothing.errors)
+    (line,) = account(PART, kept).get("gains")
+    assert line.values["gains"] == ["kp 241 N·m/rad (240 … 242), in the file 241.5"]
+    assert "gains" not in account(PART, moved_gains(nothing)).ids
+
+
+def test_a_period_of_the_loop_is_not_listed_beside_its_rate(nothing):
+    """The file has loop_hz, which ``changed`` states."""
+    frees = [dataclasses.replace(nothing.after.frees[0], name="loop_s", unit="s")]
+    after = dataclasses.replace(nothing.after, frees=frees)
+    d = changed(moved_gains(nothing), base={"loop_s": 2e-3}, start={"loop_s": 1e-3})
+    assert moved(changed(d, after=after, intervals={"loop_s": (1.9e-3, 2.1e-3)})) == {}
 
 
 @case("nothing_missing", "record_nothing")

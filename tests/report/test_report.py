@@ -24,7 +24,7 @@ from taccorl.errors import SpecError, TaccorlError, plain_name
 from taccorl.report.account import account
 from taccorl.report.compared import pad_matches
 from taccorl.report.diagnosed import account_section
-from taccorl.report.evidence import separable
+from taccorl.report.evidence import Seen, separable
 from taccorl.report.fact import clean, fact
 from taccorl.report.ingested import ingested
 from taccorl.report.page import html
@@ -295,7 +295,7 @@ def test_each_fact_of_a_diagnosis_is_on_the_page_in_the_terminal_and_in_json(
     report = json.loads((path.parent / NUMBERS).read_text())
     own = report["verdicts"][SIGNAL]
     d = finding.diagnosis
-    a = account(SIGNAL, d)
+    a = account(SIGNAL, d, Seen(has_effort=True))
     show(account_section(a))
     page, terminal = (
         " ".join(text.split())
@@ -398,7 +398,10 @@ def test_heat_maps_are_of_the_twin_whose_gains_are_refitted(
     )
     cells = [c for c in found["where"]["cells"] if c["kind"] == "position"]
     thirds = [
-        c for c in cells if c["regime"] in ("first third", "second third", "last third")
+        c
+        for c in cells
+        if c["regime"]
+        in tuple(f"{k} third of the time" for k in ("first", "second", "last"))
     ]
     over_all = np.sqrt(
         sum(c["ratio"] ** 2 * c["n"] for c in thirds) / sum(c["n"] for c in thirds)

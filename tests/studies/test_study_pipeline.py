@@ -115,8 +115,13 @@ def test_the_page_counts_failed_cases_as_wrong_and_shows_them(tmp_path, monkeypa
         {"key": f"reference {k}", "study": "reference", "cpu_s": s}
         for k, s in enumerate((2.0, 2.4, 3.0))
     ]
+    page = tmp_path / "docs" / "diagnosis.md"
+    marks = (diagnosis_page.STUDY, diagnosis_page.OTHERS)
+    page.write_text(f"the story\n\n{marks[0]}\nold\n{marks[1]}\nothers\n")
     diagnosis_page.write_page(rows)
-    text = (tmp_path / "docs" / "diagnosis.md").read_text()
+    text = page.read_text()
+    assert text.startswith(f"the story\n\n{marks[0]}\n## How often")
+    assert text.endswith(f"\n{marks[1]}\nothers\n") and "\nold\n" not in text
     assert (
         "| one hidden joint effect, pack and chirp: exact, counted as one | ≥ 87% | 75% (3 of 4;"
         in text

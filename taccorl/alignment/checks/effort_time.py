@@ -130,9 +130,9 @@ def check_effort_time(
     ):
         return
     way = (
-        "answers the row's own target already"
+        "is the answer to the target of the same row"
         if after
-        else "was taken before the row's target acts"
+        else "was measured before the target of its row acts"
     )
     line = (
         f"Write `effort_after_target: true` for {signal}"

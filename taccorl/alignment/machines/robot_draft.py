@@ -121,7 +121,7 @@ def _joint(facts: JointFacts) -> list[str]:
     lines += [
         "    # loop_hz: 1000.0          # of the drive's control loop, where it is known",
         "    # command_hz: 1000.0       # where the drive receives targets faster than they are logged",
-        "    # effort_after_target: true   # where the effort of a row answers the row's own target already",
+        "    # effort_after_target: true   # where the effort of a row is the answer to the target of the same row",
         "    # known: [armature]        # numbers and effects that you know for certain: no diagnosis moves or adds them",
     ]
     if facts.effects:

@@ -35,8 +35,6 @@ class Variable:
     """A variable on which physical effects depend, such as speed or position."""
 
     name: str
-    words: str
-    """Examples of effects that would depend on the variable, to explain why it is shown."""
     measure: Measure
     """Statistic of the residual that is shown along it."""
     values: Callable[[Motion], np.ndarray]
@@ -44,36 +42,18 @@ class Variable:
 
 
 VARIABLES: tuple[Variable, ...] = (
-    Variable(
-        "velocity", "friction, drag, damping, delay", "mean", lambda m: m.velocity
-    ),
-    Variable(
-        "position",
-        "gravity, springs, cogging, encoder waves",
-        "mean",
-        lambda m: bridged(m.trace.position),
-    ),
-    Variable(
-        "commanded acceleration",
-        "inertia, delay, slew limits",
-        "mean",
-        lambda m: m.acceleration,
-    ),
-    Variable(
-        "modelled torque",
-        "load friction, compliance, saturation, torque scale",
-        "mean",
-        lambda m: m.trace.torque,
-    ),
-    Variable(
-        "time", "heating, drift", "RMS", lambda m: m.trace.time_s - m.trace.time_s[0]
-    ),
-    Variable(
-        "commanded speed",
-        "slew limits, lag, feed-forward",
-        "RMS",
-        lambda m: np.abs(m.target_speed),
-    ),
+    # friction, drag, damping, delay
+    Variable("velocity", "mean", lambda m: m.velocity),
+    # gravity, springs, cogging, encoder waves
+    Variable("position", "mean", lambda m: bridged(m.trace.position)),
+    # inertia, delay, slew limits
+    Variable("commanded acceleration", "mean", lambda m: m.acceleration),
+    # load friction, compliance, saturation, torque scale
+    Variable("modelled torque", "mean", lambda m: m.trace.torque),
+    # heating, drift
+    Variable("time", "RMS", lambda m: m.trace.time_s - m.trace.time_s[0]),
+    # slew limits, lag, feed-forward
+    Variable("commanded speed", "RMS", lambda m: np.abs(m.target_speed)),
 )
 """The variables of the figures and reports, in their order."""
 

@@ -33,7 +33,7 @@ from taccorl.alignment.measurements.noise_floor import (
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import lacking_pads, twin_pads
-from taccorl.data.finding import Finding
+from taccorl.data.finding import Finding, listed
 from taccorl.diagnosis.comparison.replays import (
     BENCH_REST,
     Response,
@@ -417,7 +417,7 @@ def _touches(
     found = []
     if unknown:
         why_not.append(
-            f"touch of {', '.join(unknown)}: what was pressed is not known; say it: `pressed` in measurements.yaml, or "
+            f"touch of {listed(unknown)}: what was pressed is not known; state it: `pressed` in measurements.yaml, or "
             "--pressed.shape=… --pressed.radius_m=…"
         )
     if len(unknown) == len(felt):

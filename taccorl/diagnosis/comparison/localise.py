@@ -153,13 +153,13 @@ REGIMES: tuple[Regime, ...] = (
         lambda m: np.abs(m.velocity) > FAST * m.peak_speed,
     ),
     Regime(
-        "forwards",
+        "moving forwards",
         "direction",
         "moving towards larger positions",
         lambda m: m.velocity > SLOW * m.peak_speed,
     ),
     Regime(
-        "backwards",
+        "moving backwards",
         "direction",
         "moving towards smaller positions",
         lambda m: m.velocity < -SLOW * m.peak_speed,
@@ -176,12 +176,27 @@ REGIMES: tuple[Regime, ...] = (
         f"the twin's motor torque is in its highest {1 - HIGH_LOAD:.0%}",
         lambda m: np.abs(m.trace.torque) > m.high_torque,
     ),
-    Regime("pose, low third", "pose", "lowest third of the way it goes", _pose(0)),
-    Regime("pose, middle third", "pose", "middle third of the way it goes", _pose(1)),
-    Regime("pose, high third", "pose", "highest third of the way it goes", _pose(2)),
-    Regime("first third", "time", "of each recording's time", _time(0)),
-    Regime("second third", "time", "of each recording's time", _time(1)),
-    Regime("last third", "time", "of each recording's time", _time(2)),
+    Regime(
+        "lowest third of the range",
+        "pose",
+        "of the positions in all recordings",
+        _pose(0),
+    ),
+    Regime(
+        "middle third of the range",
+        "pose",
+        "of the positions in all recordings",
+        _pose(1),
+    ),
+    Regime(
+        "highest third of the range",
+        "pose",
+        "of the positions in all recordings",
+        _pose(2),
+    ),
+    Regime("first third of the time", "time", "of each recording's time", _time(0)),
+    Regime("second third of the time", "time", "of each recording's time", _time(1)),
+    Regime("last third of the time", "time", "of each recording's time", _time(2)),
     Regime(
         "in contact", "contact", "a pad of its arm touches", lambda m: m.trace.touched
     ),
@@ -194,7 +209,7 @@ REGIMES: tuple[Regime, ...] = (
 )
 """All regimes of the motion of a joint or axis."""
 WHERE_NOT_WHY = (
-    "This says where the twin is off, not why: delays, loads, gains and inertia light up the same regimes. "
+    "This says where the twin is off, not why: delays, loads, gains and inertia cause errors in the same regimes. "
     "taccorl diagnose tries each cause."
 )
 """Remark that reports add to errors by regime."""

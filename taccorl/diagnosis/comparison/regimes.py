@@ -53,6 +53,11 @@ class RegimeError:
     """RMS residual [noise floors]."""
     n: int
 
+    @property
+    def place(self) -> str:
+        """Recording and regime as text."""
+        return f"{self.recording}, {self.regime}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
@@ -171,29 +176,23 @@ def with_regimes(
 
 def _trace(r: Recording, floor: SignalFloor) -> Trace:
     """What the regimes of a recording depend on; nothing was replayed."""
-    none, position = np.full(len(r.time_s), np.nan), r.data.measured
-    of = {
-        "recording": r.name,
-        "signal": floor.signal,
-        "unit": floor.unit,
-        "time_s": r.time_s,
-        "target": r.data.target,
-    }
-    seen = {
-        "position": position,
-        "measured": position,
-        "replayed": none,
-        "torque": none,
-        "touched": none > 0.0,
-    }
+    none = np.full(len(r.time_s), np.nan)
     return Trace(
+        recording=r.name,
         use="fit",
+        signal=floor.signal,
         kind="position",
+        unit=floor.unit,
         way="joint",
+        time_s=r.time_s,
+        target=r.data.target,
+        position=r.data.measured,
+        measured=r.data.measured,
+        replayed=none,
+        torque=none,
+        touched=none > 0.0,
         floor=floor,
         origin=Origin(),
-        **of,
-        **seen,
     )
 
 

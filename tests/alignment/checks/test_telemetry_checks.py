@@ -347,7 +347,7 @@ def test_where_nothing_can_be_known_it_says_so():
         # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
         least = 8 * floors(m)[f.feature] * 0.12 / 0.005
         assert (
-            "one row (5.0 ms) not judged" in f.text
+            "one row (5.0 ms) could not be checked" in f.text
             and f"two of {least:.2g} rad" in f.text
             and len(f.text) <= 120
         )

@@ -50,8 +50,8 @@ def test_a_stop_without_turning_round_is_no_reversal():
         "near zero speed",
         "high speed",
         "after a reversal",
-        "pose, high third",
-        "last third",
+        "highest third of the range",
+        "last third of the time",
     ],
 )
 def test_error_planted_in_a_regime_is_found_there(regime):
