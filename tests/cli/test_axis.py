@@ -1,6 +1,7 @@
 """An axis by itself as a user types it: compare, diagnose, add-effect, compare. Simulated by this test, not a real drive."""
 
 import json
+import math
 import re
 import shlex
 import shutil
@@ -44,7 +45,7 @@ def write(
             else [following] * PARTS
         ):
             free = speed + dt_s * (KP * (asked - at) - (KD + damping) * speed) / MASS_KG
-            speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            speed = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             at += dt_s * speed
         goal = following
     rng = np.random.default_rng(seed)

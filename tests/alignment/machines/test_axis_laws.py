@@ -353,7 +353,7 @@ def test_torques_of_an_outer_loop_are_replayed_near_the_measured_position_and_fr
         for goal in goals.tolist():
             rows.append((q, asked := 2.0 * (goal - q) - 0.2 * v))
             for _ in range(500):
-                v += DT_S * (asked - 0.005 - friction_nm * np.sign(v)) / 0.02
+                v += DT_S * (asked - 0.005 - friction_nm * ((v > 0) - (v < 0))) / 0.02
                 q += DT_S * v
         measured, torques = np.array(rows).T
         made = {"target_kinds": ("torque",), "effort": torques}
