@@ -167,7 +167,7 @@ def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of
     efforts = []
     for n in range(1600):
         efforts += [asked] * (n % 2 == 0)
-        goal = target[(n - 3) // 2] if n >= 3 else 0.0
+        goal = float(target[(n - 3) // 2]) if n >= 3 else 0.0
         seen, asked = q, 40.0 * (goal - q) - 2.0 * (q - seen) * 2000.0
         for _ in range(50):
             v += DT_S * asked / 0.04

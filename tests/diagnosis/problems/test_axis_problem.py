@@ -414,7 +414,7 @@ def unbalanced(
     target = amplitude_rad * np.sin(2 * np.pi * hz * time_s) * np.clip(time_s, 0, 1)
     at = -WEIGHT_NM * math.cos(LEVEL_RAD) / 80.0
     speed, goal, rows = 0.0, 0.0, []
-    for following in (*np.zeros(rate_hz), *target):  # a second of rest before
+    for following in [0.0] * rate_hz + target.tolist():  # a second of rest before
         rows.append((at, 80.0 * (goal - at) - 8.0 * speed))
         goal = following
         for _ in range(parts):
@@ -1114,10 +1114,10 @@ def of_a_servo(name: str, high_hz: float, seed: int, *, supply_v=7.4, resistance
         0.5 * np.sin(np.pi * high_hz * time_s**2 / 6) * np.clip(3 * time_s - 1, 0, 1)
     )
     goals[300:] = np.sign(goals[300:]) * 0.5
-    for k in range(600):
+    for goal in goals.tolist():
         rows.append(q)
         for _ in range(200):
-            duty = min(max(6.0 * (goals[k] - q) - 0.15 * v, -1.0), 1.0)
+            duty = min(max(6.0 * (goal - q) - 0.15 * v, -1.0), 1.0)
             torque = (
                 torque_nm_per_a
                 * (supply_v * duty - torque_nm_per_a * v)
