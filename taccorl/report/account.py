@@ -9,6 +9,9 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
+from taccorl.alignment.least_squares import Free, inverse_of
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS, TORQUE_FF
 from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search import plain as plain_fit
@@ -62,19 +65,42 @@ def account(part: str, d: Diagnosis, seen: Seen | None = None) -> Account:
 
 
 def moved(d: Diagnosis) -> dict[str, Quantity]:
-    """Always fitted numbers of the machine's file whose intervals exclude its values,
-    where their refit takes away a share of the error that counts as an improvement."""
+    """Always fitted numbers of the machine's file whose intervals exclude its values, and
+    whose return to them would raise the error by a share that counts as a loss."""
     if not _refit_helps(d):
         return {}
-    units = {f.name: f.unit for f in d.after.frees}
     ends = {name: d.intervals.get(name, (-math.inf, math.inf)) for name in d.start}
     listed = {*OF_RECORDINGS, LOOP, *(c.name for c in d.changed)}
+    apart = [
+        f
+        for f in d.after.frees
+        if f.name in {*d.base} & {*d.start} - listed
+        and not ends[f.name][0] <= d.start[f.name] <= ends[f.name][1]
+    ]
     return {
-        name: Quantity.of(d.base[name], units[name], ends[name])
-        for name in d.base
-        if name in {*units} & {*d.start} - listed
-        and not ends[name][0] <= d.start[name] <= ends[name][1]
+        f.name: Quantity.of(d.base[f.name], f.unit, ends[f.name])
+        for f in _needed(d, apart)
     }
+
+
+def _needed(d: Diagnosis, apart: list[Free]) -> list[Free]:
+    """Those of ``apart`` that do not go back to the file's values for nothing, the cheapest
+    first: all others refitted, numbers that are δ off raise the squared error by
+    δᵀ Σ⁻¹ δ / n, Σ the part of (JᵀJ)⁻¹ that is theirs."""
+    fit, after = d.after, d.errors["after"]["validation"]
+    own = [fit.frees.index(f) for f in apart]
+    variances = inverse_of(fit.jacobian.T @ fit.jacobian)[np.ix_(own, own)]
+    delta = np.array(
+        [f.coordinate(d.base[f.name]) - f.coordinate(d.start[f.name]) for f in apart]
+    )
+    returned = list[int]()
+    for k in np.argsort(np.abs(delta) / np.sqrt(np.diag(variances))):
+        these = [*returned, int(k)]
+        inner = variances[np.ix_(these, these)]
+        cost = float(delta[these] @ np.linalg.solve(inner, delta[these]))
+        if gains_nothing(math.sqrt(after**2 + cost / len(fit.residuals)), after):
+            returned = these
+    return [f for k, f in enumerate(apart) if k not in returned]
 
 
 def _refit_helps(d: Diagnosis) -> bool:

@@ -1,12 +1,15 @@
 """``taccorl evaluate`` and ``taccorl correct`` as a user types them."""
 
 import json
+import pickle
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from taccorl.cli import evaluate
 from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import read_rows
@@ -16,9 +19,18 @@ EXPERT = ("evaluate", "--policy.type=expert", "--task=assembly_1", "--images=fal
 SHORT = ("--episodes=2", "--episode_length=4")
 
 
+@pytest.mark.parametrize("here", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_an_evaluation_is_rows_summary_page_and_rerun_file(
-    said: Any, tmp_path: Path
+    said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: bool
 ) -> None:
+    """``here``: the shares of two processes, pickled as for these, run in this one."""
+
+    def mapped(run: Any, items: list[Any], name: Any) -> list[Any]:
+        return [run(item) for item in pickle.loads(pickle.dumps(items))]
+
+    if here:
+        engine = SimpleNamespace(map=mapped)
+        monkeypatch.setattr(evaluate, "LocalEngine", lambda workers: engine)
     code, shown = said(*EXPERT, *SHORT, "--failures=1", "--out=scored")
     assert (
         code == 0
@@ -77,7 +89,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(
     again = read_rows(tmp_path / "again/episodes.jsonl")
     assert again[:2] == rows and {r.policy for r in again[2:]} == {
         "expert (scored)"
-    }  # from two processes, too
+    }  # from two shares, too
     code, shown = said(*EXPERT, *SHORT, "--seed=7", "--against=scored", "--out=other")
     assert (
         code == 2

@@ -137,42 +137,51 @@ def test_a_delay_that_may_be_none_is_written_as_it_was_fitted(tmp_path: Path) ->
         assert left(scores, use) == pytest.approx(stated, rel=1e-3)
 
 
-def test_the_earliest_speed_of_a_slow_loop_is_written_as_it_was_simulated(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("file", "part", "base", "place", "written"),
+    [
+        # Half a period earlier than −1.2 ms is beyond the 3 ms of ``speed_delay``.
+        (
+            robot,
+            "swing",
+            {"speed_delay_s": -1.2e-3, "loop_s": 6e-3},
+            ("joints", "swing", "effects", 0, "delay_s"),
+            pytest.approx(-3e-3),
+        ),
+        # Faster than the steps of the model.
+        (
+            "kind: axis\nname: slide\nunit: m\ninertia: 40.0\nkp: 4.0e4\nkd: 2.0e3\n"
+            "force_unit_n: 10.0\n",
+            "slide",
+            {"loop_s": 8e-5},
+            ("joints", "slide", "loop_hz"),
+            pytest.approx(12500.0),
+        ),
+        # A zero of nine digits.
+        (
+            "kind: cells\ncells: [thumb]\nload: {unit: N, rated: 20.0}\n"
+            "reading: {unit: count, lowest: 0, highest: 4294967295}\n",
+            "thumb",
+            {"gain_thumb": 400.0, "offset_thumb": 123_456_789.4},
+            ("offset", 0),
+            pytest.approx(123_456_789.4, abs=0.01),
+        ),
+    ],
+    ids=["earliest speed of a slow loop", "fast loop", "large zero"],
+)
+def test_an_extreme_number_is_written_as_it_was_fitted(
+    file: Any, part: str, base: Any, place: Any, written: Any, tmp_path: Path
 ) -> None:
-    """Half a period earlier than −1.2 ms is beyond the 3 ms of ``speed_delay``."""
-    made(tmp_path, robot)
+    if file is robot:
+        made(tmp_path, robot)
+    else:
+        (tmp_path / "machine.yaml").write_text(file)
     machine = load_machine(tmp_path / "machine.yaml")
-    base = {"speed_delay_s": -1.2e-3, "loop_s": 6e-3}
-    machine.with_additions([Addition("swing", [], base, {})]).save(tmp_path / "w.yaml")
-    joints = yaml.safe_load((tmp_path / "w.yaml").read_text())["joints"]
-    (delay,) = joints["swing"]["effects"]
-    assert delay["delay_s"] == pytest.approx(-3e-3)
-
-
-def test_a_loop_faster_than_the_model_s_steps_is_written_as_it_was_fitted(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "axis.yaml").write_text(
-        "kind: axis\nname: slide\nunit: m\ninertia: 40.0\nkp: 4.0e4\nkd: 2.0e3\nforce_unit_n: 10.0\n"
-    )
-    axis = load_machine(tmp_path / "axis.yaml")
-    fitted = axis.with_additions([Addition("slide", [], {"loop_s": 8e-5}, {})])
-    fitted.save(tmp_path / "fitted.yaml")
-    joints = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["joints"]
-    assert joints["slide"]["loop_hz"] == pytest.approx(12500.0)
-
-
-def test_a_zero_of_nine_digits_is_written_with_all_of_them(tmp_path: Path) -> None:
-    (tmp_path / "cells.yaml").write_text(
-        "kind: cells\ncells: [thumb]\nload: {unit: N, rated: 20.0}\n"
-        "reading: {unit: count, lowest: 0, highest: 4294967295}\n"
-    )
-    cells = load_machine(tmp_path / "cells.yaml")
-    base = {"gain_thumb": 400.0, "offset_thumb": 123_456_789.4}
-    cells.with_additions([Addition("thumb", [], base, {})]).save(tmp_path / "c.yaml")
-    numbers = yaml.safe_load((tmp_path / "c.yaml").read_text())
-    assert numbers["offset"] == [pytest.approx(123_456_789.4, abs=0.01)]
+    machine.with_additions([Addition(part, [], base, {})]).save(tmp_path / "w.yaml")
+    found = yaml.safe_load((tmp_path / "w.yaml").read_text())
+    for key in place:
+        found = found[key]
+    assert found == written
 
 
 @pytest.mark.slow

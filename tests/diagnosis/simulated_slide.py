@@ -1,5 +1,6 @@
 """Recordings that tests simulate with equations of their own; those of a slide with dry friction whose numbers are known here."""
 
+import math
 from collections.abc import Collection
 from functools import cache
 from pathlib import Path
@@ -101,7 +102,7 @@ def simulated(
                 speed = free - stops * bent / bristles_m
                 bent += dt_s * (speed - abs(speed) * bent / bristles_m)
             else:
-                speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+                speed = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             at += dt_s * speed
     position, force = np.array(rows).T
     rng = np.random.default_rng(seed)

@@ -113,7 +113,8 @@ def with_errors(d: Diagnosis, **stages: Any) -> Diagnosis:
 
 def moved_gains(d: Diagnosis, status: str = "nothing_missing") -> Diagnosis:
     """kp 394 → 241, as by the fit: 180 → 1 floors."""
-    frees = [dataclasses.replace(d.after.frees[0], name="kp", unit="N·m/rad")]
+    kp = dataclasses.replace(d.after.frees[0], name="kp", unit="N·m/rad", high=1e3)
+    after = dataclasses.replace(d.after, frees=(kp,), jacobian=d.after.jacobian[:, :1])
     return with_errors(
         changed(
             d,
@@ -121,7 +122,7 @@ def moved_gains(d: Diagnosis, status: str = "nothing_missing") -> Diagnosis:
             base={"kp": 241.0},
             start={"kp": 394.0},
             intervals={"kp": (240.0, 242.0)},
-            after=dataclasses.replace(d.after, frees=frees),
+            after=after,
         ),
         before=180.0,
     )
@@ -635,6 +636,38 @@ def test_gains_alone_are_the_first_facts_and_explain_the_error(nothing):
     same = changed(d, start={"kp": 241.5})
     assert moved(same) == {}, "within its interval"
     assert moved(with_errors(d, before=1.02)) == {}, "the refit removes nothing"
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "kd", "listed"),
+    [
+        (90.0, 2.004, ["kp"]),  # 100 · ln(2.004 / 2) = 0.2 floors: 0.04 of a square
+        (90.0, 2.02, ["kp", "kd"]),  # 0.995 floors
+        (0.2, 1.275, ["kp"]),  # ln(1.275 / 2) = -0.45: kp, 0.49 off, makes up for it
+    ],
+)
+def test_a_number_whose_return_costs_nothing_is_not_off(nothing, angle_deg, kd, listed):
+    """Both intervals exclude the file's values; an e-fold costs 100 floors of each."""
+    d, n = moved_gains(nothing), 3600
+    angles = np.deg2rad([0.0, angle_deg])
+    (kp,) = d.after.frees
+    both = dataclasses.replace(
+        d.after,
+        frees=(kp, dataclasses.replace(kp, name="kd")),
+        jacobian=np.outer(np.cos(2 * np.pi * np.arange(n) / n), np.cos(angles))
+        + np.outer(np.sin(2 * np.pi * np.arange(n) / n), np.sin(angles)),
+        residuals=np.zeros(n),
+    )
+    both = dataclasses.replace(both, jacobian=100.0 * 2**0.5 * both.jacobian)
+    ends = {"kp": (240.0, 242.0), "kd": (0.999 * kd, 1.001 * kd)}
+    d = changed(
+        d,
+        base={"kp": 241.0, "kd": kd},
+        start={"kp": 394.0, "kd": 2.0},
+        intervals=ends,
+        after=both,
+    )
+    assert [*moved(d)] == listed
 
 
 def test_an_error_is_that_of_the_twin_as_it_was_and_what_the_refit_left(one):

@@ -317,7 +317,8 @@ def test_a_number_of_json_has_its_unit_and_its_interval(diagnosed):
     """The file of a diagnosis without an effect has the number that moved as an object."""
     finding, _ = diagnosed
     d = finding.diagnosis
-    frees = [dataclasses.replace(d.before.frees[0], name="kp", unit="N·m/rad")]
+    kp = dataclasses.replace(d.before.frees[0], name="kp", unit="N·m/rad", high=1e3)
+    after = dataclasses.replace(d.after, frees=(kp,), jacobian=d.after.jacobian[:, :1])
     off = dataclasses.replace(
         d,
         effects=(),
@@ -325,7 +326,7 @@ def test_a_number_of_json_has_its_unit_and_its_interval(diagnosed):
         base={"kp": 241.0},
         start={"kp": 394.0},
         intervals={"kp": (240.0, 242.0)},
-        after=dataclasses.replace(d.after, frees=frees),
+        after=after,
         errors=d.errors | {"before": {"fit": 9.0, "validation": 99.0, "test": 99.0}},
     )
     report = small(found=[dataclasses.replace(finding, diagnosis=off)])

@@ -5,7 +5,7 @@ import logging
 import math
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -275,21 +275,19 @@ PAIRED = (
 """One fault of each kind, for the pairs of the fast tests."""
 
 
-@pytest.mark.parametrize("first", PAIRED)
+@pytest.mark.parametrize(
+    ("first", "others"),
+    [(first, PAIRED) for first in PAIRED]
+    # 2700 ordered pairs
+    + [pytest.param(first, FAULTS, marks=pytest.mark.slow) for first in FAULTS],
+)
 def test_of_two_faults_each_has_its_reaction(
-    first: str, robot: DrivenRobot, caplog: pytest.LogCaptureFixture
+    first: str,
+    others: Iterable[str],
+    robot: DrivenRobot,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    for second in PAIRED:
-        if second != first:
-            check(robot, [first, second], caplog)
-
-
-@pytest.mark.slow  # 2700 ordered pairs
-@pytest.mark.parametrize("first", FAULTS)
-def test_of_any_two_faults_each_has_its_reaction(
-    first: str, robot: DrivenRobot, caplog: pytest.LogCaptureFixture
-) -> None:
-    for second in FAULTS:
+    for second in others:
         if second != first:
             check(robot, [first, second], caplog)
 

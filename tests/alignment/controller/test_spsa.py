@@ -46,13 +46,18 @@ def test_rows_that_were_not_measured_add_nothing_to_the_loss() -> None:
     assert spsa.paper_loss(simulated, measured) == pytest.approx(0.3)
 
 
-def test_the_first_step_by_hand() -> None:
-    # L = 3 x: two ends c = 0.08 away differ by 0.48, slope 3.
+@pytest.mark.parametrize(
+    ("start", "ends"),
+    [(1.0, [0.92, 1.08]), pytest.param(9.0, [8.92, 9.0], id="at a bound")],
+)
+def test_the_first_step_by_hand(start: float, ends: list[float]) -> None:
+    """L = 3 x: two ends c = 0.08 away differ by 0.48, slope 3; an end beyond a bound is
+    moved onto it, and the slope stays right."""
     loss = Watched(3.0)
-    loss.minimised(1.0)
-    assert loss.places[0] == 1.0
-    assert sorted(loss.places[1:3]) == pytest.approx([0.92, 1.08])
-    assert loss.places[3] == pytest.approx(1.0 - 3.0 * FIRST_STEP)
+    loss.minimised(start)
+    assert loss.places[0] == start
+    assert sorted(loss.places[1:3]) == pytest.approx(ends)
+    assert loss.places[3] == pytest.approx(start - 3.0 * FIRST_STEP)
 
 
 def test_a_steep_slope_is_clipped_at_5() -> None:
@@ -60,13 +65,6 @@ def test_a_steep_slope_is_clipped_at_5() -> None:
     found = loss.minimised(1.0)
     assert loss.places[3] == pytest.approx(1.0 - 5.0 * FIRST_STEP)
     assert found.x[0] == -9.0  # the bound
-
-
-def test_an_end_beyond_a_bound_is_moved_onto_it_and_the_slope_stays_right() -> None:
-    loss = Watched(3.0)
-    loss.minimised(9.0)
-    assert sorted(loss.places[1:3]) == pytest.approx([8.92, 9.0])
-    assert loss.places[3] == pytest.approx(9.0 - 3.0 * FIRST_STEP)
 
 
 def test_it_ends_after_20_iterations_without_a_better_iterate() -> None:

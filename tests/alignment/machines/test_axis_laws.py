@@ -167,7 +167,7 @@ def test_a_target_that_acts_between_two_rows_has_the_effort_of_its_own_period_of
     efforts = []
     for n in range(1600):
         efforts += [asked] * (n % 2 == 0)
-        goal = target[(n - 3) // 2] if n >= 3 else 0.0
+        goal = float(target[(n - 3) // 2]) if n >= 3 else 0.0
         seen, asked = q, 40.0 * (goal - q) - 2.0 * (q - seen) * 2000.0
         for _ in range(50):
             v += DT_S * asked / 0.04
@@ -353,7 +353,7 @@ def test_torques_of_an_outer_loop_are_replayed_near_the_measured_position_and_fr
         for goal in goals.tolist():
             rows.append((q, asked := 2.0 * (goal - q) - 0.2 * v))
             for _ in range(500):
-                v += DT_S * (asked - 0.005 - friction_nm * np.sign(v)) / 0.02
+                v += DT_S * (asked - 0.005 - friction_nm * ((v > 0) - (v < 0))) / 0.02
                 q += DT_S * v
         measured, torques = np.array(rows).T
         made = {"target_kinds": ("torque",), "effort": torques}

@@ -157,30 +157,33 @@ def test_a_byte_of_ros_2_is_an_octet(tmp_path: Path, container: str) -> None:
     assert found == dict.fromkeys(("/list", "/six", "/within", "/array"), OCTETS)
 
 
-def test_a_byte_of_a_bag_without_definitions_is_an_octet(tmp_path: Path) -> None:
-    """Before ROS 2 Iron the definitions are those of the distribution."""
-    bag = write_bag(tmp_path / "bag", 2, rosbag2.StoragePlugin.SQLITE3)
-    with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as file:
-        file.execute("DELETE FROM message_definitions")
-        file.commit()
-    reader = readers.get("db3")(find_sources(bag)[0][1])
-    (message,) = reader.messages({"/array"})
-    assert message.value.data.tolist() == OCTETS
-
-
-def test_an_octet_of_idl_is_an_octet(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "bag", 2, rosbag2.StoragePlugin.SQLITE3)
-    idl = "module pads_msgs { module msg { struct List { sequence<octet> data; }; }; };"
-    head = f"{'=' * 80}\nIDL: pads_msgs/msg/List\n"
-    with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as file:
-        file.execute(
+@pytest.mark.parametrize(
+    ("change", "values", "topic"),
+    [
+        # Before ROS 2 Iron the definitions are those of the distribution.
+        ("DELETE FROM message_definitions", (), "/array"),
+        (
             "UPDATE message_definitions SET encoding = 'ros2idl', "
             "encoded_message_definition = ? WHERE topic_type = 'pads_msgs/msg/List'",
-            (head + idl,),
-        )
+            (
+                f"{'=' * 80}\nIDL: pads_msgs/msg/List\n"
+                "module pads_msgs { module msg { struct List { sequence<octet> data; }; "
+                "}; };",
+            ),
+            "/list",
+        ),
+    ],
+    ids=["without definitions", "IDL"],
+)
+def test_a_byte_of_a_bag_of_other_definitions_is_an_octet(
+    tmp_path: Path, change: str, values: tuple[str, ...], topic: str
+) -> None:
+    bag = write_bag(tmp_path / "bag", 2, rosbag2.StoragePlugin.SQLITE3)
+    with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as file:
+        assert file.execute(change, values).rowcount > 0
         file.commit()
     reader = readers.get("db3")(find_sources(bag)[0][1])
-    (message,) = reader.messages({"/list"})
+    (message,) = reader.messages({topic})
     assert message.value.data.tolist() == OCTETS
 
 

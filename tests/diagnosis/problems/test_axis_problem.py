@@ -81,12 +81,12 @@ def test_cases_side_by_side_are_those_one_by_one(slide: Measurements):
     cases += [cases[4], cases[9]]
     recordings = [*made.fit, *made.validation]
     together = made.simulate_all(cases, recordings)
-    for recording, those in zip(recordings, together, strict=True):
+    for those in together:
         assert len({answer.tobytes() for answer in those}) == 11
-        for case, answer in zip(cases, those, strict=True):
-            np.testing.assert_array_equal(
-                problem_of(AXIS, slide).simulate(*case, recording), answer
-            )
+    for k, case in enumerate(cases):
+        alone = problem_of(AXIS, slide)
+        for recording, those in zip(recordings, together, strict=True):
+            np.testing.assert_array_equal(alone.simulate(*case, recording), those[k])
 
 
 def test_beside_an_integral_which_takes_it_up_no_constant_force_is_fitted(
@@ -414,7 +414,7 @@ def unbalanced(
     target = amplitude_rad * np.sin(2 * np.pi * hz * time_s) * np.clip(time_s, 0, 1)
     at = -WEIGHT_NM * math.cos(LEVEL_RAD) / 80.0
     speed, goal, rows = 0.0, 0.0, []
-    for following in (*np.zeros(rate_hz), *target):  # a second of rest before
+    for following in [0.0] * rate_hz + target.tolist():  # a second of rest before
         rows.append((at, 80.0 * (goal - at) - 8.0 * speed))
         goal = following
         for _ in range(parts):
@@ -580,7 +580,7 @@ def of_a_sampled_loop(
         for _ in range(parts):
             stops = dt_s * friction_n(speed) / MASS_KG
             free = speed + dt_s * (force - damping * speed) / MASS_KG
-            speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            speed = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             at += dt_s * speed
     time_s, target = time_s[250:], target[250:]
     noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [
@@ -1114,10 +1114,10 @@ def of_a_servo(name: str, high_hz: float, seed: int, *, supply_v=7.4, resistance
         0.5 * np.sin(np.pi * high_hz * time_s**2 / 6) * np.clip(3 * time_s - 1, 0, 1)
     )
     goals[300:] = np.sign(goals[300:]) * 0.5
-    for k in range(600):
+    for goal in goals.tolist():
         rows.append(q)
         for _ in range(200):
-            duty = min(max(6.0 * (goals[k] - q) - 0.15 * v, -1.0), 1.0)
+            duty = min(max(6.0 * (goal - q) - 0.15 * v, -1.0), 1.0)
             torque = (
                 torque_nm_per_a
                 * (supply_v * duty - torque_nm_per_a * v)
@@ -1237,7 +1237,7 @@ def of_a_wheel(
                     speed + dt_s * (torque - 0.035 * speed) / 0.05,
                     dt_s * 0.18 / 0.05,
                 )
-                speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+                speed = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
                 at += dt_s * speed
     time_s = np.arange(len(target)) / 250
     position, effort = np.transpose(rows) + np.random.default_rng(len(name)).normal(

@@ -1,6 +1,7 @@
 """Numbers that change between recordings: planted by this test's own equations of a link on a hinge, not by the kernel."""
 
 import functools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def moved(
         for _ in range(PARTS):
             torque = gain * (KP * (goal - q) - KD * v) - viscous * v + constant
             free = v + step_s * torque / INERTIA
-            v = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            v = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             q += step_s * v
     return target, np.roll(rows, late_rows)
 

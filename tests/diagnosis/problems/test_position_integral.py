@@ -1,5 +1,7 @@
 """An integral in the position loop of a cascade, beside dry friction, is found; recordings by this test's own integration."""
 
+import math
+
 import numpy as np
 from axes import axis_of, problem_of
 from made_rows import of_signal
@@ -40,7 +42,7 @@ def recording(name: str, hz: float, seed: int) -> Measurement:
             total += DT_S * (goal - q)
             given = KD * (KP * (goal - q + RATE_PER_S * total) - v)
             free = v + DT_S * given / INERTIA
-            v = np.sign(free) * max(abs(free) - stops, 0.0)
+            v = math.copysign(max(abs(free) - stops, 0.0), free)
             q += DT_S * v
     position, effort = np.array(rows).T
     noise = np.random.default_rng(seed).standard_normal((2, len(rows)))
