@@ -427,7 +427,9 @@ class Fits:
         """Fit of the same hypothesis until it converges, with derivatives fine enough for its intervals. Numbers that go on
         moving while χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
         self.progress("last refit, with finer derivatives")
-        fine = self._fine(out_of_dents(self.problem, model, self.fit_to, STEPS))
+        if model.error > self.config.floor:
+            model = out_of_dents(self.problem, model, self.fit_to, STEPS)
+        fine = self._fine(model)
         if fine.trouble:
             further = self._fine(fine)
             fell = (
@@ -618,6 +620,16 @@ class Fits:
             if fled
             else ""
         )
+
+    def simplified(self, model: Model) -> tuple[str, ...]:
+        """The effects of ``model`` with simpler ones in place of those that practically
+        equal them; empty if none does."""
+        found = list(model.names)
+        for c in chosen(self.problem, self.added(model)):
+            same = [n for n in c.cls.reduces_to if n in self.problem.candidates]
+            if same and _simpler_form(c, model.fit.values):
+                found[found.index(c.name)] = same[0]
+        return () if found == [*model.names] else tuple(dict.fromkeys(found))
 
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
