@@ -368,7 +368,10 @@ def test_a_solver_of_few_rows_ends_where_one_of_all_rows_ends():
 
     def residuals_of(points):
         return np.array(
-            [p["size"] * np.exp(-p["rate"] * t) + p["offset"] - measured for p in points]
+            [
+                p["size"] * np.exp(-p["rate"] * t) + p["offset"] - measured
+                for p in points
+            ]
         )
 
     layout = (Rows(np.ones((len(t), 1), dtype=bool), 1000.0, False),)
