@@ -34,7 +34,7 @@ to its top."""
 TIGHT, LOOSE = 1e-5, 1e-3
 """Relative fall of the squared residuals below which a fit ends; the loose one while
 hypotheses are compared."""
-LEFT_OVER = 1.5
+LEFT_OVER = 1.3
 """RMS residual [floors] from which on the rest counts as an effect that the model lacks:
 below it, as noise."""
 ENTRIES_LEFT_OVER = 4
