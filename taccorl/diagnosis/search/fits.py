@@ -349,6 +349,7 @@ class Fits:
 
         first_refits(names)
         forms = {f for n in leading() for f in simple_forms(candidates[n].cls)}
+        forms |= {f for n in leading() for f in self._simpler_twins(n)}
         first_refits([f for f in order if f in forms and f not in short])
         names = list(short)
         left = min((f.error**2 for f in short.values()), default=0.0)
@@ -372,6 +373,15 @@ class Fits:
                 self._keep(self._full(parent.fit, n, began), full=True)
             else:
                 self._keep(short[n], full=False)
+
+    def _simpler_twins(self, name: str) -> list[str]:
+        """Effects like ``name`` with fewer fitted numbers, which a weak start may hide."""
+        candidates = self.problem.candidates
+        numbers = {
+            n: sum(not f.optional for f in c.frees) for n, c in candidates.items()
+        }
+        twins = [n for n in candidates[name].cls.near_twins if n in numbers]
+        return [n for n in twins if 0 < numbers[n] < numbers[name]]
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
         """``parent`` with one effect more, after a few steps for each of its numbers; one
