@@ -32,7 +32,7 @@ to its top."""
 TIGHT, LOOSE = 1e-5, 1e-3
 """Relative fall of the squared residuals below which a fit ends; the loose one while
 hypotheses are compared."""
-LEFT_OVER = 1.5
+LEFT_OVER = 1.3
 """RMS residual [floors] from which on the rest counts as an effect that the model lacks:
 below it, as noise."""
 ENTRIES_LEFT_OVER = 4
@@ -284,6 +284,7 @@ def minimise(
     inside = 1e-6 * (high - low)
     first = np.clip(first, low + inside, high - inside)
     newest: dict[bytes, np.ndarray] = {}
+    newest_slopes: list[np.ndarray] = []  # residuals and derivatives
 
     def at(coordinates: np.ndarray) -> Values:
         return {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
@@ -315,6 +316,24 @@ def minimise(
         ends = np.array([newest[point.tobytes()] for point in points])
         return ((ends - here) / ways(coordinates)[:, None]).T
 
+    # SciPy decomposes what it is given in every step. So it gets p + 1 rows with the same
+    # JᵀJ, Jᵀr and |r| in place of n: in the direction of r, and a triangle for the rest.
+
+    def size(coordinates: np.ndarray) -> np.ndarray:
+        residual = np.zeros(len(frees) + 1)
+        residual[0] = np.linalg.norm(measured(coordinates))
+        return residual
+
+    def triangle(coordinates: np.ndarray) -> np.ndarray:
+        here = measured(coordinates)
+        newest_slopes[:] = [here, slopes(coordinates)]
+        direction = here / max(np.linalg.norm(here), 1e-300)
+        along = direction @ newest_slopes[1]
+        rest = np.linalg.qr(newest_slopes[1] - np.outer(direction, along), mode="r")
+        found = np.zeros((len(frees) + 1, len(frees)))
+        found[0], found[1 : 1 + len(rest)] = along, rest
+        return found
+
     if len(frees) == 0:
         here = measured(first)
         return Solution(
@@ -329,9 +348,9 @@ def minimise(
     # SciPy's first step is at most as long as the start is far from 0: all coordinates start at 1 there.
     shift = first - 1.0
     found = least_squares(
-        lambda u: measured(u + shift),
+        lambda u: size(u + shift),
         first - shift,
-        jac=lambda u: slopes(u + shift),  # pyright: ignore[reportArgumentType]
+        jac=lambda u: triangle(u + shift),  # pyright: ignore[reportArgumentType]
         bounds=(low - shift, high - shift),
         max_nfev=most,
         ftol=tolerance,
@@ -342,9 +361,9 @@ def minimise(
     values = at(ended)
     return Solution(
         values=values,
-        residuals=found.fun,
+        residuals=newest_slopes[0],
         layout=tuple(layout),
-        jacobian=found.jac,
+        jacobian=newest_slopes[1],
         frees=tuple(frees),
         at_bound=tuple(f.name for f in frees if f.is_at_end(values[f.name])),
         trouble=""

@@ -313,7 +313,7 @@ def _ties(of: _Part) -> list[Fact]:
     led, n = of.seen.led
     simpler = simpler_twin(d)
     return [
-        *(fact("tie", other=o, effect=e) for e in new for o in d.rivals.get(e, ())),
+        *(_tie(d, o, e) for e in new for o in d.rivals.get(e, ())),
         *(fact("tie_clock", columns=LATE[e], effect=e) for e in new if e in LATE),
         *(fact("tie_place", body=body) for body in d.or_in),
         *(
@@ -332,6 +332,18 @@ def _ties(of: _Part) -> list[Fact]:
         *when(simpler, "may_be_two", **simpler),
         *when(of.is_short and new, "stands_in", effects=new),
     ]
+
+
+def _tie(d: Diagnosis, other: str, effect: str) -> Fact:
+    """That ``other`` in place of ``effect`` leaves as much, or how much more it leaves."""
+    names = tuple(other if n == effect else n for n in added(d))
+    after = d.errors["after"]["validation"]
+    left = [o.errors["validation"] for o in d.offers if o.added == names]
+    for error in left:
+        more = max(error, 1.0) ** 2 / max(after, 1.0) ** 2 - 1.0
+        if more > SearchConfig().min_gain:
+            return fact("tie_more", other=other, effect=effect, more=more, error=error)
+    return fact("tie", other=other, effect=effect)
 
 
 def _doubts(of: _Part) -> list[Fact]:

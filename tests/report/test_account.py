@@ -21,6 +21,7 @@ from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import (
     Changed,
     Diagnosis,
+    Offer,
     SearchConfig,
     gains_nothing,
     of_test,
@@ -265,6 +266,28 @@ def _(one, nothing, short):
 @case("not_converged", "trouble")
 def _(one, nothing, short):
     return changed(nothing, status="not_converged", trouble="still moving"), Seen()
+
+
+def with_rival(one, ratio: float) -> Diagnosis:
+    """Coulomb friction, 1.2 floors, and asymmetric friction, ``ratio`` times as many."""
+    d = named(one, "coulomb_friction", torque_nm=0.25)
+    offer = Offer(
+        added=("asymmetric_friction",),
+        effects=(),
+        base={},
+        intervals={},
+        errors={"fit": 1.2, "validation": 1.2 * ratio},
+        at_bound=(),
+        undetermined=(),
+    )
+    errors = {**d.errors, "after": {**d.errors["after"], "validation": 1.2}}
+    rivals = {"coulomb_friction": offer.added}
+    return changed(d, rivals=rivals, offers=(offer,), errors=errors)
+
+
+@case("tie_more")
+def _(one, nothing, short):
+    return with_rival(one, 1.55**0.5), Seen()
 
 
 @case("ties", "tie", "record_efforts")
@@ -926,6 +949,16 @@ def test_no_motion_is_planned_for_a_part_whose_position_is_its_input(
     )
     report = Report(title="made", comparison=replays, found=[found(d)])
     assert bool(report.accounts()[PART].command) == has_command
+
+
+@pytest.mark.parametrize(
+    ("ratio", "id"), [(1.0, "tie"), (1.03, "tie"), (1.55**0.5, "tie_more")]
+)
+def test_a_rival_that_leaves_more_is_not_called_equal(one, ratio: float, id: str):
+    ties = [f for f in account(PART, with_rival(one, ratio)).facts if "tie" in f.id]
+    assert [f.id for f in ties if f.id != "ties"] == [id]
+    if id == "tie_more":
+        assert ties[-1].values["more"] == pytest.approx(0.55)
 
 
 def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_refuses(

@@ -168,10 +168,10 @@ def check_clock(t: Trial) -> Iterator[Finding]:
             )
         elif fit.delay_s - SURE * fit.delay_sd_s > LATE_ROWS * row_s:
             text = (
-                f"{name} answers its target after a delay of {delay} ({fit.delay_s / row_s:.1f} rows), then with a lag "
-                f"of {fit.time_constant_s * 1e3:.0f} ms: a real delay or a clock offset, which positions cannot tell apart. "
-                "If the clocks are known to agree, it is a delay (effects command_delay, sensor_delay); else compare them "
-                "or log both by one clock"
+                f"{name} answers its target {fit.delay_s * 1e3:.1f} ms ({fit.delay_s / row_s:.1f} rows) later than a lag of "
+                f"{fit.time_constant_s * 1e3:.0f} ms does: by its inertia and by a real delay or a clock offset, which "
+                "positions cannot tell apart. If the clocks are known to agree, diagnose fits the delay (effects "
+                "command_delay, sensor_delay) beside the inertia; else compare them or log both by one clock"
             )
             yield find("late_answer", name, text)
     if not judged:

@@ -277,7 +277,7 @@ class ArmJoint(RigidJoint):
             ).compile()
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
             q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
-            needed, carried, _ = torque_along(model, q, m.period_s)
+            needed, carried = torque_along(model, q, m.period_s)
             both.append((needed - carried)[:, model.joint(self.signal).dofadr[0]])
         return both[0] - both[1]
 

@@ -4,6 +4,7 @@ Letters in shapes: T rows, N numbers of a pose.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -198,6 +199,19 @@ def _seen(m: Measurement, signal: str) -> np.ndarray:
     return m.measured[:, j] if np.isfinite(m.measured[:, j]).any() else _planned(m, j)
 
 
+@lru_cache(maxsize=32)  # their design takes longer than their use
+def _filters(
+    rows: int, rate_hz: float, bands_hz: tuple[float, ...]
+) -> tuple[list[np.ndarray], list[float]]:
+    """Low-pass filters, and the share of white noise that passes between two of them."""
+    filters = [butter(2, min(f / (rate_hz / 2), 0.8), output="sos") for f in bands_hz]
+    one = np.eye(1, rows, rows // 2)[0]
+    padding = {"padtype": "odd", "padlen": min(9, rows - 1)}
+    passed = [sosfiltfilt(sos, one, **padding) for sos in filters]
+    pairs = itertools.pairwise(passed)
+    return filters, [float(np.sum((wide - low) ** 2)) for low, wide in pairs]
+
+
 def _smooth(
     angles: np.ndarray, rate_hz: float, bands_hz: Sequence[float]
 ) -> np.ndarray:
@@ -209,22 +223,15 @@ def _smooth(
         if seen.any()
         else np.zeros(len(angles))
     )
-    one = np.eye(1, len(rows), len(rows) // 2)[0]
-    filters = [butter(2, min(f / (rate_hz / 2), 0.8), output="sos") for f in bands_hz]
+    filters, shares = _filters(len(rows), rate_hz, tuple(bands_hz))
     ends, beyond = (
         ("even", round(rate_hz / bands_hz[0])) if bands_hz == _LEFT_HZ else ("odd", 9)
     )
     beyond = min(beyond, len(rows) - 1)
-    below, passed = (
-        [sosfiltfilt(sos, x, padtype=ends, padlen=beyond) for sos in filters]
-        for x in (whole, one)
-    )
+    below = [sosfiltfilt(sos, whole, padtype=ends, padlen=beyond) for sos in filters]
     found, white = below[0], -1.0
     for k in reversed(range(1, len(filters))):
-        band, share = (
-            below[k] - below[k - 1],
-            float(np.sum((passed[k] - passed[k - 1]) ** 2)),
-        )
+        band, share = below[k] - below[k - 1], shares[k - 1]
         power = uniform_filter1d(band**2, max(3, round(_FAST_S * rate_hz)))
         white = float(np.median(power)) / max(share, 1e-12) if white < 0.0 else white
         found = (

@@ -73,7 +73,8 @@ class MassTorque(NamedTuple):
     def of(self, one: PointMass) -> np.ndarray:
         """(T,) torque [N·m] for one mass in that body."""
         at = np.array(one.place_m)
-        square = np.sum(self.square * (np.outer(at, at) + one.spread_m2), axis=(1, 2))
+        squares = (np.outer(at, at) + one.spread_m2).ravel()
+        square = self.square.reshape(-1, 9) @ squares
         return one.mass_kg * (self.constant + self.linear @ at + square)
 
 
@@ -282,27 +283,42 @@ def _levers(
 
 def torque_along(
     model: mujoco.MjModel, positions: np.ndarray, period_s: float, still: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Inverse dynamics without armature for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart, at rest at both
-    ends (``still``: everywhere). Returns (T, nv) torques [N·m] at all joints, (T, nv) the part of them that the gravity
-    compensation supplies, and (T, nv, nv) the mass matrix [kg·m²]."""
-    velocities, accelerations = rates(positions, np.inf if still else period_s)
-    torque, carried = np.empty((2, len(positions), model.nv))
+    ends (``still``: everywhere). Returns (T, nv) torques [N·m] at all joints, and (T, nv) the part of them that the gravity
+    compensation supplies."""
+    data, (velocities, accelerations) = (
+        mujoco.MjData(model),
+        rates(positions, np.inf if still else period_s),
+    )
+    torque, carried = np.zeros((2, len(positions), model.nv))
+    compensates = bool(model.body_gravcomp.any())
+    q, v, a = data.qpos, data.qvel, data.qacc
+    for row in range(len(positions)):
+        q[:], v[:], a[:] = positions[row], velocities[row], accelerations[row]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_rne(model, data, 1, torque[row])
+        if compensates:
+            mujoco.mj_passive(model, data)
+            carried[row] = data.qfrc_gravcomp
+    return torque, carried
+
+
+def masses_along(model: mujoco.MjModel, positions: np.ndarray) -> np.ndarray:
+    """(T, nv, nv) mass matrices [kg·m², kg] at ``positions`` (T, nq)."""
+    data = mujoco.MjData(model)
     masses = np.empty((len(positions), model.nv, model.nv), np.float32)
     mass = np.empty((model.nv, model.nv))
-    data = mujoco.MjData(model)  # of whose fields an access costs a tenth of a row
-    qpos, qvel, qacc, gravcomp = data.qpos, data.qvel, data.qacc, data.qfrc_gravcomp
-    for row, motion in enumerate(
-        zip(positions, velocities, accelerations, strict=True)
-    ):
-        qpos[:], qvel[:], acceleration = motion
-        mujoco.mj_forward(model, data)
-        qacc[:] = acceleration
-        mujoco.mj_rne(model, data, 1, torque[row])
-        carried[row] = gravcomp
+    for row, position in enumerate(positions):
+        data.qpos[:] = position
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_makeM(model, data)
         mujoco.mj_fullM(model, data, mass)
         masses[row] = mass
-    return torque, carried, masses
+    return masses
 
 
 def mass_torque_along(
@@ -322,14 +338,16 @@ def mass_torque_along(
     jac, dot = np.zeros((2, len(positions), 2, 3, model.nv))
     rotation = np.empty((len(positions), 3, 3))
     velocities, accelerations = rates(positions, period_s)
-    for row, (q, v) in enumerate(zip(positions, velocities, strict=True)):
-        data.qpos[:], data.qvel[:] = q, v
+    qpos, qvel = data.qpos, data.qvel
+    place, turn = data.xpos[body], data.xmat[body].reshape(3, 3)
+    for row in range(len(positions)):
+        qpos[:], qvel[:] = positions[row], velocities[row]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
-        mujoco.mj_jac(model, data, *jac[row], data.xpos[body], body)
-        mujoco.mj_jacDot(model, data, *dot[row], data.xpos[body], body)
-        rotation[row] = data.xmat[body].reshape(3, 3)
+        mujoco.mj_jac(model, data, jac[row, 0], jac[row, 1], place, body)
+        mujoco.mj_jacDot(model, data, dot[row, 0], dot[row, 1], place, body)
+        rotation[row] = turn
     v, a = velocities[:, None, :, None], accelerations[:, None, :, None]
     origin, turn = np.moveaxis((jac @ a + dot @ v)[..., 0], 1, 0)
     origin = origin - gravity_mps2

@@ -6,7 +6,7 @@ import hashlib
 import math
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import mujoco
@@ -31,6 +31,7 @@ from taccorl.alignment.controller.rigid_joint import (
     Rigid,
     RigidJoint,
     mass_torque_along,
+    masses_along,
     rates,
     rigid_terms,
     torque_along,
@@ -221,15 +222,22 @@ class RobotJoint(RigidJoint):
             free_inertia=max(self._free_inertia(masses), least),
         )
 
-    def _free_inertia(self, masses: Sequence[PointMass]) -> float:
-        """``Rigid.free_inertia`` with point masses."""
-        model, joints = self._robot.rigid.model, self._robot.config.joints
+    @cached_property
+    def _at_zero(self) -> tuple[mujoco.MjData, np.ndarray]:
+        """The model at its zero pose, and its mass matrix (nv, nv) there with rotors."""
+        model = self._robot.rigid.model
         data, mass = mujoco.MjData(model), np.empty((model.nv, model.nv))
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, mass)
-        for name, joint in joints.items():
+        for name, joint in self._robot.config.joints.items():
             dof = model.joint(name).dofadr[0]
             mass[dof, dof] += joint.armature
+        return data, mass
+
+    def _free_inertia(self, masses: Sequence[PointMass]) -> float:
+        """``Rigid.free_inertia`` with point masses."""
+        model, (data, empty) = self._robot.rigid.model, self._at_zero
+        mass = empty.copy()
 
         def lever(one: PointMass, by: np.ndarray) -> np.ndarray:
             """(3, nv) Jacobian of a point beside the mass, by so much in its body's frame."""
@@ -580,8 +588,7 @@ class RobotJoint(RigidJoint):
         if along is None or along.moving <= {self.signal}:
             rest = needed_along(self._robot, np.tile(pose, (2, 1)), 1.0)
             needed, carried = (
-                np.full(m.num_rows, values[0, dof] if slide else 0.0)
-                for values in rest[:2]
+                np.full(m.num_rows, values[0, dof] if slide else 0.0) for values in rest
             )
             return needed, carried
         terms, q = self._terms(pose), along.positions[:, joint.qposadr[0]]
@@ -617,13 +624,13 @@ class Along(NamedTuple):
 
 def needed_along(
     robot: "Robot", positions: np.ndarray, period_s: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``torque_along`` of ``positions`` (T, nq) with the robot's own gravity: twice (T, nv), and (T, nv, nv)."""
-    needed, carried, masses = torque_along(robot.rigid.model, positions, period_s)
+) -> tuple[np.ndarray, np.ndarray]:
+    """``torque_along`` of ``positions`` (T, nq) with the robot's own gravity: twice (T, nv)."""
+    needed, carried = torque_along(robot.rigid.model, positions, period_s)
     if (more := robot.more_gravity).any():
         leaned = under_gravity(robot.rigid.model, more)
         needed += torque_along(leaned, positions, period_s, still=True)[0]
-    return needed, carried, masses
+    return needed, carried
 
 
 def moved_together(robot: "Robot", m: Measurement) -> Along | None:
@@ -691,14 +698,17 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         q[:, model.joint(name).qposadr[0]] = (
             CubicSpline(rows, values)(times) if fine > 1 else values
         )
-    needed, carried, masses = needed_along(robot, q, m.period_s / fine)
+    needed, carried = needed_along(robot, q, m.period_s / fine)
+    # They hardly change between two rows, and only guide the sweeps.
+    masses = np.repeat(masses_along(model, q[::fine] if driven else q[:0]), fine, 0)
     found = Along(frozenset(angles), q, needed, carried)
-    models = {name: JointModel(RobotJoint(robot, name, along=found)) for name in driven}
-    motions = {name: motion_of(m, name, one.joint) for name, one in models.items()}
+    joints = {name: RobotJoint(robot, name, along=found) for name in driven}
+    models = {name: JointModel(joint) for name, joint in joints.items()}
+    motions = {name: motion_of(m, name, joint) for name, joint in joints.items()}
     # Four Gauss–Seidel sweeps, a choice: each removes two thirds of the error.
     for name in driven * 4:
         one, moved, joint = models[name], motions[name], model.joint(name)
-        coupling, carrying = RobotJoint(robot, name)._coupling(m, moved.pose, found)
+        coupling, carrying = joints[name]._coupling(m, moved.pose, found)
         coupling = coupling + one.joint.moving_masses_nm(moved, one.joint.effects(()))
         moved = dataclasses.replace(
             moved, coupling_nm=coupling, carrying_nm=carrying, positions=None
@@ -712,6 +722,6 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
         more = rates(q[:, joint.qposadr[0]] - before, m.period_s / fine)[1]
         needed += masses[:, :, joint.dofadr[0]] * more[:, None]
     needed, carried = (
-        needed_along(robot, q, m.period_s / fine)[:2] if driven else (needed, carried)
+        needed_along(robot, q, m.period_s / fine) if driven else (needed, carried)
     )
     return Along(frozenset(angles), q, needed, carried) if angles else None

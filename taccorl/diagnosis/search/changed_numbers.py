@@ -15,8 +15,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from taccorl.alignment.controller.drive_law import SHORTEST_STEP_S
+from taccorl.alignment.least_squares import LOOSE
 from taccorl.diagnosis.search.fit import Fit, best_fit
-from taccorl.diagnosis.search.fits import STEPS, Fits, Model, model_of, refusal
+from taccorl.diagnosis.search.fits import (
+    FIRST_STEPS,
+    NEAR_BEST,
+    STEPS,
+    SURELY_FULL,
+    Fits,
+    Model,
+    model_of,
+    refusal,
+)
 from taccorl.diagnosis.search.problem import (
     EFFORT_SCALE,
     Free,
@@ -173,12 +183,18 @@ def _instead(fits: Fits, model: Fit, f: Free) -> tuple[str, ...]:
 
 
 def _refitted(
-    fits: Fits, model: Fit, problem: Problem, starts: Sequence[Values] = ()
+    fits: Fits,
+    model: Fit,
+    problem: Problem,
+    starts: Sequence[Values] = (),
+    short: bool = False,
 ) -> Model:
     """The effects of ``model`` refitted to the same recordings with the free and held
-    numbers of another ``problem``."""
-    began = starts or [model.values, model.values | fits.given]
-    found = best_fit(problem, fits.fit_to, model.names, began, STEPS)
+    numbers of another ``problem``; ``short``: by a few steps only."""
+    began, most = starts or [model.values, model.values | fits.given], STEPS
+    if short:
+        most = FIRST_STEPS
+    found = best_fit(problem, fits.fit_to, model.names, began, most, LOOSE)
     return model_of(problem, found, fits.validation)
 
 
@@ -204,7 +220,7 @@ def _fewest(
         ):
             groups.append(frees)
 
-    def trial(*taken: list[Free]) -> Model:
+    def trial(*taken: list[Free], short: bool = False) -> Model:
         free = {f.name: given[f.name] for frees in taken for f in frees}
         problem = with_held(
             fits.problem, {f.name: given[f.name] for f in every if f.name not in free}
@@ -214,9 +230,21 @@ def _fewest(
             n: v for n, v in model.values.items() if n in timing or n not in given
         }
         near = [
-            model.values | given | {n: k * v for n, v in free.items()} for k in NEAR
+            model.values | given | {n: k * v for n, v in free.items()}
+            for k in (NEAR[:1] if short or not free else NEAR)
         ]
-        return _refitted(fits, model, problem, [begun, *near])
+        return _refitted(fits, model, problem, [begun, *near], short)
+
+    def trials(*taken: list[Free]) -> list[tuple[Model, list[Free]]]:
+        """Models with one group more; fitted until they converge where they may be the best."""
+        rest = [frees for frees in groups if frees not in taken]
+        first = [(trial(*taken, frees, short=True), frees) for frees in rest]
+        first.sort(key=lambda pair: pair[0].error)
+        enough = NEAR_BEST * max(first[0][0].error, 1.0)
+        return [
+            (trial(*taken, f), f) if k < SURELY_FULL or m.error <= enough else (m, f)
+            for k, (m, f) in enumerate(first)
+        ]
 
     answer, taken, tried, smaller = (
         fits.model_of(model),
@@ -229,10 +257,7 @@ def _fewest(
         if len(taken) == 2:
             return None
         fits.progress("which number of the file is off")
-        before, tried = (
-            smaller,
-            [(trial(*taken, frees), frees) for frees in groups if frees not in taken],
-        )
+        before, tried = smaller, trials(*taken)
         smaller, own = min(tried, key=lambda pair: pair[0].error)
         taken.append(own)
     if not taken:

@@ -349,6 +349,7 @@ class Fits:
 
         first_refits(names)
         forms = {f for n in leading() for f in simple_forms(candidates[n].cls)}
+        forms |= {f for n in leading() for f in self._simpler_twins(n)}
         first_refits([f for f in order if f in forms and f not in short])
         names = list(short)
         left = min((f.error**2 for f in short.values()), default=0.0)
@@ -372,6 +373,15 @@ class Fits:
                 self._keep(self._full(parent.fit, n, began), full=True)
             else:
                 self._keep(short[n], full=False)
+
+    def _simpler_twins(self, name: str) -> list[str]:
+        """Effects like ``name`` with fewer fitted numbers, which a weak start may hide."""
+        candidates = self.problem.candidates
+        numbers = {
+            n: sum(not f.optional for f in c.frees) for n, c in candidates.items()
+        }
+        twins = [n for n in candidates[name].cls.near_twins if n in numbers]
+        return [n for n in twins if 0 < numbers[n] < numbers[name]]
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
         """``parent`` with one effect more, after a few steps for each of its numbers; one
@@ -427,7 +437,9 @@ class Fits:
         """Fit of the same hypothesis until it converges, with derivatives fine enough for its intervals. Numbers that go on
         moving while χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
         self.progress("last refit, with finer derivatives")
-        fine = self._fine(out_of_dents(self.problem, model, self.fit_to, STEPS))
+        if model.error > self.config.floor:
+            model = out_of_dents(self.problem, model, self.fit_to, STEPS)
+        fine = self._fine(model)
         if fine.trouble:
             further = self._fine(fine)
             fell = (
@@ -618,6 +630,16 @@ class Fits:
             if fled
             else ""
         )
+
+    def simplified(self, model: Model) -> tuple[str, ...]:
+        """The effects of ``model`` with simpler ones in place of those that practically
+        equal them; empty if none does."""
+        found = list(model.names)
+        for c in chosen(self.problem, self.added(model)):
+            same = [n for n in c.cls.reduces_to if n in self.problem.candidates]
+            if same and _simpler_form(c, model.fit.values):
+                found[found.index(c.name)] = same[0]
+        return () if found == [*model.names] else tuple(dict.fromkeys(found))
 
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of

@@ -266,6 +266,15 @@ def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_canno
         assert len(every) == said * len(set(every))
 
 
+@pytest.mark.parametrize("delay_ms", [12.0, 18.2, 24.0, 31.0])
+def test_a_late_answer_states_no_interval_that_the_inertia_s_share_breaks(delay_ms):
+    """Inertia over damping delays a motion as a delay does, by some milliseconds."""
+    m = sweep(0, joints=[1], delay_s=1e-3 * delay_ms)
+    text = text_of(m, "late_answer")
+    late_ms = float(re.search(r"target ([0-9.]+) ms", text).group(1))
+    assert delay_ms - 0.5 < late_ms < delay_ms + 10.0 and "±" not in text
+
+
 @pytest.mark.parametrize("late_s", [0.2, 0.5, 1.5])
 @pytest.mark.parametrize("friction_nm", [0.0, 1.0])
 def test_positions_far_too_late_are_told_in_all_recordings_or_in_the_one(

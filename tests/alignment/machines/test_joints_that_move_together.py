@@ -9,6 +9,7 @@ from simulated_slide import robot_machine
 
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.controller.rigid_joint import masses_along, rates, torque_along
 from taccorl.alignment.measurements.measurement import Measurement
 
 ARM = """<mujoco><option timestep="0.0001" integrator="implicitfast"/><worldbody>
@@ -73,3 +74,25 @@ def test_a_joint_that_is_later_than_its_file_says_is_a_better_known_load_than_by
     """1.45 with loads by the positions of rows."""
     off = left(tmp_path, steps(late_rows=4), "fore")
     assert np.sqrt(np.mean(off**2)) < 1.25
+
+
+def test_torques_and_masses_along_a_motion_are_those_of_mujoco_s_inverse_dynamics():
+    """M q̈ + c(q, q̇) − compensation row by row, with the rotors in the mass matrix alone."""
+    lifted = ARM.replace('<body pos="0.3 0 0">', '<body pos="0.3 0 0" gravcomp="0.4">')
+    model = mujoco.MjModel.from_xml_string(lifted)
+    time_s = np.linspace(0.0, 1.0, 201)
+    positions = np.column_stack([0.4 * np.sin(5 * time_s), 0.7 * np.cos(3 * time_s)])
+    needed, carried = torque_along(model, positions, 0.005)
+    masses = masses_along(model, positions)
+    velocities, accelerations = rates(positions, 0.005)
+    data = mujoco.MjData(model)
+    for row in (1, 50, 137):
+        data.qpos[:], data.qvel[:] = positions[row], velocities[row]
+        data.qacc[:] = accelerations[row]
+        mujoco.mj_inverse(model, data)
+        rotors = model.dof_armature * accelerations[row]
+        torque = data.qfrc_inverse + data.qfrc_passive - rotors
+        np.testing.assert_allclose(needed[row], torque, atol=1e-9)
+        np.testing.assert_allclose(carried[row], data.qfrc_gravcomp, atol=1e-9)
+        moved = masses[row] @ accelerations[row] + data.qfrc_bias - rotors
+        np.testing.assert_allclose(moved, needed[row], atol=1e-4)

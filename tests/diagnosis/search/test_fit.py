@@ -5,7 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 from made_problem import MadeProblem, Ripple, Square, drive, record
+from scipy.optimize import least_squares
 
+from taccorl.alignment.least_squares import minimise
+from taccorl.alignment.measurements.correlation import Rows
 from taccorl.diagnosis.search.evidence import (
     Blocks,
     bic_gain,
@@ -354,3 +357,29 @@ def test_a_group_without_which_a_number_is_hardly_known_does_not_count_for_it():
     steep = np.repeat([10.0, 1.0, 1.0, 1.0], 10)[:, None]
     groups = [np.repeat(np.arange(4), 10) == k for k in range(4)]
     assert _scatter(steep, left, groups) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_solver_of_few_rows_ends_where_one_of_all_rows_ends():
+    """An exponential of 3000 rows: SciPy with all of them, and ``minimise`` with p + 1."""
+    rng, t = np.random.default_rng(4), np.linspace(0.0, 3.0, 3000)
+    measured = 2.0 * np.exp(-1.3 * t) + 0.4 + 0.02 * rng.normal(size=len(t))
+    names = ("size", "rate", "offset")
+    frees = [Free(name=n, unit="1", start=1.0, low=-9.0, high=9.0) for n in names]
+
+    def residuals_of(points):
+        return np.array(
+            [
+                p["size"] * np.exp(-p["rate"] * t) + p["offset"] - measured
+                for p in points
+            ]
+        )
+
+    layout = (Rows(np.ones((len(t), 1), dtype=bool), 1000.0, False),)
+    found = minimise(residuals_of, frees, {}, layout, at_once=2, step=1e-6)
+    all_rows = least_squares(
+        lambda x: residuals_of([dict(zip(names, x, strict=True))])[0], np.ones(3)
+    )
+    values = [found.values[n] for n in names]
+    np.testing.assert_allclose(values, all_rows.x, rtol=1e-5)
+    np.testing.assert_allclose(found.residuals, all_rows.fun, atol=1e-5)
+    np.testing.assert_allclose(found.jacobian, all_rows.jac, atol=1e-4)

@@ -345,6 +345,18 @@ def test_both_effects_between_which_the_first_one_lies_take_its_place_before_oth
     assert set(alone.names) == {"ripple", "bumps"}
 
 
+@pytest.mark.parametrize(("idle", "names"), [(0.52, ("ripple", "square")), (1.0, ())])
+def test_an_effect_that_practically_equals_a_simpler_one_is_tried_as_that(idle, names):
+    """``between`` equals a ripple at idle = 0.5, the end of its range."""
+    fit, validation, _ = made(Ripple(strength=3.0))
+    problem = MadeProblem(Ripple, Square, Between)
+    one = fits.Fits(problem, fit, validation, {}, (), SearchConfig(), lambda text: None)
+    model = one.whole(("between", "square"), {})
+    values = model.fit.values | {"between.idle": idle}
+    model.fit = dataclasses.replace(model.fit, values=values)
+    assert one.simplified(model) == names
+
+
 class Driven(MadeProblem):
     """The first number is a gain that the twin states."""
 
