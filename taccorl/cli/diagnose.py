@@ -145,8 +145,7 @@ def run(config: DiagnoseConfig) -> int:
     lines = [disagree] if disagree else []
     if config.until == "noise_floor":
         mended.save(path := config.out / mended.file_name)
-        whole = ", ".join([*machine.changes_as_a_whole(found), mended.saved_words])
-        lines = [f"wrote {path}: {whole}", *lines]
+        lines = [f"wrote {path}: {mended.saved_words}", *lines]
     show(Section(text=[*refused, *clocks]), written, Section(text=lines))
     if stopped_by == signal.SIGTERM:
         return 128 + stopped_by
@@ -286,9 +285,7 @@ def _next(config: DiagnoseConfig, report: "Report", machine: "Machine") -> "list
         parts = [f.part for f in found]
         return [fact("next", command=compare_words(own, parts, config.twin, path))]
     whole = dataclasses.replace(config, until="noise_floor")
-    if machine.changes_as_a_whole(found) or any(
-        f.diagnosis.status == "too_many" for f in found
-    ):
+    if any(f.diagnosis.status == "too_many" for f in found):
         words = command("diagnose", whole, "measurements")
         return [fact("next", command=shlex.join(words))]
     names: dict[str, list[str]] = {}
