@@ -463,7 +463,7 @@ class RobotMachine(Machine):
         }
         d = {part: f.diagnosis for part, f in group.items()}
         found = shared_fit(problems, d, stands_for, self._tilt())
-        if found.worse or found.fit.at_bound:
+        if found.worse or any(n.startswith("gravity.") for n in found.fit.at_bound):
             if len(group) == 1:
                 return findings
             return self.without_shared(findings, group, stands_for, "gravity", how[2])
