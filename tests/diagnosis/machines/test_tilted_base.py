@@ -17,7 +17,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
-from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.machines.robot import GRAVITY, RobotMachine
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError
 from taccorl.report.account import account
@@ -324,3 +324,8 @@ def test_a_tilt_in_a_search_is_the_gravity_of_a_file(tmp_path: Path) -> None:
         searched, stated, upright = answers
         most = np.abs(stated - upright).max()
         assert most > 0.1 and np.abs(searched - stated).max() < 0.01 * most, name
+    found = dict(zip(GRAVITY, down, strict=True))
+    written = robot.with_additions([Addition("pan", [], found, {})])
+    assert written.robot.config.gravity == [*down]
+    for name, value in found.items():
+        assert written.numbers("lift")[name] == (pytest.approx(value), "1")
