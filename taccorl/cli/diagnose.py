@@ -248,8 +248,7 @@ def _saved(
     lines = [*map(str, write_report(report, folder, replaced).text)]
     if file is not None:
         mended.save(file)
-        whole = [*mended.changes_as_a_whole(report.found), mended.saved_words]
-        lines.append(f"wrote {file}: {', '.join(whole)}")
+        lines.append(f"wrote {file}: {mended.saved_words}")
     return lines
 
 
@@ -300,9 +299,7 @@ def _next(
     if file is not None:
         parts = [f.part for f in found]
         return [fact("next", command=compare_words(words, parts, twin, file))]
-    if machine.changes_as_a_whole(found) or any(
-        f.diagnosis.status == "too_many" for f in found
-    ):
+    if any(f.diagnosis.status == "too_many" for f in found):
         return [fact("next", command=shlex.join([*words, "--until=noise_floor"]))]
     names: dict[str, list[str]] = {}
     largest_first = sorted(

@@ -117,7 +117,6 @@ class RigidJoint(ABC):
         "kp",
         "kd",
     )  # Gains that a recording can state and a fit can determine
-    holds_torque_ff: bool = False  # True: ``torque_ff`` stays as the file states it. False: it is always fitted.
     wave: float = 1.0
     """Position that counts as 1 rad in periodic forces: of a slide ``Scale.wave`` [m]."""
     known_names: tuple[

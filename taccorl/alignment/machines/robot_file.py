@@ -262,8 +262,6 @@ class Robot:
     config: RobotConfig  # Content of the file
     rigid: RobotModel  # The model that the file names
     path: Path  # Path of the robot file
-    assumed: Mapping[int, PointMass] = field(default_factory=dict)
-    """Id of a body → payload of which a search assumes the place and fits the mass."""
     motions: KeptMotions = field(default_factory=KeptMotions, repr=False, compare=False)
 
     @property

@@ -6,6 +6,7 @@ import hashlib
 import math
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -41,7 +42,7 @@ from taccorl.alignment.machines.robot_model import JointFacts
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.effect import Effect, number
 from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import OF_A_TURN, Scale, bounded, scaled
 
@@ -68,6 +69,28 @@ PAYLOAD_AT = (
     "y_m",
     "z_m",
 )  # Parameters of ``payload`` for its place along the axes of its body
+
+
+MOST_TILT = (-0.2, 0.2)
+"""Change of the direction of gravity that a fit tries along each axis [rad], 11° (a choice)."""
+
+
+@dataclass(kw_only=True)
+class TiltedBase(Effect):
+    """Change of the unit vector along gravity in the frame of a robot's model: number
+    ``gravity`` of its file, which every hinge shares. No file has it as an effect."""
+
+    name: ClassVar = "gravity"
+    slot: ClassVar = "body"
+    x: float = number("g_x", "1", 0, 0.01, MOST_TILT)
+    y: float = number("g_y", "1", 0, 0.01, MOST_TILT)
+    z: float = number("g_z", "1", 0, 0.01, MOST_TILT)
+
+    def tilted(self, gravity: np.ndarray) -> np.ndarray:
+        """(3,) gravity of the same size in the changed direction."""
+        size = np.linalg.norm(gravity)
+        direction = gravity / size + (self.x, self.y, self.z)
+        return size * direction / np.linalg.norm(direction)
 
 
 def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> mujoco.MjModel:
@@ -121,14 +144,12 @@ class RobotJoint(RigidJoint):
         self._stated_loop_hz = law.loop_hz
         self._stated, self._along = robot if stated is None else stated, along
         self._masses = robot.masses() if masses is None else masses
-        own = [self._masses[signal].body] if signal in self._masses else []
-        own += [body for body in robot.assumed if robot.moves_body(signal, body)]
-        self._payload_in = [*own, robot.last_body(signal)][0]
-        # At a slide the weight of an unknown mass is a constant force, too.
-        self.holds_torque_ff = self.unit == "m" and self._payload_in in robot.assumed
+        own = self._masses.get(signal)
+        self._payload_in = robot.last_body(signal) if own is None else own.body
         self.scale = self._scale()
         self.wave = self.scale.wave
         self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
+        self._weight_levers: dict[JointMotion, np.ndarray] = {}
         self._unloaded: dict[bytes, Rigid] = {}
 
     def _use(self, config: "JointConfig") -> None:
@@ -210,8 +231,8 @@ class RobotJoint(RigidJoint):
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         if self._config.inertia is not None:
             return self._stated_rigid(motion, self._config.inertia)
-        masses = self._every_mass(bodies)
-        terms = self._terms(motion.pose, masses)
+        masses, more = self._every_mass(bodies), self._more_gravity(bodies)
+        terms = self._terms(motion.pose, masses, more)
         # A mass below 0 that a search tries far from its body's centre would leave the
         # joint no inertia: a hundredth stays, a choice.
         least = 0.01 * self.known.inertia
@@ -274,13 +295,29 @@ class RobotJoint(RigidJoint):
             + self._config.armature
         )
 
-    def _terms(self, pose: np.ndarray, masses: Sequence[PointMass] = ()) -> Rigid:
-        """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor."""
+    def _more_gravity(self, bodies: Sequence[Effect]) -> np.ndarray:
+        """(3,) gravity of the file and of a ``TiltedBase`` less the model's [m/s²]."""
+        more = self._robot.more_gravity
+        for effect in bodies:
+            if isinstance(effect, TiltedBase):
+                gravity = self._robot.rigid.model.opt.gravity
+                more = effect.tilted(gravity + more) - gravity
+        return more
+
+    def _terms(
+        self,
+        pose: np.ndarray,
+        masses: Sequence[PointMass] = (),
+        more: np.ndarray | None = None,
+    ) -> Rigid:
+        """``Rigid`` at ``pose`` (nq,), with point masses and without a rotor. ``more``: (3,)
+        gravity less the model's [m/s²]; by default that of the file."""
         model = self._robot.rigid.model
+        more = self._robot.more_gravity if more is None else more
         if (key := pose.tobytes()) not in self._unloaded:
             self._unloaded[key] = rigid_terms(model, self.signal, pose)
         terms = with_masses(self._unloaded[key], model, self.signal, pose, masses)
-        if not (more := self._robot.more_gravity).any():
+        if not more.any():
             return terms
         leaned = under_gravity(model, more)  # the weight is linear in gravity
         extra = with_masses(
@@ -305,10 +342,37 @@ class RobotJoint(RigidJoint):
     ) -> np.ndarray | float:
         if motion.positions is None:
             return 0.0
-        return sum(
+        torque = sum(
             self._mass_torque(motion, one.body).of(one)
             for one in self._every_mass(bodies)
         )
+        by = self._more_gravity(bodies) - self._robot.more_gravity
+        return torque + self._moving_weight(motion) @ by if by.any() else torque
+
+    def _moving_weight(self, motion: JointMotion) -> np.ndarray:
+        """(T, 3) torque that holds the weight of a hinge because other joints move, for
+        each component of gravity [N·m·s²/m]; kept, since a search changes gravity only."""
+        if motion not in self._weight_levers:
+            model, q = self._robot.rigid.model, motion.positions
+            assert q is not None
+            data, joint = mujoco.MjData(model), model.joint(self.signal)
+            body, levers = joint.bodyid[0], np.empty((len(q), 3))
+            for row, positions in enumerate(q):
+                data.qpos[:] = positions
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                off_axis = data.subtree_com[body] - data.xanchor[joint.id]
+                levers[row] = -np.cross(data.xaxis[joint.id], off_axis)
+            own = q[:, joint.qposadr[0]]
+            for k, axis in enumerate(np.eye(3)):
+                alone = rigid_terms(
+                    under_gravity(model, axis), self.signal, motion.pose
+                )
+                levers[:, k] *= model.body_subtreemass[body]
+                levers[:, k] -= alone.gravity_sin * np.sin(own)
+                levers[:, k] -= alone.gravity_cos * np.cos(own)
+            self._weight_levers[motion] = levers
+        return self._weight_levers[motion]
 
     def _mass_torque(self, motion: JointMotion, body: int) -> MassTorque:
         """Torque for masses in one body because other joints move; kept, since a search changes masses only."""
@@ -546,21 +610,17 @@ class RobotJoint(RigidJoint):
         return self._idle_place() if cls is Payload else {}
 
     def _idle_place(self) -> dict[str, Any]:
-        """Payload's link, and its place along the axes along which the joint does not feel it, or at all where it is assumed: as
-        the file has it, else in the centre of mass of its body."""
+        """Payload's link, and its place along the axes along which the joint does not feel it: as the file has it, else in the
+        centre of mass of its body."""
         robot, last = self._robot, self._payload_in
-        known = robot.assumed.get(last, self._masses.get(self.signal))
+        known = self._masses.get(self.signal)
         at = (
             np.zeros(3)
             if known is None
             else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
         )
         spread = known is not None and known.spread_m2.any()
-        axes = (
-            (0, 1, 2)
-            if last in robot.assumed or spread
-            else robot.idle_axes(self.signal, last)
-        )
+        axes = (0, 1, 2) if spread else robot.idle_axes(self.signal, last)
         link = (
             {"link": robot.body_name(last)}
             if spread or last != robot.last_body(self.signal)

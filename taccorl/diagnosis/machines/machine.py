@@ -8,7 +8,7 @@ A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
@@ -21,12 +21,15 @@ from taccorl.data.finding import Finding as DataFinding
 from taccorl.data.finding import listed
 from taccorl.diagnosis.comparison.result import USES, Comparison
 from taccorl.diagnosis.problems.joints import each
+from taccorl.diagnosis.problems.shared import ALIKE, SharedFit, left_of
+from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search.problem import Progress, Stopped, no_progress
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.solve import PartFinding as Finding
 from taccorl.diagnosis.search.solve import PartProblem, RecordedProblem, solved
 from taccorl.errors import TaccorlError, nearest
 from taccorl.plugins import Registry
+from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 
 Counted = Callable[[str, int, int], None]
@@ -338,6 +341,38 @@ class Machine(ABC):
         """
         return list(findings)
 
+    def shared_by(
+        self, alone: Mapping[str, Finding], found: SharedFit, diagnosed: "Diagnosed"
+    ) -> dict[str, Finding]:
+        """Findings of parts by this machine, which has the numbers ``found`` that they
+        share; empty if one of them ends with a larger error than ``alone``, without."""
+        name = found.effect.name
+        without = [name] if name in effects else []
+        again = diagnosed(self, [*alone], without)
+        for f in again:
+            left = left_of(f.diagnosis)
+            if left > ALIKE * left_of(alone[f.part].diagnosis):
+                return {}
+        remark = Remark("shared", {"name": name, "joints": [*alone]})
+        return {f.part: remarked(f, remark) for f in again}
+
+    def without_shared(
+        self,
+        findings: Sequence[Finding],
+        group: Collection[str],
+        stands_for: Collection[str],
+        name: str,
+        diagnosed: "Diagnosed",
+    ) -> list[Finding]:
+        """``findings`` with a remark that no effect ``name`` explains all parts of
+        ``group``. Those that may have it alone are diagnosed without it."""
+        remark = Remark("shared_without", {"name": name, "joints": [*group]})
+        again = {f.part: f for f in findings if f.part in stands_for}
+        if name in effects:
+            again = {f.part: f for f in diagnosed(self, [*again], [name])}
+        told = {part: remarked(f, remark) for part, f in again.items()}
+        return [told.get(f.part, f) for f in findings]
+
     def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
         """Copy of the machine with everything that was found, and text: why a part of it could not be written, or empty."""
         found = [
@@ -347,10 +382,6 @@ class Machine(ABC):
             for f in findings
         ]
         return self.with_additions(found), ""
-
-    def changes_as_a_whole(self, findings: Sequence[Finding]) -> list[str]:
-        """Texts on what ``mended`` changes that belongs to no single part."""
-        return []
 
     def refitted(self, findings: Sequence[Finding]) -> Self:
         """The machine with no effect added, and with the numbers refitted that every fit adjusts, to compare errors with."""
@@ -371,6 +402,13 @@ class Machine(ABC):
         """Command-line options with which ``taccorl add-effect`` must name this part, such as ["--pads=left"]; empty if the
         diagnosis determines it."""
         return []
+
+
+def remarked[FindingT: Finding](f: FindingT, *remarks: str | Remark) -> FindingT:
+    """The finding with more remarks about its result."""
+    every: tuple[Any, ...] = (*f.diagnosis.remarks, *remarks)
+    d = dataclasses.replace(f.diagnosis, remarks=every)
+    return dataclasses.replace(f, diagnosis=d)
 
 
 def numbers_of(effects: Iterable[Effect]) -> dict[str, tuple[float, str]]:

@@ -1,13 +1,10 @@
 """The PiPER's twin as a machine: two arms and their pads, described by a ``twin.yaml`` (``taccorl.sim.twin_file``)."""
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self, cast
-
-import numpy as np
+from typing import Any, ClassVar, Self
 
 from taccorl.alignment.checks.robot import pose_unknown
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
@@ -20,7 +17,6 @@ from taccorl.alignment.touch.motion import lacking_pads
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.machines.changed_findings import remarked
 from taccorl.diagnosis.machines.machine import (
     Addition,
     Counted,
@@ -33,11 +29,11 @@ from taccorl.diagnosis.machines.machine import (
 )
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.diagnosis.problems.joint_problem import JointProblem, selectors
-from taccorl.diagnosis.search.changed_numbers import REFIT_WORSE
+from taccorl.diagnosis.problems.shared import shared_fit, with_effect
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
 
@@ -233,55 +229,44 @@ class PiperTwin(Machine):
         gains: GainsAre,
         diagnosed: Diagnosed,
     ) -> list[Finding]:
-        """An effect of a whole arm with one number, ``gravity_mismatch``, that was found at a joint has the strength of the joint
-        that determines it best. It is held at the arm's other joints, which are diagnosed again where it changes something. Where
-        that leaves a larger error, it is not what the arm lacks: joints that named it are diagnosed without it."""
+        """``gravity_mismatch`` is one number of an arm: where it was found at a joint, it is
+        fitted to all joints of the arm that move, which are diagnosed again with it, or
+        without it if it does not hold at all of them."""
+        name = "gravity_mismatch"
         for arm in ROBOT.arms:
-            mine = [
-                cast(joints.JointFinding, f)
-                for f in findings
-                if f.part.startswith(f"{arm}_joint")
-            ]
-            if not (found := _of_whole_arm(mine)):
+            group = {f.part: f for f in findings if f.part.startswith(f"{arm}_joint")}
+            d = {part: f.diagnosis for part, f in group.items()}
+            named = {
+                part: (name,)
+                for part, own in d.items()
+                if name in {*own.names} - {*own.present}
+            }
+            if not named or len(group) < 2:
                 continue
-            owner, effect = found[0]
-            machine = self.with_additions([Addition(owner.part, [effect], {}, {})])
-            named = [f.part for f, e in found if e.name == effect.name]
-            others = [
-                f
-                for f in mine
-                if f is not owner
-                and (f.part in named or machine.differs(self, f, measurements))
-            ]
-            again = diagnosed(machine, [f.part for f in others], [effect.name])
-            ((value, _),) = numbers_of([effect]).values()
-            told = f"{effect.name} {value:.3g} of the arm, as {owner.part} shows it"
-            worse = [
-                f"{_left(new):.2f} instead of {_left(old):.2f} noise floors at {old.part}"
-                for new, old in zip(again, others, strict=True)
-                if _left(new) > REFIT_WORSE * max(_left(old), 1.0)
-            ]
-            text = f"judged with {told}: add both, or that first"
-            if worse:
-                text = f"{told} does not hold at all joints: it would leave {', '.join(worse)}"
-                again = diagnosed(self, named, [effect.name])
-            changed = {f.part: remarked(f, text) for f in again}
-            findings = [changed.get(f.part, f) for f in findings]
+            problems = {
+                part: self._problem_of(f, measurements, gains)
+                for part, f in group.items()
+            }
+            owner = next(iter(named))
+            shared = problems[owner].candidates[name]
+            found = shared_fit(problems, d, named, shared)
+            mended = self.with_additions([Addition(owner, [found.effect], {}, {})])
+            again = {} if found.worse else mended.shared_by(group, found, diagnosed)
+            if not again:
+                findings = self.without_shared(findings, group, named, name, diagnosed)
+                continue
+            again[owner] = with_effect(again[owner], d[owner], found.effect)
+            findings = [again.get(f.part, f) for f in findings]
         return list(findings)
 
-    def differs(
-        self,
-        other: "PiperTwin",
-        finding: joints.JointFinding,
-        measurements: Measurements,
-    ) -> bool:
-        """Whether the replays of a joint differ from those of ``other`` by more than half of the joint's noise floor."""
-        part, most = finding.part, 0.5 * finding.floors[0].value
-        return any(
-            np.abs(self.answer(part, m).reported - other.answer(part, m).reported).max()
-            > most
-            for m in joints.of_joints(measurements, [part]).fit
-        )
+    def _problem_of(
+        self, f: Finding, measurements: Measurements, gains: GainsAre
+    ) -> JointProblem:
+        """``motion_problem`` in which effects of the file that its diagnosis did not fit stay."""
+        own = joints.of_joints(measurements, [f.part], touch=False)
+        here = {e.name for e in self.config.effects if f.part in e.acts_on()}
+        held = here - {*f.diagnosis.present}
+        return JointProblem(self.config, f.part, own, gains=gains, held=held)
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[PiperTwin, str]":
         """The twin with everything that was found, except effects of pads if two arms need different k_n or k_d."""
@@ -322,37 +307,6 @@ class PiperTwin(Machine):
 
 _SIGNALS = joints.SIGNALS
 _part_of = pads.part_of
-
-
-def _left(finding: Finding) -> float:
-    """Validation error with what was found [floors]."""
-    return finding.diagnosis.errors["after"]["validation"]
-
-
-def _of_whole_arm(findings: Sequence[Finding]) -> list[tuple[Finding, Effect]]:
-    """Added effects of whole arms with one number, each with its joint; first the one that is determined best."""
-
-    def unsure(item: tuple[Finding, Effect]) -> tuple[bool, float]:
-        (f, effect), (number,) = item, item[1].parameters()
-        low, high = effect.interval.get(number.name, (0.0, math.inf))
-        return effect.name in f.diagnosis.rivals, (high - low) / abs(
-            getattr(effect, number.name) - number.absent
-        )
-
-    found = [
-        (f, e)
-        for f in findings
-        for e in f.diagnosis.effects
-        if e.name not in f.diagnosis.present
-    ]
-    of_arm = [
-        (f, e)
-        for f, e in found
-        if isinstance(e, ArmEffect) and not isinstance(e, JointEffect)
-    ]
-    return sorted(
-        (pair for pair in of_arm if len(pair[1].parameters()) == 1), key=unsure
-    )
 
 
 def _joints_named(names: Sequence[str], known: Sequence[str]) -> list[str]:

@@ -2,7 +2,7 @@
 robot without a model (``alignment.machines.robot_file``). Its parts are its joints."""
 
 import dataclasses
-import math
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,28 +16,14 @@ from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
+from taccorl.alignment.controller.rigid_joint import NEED_ROTOR
 from taccorl.alignment.machines.robot_file import Robot, load_robot
-from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
+from taccorl.alignment.machines.robot_joint import PAYLOAD_AT, TiltedBase
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare_joints
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.machines.changed_findings import (
-    TILT,
-    lacked,
-    left_of,
-    numbers_off,
-    payload_of,
-    payloads,
-    placed,
-    remarked,
-    standing_in,
-    without_numbers,
-    without_payload,
-    without_tilt,
-)
 from taccorl.diagnosis.machines.machine import (
     Addition,
     Counted,
@@ -48,33 +34,35 @@ from taccorl.diagnosis.machines.machine import (
     Machine,
     machines,
     numbers_of,
+    remarked,
 )
 from taccorl.diagnosis.problems.joint_problem import SPEED_DELAY, JointProblem
 from taccorl.diagnosis.problems.joints import (
-    JointFinding,
     apart,
     diagnose_joint,
     drifts_of,
     moves,
     of_joints,
 )
-from taccorl.diagnosis.problems.one_mass import ALIKE, OneMass, is_better, one_mass
-from taccorl.diagnosis.problems.one_tilt import one_tilt
-from taccorl.diagnosis.problems.tilted_base import (
-    MOST_LEFT,
-    change_between_poses,
-    tilt_like,
+from taccorl.diagnosis.problems.shared import (
+    ALIKE,
+    SharedFit,
+    beside_alone,
+    left_of,
+    shared_fit,
+    standing_in,
+    with_effect,
 )
 from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
-from taccorl.diagnosis.search.problem import candidate, split_rows
-from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.problem import Candidate, candidate, split_rows
+from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
-from taccorl.sim.effects.scaled import Scale
+from taccorl.sim.effects.scaled import Scale, bounded
 from taccorl.sim.twin_file import write_whole
 
 How = tuple[Measurements, GainsAre, Diagnosed]
@@ -87,8 +75,8 @@ OF_POSITION = (
     "unbalance",
 )
 """Effects with a torque that depends on the position of the joint, as that of a weight does."""
-CLEAR_FLOORS = 3.0
-"""Largest error [noise floors] of a joint with a shared payload at which it helps to say where the mass is (a choice)."""
+GRAVITY = tuple(f"gravity_{axis}" for axis in "xyz")
+"""Numbers of a robot file: unit vector along gravity in the frame of its model."""
 ONE_POSE = {"rad": 0.3, "m": 0.1}
 """Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
 
@@ -136,6 +124,9 @@ class RobotMachine(Machine):
             for name in weights if joint.unit == "rad" else weights[1:]:
                 own[name] = (getattr(config, name), "N·m")
         own |= {name: (getattr(config, name), "s") for name in times}
+        if self.robot.config.model:
+            direction = map(float, self._down())
+            own |= {n: (x, "1") for n, x in zip(GRAVITY, direction, strict=True)}
         return {
             n: (value, Scale(unit=joint.unit).unit_of(unit))
             for n, (value, unit) in own.items()
@@ -233,25 +224,10 @@ class RobotMachine(Machine):
         found = diagnose_joint(self.robot, part, measurements, **options)
         if not self.robot.config.model:
             return found
-        if any(
-            "payload" in own
-            for own in (found.diagnosis.names, *found.diagnosis.rivals.values())
-        ):
-            body, file, far = (
-                self._payload_body(found),
-                self.robot.rigid.path.name,
-                self.robot.reach_m(part),
-            )
-            name = self.robot.body_name(body)
-            text = f"payload in {name}: x_m, y_m and z_m are along its axes in {file}, within ± {far:.3g} m of its centre of mass"
-            if idle := self.robot.idle_axes(part, body):
-                text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
-            if own := [
-                p.mass_kg for f in payloads([found]) if (p := payload_of(f)).like_link
-            ]:
-                times = 1.0 + own[0] / self.robot.rigid.model.body_mass[body]
-                text = f"mass and inertia of {name} are {times:.4g} times those in {file}: correct them there"
-            found = dataclasses.replace(found, remark=text)
+        d = found.diagnosis
+        if any("payload" in own for own in (d.names, *d.rivals.values())):
+            place = self._place(part, payload_of(found))
+            found = dataclasses.replace(found, remark=place)
         if (
             found.diagnosis.status == "something_else"
             and not self.robot.config.joints[part].rotor_inertia
@@ -271,8 +247,6 @@ class RobotMachine(Machine):
                     found.diagnosis, one_pose=dict.fromkeys(lacked, others)
                 ),
             )
-        if tilt := self._tilt(found, measurements):
-            found = remarked(found, tilt)
         if (
             self.robot.config.joints[part].law != "impedance"
             or "torque_speed_limit" not in found.diagnosis.names
@@ -302,42 +276,62 @@ class RobotMachine(Machine):
                 return ()
         return others
 
-    def _tilt(self, found: JointFinding, measurements: Measurements) -> Remark | None:
-        """By how much the base would have to be tilted so that gravity gives the torque of the effect
-        ``unbalance``, in the poses of the fit recordings. None if ``unbalance`` was neither added nor tied with the added
-        effect, or if the error is at the floor in poses between which that torque would differ."""
-        d = found.diagnosis
-        values = (
-            [dict(d.after.values)]
-            if "unbalance" in d.names and "unbalance" not in d.present
-            else []
+    def _place(self, part: str, payload: Payload | None) -> str:
+        """Text on the place of a payload that was, or would be, added at a joint."""
+        robot, file = self.robot, self.robot.rigid.path.name
+        body = robot.last_body(part)
+        if payload is not None:
+            body = robot.body_of(part, payload)
+        name = robot.body_name(body)
+        if payload is not None and payload.like_link:
+            times = 1.0 + payload.mass_kg / robot.rigid.model.body_mass[body]
+            return f"mass and inertia of {name} are {times:.4g} times those in {file}: correct them there"
+        text = (
+            f"payload in {name}: x_m, y_m and z_m are along its axes in {file}, "
+            f"within ± {robot.reach_m(part):.3g} m of its centre of mass"
         )
-        values += [
-            e.values
-            for r in d.rounds
-            if "unbalance" in r.ties
-            for e in r.evidence
-            if e.name == "unbalance"
-        ]
-        if not values:
-            return None
-        own = [self._whole(m) for m in of_joints(measurements, [found.part]).fit]
-        numbers = (
-            values[0][f"unbalance.{name}"] for name in ("torque_nm", "hangs_at_rad")
-        )
-        down = tilt_like(self.robot, found.part, own, *numbers)
-        if down is None:
-            return None
-        if (
-            d.status == "at_floor"
-            and change_between_poses(self.robot, found.part, own, down) > MOST_LEFT
-        ):
-            return None  # an equal torque in poses in which a tilt has others
-        g = self.robot.rigid.model.opt.gravity
-        leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
-        gravity = f"[{', '.join(f'{x:.4f}' for x in down + 0.0)}]"
-        values = {"degrees": float(leans), "part": found.part, "gravity": gravity}
-        return Remark(TILT, values | {"file": self.robot.path.name})
+        idle = " and ".join("xyz"[axis] for axis in robot.idle_axes(part, body))
+        return f"{text}; {part} does not feel {idle}" if idle else text
+
+    def _down(self) -> np.ndarray:
+        """(3,) unit vector along gravity in the model's frame; 0 without gravity."""
+        gravity = self.robot.rigid.model.opt.gravity + self.robot.more_gravity
+        return gravity / max(float(np.linalg.norm(gravity)), 1e-9)
+
+    def _tilt(self) -> Candidate:
+        """The direction of gravity as an effect that all hinges share: its two components
+        across the direction of the file."""
+        along = "xyz"[int(np.argmax(np.abs(self._down())))]
+        return candidate(TiltedBase, {}, **{along: 0.0})
+
+    def _payload(self, parts: Sequence[str], body: int, spread: bool) -> Candidate:
+        """A payload in one body as an effect that the joints ``parts`` share.
+
+        Args:
+            body: its id.
+            spread: whether its mass is spread as that of the body; else it is a point.
+        """
+        robot = self.robot
+        link = "" if body == robot.last_body(parts[0]) else robot.body_name(body)
+        idle = set.intersection(*({*robot.idle_axes(p, body)} for p in parts))
+        still = PAYLOAD_AT if spread else [PAYLOAD_AT[axis] for axis in sorted(idle)]
+        most = next(p.high for p in Payload.parameters() if p.name == "mass_kg")
+        least, far = min(robot.removable_kg(body), most), robot.reach_m(parts[-1])
+        ends = [("mass_kg", -least, most), *((n, -far, far) for n in PAYLOAD_AT)]
+        where: dict[str, Any] = dict.fromkeys(still, 0.0)
+        where |= {"link": link, "like_link": spread}
+        return candidate(bounded("payload", tuple(ends)), {}, **where)
+
+    def _tilted(self, found: SharedFit) -> "RobotMachine":
+        """The machine with the direction of gravity that was found."""
+        assert isinstance(found.effect, TiltedBase)
+        down = found.effect.tilted(self._down())
+        return self._with_gravity([float(x) for x in down])
+
+    def _with_gravity(self, direction: list[float]) -> "RobotMachine":
+        config = dataclasses.replace(self.robot.config, gravity=direction)
+        robot = dataclasses.replace(self.robot, config=config)
+        return dataclasses.replace(self, robot=robot)
 
     def reconsidered(
         self,
@@ -346,18 +340,73 @@ class RobotMachine(Machine):
         gains: GainsAre,
         diagnosed: Diagnosed,
     ) -> list[Finding]:
-        """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again.
-        Where no joint alone determines its mass and place, or several found one, one mass is fitted to all joints
-        (``one_mass``). So is what else was found at a joint, where it changes the error of others that lack less. One tilt of
-        the base is fitted to all joints where several lack what it would explain (``one_tilt``)."""
+        """Where joints lack what a payload or a tilt of the base explains as well, these
+        are fitted to all joints that share them. If they hold at all of these joints, the
+        joints are diagnosed again with them in the file; else without them. What else was
+        found at a joint is in the model when joints that lack less are judged again."""
         if not self.robot.config.model:
             return list(findings)
         how = measurements, gains, diagnosed
-        return self._with_one_tilt(
-            self._beside_larger(self._with_payloads(findings, how), how),
-            measurements,
-            gains,
-        )
+        findings = self._with_tilt(findings, how)
+        for body in dict.fromkeys(self.robot.last_body(f.part) for f in findings):
+            findings = self._with_payload(body, findings, how)
+        return self._beside_larger(findings, how)
+
+    def _with_payload(
+        self, body: int, findings: Sequence[Finding], how: How
+    ) -> Sequence[Finding]:
+        """``findings`` with one payload in ``body``, or in the link before it that leaves
+        less, in place of what several joints lack that move it."""
+        robot, (measurements, gains, _) = self.robot, how
+        group = {f.part: f for f in findings if robot.last_body(f.part) == body}
+        stands_for = _standing_in(group, "payload")
+        named = [part for part, names in stands_for.items() if "payload" in names]
+        alone = len(group) == 1 and self.units[next(iter(group))] == "rad"
+        if not stands_for or alone:
+            return findings
+        problems = {
+            part: self._problem_of(f, measurements, gains) for part, f in group.items()
+        }
+        d = {part: f.diagnosis for part, f in group.items()}
+        tried: list[tuple[int, SharedFit]] = []
+        places = [body, *robot.links_before(body).values()]
+        for spread, place in itertools.product((False, True), places):
+            parts = [part for part in group if robot.moves_body(part, place)]
+            if {*(named or stands_for)} <= {*parts}:
+                own = {part: problems[part] for part in parts}
+                mass = self._payload(parts, place, spread)
+                tried.append((place, shared_fit(own, d, stands_for, mass)))
+        place, found = tried[0]
+        for other, one in tried[1:]:
+            sure = 0.0 if one.numbers < found.numbers else SearchConfig().sure_score
+            if one.is_better(found, sure):
+                place, found = other, one
+        tied = {k for k, o in tried if not o.worse and not found.is_better(o)}
+        ties = {robot.body_name(k) for k in tied - {place}}
+        if found.worse:
+            return self.without_shared(findings, group, stands_for, "payload", how[2])
+        if not (named or found.pays):
+            return findings
+        little = SearchConfig().little
+        clear = [part for part, error in found.errors.items() if error <= little]
+        if 0 < len(clear) < len(found.errors):
+            # What other joints lack besides must not say how large the mass is.
+            own = {part: problems[part] for part in clear}
+            spread = cast(Payload, found.effect).like_link
+            mass = self._payload(clear, place, spread)
+            found = shared_fit(own, d, stands_for, mass)
+        nearest = {part: robot.rigid.model.joint(part).id for part in stands_for}
+        owner = max(named or stands_for, key=nearest.__getitem__)
+        payload = cast(Payload, found.effect)
+        moved = [f.part for f in findings if robot.moves_body(f.part, place)]
+        mended = self.with_additions([Addition(owner, [payload], {}, {})])
+        own = {f.part: f for f in findings if f.part in moved}
+        if not (again := mended.shared_by(own, found, how[2])):
+            return self.without_shared(findings, group, stands_for, "payload", how[2])
+        judged = with_effect(again[owner], d[owner], payload, sorted(ties))
+        place = self._place(owner, payload)
+        again[owner] = dataclasses.replace(judged, remark=place)
+        return [again.get(f.part, f) for f in findings]
 
     def _beside_larger(self, findings: Sequence[Finding], how: How) -> list[Finding]:
         """``findings`` with those of joints that were judged again beside what was found at joints that lack more, where that
@@ -365,7 +414,9 @@ class RobotMachine(Machine):
         measurements, gains, diagnosed = how
         done: dict[str, Finding] = {}
         masses = [
-            f for f in payloads(findings) if not f.diagnosis.rivals.get("payload")
+            f
+            for f in findings
+            if payload_of(f) is not None and not f.diagnosis.rivals.get("payload")
         ]
         for f in sorted(
             findings,
@@ -384,11 +435,11 @@ class RobotMachine(Machine):
                 f.diagnosis.after,
                 problem.validation or split_rows(problem.fit)[1],
             )
-            if 1.0 / ALIKE < above_floor(left) / left_of(f) < ALIKE:
+            if 1.0 / ALIKE < above_floor(left) / left_of(f.diagnosis) < ALIKE:
                 continue
             (again,) = diagnosed(machine, [f.part])
             most = ALIKE if len(lacked(again)) <= len(lacked(f)) else 1.0 / ALIKE
-            if left_of(again) <= most * left_of(f):
+            if left_of(again.diagnosis) <= most * left_of(f.diagnosis):
                 what = " and ".join(
                     f"{' and '.join(lacked(o))} of {o.part}" for o in others
                 )
@@ -398,311 +449,92 @@ class RobotMachine(Machine):
                 )
         return [done[f.part] for f in findings]
 
-    def _with_one_tilt(
-        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre
-    ) -> list[Finding]:
-        """``findings`` with a remark on one tilt of the base in place of those on single joints, where it explains what several
-        hinges lack, or where it does not hold at all of them."""
-        group = {
-            f.part: f
-            for f in findings
-            if self.units[f.part] == "rad"
-            and self.robot.config.joints[f.part].law != "effort"
-        }
-        stands_for = {
-            part: names
-            for part, f in group.items()
-            if (names := standing_in(f.diagnosis, "unbalance"))
-        }
-        if len(group) < 2 or not stands_for:
-            return list(findings)
+    def _with_tilt(self, findings: Sequence[Finding], how: How) -> Sequence[Finding]:
+        """``findings`` with one direction of gravity in place of what several hinges lack."""
+        measurements, gains, _ = how
+        laws = self.robot.config.joints
+        hinges = [f for f in findings if self.units[f.part] == "rad"]
+        group = {f.part: f for f in hinges if laws[f.part].law != "effort"}
+        stands_for = _standing_in(group, "unbalance")
+        if not stands_for or not self._down().any():
+            return findings
         problems = {
             part: self._problem_of(f, measurements, gains) for part, f in group.items()
         }
-        found = one_tilt(
-            self.robot,
-            problems,
-            {part: f.diagnosis for part, f in group.items()},
-            stands_for,
-        )
-        if not found.disagree and not found.is_simpler:
-            return list(findings)
-        if found.disagree:
-            errors = [
-                f"{with_it:.2f} instead of {alone:.2f} noise floors at {j}"
-                for j, (alone, with_it) in found.disagree.items()
-            ]
-            text = f"no tilt of the base explains {' and '.join(group)} together: it would leave {', '.join(errors)}"
-        else:
-            text = found.words(stands_for, self.robot.path.name)
-            leaned = {
-                part: dataclasses.replace(
-                    cast(JointFinding, f), leaned=found.joints[part]
+        d = {part: f.diagnosis for part, f in group.items()}
+        found = shared_fit(problems, d, stands_for, self._tilt())
+        if found.worse or any(n.startswith("gravity.") for n in found.fit.at_bound):
+            if len(group) == 1:
+                return findings
+            return self.without_shared(findings, group, stands_for, "gravity", how[2])
+        mended = self._tilted(found)
+        if found.pays and len(group) > 1:
+            if not (again := mended.shared_by(group, found, how[2])):
+                return self.without_shared(
+                    findings, group, stands_for, "gravity", how[2]
                 )
-                for part, f in group.items()
+            again = {
+                part: self._with_changed_gravity(f, d[part], mended, found)
+                for part, f in again.items()
             }
-            findings = [leaned.get(f.part, f) for f in findings]
-        return [
-            remarked(without_tilt(f), text) if f.part in stands_for else f
-            for f in findings
-        ]
+            return [again.get(f.part, f) for f in findings]
+        down = mended._down()
+        leans = float(np.degrees(np.arccos(np.clip(down @ self._down(), -1.0, 1.0))))
+        gravity = f"[{', '.join(f'{x:.4f}' for x in down + 0.0)}]"
+        values = {"degrees": leans, "gravity": gravity, "joints": [*stands_for]}
+        tilt = Remark("tilt", values | {"file": self.robot.path.name})
+        return [remarked(f, tilt) if f.part in stands_for else f for f in findings]
 
-    def _with_payloads(
-        self, given: Sequence[Finding], how: How, sure: bool = True
-    ) -> list[Finding]:
-        """``sure``: a payload that one joint alone determines stays, unless joints that move it end with a larger error, or need
-        other numbers of the file with it, which one mass at all of them makes superfluous."""
-        findings = given
-        for body in dict.fromkeys(self.robot.last_body(f.part) for f in given):
-            findings = self._with_one_mass(body, findings, how, sure)
-        owners = [
-            f for f in payloads(findings) if not f.diagnosis.rivals.get("payload")
-        ]
-        shared = {f.part: self._payload_body(f) for f in owners if payload_of(f).link}
-        owners = [
-            f
-            for f in owners
-            if not any(
-                self.robot.moves_body(f.part, shared[p]) for p in {*shared} - {f.part}
-            )
-        ]
-        owners = [f for f in owners if f.part in self._owners(owners)]
-        felt = {
-            f.part: owner
-            for owner in owners
-            for f in findings
-            if f.part not in {o.part for o in owners}
-            and self.robot.moves_body(f.part, self._payload_body(owner))
-        }
-        if not felt:
-            return list(findings)
-        again: dict[str, Finding] = {}
-        for f in how[2](
-            self.with_additions(
-                [Addition(f.part, [payload_of(f)], {}, {}) for f in owners]
-            ),
-            list(felt),
-        ):
-            mass, body = (
-                payload_of(felt[f.part]),
-                self.robot.body_name(self._payload_body(felt[f.part])),
-            )
-            text = (
-                f"judged with the payload of {mass.mass_kg:.3g} kg in {body} that this diagnosis found at "
-                f"{felt[f.part].part}: add both, or the payload first and diagnose {f.part} again"
-            )
-            again[f.part] = remarked(without_numbers(f, felt[f.part]), text)
-        judged = [(f, again[f.part]) for f in given if f.part in again]
-        worse = any(left_of(now) > ALIKE * left_of(f) for f, now in judged)
-        if sure and (
-            worse or any({*numbers_off(now)} - {*numbers_off(f)} for f, now in judged)
-        ):
-            together = self._with_payloads(given, how, sure=False)
-            if worse or payloads(together):
-                return together
-        return [again.get(f.part, f) for f in findings]
-
-    def _with_one_mass(
-        self, body: int, findings: Sequence[Finding], how: How, sure: bool
-    ) -> list[Finding]:
-        """``findings`` with one payload in place of what several joints lack, if it holds with fewer numbers at all that move
-        it: in ``body`` or a link before it that leaves less. Without a payload if it holds in none of them."""
-        robot, (measurements, gains, diagnosed) = self.robot, how
-        group = {f.part: f for f in findings if robot.last_body(f.part) == body}
-        stands_for = {
-            part: found
-            for part, f in group.items()
-            if (found := standing_in(f.diagnosis, "payload"))
-        }
-        tied = [part for part, f in group.items() if f.diagnosis.rivals.get("payload")]
-        alone = [
-            part
-            for part, names in stands_for.items()
-            if "payload" in names and part not in tied
-        ]
-        loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
-        if not stands_for or (sure and loaded and len(alone) == 1):
-            return list(
-                findings
-            )  # weight that turns with a joint shows where the mass is
-        if len(group) == 1 and not alone and self.units[next(iter(group))] == "rad":
-            return list(
-                findings
-            )  # one vertical hinge tells a mass from a rotor in no way
-        (owner,) = self._owners([group[part] for part in alone or stands_for])
-        at_centre, made = (
-            dict.fromkeys(PAYLOAD_AT, 0.0),
-            dict[tuple[str, int], JointProblem](),
+    def _with_changed_gravity(
+        self, f: Finding, alone: Diagnosis, machine: "RobotMachine", found: SharedFit
+    ) -> Finding:
+        """Finding ``f`` of ``machine``, with the direction of gravity as numbers of the
+        file that change."""
+        d = f.diagnosis
+        old, new = self._down(), machine._down()
+        numbers = {n: float(x) for n, x in zip(GRAVITY, new, strict=True)}
+        ends, changed, scale = dict(d.intervals), [], 1.0
+        for k, (name, axis) in enumerate(zip(GRAVITY, "xyz", strict=True)):
+            if axis not in found.intervals:
+                continue
+            scale = new[k] / (old[k] + getattr(found.effect, axis) or 1.0)
+            low, high = (float(scale * (old[k] + end)) for end in found.intervals[axis])
+            ends[name] = low, high
+            without = alone.errors[alone.baseline]["validation"]
+            was, now = float(old[k]), float(new[k])
+            one = Changed(name=name, before=was, after=now, unit="1", without=without)
+            changed.append(one)
+        d = dataclasses.replace(
+            beside_alone(d, alone),
+            status="numbers_off" if d.status == "nothing_missing" else d.status,
+            base={**d.base, **numbers},
+            start={**d.start, **dict(zip(GRAVITY, map(float, old), strict=True))},
+            intervals=ends,
+            changed=(*changed, *d.changed),
         )
-
-        def fitted(parts: Sequence[str], assumed: Payload) -> OneMass:
-            place = robot.body_of(owner, assumed)
-            parts = [part for part in parts if robot.moves_body(part, place)]
-            machine, own = (
-                self._assuming(owner, assumed),
-                {"link": assumed.link, "like_link": assumed.like_link},
-            )
-            for part in [part for part in parts if (part, place) not in made]:
-                made[part, place] = machine._problem_of(
-                    group[part], measurements, gains
-                )
-            problems = {part: made[part, place] for part in parts}
-            idle = set.intersection(
-                *({*robot.idle_axes(part, place)} for part in parts)
-            )
-            at = (
-                at_centre
-                if assumed.like_link
-                else {PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
-            )
-            mass = candidate(
-                machine.robot.joint(owner).in_units(Payload), {}, **own, **at
-            )
-            return one_mass(
-                problems,
-                {part: group[part].diagnosis for part in parts},
-                stands_for,
-                mass,
-            )
-
-        places = [
-            (link, spread)
-            for spread in (False, True)
-            for link in ("", *robot.links_before(body))
-        ]
-        tried = [
-            Payload(mass_kg=0.0, link=link, like_link=spread, **at_centre)
-            for link, spread in places
-        ]
-        first = found = fitted([*group], tried[0])
-        every = [first]
-        for one in tried[1:]:
-            if all(
-                robot.moves_body(part, robot.body_of(owner, one))
-                for part in alone or stands_for
-            ):
-                every.append(fitted([*group], one))
-                least = (
-                    0.0
-                    if one.like_link > found.payload.like_link
-                    else SearchConfig().sure_score
-                )  # fewer numbers
-                found = (
-                    every[-1] if is_better(every[-1], found, first, least) else found
-                )
-        bodies = [
-            robot.body_of(owner, o.payload)
-            for o in every
-            if o.holds and not is_better(found, o, first)
-        ]
-        ties = {robot.body_name(k) for k in bodies} - {
-            robot.body_name(robot.body_of(owner, found.payload))
-        }
-        if not found.holds:
-            added = [part for part, names in stands_for.items() if "payload" in names]
-            again = (
-                {f.part: f for f in diagnosed(self, added, ["payload"])}
-                if added
-                else {}
-            )
-            findings = [again.get(f.part, f) for f in findings]
-            return [
-                without_payload(f, list(group)) if f.part in stands_for else f
-                for f in findings
-            ]
-        if not (found.is_simpler or alone):
-            mass, where = (
-                found.payload.mass_kg,
-                robot.body_name(robot.body_of(owner, found.payload)),
-            )
-            text = (
-                f"one mass of {mass:.3g} kg in {where} explains as much at {' and '.join(stands_for)}, with as many numbers: "
-                "record a joint that weight loads, or one more that moves it"
-            )
-            return [
-                remarked(f, text) if len(stands_for) > 1 and f.part in stands_for else f
-                for f in findings
-            ]
-        clear = [part for part in found.errors if found.errors[part] <= CLEAR_FLOORS]
-        if len(clear) < len(
-            found.errors
-        ):  # what other joints lack besides must not say where the mass is
-            found = fitted(clear or [owner], found.payload)
-        left_out = [name for name in stands_for[owner] if name != "payload"]
-        (again,) = diagnosed(self._assuming(owner, found.payload), [owner], left_out)
-        if "payload" not in again.diagnosis.names:
-            return list(findings)
-        return [
-            placed(again, found.model, stands_for, sorted(ties))
-            if f.part == owner
-            else f
-            for f in findings
-        ]
-
-    def _payload_body(self, found: Finding) -> int:
-        """Id of the body of the payload that a finding adds, or would add."""
-        own = [self.robot.body_of(found.part, payload_of(f)) for f in payloads([found])]
-        return own[0] if own else self.robot.last_body(found.part)
-
-    def _assuming(self, part: str, payload: Payload) -> "RobotMachine":
-        """The machine in which a search assumes the place of the payload of ``part``."""
-        assumed = {self.robot.body_of(part, payload): self.robot.mass(part, payload)}
-        return dataclasses.replace(
-            self, robot=dataclasses.replace(self.robot, assumed=assumed)
-        )
+        return dataclasses.replace(f, diagnosis=d)
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
-        """The machine with what was found, and a sentence on what was not written. If several joints that move the same body each
-        have a payload, only the one whose mass has the narrowest relative interval is written: it is the same mass. If one tilt
-        of the base explains several joints, it is written as ``gravity``, with the numbers that were fitted beside it."""
-        leaned = {
-            f.part: own
-            for f in findings
-            if (own := cast(JointFinding, f).leaned) is not None
-        }
-        found = payloads(findings)
-        kept = self._owners(found)
-        left = [f.part for f in found if f.part not in kept]
-        additions = []
+        """The machine with what was found, and a sentence on what was not written: of
+        payloads that joints alone found in one body, all but the last."""
+        bodies: dict[int, str] = {}
         for f in findings:
-            own = leaned.get(f.part, f.diagnosis)
-            written = [
-                e for e in own.effects if e.name != "payload" or f.part not in left
-            ]
-            additions.append(Addition(f.part, written, own.base, own.intervals))
-        machine = self
-        for own in leaned.values():  # which all have the same
-            config = dataclasses.replace(self.robot.config, gravity=[*own.gravity])
-            machine = dataclasses.replace(
-                self, robot=dataclasses.replace(self.robot, config=config)
+            if (own := payload_of(f)) is not None:
+                bodies[self.robot.body_of(f.part, own)] = f.part
+        additions, left = [], []
+        for f in findings:
+            d, written = f.diagnosis, [*f.diagnosis.effects]
+            if payload_of(f) is not None and f.part not in bodies.values():
+                written = [e for e in written if e.name != "payload"]
+                left.append(f.part)
+            additions.append(Addition(f.part, written, d.base, d.intervals))
+        text = ""
+        if left:
+            text = (
+                f"the payload of {' and '.join(left)} is not written: it is in the same "
+                f"body as that of {' and '.join(bodies.values())}"
             )
-        text = f"the payload of {' and '.join(left)} is not written: it is the mass that was found at {' and '.join(kept)}"
-        return machine.with_additions(additions), text * bool(left)
-
-    def changes_as_a_whole(self, findings: Sequence[Finding]) -> list[str]:
-        """The direction of gravity, if one tilt of the base explains several joints."""
-        found = {
-            own.gravity
-            for f in findings
-            if (own := cast(JointFinding, f).leaned) is not None
-        }
-        return [
-            f"gravity [{', '.join(f'{x:.4f}' for x in gravity)}]" for gravity in found
-        ]
-
-    def _owners(self, findings: Sequence[Finding]) -> set[str]:
-        """Of joints with a payload in the same body the one that determines its mass best; without a payload the nearest one."""
-
-        def unsure(f: Finding) -> tuple[float, int]:
-            low, high = f.diagnosis.intervals.get("payload.mass_kg", (0.0, math.inf))
-            return (high - low) / max(low, -high, 1e-9), -self.robot.rigid.model.joint(
-                f.part
-            ).id
-
-        owners: dict[int, Finding] = {}
-        for f in sorted(findings, key=unsure):
-            owners.setdefault(self._payload_body(f), f)
-        return {f.part for f in owners.values()}
+        return self.with_additions(additions), text
 
     @property
     def fitted_gains(self) -> tuple[str, ...]:
@@ -780,6 +612,10 @@ class RobotMachine(Machine):
     def with_additions(self, additions: Sequence[Addition]) -> "RobotMachine":
         robot = self.robot
         for a in additions:
+            if GRAVITY[0] in a.base:
+                direction = [float(a.base[name]) for name in GRAVITY]
+                leaning = dataclasses.replace(robot.config, gravity=direction)
+                robot = dataclasses.replace(robot, config=leaning)
             config = robot.config.joints[a.part].with_numbers(a.base)
             joint = robot.joint(a.part)  # bounds of a search may be narrower
             new = [
@@ -800,3 +636,23 @@ class RobotMachine(Machine):
 
     def _whole(self, m: Measurement) -> Measurement:
         return self.robot.joint(next(iter(self.robot.config.joints))).whole(m)
+
+
+def payload_of(f: Finding) -> Payload | None:
+    """The payload that a finding adds."""
+    found = [e for e in f.diagnosis.effects if isinstance(e, Payload)]
+    return found[0] if found and "payload" not in f.diagnosis.present else None
+
+
+def lacked(f: Finding) -> tuple[str, ...]:
+    """Names of the effects that a finding adds, and of the numbers in the robot's file that it calls wrong."""
+    added = [n for n in f.diagnosis.names if n not in f.diagnosis.present]
+    return (*added, *(c.name for c in f.diagnosis.changed))
+
+
+def _standing_in(
+    group: Mapping[str, Finding], effect: str
+) -> dict[str, tuple[str, ...]]:
+    """Joint → what it has in place of ``effect``, where it has anything (``standing_in``)."""
+    found = {part: standing_in(f.diagnosis, effect) for part, f in group.items()}
+    return {part: names for part, names in found.items() if names}

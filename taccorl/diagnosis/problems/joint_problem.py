@@ -490,9 +490,7 @@ class JointProblem(WithoutMaps):
 
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
-        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (
-            not self.model.joint.holds_torque_ff
-        )
+        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)]
         joint = self.model.joint
         # A drive that measures its speed has it half a loop period earlier than one that computes it from two positions. The
         # lower bound is a little below that value, so that a fit to such a drive does not end at the bound. A loop below 200 Hz

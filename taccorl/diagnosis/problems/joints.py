@@ -32,7 +32,7 @@ from taccorl.diagnosis.search.identifiable import (
     absolute_numbers,
     identifiable_numbers,
 )
-from taccorl.diagnosis.search.problem import Progress, Values, no_progress
+from taccorl.diagnosis.search.problem import Progress, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import PartFinding, solved, with_drifts
 from taccorl.errors import TaccorlError
@@ -49,28 +49,11 @@ SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints
 
 
 @dataclass(frozen=True, kw_only=True)
-class Leaned:
-    """Fitted numbers of one joint of a robot whose base leans. The direction of gravity was fitted to several joints at once
-    (``one_tilt``); these numbers replace those that were fitted to this joint alone."""
-
-    gravity: tuple[float, float, float]
-    """Unit vector along gravity in the model's frame."""
-    effects: tuple[Effect, ...]
-    """Effects of the joint, without those in whose place the tilt stands."""
-    base: Values
-    """The always fitted numbers."""
-    intervals: dict[str, tuple[float, float]]
-    """Fitted number → (low, high) of its 95 % interval."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class JointFinding(PartFinding):
     """Finding about one joint."""
 
     floors: tuple[SignalFloor, ...]
     """Noise floor of the angle, and of the effort if it was used."""
-    leaned: Leaned | None = None
-    """What a corrected file has instead, if one tilt of the base explains several joints; None otherwise."""
 
 
 def swept_joints(measurements: Measurements) -> tuple[str, ...]:

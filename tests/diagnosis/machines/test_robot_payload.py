@@ -13,11 +13,10 @@ from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.diagnosis.machines.changed_findings import payloads
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
-from taccorl.diagnosis.machines.robot import RobotMachine
-from taccorl.diagnosis.problems.one_mass import OneMass, is_better
+from taccorl.diagnosis.machines.robot import RobotMachine, payload_of
+from taccorl.diagnosis.problems.shared import SharedFit
 from taccorl.diagnosis.search.evidence import Blocks
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.result import SearchConfig
@@ -230,7 +229,8 @@ def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(
         yaw.diagnosis.errors["after"]["validation"]
         < 0.2 * alone.errors["after"]["validation"]
     )
-    assert any("elbow" in str(r) for r in yaw.diagnosis.remarks)
+    for f in (yaw, elbow):
+        assert account(f.part, f.diagnosis).values("shared", "joints") == [[*JOINTS]]
     assert "effort_scale" not in [c.name for c in yaw.diagnosis.changed]
 
     mended, left = arm.mended([yaw, elbow])
@@ -366,18 +366,6 @@ def test_one_mass_explains_joints_that_all_move_at_once(tmp_path: Path) -> None:
         assert low <= value <= high and low <= getattr(payload, name) <= high, name
     low, high = payload.interval["mass_kg"]
     assert high - low < 0.03
-    (stated,) = [
-        n
-        for f in found
-        if f.part == owner
-        for n in f.known.identifiable
-        if n.name == "payload.mass_kg"
-    ]
-    assert (stated.low, stated.high) == (
-        low,
-        high,
-    ) and stated.words() in payload.evidence, "one interval everywhere"
-
     made = teaching(TEACH_MODEL.format(tip=""), (0.7, 1.0, 1.0))
     weak = diagnose_parts(robot, TEACH_JOINTS, made, search=one, without=without)
     assert not any("payload" in f.diagnosis.names for f in weak)
@@ -461,7 +449,8 @@ def test_a_link_that_is_too_light_or_too_heavy_is_named_where_efforts_are_the_in
             payload.link == "fore" and low <= missing_kg <= high and high - low < 0.03
         )
         assert ("fore is lighter" in payload.evidence) == (missing_kg < 0.0)
-    assert len(payloads(found)) == (missing_kg != 0.0)
+    named = [f.part for f in found if payload_of(f) is not None]
+    assert len(named) == (missing_kg != 0.0)
     assert all(
         f.diagnosis.errors["after"]["validation"] < 1.2 and not f.diagnosis.changed
         for f in found
@@ -472,16 +461,13 @@ def test_of_masses_at_the_floor_the_one_that_surely_leaves_less_is_better() -> N
     """Repeats that differ by a disturbance make floors too high: 40 half seconds of each joint have 0.3 to 0.5 floors²."""
     rng, share = np.random.default_rng(0), np.full(40, 1 / 40)
 
-    def mass(holds: bool = True, **left: float) -> OneMass:
+    def mass(alone: float = 0.3, **left: float) -> SharedFit:
         own = {
             j: Blocks(level + 0.2 * rng.random(40), share) for j, level in left.items()
         }
-        return OneMass(
-            cast(Fit, None),
-            holds,
-            True,
-            {j: (Blocks(0.3 + 0.0 * share, share), b) for j, b in own.items()},
-        )
+        before = Blocks(alone + 0.0 * share, share)
+        squares = {j: (before, b) for j, b in own.items()}
+        return SharedFit(cast(Fit, None), {}, squares, 4, 0)
 
     more = dict.fromkeys("abcde", 0.5)
     hand, same, fore = (
@@ -489,15 +475,12 @@ def test_of_masses_at_the_floor_the_one_that_surely_leaves_less_is_better() -> N
         mass(**more, lift=0.5, wrist=0.5),
         mass(**more, lift=0.3),
     )
-    assert (
-        {*hand.errors.values()} == {1.0}
-        and is_better(fore, hand, hand)
-        and not is_better(hand, fore, hand)
-    )
-    assert not is_better(same, hand, hand) and not is_better(hand, same, hand), "a tie"
-    assert is_better(hand, mass(False, lift=0.1), hand) and not is_better(
-        mass(False, lift=0.1), hand, hand
-    )
+    assert {*hand.errors.values()} == {1.0} and not hand.worse
+    assert fore.is_better(hand) and not hand.is_better(fore)
+    assert not same.is_better(hand) and not hand.is_better(same), "a tie"
+    worse = mass(lift=2.0)
+    assert [*worse.worse] == ["lift"]
+    assert hand.is_better(worse) and not worse.is_better(hand)
 
 
 def scara_recordings(arm: Arm, joints: Sequence[str] = SCARA_JOINTS) -> Measurements:
@@ -570,8 +553,8 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
         elbow.diagnosis.errors["after"]["validation"] < 1.2
         and not elbow.diagnosis.names
     )
-    (stays,) = account("lift", lift.diagnosis).get("torque_stays")
-    assert stays.values == {"name": "torque_ff", "part": "lift"}
+    joints = account("lift", lift.diagnosis).values("shared", "joints")
+    assert joints == [[*SCARA_JOINTS]]
     mended, left = robot.mended([shoulder, elbow, lift])
     assert left == "" and list(mended.robot.masses()) == ["lift"]
 

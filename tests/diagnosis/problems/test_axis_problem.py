@@ -43,7 +43,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.axis_numbers import GAINS_WITHIN
 from taccorl.diagnosis.problems.joint_problem import JointProblem, measured_part
-from taccorl.diagnosis.problems.one_mass import OneMassProblem
+from taccorl.diagnosis.problems.shared import SeveralJoints
 from taccorl.diagnosis.search.fit import Fit, best_fit, fit
 from taccorl.diagnosis.search.problem import Recording, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
@@ -506,7 +506,7 @@ def test_rows_after_the_last_measured_one_are_not_simulated_and_change_no_other(
     joints: Any = {
         "drive": problem
     }  # both halves have one name; what is kept of one is not the other's
-    whole_robot = OneMassProblem(joints, {"drive": ()}, delay)
+    whole_robot = SeveralJoints(joints, {"drive": ()}, delay)
     numbers = {f"drive/{name}": value for name, value in problem.start.items()}
     both = [
         whole_robot.simulate(numbers, effects, r)
