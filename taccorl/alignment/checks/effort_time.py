@@ -202,9 +202,10 @@ def _other_gains(
     def near(fit: LawFit) -> bool:
         return all(1 / GAINS_OFF < gain < GAINS_OFF for gain in times(fit))
 
-    fit = first = law_fit(law, recordings, signal)
+    first = law_fit(law, recordings, signal)
     if first is None or (first.left <= GAINS_LEFT and near(first)):
         return None
+    fit = first
     stated = math.inf
     for delay_s, lag_s in itertools.product(DELAYS_S, LAGS_S):
         late = [_late(m, delay_s, lag_s) for m in recordings]
