@@ -21,26 +21,26 @@ class Concepts(NamedTuple):
 
 
 MOST = {
-    "taccorl/alignment": Concepts(11_322, 118, 561),
-    "taccorl/cli": Concepts(3_554, 38, 41),
+    "taccorl/alignment": Concepts(11_372, 116, 477),
+    "taccorl/cli": Concepts(3_588, 38, 41),
     "taccorl/data": Concepts(7_020, 77, 223),
-    "taccorl/diagnosis": Concepts(6_938, 82, 196),
+    "taccorl/diagnosis": Concepts(6_823, 78, 191),
     "taccorl/episodes": Concepts(2_722, 65, 53),
     "taccorl/evaluation": Concepts(1_227, 18, 25),
     "taccorl/lerobot_plugin": Concepts(209, 2, 10),
     "taccorl/lineage": Concepts(1_394, 20, 29),
     "taccorl/policies": Concepts(2_275, 45, 78),
-    "taccorl/report": Concepts(2_013, 19, 46),
-    "taccorl/rl": Concepts(1_799, 35, 31),
+    "taccorl/report": Concepts(2_071, 19, 49),
+    "taccorl/rl": Concepts(1_828, 35, 31),
     "taccorl/robot_plugin": Concepts(2_700, 45, 60),
     "taccorl/robots": Concepts(158, 5, 12),
-    "taccorl/sim": Concepts(6_182, 157, 152),
+    "taccorl/sim": Concepts(6_186, 157, 152),
     "taccorl/surrogate": Concepts(2_096, 26, 125),
     "taccorl/tasks": Concepts(1_629, 18, 135),
     "taccorl/training": Concepts(1_042, 15, 13),
     "taccorl/views": Concepts(1_535, 8, 73),
-    "tests": Concepts(41_253, 137, 1165),
-    "pipelines": Concepts(4_638, 24, 202),
+    "tests": Concepts(41_700, 138, 1178),
+    "pipelines": Concepts(5_021, 26, 227),
 }
 MOST_LINES_OF_A_FILE = 850  # at 88 columns
 
