@@ -205,9 +205,9 @@ def test_settings_that_a_run_of_an_older_version_lacks_have_their_defaults(
 def test_a_run_with_a_setting_that_no_longer_exists_is_refused(out: Path) -> None:
     file = out / "settings.json"
     file.write_text(
-        json.dumps(json.loads(file.read_text()) | {"noise.correlation": 0.9})
+        json.dumps(json.loads(file.read_text()) | {"noise.correlation_time": 0.9})
     )
-    with pytest.raises(TaccorlError, match=r"noise\.correlation=0\.9"):
+    with pytest.raises(TaccorlError, match=r"noise\.correlation_time=0\.9"):
         run_settings.refuse_changes(resumed(f"--out={out}"))
 
 
