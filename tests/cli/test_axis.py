@@ -45,7 +45,9 @@ def write(
             else [following] * PARTS
         ):
             free = speed + dt_s * (KP * (asked - at) - (KD + damping) * speed) / MASS_KG
-            speed = 0.0 if abs(free) <= stops else free - math.copysign(1.0, free) * stops
+            speed = (
+                0.0 if abs(free) <= stops else free - math.copysign(1.0, free) * stops
+            )
             at += dt_s * speed
         goal = following
     rng = np.random.default_rng(seed)

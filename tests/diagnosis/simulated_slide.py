@@ -102,7 +102,11 @@ def simulated(
                 speed = free - stops * bent / bristles_m
                 bent += dt_s * (speed - abs(speed) * bent / bristles_m)
             else:
-                speed = 0.0 if abs(free) <= stops else free - math.copysign(1.0, free) * stops
+                speed = (
+                    0.0
+                    if abs(free) <= stops
+                    else free - math.copysign(1.0, free) * stops
+                )
             at += dt_s * speed
     position, force = np.array(rows).T
     rng = np.random.default_rng(seed)

@@ -580,7 +580,9 @@ def of_a_sampled_loop(
         for _ in range(parts):
             stops = dt_s * friction_n(speed) / MASS_KG
             free = speed + dt_s * (force - damping * speed) / MASS_KG
-            speed = 0.0 if abs(free) <= stops else free - math.copysign(1.0, free) * stops
+            speed = (
+                0.0 if abs(free) <= stops else free - math.copysign(1.0, free) * stops
+            )
             at += dt_s * speed
     time_s, target = time_s[250:], target[250:]
     noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [
@@ -1237,7 +1239,11 @@ def of_a_wheel(
                     speed + dt_s * (torque - 0.035 * speed) / 0.05,
                     dt_s * 0.18 / 0.05,
                 )
-                speed = 0.0 if abs(free) <= stops else free - math.copysign(1.0, free) * stops
+                speed = (
+                    0.0
+                    if abs(free) <= stops
+                    else free - math.copysign(1.0, free) * stops
+                )
                 at += dt_s * speed
     time_s = np.arange(len(target)) / 250
     position, effort = np.transpose(rows) + np.random.default_rng(len(name)).normal(
