@@ -253,7 +253,7 @@ class Recorded:
             )
             row["written"] = {f.part: _errors(after, f.part) for f in found}
             restated = getattr(machine_module, "as_written", lambda all_, *_: all_)
-            row["stated"] = {
+            row["stated_errors"] = {
                 f.part: f.diagnosis.errors["after"]
                 for f in restated(found, before, {"after": after})
             }
@@ -503,7 +503,9 @@ def _is_as_stated(row: Row) -> bool:
 
 def _stated(row: Row, part: str) -> dict[str, float]:
     """Use → error that a report states of a part; rows of earlier builds have the fit's."""
-    return row.get("stated", {}).get(part) or row["parts"][part]["errors"]["after"]
+    return (
+        row.get("stated_errors", {}).get(part) or row["parts"][part]["errors"]["after"]
+    )
 
 
 def _right(rows: Sequence[Row]) -> str:
