@@ -39,7 +39,7 @@ MOST = {
     "taccorl/tasks": Concepts(1_629, 18, 135),
     "taccorl/training": Concepts(1_042, 15, 13),
     "taccorl/views": Concepts(1_535, 8, 73),
-    "tests": Concepts(41_700, 138, 1178),
+    "tests": Concepts(41_708, 138, 1178),
     "pipelines": Concepts(5_021, 26, 227),
 }
 MOST_LINES_OF_A_FILE = 850  # at 88 columns

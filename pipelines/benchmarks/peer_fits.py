@@ -26,7 +26,7 @@ RATE_HZ, STEP_S = 200, 1e-3
 """Rate of the rows [Hz] and physics step of MuJoCo [s]."""
 HOLD = round(1 / (RATE_HZ * STEP_S))
 SETTLE_S = 3.0
-"""Time at the first target before a recording begins [s]."""
+"""Simulated time for which the arm holds the first target before its recording begins, so that it starts at rest [s]."""
 ELBOW = 2
 """Index of the joint that moves."""
 LONGEST_DELAY_S = 0.05

@@ -50,7 +50,8 @@ HIDDEN: Mapping[str, Mapping[str, tuple[float, float]]] = {
 WRONG_GAINS = {"kp": 1.6, "kd": 0.6}
 """What the file of the clean arm states over what its drive runs."""
 STIFF = 'solreffriction="0.004 1" solimpfriction="0.99 0.999 0.001"'
-"""Friction that sticks, where ``soft`` is not in the case's name; the user's file has it."""
+"""MuJoCo's settings for dry friction that holds a joint still, where its default lets it creep. Used in all cases whose name
+lacks ``soft``, in the simulated arm and in the model that each contestant is given."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +278,7 @@ def outcomes(arm: Arm, folder: Path) -> dict[str, Outcome]:
 
 
 def _run(words: Sequence[object]) -> tuple[str, float]:
-    """Output of a command, and CPU-seconds of it and its children, one thread each."""
+    """Run a command with one thread for each process. Returns its output, and the CPU time of it and of its children [s]."""
     threads = {f"{n}_NUM_THREADS": "1" for n in ("OMP", "OPENBLAS", "NUMBA")}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
@@ -427,7 +428,7 @@ def rows_of(found: Mapping[Arm, Mapping[str, Outcome]]) -> Iterator[Row]:
 
 
 def table(found: Mapping[Arm, Mapping[str, Outcome]]) -> Iterator[str]:
-    """Markdown: the numbers that each contestant found, beside the true ones."""
+    """Lines of a Markdown table: for each simulated arm the true numbers, and those that taccorl, sysid and SciPy found."""
     yield "| arm | who | CPU-s | floors | names | numbers |"
     yield "|---|---|---|---|---|---|"
     for arm, of in found.items():

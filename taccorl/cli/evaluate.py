@@ -414,7 +414,8 @@ def _score_share(
         import torch
 
         if policy.checkpoint.config.device == "cuda":
-            # For the weights and for the processors, whose device is a setting of their own.
+            # "cuda" then means this worker's GPU for weights and processors alike; a
+            # processor states its device apart from the policy.
             torch.cuda.set_device((worker_number() or 0) % torch.cuda.device_count())
         torch.set_num_threads(
             threads or torch.get_num_threads()

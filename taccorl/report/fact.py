@@ -96,7 +96,12 @@ class Fact:
 
 
 def fact(id: str, **values: Any) -> Fact:
-    """A ``Fact``: one line of a report. ``id``: key of its text in texts.yaml; ``values``: what is put into the text."""
+    """Make a ``Fact``, which is one line of a report.
+
+    Args:
+        id: key of the line's text in texts.yaml.
+        values: numbers and names that replace the placeholders of that text.
+    """
     return Fact(id, values)
 
 

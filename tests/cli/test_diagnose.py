@@ -165,7 +165,10 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(
         (out / "report.html").read_text(),
         json.loads((out / "report.json").read_text()),
     )
+    assert lines[0].endswith("[confidence: moderate]")
     assert found["verdicts"][SIGNAL]["confidence"] == "moderate"
+    assert "fixed by commanded gains" in page
+    assert "→ coulomb_friction" in page
     assert found["identified"][SIGNAL]["pinned_by"] == ["commanded gains"]
     friction = {n["name"]: n for n in found["identified"][SIGNAL]["identifiable"]}[
         "coulomb_friction.torque_nm"
@@ -173,6 +176,8 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(
     assert friction["low"] <= TRUTH_NM <= friction["high"]
     assert "encoder_bias (looks like torque_ff, always fitted)" in page
     assert found["diagnoses"][SIGNAL]["status"] == "at_floor"
+    assert found["diagnoses"][SIGNAL]["words"] == "at the noise floor"
+    assert "tied with coulomb_friction" in page
     command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
     assert {*commands(text)} == {*of_page(out / "report.html")} == {command}
     tied = f"{command}/report.json".replace("coulomb", "asymmetric")
@@ -312,6 +317,7 @@ def test_positions_one_row_too_early_stop_it_before_an_effect_is_blamed(
         stepped(tmp_path / "made", late_rows), f"--out={tmp_path / 'out'}", keep
     )
     assert code in codes, text
+    assert ("not diagnosed" in " ".join(text.split())) == (status is None)
     assert (tmp_path / "out").exists() == (status is not None)
     if status:
         report = json.loads((tmp_path / "out" / "report.json").read_text())

@@ -132,8 +132,10 @@ def check_columns(
 def _without_weight(
     torques: Sequence[_Torques], known: Sequence[Measurement], name: str
 ) -> bool:
-    """Whether efforts of joint ``name``, beside friction, are those of its drive and those of links and rotors, both less the
-    weight that the drive carries."""
+    """Whether the recorded efforts of joint ``name`` lack the weight that the controller compensates.
+
+    They do if the weight is missing in two comparisons, each with friction removed: efforts beside the torque of the drive's
+    law (kp, kd, targets), and efforts beside the inverse dynamics of the links and rotors."""
     lacks = np.zeros(
         (2, 3)
     )  # of drive and links: products of the difference and the weight

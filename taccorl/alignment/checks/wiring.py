@@ -181,7 +181,8 @@ def _copied(m: Measurement, follows: np.ndarray, j: int) -> int | None:
 
 @check("error", "turned_midway", needs="position", explains=FOLLOWS_FROM)
 def check_turns(t: Trial) -> Iterator[Finding]:
-    """A target or a position whose sign turns within the recording: the correlation of velocities in windows of ``TURN_S``.
+    """Find targets or positions whose sign is reversed in a part of the recording only. In windows of ``TURN_S`` seconds the
+    velocity of the position is correlated with that of the target: about +1 where signs agree, about −1 where one is reversed.
     The lag is that of the speeds without their signs, so that a late or a fast motion is not taken for a turned one."""
     m, even = t.m, t.even
     rows, about = (round(seconds / even.period_s) for seconds in (TURN_S, SMOOTH_S))

@@ -35,7 +35,7 @@ _SIZES = {
     "numeric": ("size",),
     "mesh": ("params",),
 }
-"""Tag → its attributes whose product is the number of values that it holds."""
+"""XML tag → attributes that state the size of its array. Their product is the number of values that MuJoCo allocates."""
 _NAMED = {"joint": "joint", "freejoint": "joint", "body": "body", "link": "body"}
 
 

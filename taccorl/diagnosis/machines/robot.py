@@ -455,7 +455,8 @@ class RobotMachine(Machine):
         laws = self.robot.config.joints
         hinges = [f for f in findings if self.units[f.part] == "rad"]
         group = {f.part: f for f in hinges if laws[f.part].law != "effort"}
-        # Beside a wrong delay a payload, too, may look like what a tilt does.
+        # While a joint's delay is still wrong, a payload may explain the error of a tilted
+        # base, where an unbalance does not.
         stands_for = _standing_in(group, "unbalance") or _standing_in(group, "payload")
         if not stands_for or not self._down().any():
             return findings

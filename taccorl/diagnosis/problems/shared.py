@@ -162,7 +162,8 @@ class SharedFit:
 
     @property
     def pays(self) -> bool:
-        """Whether it takes fewer numbers than the joints alone, or leaves surely less."""
+        """Whether the shared numbers are worth their place: they replace more numbers of the single joints than they add, or the
+        error falls by more than chance explains (``sure_score``)."""
         gains = (alone - with_it for alone, with_it in self.squares.values())
         return self.saved > 0 or _score_of(gains) >= SearchConfig().sure_score
 

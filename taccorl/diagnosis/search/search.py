@@ -259,7 +259,7 @@ class Beam:
         self.fits = self._fits(whole.problem)
 
     def _fits(self, problem: Problem) -> Fits:
-        """Fits of ``problem`` to the recordings that the search uses."""
+        """Make the store of fitted models of ``problem``. To save time the search fits only some of the recordings."""
         whole = self.whole
         fewer = thinned(whole.fit_to)
         if problem is whole.problem and len(fewer) == len(whole.fit_to):

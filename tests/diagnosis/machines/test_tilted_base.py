@@ -297,9 +297,11 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
         assert written.robot.config.gravity == pytest.approx(
             (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), abs=1e-3
         )
-        assert {*written.effects} <= {"speed_delay"}  # 0.4 ms that pan has alone, too
         raised = turned("raised", 1.2, 0.3, 8, lift=-0.9)
         assert replay_error(written, raised) < 1.5e-4 < replay_error(robot, raised)
+        if [*written.effects] == ["speed_delay"]:
+            pytest.xfail("not reached: pan is left a speed_delay of 0.4 ms, as alone")
+        assert written.effects == ()
     else:
         assert found[0].diagnosis.names == ("unbalance",)
         assert "tilt" not in facts[0].ids
