@@ -21,7 +21,7 @@ class Concepts(NamedTuple):
 
 
 MOST = {
-    "taccorl/alignment": Concepts(11_372, 116, 477),
+    "taccorl/alignment": Concepts(11_370, 116, 476),
     "taccorl/cli": Concepts(3_588, 38, 41),
     "taccorl/data": Concepts(7_020, 77, 223),
     "taccorl/diagnosis": Concepts(6_823, 78, 191),

@@ -463,8 +463,6 @@ def _in_time(
     return found
 
 
-INTEGRALS = ("integral_action", "position_integral")
-"""Effects that hold what acts on a joint at rest with any effort within the dry friction."""
 OTHER = 0.05  # Share by which numbers are changed to see what they do to a response
 
 
