@@ -62,7 +62,13 @@ STAGES = {
     "ppo": "after",
     "ppo_anchored": "after, with an anchor",
 }  # PPO: field of a row → text
-_LONG, _SHORT = (f"--train_options=[--steps={n},--save_freq={n}]" for n in (5400, 2500))
+_LONG, _SHORT, _BRIEF = (
+    f"--train_options=[--steps={n},--save_freq={n}]" for n in (5400, 2500, 1500)
+)
+_PPO = (
+    "--post_train=[configs/post_train/gpu.yaml] --scored=512"
+    " --post_train_options=[--iterations=70,--rerun=false]"
+)
 PARTS = {
     "imitation": [
         f"--task=[assembly_1,assembly_2,test_tube] {_EACH}",
@@ -86,6 +92,10 @@ PARTS = {
     "effects": [
         f"--scored_in=[configs/surrogates/{r}.yaml] --singly=true --episodes=1000 {_SHORT} {_SEEDS}"
         for r in ROBOTS
+    ],
+    "ppo": [
+        f"--task=assembly_1 --episodes=300 {_BRIEF} {_PPO} {_EACH}",
+        f"--task=puzzle --episodes=1000 --rows_per_picture=4 {_SHORT} {_PPO} {_EACH}",
     ],
 }
 """Part of the tables → command-line arguments of each call of ``pipelines.learn`` that measures it."""
@@ -120,7 +130,7 @@ class PaperTablesConfig:
     """Parts to run, and scores to take."""
 
     only: list[str] = field(default_factory=list)
-    """Parts to run: imitation, randomised, grips, transfer, cotrained, effects."""
+    """Parts to run: imitation, randomised, grips, transfer, cotrained, effects, ppo."""
     page: bool = False
     """Run nothing."""
     take: list[Path] = field(default_factory=list)

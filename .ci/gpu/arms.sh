@@ -1,7 +1,7 @@
 # PPO of one carried policy by several settings at once, on each GPU as many as fit. After start.sh and warp.sh, with the parts of its
 # model.safetensors (bfloat16, zstd) and the archive of its other files, as next.sh brings them, in /dev/shm/start:
 # setsid bash .ci/gpu/arms.sh SECOND "NAME OPTIONS" "NAME OPTIONS" … > /dev/shm/job.log 2>&1 < /dev/null &
-# Each NAME is post-trained by .ci/gpu/post_train.yaml and its OPTIONS until SECOND of the machine's clock; then start and results are
+# Each NAME is post-trained by configs/post_train/gpu.yaml and its OPTIONS until SECOND of the machine's clock; then start and results are
 # scored on the same $SCORED scenes by MuJoCo C, and the first result in the resident mode, too.
 . /dev/shm/env.sh
 end=$1 task=${TASK:-assembly_1} scored=${SCORED:-256} seed=${SEED:-1000} first_scene=${FIRST_SCENE:-70000}
@@ -33,7 +33,7 @@ k=0
 for arm in "$@"; do
   read -ra words <<<"$arm"
   out=$folder/policy_${words[0]}
-  CUDA_VISIBLE_DEVICES=$((k % gpus)) timeout -s TERM $((end - $(now))) python3 -m taccorl.cli.main post-train --config_path=.ci/gpu/post_train.yaml \
+  CUDA_VISIBLE_DEVICES=$((k % gpus)) timeout -s TERM $((end - $(now))) python3 -m taccorl.cli.main post-train --config_path=configs/post_train/gpu.yaml \
     --policy.path="$start" --env.task="$task" --env.twin="$twin" --env.threads=4 --rerun=false --keep_checkpoints=1 --seed="$seed" \
     "${words[@]:1}" --out="$out" >"$out.log" 2>&1 &
   k=$((k + 1))

@@ -6,7 +6,8 @@ now() { echo $(($(date +%s) - $(cat /dev/shm/t0))); }
 echo "from $(now) s"
 while [ "$(now)" -lt "$1" ] && [ ! -e /dev/shm/done ]; do sleep 1; done
 cd /dev/shm || exit 1
-for policy in learn_*/*/policy_*/checkpoints/0*/pretrained_model; do # not last, a link to one of these
+for policy in learn_*/*/policy_*/checkpoints/last/pretrained_model; do
+  policy=$(realpath --relative-to=. "$policy") # last is a link
   if [ "${WEIGHTS:-true}" = false ]; then break; fi
   if [ -e "$policy/model.safetensors" ] && ! grep -qs "$policy" fetched && [ $(($(date +%s) - $(stat -c %Y "$policy/model.safetensors"))) -gt 10 ]; then
     echo "$policy" >>fetched

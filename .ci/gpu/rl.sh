@@ -1,9 +1,8 @@
-# On a GPU machine, after start.sh, with the build to compare with in /dev/shm/old:
-# setsid bash .ci/gpu/rl.sh SECOND > /dev/shm/job.log 2>&1 < /dev/null &
-# A policy of $EPISODES demonstrations of $TASK learns; meanwhile, when warp.sh has run, modes.py compares the modes of MuJoCo Warp.
-# The policy is scored by MuJoCo C and in the resident mode, then post-trained by .ci/gpu/post_train.yaml until SECOND of the
-# machine's clock (by MuJoCo C, 128 environments, if the modes differ), then the result is scored, and an iteration of either
-# build is timed. One GPU, all cores.
+# On a GPU machine, after start.sh and warp.sh: setsid bash .ci/gpu/rl.sh SECOND > /dev/shm/job.log 2>&1 < /dev/null &
+# A policy of $EPISODES demonstrations of $TASK learns; meanwhile modes.py compares the modes of MuJoCo Warp. It is post-trained by
+# configs/post_train/gpu.yaml and $OPTIONS until SECOND of the machine's clock (by MuJoCo C, 128 environments, if the modes differ); beside
+# it, replayed.py compares what the policy does by MuJoCo C and by Warp, and the start is scored by either. Then the result is scored,
+# and, with a build to compare with in /dev/shm/old, an iteration of either build is timed. One GPU, all cores.
 . /dev/shm/env.sh
 end=$1 task=${TASK:-assembly_1} episodes=${EPISODES:-300} steps=${STEPS:-1500} scored=${SCORED:-192} seed=${SEED:-1000}
 threads=$(env -u OMP_NUM_THREADS nproc)
@@ -34,19 +33,23 @@ score() { # NAME POLICY OPTIONS
     --episodes="$scored" --seed=70000 --failures=0 "${@:3}" --out="${out}_score_$1" >"${out}_score_$1.log" 2>&1
   since "$1 scored: $?"
 }
-by_c=(--workers="$((threads - 2))" --batch_size=14)
-score start_warp "$start" --physics=warp:mode=resident --batch_size=192 &
-score start_c "$start" "${by_c[@]}"
-wait
+(
+  python3 .ci/gpu/replayed.py "$start" cuda:0 "${REPLAYED:-24}" 24 "$task" >/dev/shm/replayed.log 2>&1
+  since "replayed: $?"
+  score start_c "$start" --workers="$((threads - 4))" --batch_size="$((threads - 4))"
+  score start_warp "$start" --physics=warp:mode=resident --batch_size="$scored"
+) &
 options=()
 if [ "$(cat /dev/shm/modes_rc)" != 0 ]; then options=(--env.physics=c --env.num_envs=128 --ppo.batch_size=512); fi
-timeout -s TERM $((end > $(now) ? end - $(now) : 1)) python3 -m taccorl.cli.main post-train --config_path=.ci/gpu/post_train.yaml --policy.path="$start" --env.task="$task" \
-  --env.twin="$twin" --env.threads="$threads" --rerun=false --keep_checkpoints=1 --save_freq=2 --seed="$seed" "${options[@]}" ${OPTIONS:-} --out="$out" >"$out.log" 2>&1
+timeout -s TERM $((end > $(now) ? end - $(now) : 1)) python3 -m taccorl.cli.main post-train --config_path=configs/post_train/gpu.yaml --policy.path="$start" --env.task="$task" \
+  --env.twin="$twin" --env.threads=4 --rerun=false --keep_checkpoints=1 --save_freq=5 --seed="$seed" "${options[@]}" ${OPTIONS:-} --out="$out" >"$out.log" 2>&1
 since "post-trained: $?"
-result=$out/checkpoints/last/pretrained_model
-score result_warp "$result" --physics=warp:mode=resident --batch_size=192 &
-score result_c "$result" "${by_c[@]}"
 wait
+result=$out/checkpoints/last/pretrained_model
+score result_warp "$result" --physics=warp:mode=resident --batch_size="$scored" &
+score result_c "$result" --workers="$((threads - 2))" --batch_size="$((threads - 2))"
+wait
+if [ ! -e /dev/shm/old ]; then exit; fi
 
 speed() { # BUILD NAME SECONDS OPTIONS: an iteration of PPO
   local out=/dev/shm/learn_speed/$2 path=/dev/shm/$1:$PYTHONPATH

@@ -252,6 +252,9 @@ class PostTraining:
         """Run the remaining iterations."""
         settings, ppo, log = self.settings, self._ppo, _logger(self.settings)
         while self._iteration < settings.iterations:
+            self._sde.level = settings.noise.level_after(
+                self._iteration - settings.ppo.critic_warmup
+            )
             rollout = collect(
                 self.world,
                 ppo,
@@ -268,6 +271,7 @@ class PostTraining:
             row: dict[str, Any] = {
                 "iteration": self._iteration,
                 "decisions": self._iteration * len(rollout.decisions),
+                "noise_level": self._sde.level,
             }
             seconds = {name: round(s, 3) for name, s in self._clock.restart().items()}
             row |= rollout.facts | facts | {"seconds": seconds}

@@ -92,9 +92,12 @@ class FlowSDESettings:
     correlation: float = 0.0
     """Correlation of the noise of one joint between the executed actions of a chunk, 0 or more and below 1. 0: each action has
     noise of its own (paper), which the arm averages out; near 1: the whole chunk is displaced."""
+    half_life: int = 0
+    """Iterations in which the level falls to its half, counted from the first iteration that trains the actor. 0: the level stays
+    (paper). A policy that learns with much noise may need it: without noise it then completes fewer scenes than with it."""
 
     def __post_init__(self) -> None:
-        _at_least("noise.", self, num_steps=1, level=0)
+        _at_least("noise.", self, num_steps=1, level=0, half_life=0)
         if not 0 <= self.correlation < 1:
             raise TaccorlError(
                 f"--noise.correlation={self.correlation:g}: 0 or more, and below 1"
@@ -102,6 +105,12 @@ class FlowSDESettings:
         if not math.isfinite(self.level):
             raise TaccorlError(f"--noise.level={self.level:g}: is not finite")
         _one_of("noise.stochastic_steps", self.stochastic_steps, ("one", "all", "last"))
+
+    def level_after(self, iterations: int) -> float:
+        """The level after so many iterations that trained the actor."""
+        if self.half_life == 0:
+            return self.level
+        return self.level * 0.5 ** (max(iterations, 0) / self.half_life)
 
 
 @dataclass(kw_only=True)

@@ -207,7 +207,16 @@ def test_correlation_counts_rows_with_noise_only() -> None:
     assert sampler.sample(smooth, draws(sampler, 5), ALL).log_prob_B.tolist() == [0] * 5
 
 
+def test_the_level_halves_from_the_first_iteration_that_trains_the_actor() -> None:
+    halved = FlowSDESettings(level=0.4, half_life=10)
+    expected = {-3: 0.4, 0: 0.4, 10: 0.2, 20: 0.1}
+    assert {n: halved.level_after(n) for n in expected} == pytest.approx(expected)
+    assert FlowSDESettings(level=0.4).level_after(1000) == 0.4
+
+
 def test_settings_out_of_range_are_named() -> None:
+    with pytest.raises(TaccorlError, match=r"--noise\.half_life=-1"):
+        FlowSDESettings(half_life=-1)
     for correlation in (-0.1, 1.0, math.nan):
         with pytest.raises(TaccorlError, match=r"--noise\.correlation="):
             FlowSDESettings(correlation=correlation)

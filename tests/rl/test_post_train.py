@@ -220,7 +220,12 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
 @pytest.mark.slow
 def test_killed_and_resumed_is_the_same_bit_for_bit(start, real, tmp_path, capsys):
     """Two iterations at once, and one, kill -9, a line that was written without its checkpoint, and one more."""
-    more = {"ppo.privileged_critic": True, "ppo.adapt_lr": True}
+    more = {
+        "ppo.privileged_critic": True,
+        "ppo.adapt_lr": True,
+        "noise.level": 0.4,
+        "noise.half_life": 1,
+    }
     assert main(options(start, real, tmp_path / "once", iterations=2, **more)) == 0
     out = tmp_path / "twice"
     command = [
@@ -258,6 +263,7 @@ def test_killed_and_resumed_is_the_same_bit_for_bit(start, real, tmp_path, capsy
         for p in (tmp_path / "once", out)
     ]
     assert rows[0] == rows[1] and len(rows[0]) == 2
+    assert [row["noise_level"] for row in rows[0]] == [0.4, 0.2]
     assert (
         rows[0][0]["actor_lr"] != rows[0][1]["actor_lr"]
     )  # adapted, and resumed with it
