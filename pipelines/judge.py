@@ -80,7 +80,7 @@ SAMPLE = {
         taxel_ghosting 770000""",
     "removed press": "rate_softening 772000",
     "robots": """coulomb_friction 60000, viscous_friction 60001,
-        stribeck_friction 60002, load_friction 60003, torque_scale 60006,
+        stribeck_friction 60002, gear_friction 60003, torque_scale 60006,
         torque_saturation 60007, command_delay 60008, cable_spring 60024,
         command_lag 60028, backlash 60035, armature 60042, none 70000, none 70002,
         none 70020""",
@@ -298,7 +298,7 @@ def _of_rows(after: Comparison, part: str, use: str) -> float:
 KEYS = {
     "coulomb": "coulomb_friction.torque_nm",
     "viscous": "viscous_friction.damping_nms_per_rad",
-    "load_share": "load_friction.share",
+    "gear_share": "gear_friction.share",
     "armature": "armature.added_kgm2",
     "spring": "cable_spring.stiffness_nm_per_rad",
     "scale": "torque_scale.factor",

@@ -38,7 +38,7 @@ KINDS = {
     "coulomb_friction": (0.01, 0.06),
     "viscous_friction": (0.1, 0.5),
     "stribeck_friction": (0.01, 0.04),
-    "load_friction": (0.05, 0.2),
+    "gear_friction": (0.05, 0.2),
     "armature": (0.15, 0.6),
     "cable_spring": (0.04, 0.2),
     "torque_scale": (0.08, 0.25),
@@ -384,7 +384,7 @@ def _number(
         "stribeck_friction": {"coulomb": torque, "stick": torque},
         "asymmetric_friction": {"coulomb": torque, "one_way": 0.4},
         "power_law_friction": {"grease": torque, "exponent": 0.4},
-        "load_friction": {"load_share": s},
+        "gear_friction": {"gear_share": s},
         "armature": {"armature": s * inertia},
         "cable_spring": {"spring": s * kp},
         "torque_scale": {"scale": 1.0 - s},
@@ -516,8 +516,8 @@ def _simulate(
         )
         limit += h.get("grease", 0.0) * abs(v / 0.1) ** h.get("exponent", 1.0)
         limit *= 1.0 + math.copysign(h.get("one_way", 0.0), v)
-        if "load_share" in h:
-            limit += h["load_share"] * abs(torque[j])
+        if "gear_share" in h:
+            limit += h["gear_share"] * abs(torque[j])
         model.dof_frictionloss[own] = limit
         data.qfrc_applied[dofs] = applied
         mujoco.mj_step(model, data, subs)

@@ -270,6 +270,7 @@ KINDS: dict[str, Kind] = {
         plant=lambda v: _drive(coulomb=v["torque_nm"], asymmetry=v["asymmetry"]),
     ),
     "load_friction": _kind({"share": "load_share"}, _range(0.005, 0.5)),
+    "gear_friction": _kind({"share": "gear_share"}, _range(0.005, 0.5)),
     "quadratic_drag": _kind(
         {"drag_nms2_per_rad2": "quadratic"}, _range(0.01, 1.0), lambda c: c.kd / c.speed
     ),

@@ -57,6 +57,7 @@ class Drive(NamedTuple):
         3e-5  # Deflection of the bristles at the break-away torque [rad]
     )
     load_share: float = 0.0  # Dry friction per torque through the joint
+    gear_share: float = 0.0  # Dry friction per torque of the motor
     angle_share: float = 0.0
     """Relative variation of the friction torque with the angle, with two periods per turn (not in the registry)."""
     angle_phase: float = 0.0  # Phase of that variation [rad]
@@ -266,7 +267,7 @@ def simulate(
     command_share = 1.0 - math.exp(-1e-3 / d.lag) if d.lag > 0.0 else 1.0
     bristle, wound = 0.0, 0.0
     # of friction, for the bristles' stiffness; loads are of 3 N·m
-    most = d.coulomb + d.stribeck + d.spot + 3.0 * d.load_share
+    most = d.coulomb + d.stribeck + d.spot + 3.0 * (d.load_share + d.gear_share)
     s0 = most / d.presliding
     s1_rest = 1.4 * math.sqrt(s0 * d.motor_inertia)
     inverse = np.empty(NUM_JOINTS)
@@ -434,6 +435,7 @@ def simulate(
             )
         if d.load_share > 0.0:
             limit += d.load_share * abs(torque + lift + bias[joint])
+        limit += d.gear_share * abs(torque + lift)
         if d.asymmetry != 0.0:
             limit *= 1.0 + d.asymmetry * math.copysign(1.0, bristle)
         if d.angle_share != 0.0:

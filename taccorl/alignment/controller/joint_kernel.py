@@ -293,10 +293,8 @@ def _simulated(
         p.position_dependent_friction__torque_nm,
         p.position_dependent_friction__angle_rad,
     )
-    spot_width, load_share = (
-        p.position_dependent_friction__width_rad,
-        p.load_friction__share,
-    )
+    spot_width = p.position_dependent_friction__width_rad
+    load_share, gear_share = p.load_friction__share, p.gear_friction__share
     cogging_nm, periods, phase = (
         p.cogging__torque_nm,
         p.cogging__periods,
@@ -382,7 +380,8 @@ def _simulated(
         holds(power_nm > 0.0),
         holds(stop_stiffness > 0.0),
     )
-    with_integral, with_load = holds(integral_rate > 0.0), holds(load_share > 0.0)
+    with_integral = holds(integral_rate > 0.0)
+    with_load = holds((load_share > 0.0) | (gear_share > 0.0))
     with_position_integral = holds(position_rate > 0.0)
     with_soft = holds(p.soft_friction__torque_nm > 0.0)
     # MuJoCo has it from its mass matrix with all joints free, relative to the joint's own inertia.
@@ -707,10 +706,10 @@ def _simulated(
                 force -= BRISTLE_DAMPING_S * bending * (v - slips * v)
                 damping += BRISTLE_DAMPING_S * bending
         if with_load:
-            limit += load_share * abs(
-                (limited if midpoint else _limited(p, strength * (given + carried), v))
-                + load_nm
+            motor_nm = (
+                limited if midpoint else _limited(p, strength * (given + carried), v)
             )
+            limit += load_share * abs(motor_nm + load_nm) + gear_share * abs(motor_nm)
         if with_spot:
             off = (q - spot_angle) / spot_width
             limit += where(spot_nm > 0.0, spot_nm * decayed(off * off)[0], 0.0)

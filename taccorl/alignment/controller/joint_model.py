@@ -42,6 +42,7 @@ _ADDITIVE = {
     "quadratic_drag__drag_nms2_per_rad2",
     "coulomb_friction__torque_nm",
     "load_friction__share",
+    "gear_friction__share",
     "command_delay__delay_s",
     "sensor_delay__delay_s",
     "speed_delay__delay_s",

@@ -152,6 +152,26 @@ class LoadFriction(_LiveFriction):
         )
 
 
+@effect("gear_friction", slot="friction", needs=("velocity", "load"))
+class GearFriction(_LiveFriction):
+    """Loss of a gear: dry friction in proportion to the torque that its motor gives, τ = −μ |τ_motor| sign q̇; at rest |τ| ≤ μ
+    |τ_motor|. τ_motor is the torque of the drive, gravity compensation included. 1 − μ is the gear's efficiency."""
+
+    kept: ClassVar = ("passed_nm",)
+    share: float = number(
+        "μ", "1", 0, 0.1, (0, 0.5),
+        "a choice; 1 − μ of 0.8 … 0.95 is usual for planetary, harmonic and cycloidal gears",
+    )  # fmt: skip
+
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (np.abs(live.motor_torque_nm(self.acts_on())),)
+
+    def rewrite(self, live: LiveModel, memory: Memory) -> None:
+        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += (
+            self.share * memory["passed_nm"]
+        )
+
+
 @effect("position_dependent_friction", slot="friction", needs=("position", "velocity"))
 class PositionDependentFriction(_LiveFriction):
     """Dry friction about one angle of the joint: τ = −F(q) sign q̇ with F(q) = F₀ exp(−((q − q₀) / w)²); at rest any τ with |τ|

@@ -77,6 +77,7 @@ def test_a_lane_does_not_depend_on_the_others() -> None:
         {"cogging__torque_nm": 0.2},
         {"power_law_friction__torque_nm": 0.4, "power_law_friction__exponent": 1.3},
         {"load_friction__share": 0.2, "gravity_cos": 1.0},
+        {"gear_friction__share": 0.2, "gravity_cos": 1.0},
         {"torque_lag__time_constant_s": 0.01},
         {"integral_action__rate_per_s": 2.0},
         {"position_integral__rate_per_s": 5.0},
@@ -103,7 +104,7 @@ COGS = {"cogging__torque_nm": 5.0, "cogging__periods": 30.0}
 
 @pytest.mark.parametrize(
     "effect",
-    [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}, COGS],
+    [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}, {"gear_friction__share": 0.2}, COGS],
 )
 def test_steps_of_half_a_millisecond_are_nearly_as_good_as_those_of_a_twentieth(
     effect: dict[str, float],
