@@ -202,6 +202,8 @@ class JointProblem(WithoutMaps):
                 f"{silent[0]}: the commanded gains of {signal} are not stated; write {' and '.join(joint.gain_names)} into its "
                 "measurements.yaml, or fit them (gains=fitted)"
             )
+        self.states_gains = not silent
+        """True if every recording, or the file, states gains."""
         self.signal, self.commanded = (
             signal,
             not silent and (gains != "fitted" or not joint.gain_names),
@@ -299,7 +301,7 @@ class JointProblem(WithoutMaps):
         return (
             "commanded gains"
             if self.commanded
-            else "gains fitted (not stated by the recordings)"
+            else f"gains fitted ({'not those of the file' if self.states_gains else 'not stated by the recordings'})"
         ) + known
 
     @property

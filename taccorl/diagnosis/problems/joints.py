@@ -33,7 +33,7 @@ from taccorl.diagnosis.search.identifiable import (
     identifiable_numbers,
 )
 from taccorl.diagnosis.search.problem import Progress, no_progress
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, gains_nothing
 from taccorl.diagnosis.search.solve import PartFinding, solved, with_drifts
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import Done, Failed, run_in_processes
@@ -125,6 +125,12 @@ def diagnose_joint(
     own = apart(own, drifted)
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
     found = solved(signal, problem, search, without, progress)
+    if gains == "auto" and problem.commanded and _other_gains_do(found.diagnosis):
+        progress("the gains are not those of the file: search again, with gains fitted")
+        freed = JointProblem(machine, signal, own, gains="fitted", held=without)
+        again = solved(signal, freed, search, without, progress)
+        if _removes_more(_left(again.diagnosis), _left(found.diagnosis)):
+            problem, found = freed, again
     if problem.axis is not None:
         return JointFinding(**vars(found), floors=tuple(problem.floors))
     known = known_numbers(problem, found.diagnosis)
@@ -136,6 +142,24 @@ def diagnose_joint(
     joint = JointFinding(**told, floors=tuple(problem.floors))
     # For other machines a finding of their checks says it.
     return with_drifts(joint, drifted) if isinstance(machine, TwinConfig) else joint
+
+
+def _left(found: Diagnosis) -> float:
+    """RMS error that a diagnosis leaves in validation recordings [floors]."""
+    return found.errors["after"]["validation"]
+
+
+def _removes_more(error: float, other: float) -> bool:
+    """Whether ``error`` is lower than ``other`` [floors] by what an effect must gain."""
+    return error < other and not gains_nothing(other, error)
+
+
+def _other_gains_do(found: Diagnosis) -> bool:
+    """Whether the plain fit, in which gains are free, leaves much less than the answer."""
+    plain = found.plain
+    return plain is not None and _removes_more(
+        plain.errors["validation"], _left(found)
+    )
 
 
 def drifts_of(

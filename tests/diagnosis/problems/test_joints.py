@@ -79,6 +79,30 @@ def finding() -> JointFinding:
     )
 
 
+def test_gains_that_recordings_state_wrongly_are_found_and_no_effect_instead():
+    """The drive runs kp of the twin; the recordings state half as much again."""
+    right = sweeps(torque_nm=0.0)
+    true_kp, true_kd = (getattr(right.fit[0], name)[SIGNAL] for name in ("kp", "kd"))
+    stated = {"kp": {SIGNAL: 1.5 * true_kp}, "kd": {SIGNAL: true_kd}}
+    fit, validation = (
+        tuple(dataclasses.replace(m, **stated) for m in own)
+        for own in (right.fit, right.validation)
+    )
+    found = diagnose_joint(
+        TwinConfig(),
+        SIGNAL,
+        Measurements(fit, validation),
+        search=ONE,
+        without=WITHOUT,
+    ).diagnosis
+    assert found.names == ()
+    assert found.errors["after"]["validation"] < 1.2
+    # kp of the twin, which the recordings say they multiply by 1.5.
+    assert 1.5 * found.base["kp"] / found.base["kd"] == pytest.approx(
+        true_kp / true_kd, rel=0.02
+    )
+
+
 def test_recordings_of_other_joints_are_left_out():
     own, other, both = (
         still("own", left_joint5=0.1),
