@@ -483,7 +483,11 @@ class Fits:
                 self.error(other), self.error(model)
             ):
                 of_file = {name: stated(name, other.values) for name in names}
-                return dataclasses.replace(other, values=other.values | of_file)
+                return dataclasses.replace(
+                    other,
+                    values=other.values | of_file,
+                    moved=np.hypot(other.moved, _moved_from(model, other)),
+                )
         return model
 
     def _with_intervals(self, problem: Problem, fine: Fit) -> Fit:
@@ -736,3 +740,14 @@ def _simpler_form(c: Candidate, values: Values) -> str:
         if abs(own[name] - limit) <= NEARLY
     ]
     return " or ".join(f"{words}: {name} {own[name]:.3g}" for words, name in found)
+
+
+def _moved_from(model: Fit, other: Fit) -> np.ndarray:
+    """(p,) how far the coordinates of ``other`` are from those of ``model``, in which more
+    numbers are free: the recordings hold either."""
+    return np.array(
+        [
+            f.coordinate(other.values[f.name]) - f.coordinate(model.values[f.name])
+            for f in other.frees
+        ]
+    )
