@@ -1,11 +1,11 @@
 """taccorl effects [NAME] [--for=joint|pads|camera|cells]
-taccorl effects new NAME [--out=NAME.py] [--for=joint|cells]
+taccorl effects new NAME [--out=NAME] [--for=joint|cells]
 
 List the physical effects that a model may lack: equation, unit of each parameter, knowledge that a model needs to compute it,
 recording that shows it, and effects that look similar. With NAME: the whole description of one.
 
-new    write a working example of an effect of your own, with its test: an effect of joints, or of
-       pads and cells
+new    write a working effect of your own: a package of one module with its test, an effect of
+       joints, or of pads and cells. Once it is installed, compare and diagnose know the effect
 """
 
 import keyword
@@ -38,7 +38,7 @@ class NewConfig:
     name: str
     """Name of the effect or task: small letters, digits and underscores."""
     out: Path | None = None
-    """File of the effect, or folder of the task; NAME.py, or NAME, if not given. Nothing is overwritten."""
+    """Folder of the package; NAME if not given. Nothing is overwritten."""
 
 
 @dataclass(kw_only=True)
@@ -75,27 +75,49 @@ def main(argv: list[str]) -> int:
 
 def _new(argv: list[str]) -> int:
     config = parse(NewEffectConfig, argv, positional="name", prog="taccorl effects new")
-    from taccorl.sim.effects import effects
-    from taccorl.sim.effects.example import example
+    from taccorl.sim import effects
 
-    check_new("effect", config.name, effects)
-    out = config.out or Path(f"{config.name}.py")
-    if not out.stem.isidentifier() or out.suffix != ".py":
-        raise TaccorlError(
-            f"--out={out}: must be a Python module, such as {config.name}.py"
-        )
-    try:
-        write_new(out, example(config.name, out.stem, config.for_))
-    except FileExistsError:
-        raise TaccorlError(
-            f"{out}: already exists; give another --out, or remove it"
-        ) from None
-    print(f"wrote {out}; its test: python -m pytest {out}")
+    check_new("effect", config.name, effects.effects)
+    texts = Path(effects.__file__).with_name("example")
+    package = write_package(config, "my_effect", [texts, texts / config.for_])
+    out = package.parent
+    print(f"wrote {package / '__init__.py'}: change the law there")
+    print(f"its test: python -m pytest {package}")
     print(
-        "to use it, publish the module in your package's pyproject.toml and install the package:"
+        f"next: python -m pip install --editable {out}; taccorl effects {config.name}"
     )
-    print(f'  [project.entry-points."taccorl.plugins"]\n  {config.name} = "{out.stem}"')
     return 0
+
+
+def write_package(config: NewConfig, example: str, folders: list[Path]) -> Path:
+    """Write the package of an example: each ``FILE.txt`` of ``folders`` as FILE, with the
+    name of ``config`` in place of ``example``. Returns the folder of the package, beside
+    which its pyproject.toml is. Raises TaccorlError: one of the two is there already."""
+    out = config.out or Path(config.name)
+    package = out / config.name
+    for path in (package, out / "pyproject.toml"):
+        if path.exists():
+            raise TaccorlError(
+                f"{path}: is there already; nothing was changed: give another --out, or "
+                "remove it"
+            )
+    try:
+        package.mkdir(parents=True)
+    except OSError as error:
+        raise TaccorlError(
+            f"{package}: cannot be made: {error.strerror}; give another --out"
+        ) from error
+    words = {example: config.name, _camel(example): _camel(config.name)}
+    for path in sorted(path for folder in folders for path in folder.glob("*.txt")):
+        text, name = path.read_text(encoding="utf-8"), path.stem
+        for old, new in words.items():
+            text, name = text.replace(old, new), name.replace(old, new)
+        write_new((out if name == "pyproject.toml" else package) / name, text)
+    return package
+
+
+def _camel(name: str) -> str:
+    return name.title().replace("_", "")
 
 
 def check_new(kind: str, name: str, known: "Registry[Any]") -> None:

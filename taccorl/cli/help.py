@@ -19,7 +19,7 @@ SHOWN = {
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
     "evaluate": "policy.path policy.type task episodes seed against twin robot pictures hide out",
     "post-train": "policy.path env.task env.twin anchor.dataset anchor.weight iterations resume rerun out",
-    "init-robot": "out dataset",
+    "init-robot": "out dataset servo law gains gravity_compensation",
     "compare": "twin against joints columns out rerun",
     "align": "twin joints pads cameras fit_kp out",
     "diagnose": "twin joints pads until columns out",

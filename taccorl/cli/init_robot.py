@@ -8,6 +8,7 @@ whether they compensate gravity. ``--dataset=DATASET`` also drafts a columns fil
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
@@ -24,6 +25,15 @@ class InitRobotConfig:
     """File to write; beside the model, with _robot.yaml in its name, if not given. An existing file is not overwritten."""
     dataset: Path | None = None
     """LeRobot dataset of the robot: its columns file is drafted as columns.yaml beside --out."""
+    servo: str = ""
+    """so101, sts3215, mx64, mx106, xl320, xl330, erob80_50 or erob80_100: write the published numbers of this servo (law, supply,
+    winding, inertia, friction) at every hinge, each with its source."""
+    law: Literal["", "impedance", "cascade", "velocity", "torque", "effort", "pwm"] = ""
+    """Control law of every drive; that of the model's actuators if not given."""
+    gains: Literal["", "commanded", "fitted"] = ""
+    """commanded: the drives run kp and kd. fitted: nobody knows them. TODO in the file if not given."""
+    gravity_compensation: float | None = None
+    """Share of the weight that the controller adds to its torque, 0 … 1. TODO in the file if not given; 0 of a servo."""
 
 
 def main(argv: list[str]) -> int:
@@ -36,13 +46,34 @@ def main(argv: list[str]) -> int:
             raise TaccorlError(
                 f"{path}: already exists; give another --out, or remove it"
             )
-    from taccorl.alignment.machines.robot_draft import columns_draft, robot_draft
+    from taccorl.alignment.machines.robot_draft import (
+        StatedFacts,
+        columns_draft,
+        robot_draft,
+        servo_of,
+    )
     from taccorl.alignment.machines.robot_file import TODO
 
-    text, robot = robot_draft(config.model, out)
+    share = config.gravity_compensation
+    if share is not None and not 0.0 <= share <= 1.0:
+        raise TaccorlError(
+            f"--gravity_compensation={share:g}: give the share of the weight, 0 … 1"
+        )
+    stated = StatedFacts(
+        law=config.law or None,
+        gains=config.gains or None,
+        gravity_compensation=share,
+        servo=servo_of(config.servo) if config.servo else {},
+    )
+    text, robot = robot_draft(config.model, out, stated)
+    if config.gains and f"    gains: {config.gains}" not in text:
+        print(
+            f"note: --gains={config.gains} is not written: no joint's law fits kp and kd; "
+            "law pwm fits stall torque and back-EMF instead"
+        )
     texts, spare = {out: text}, []
     if config.dataset is not None:
-        texts[beside], spare = columns_draft(config.dataset, robot)
+        texts[beside], spare = columns_draft(config.dataset, robot, stated.servo)
     for path, written in texts.items():
         try:
             write_new(path, written)
@@ -78,6 +109,8 @@ def _print_todo(text: str, todo: str) -> None:
         for number, line in enumerate(text.splitlines(), 1)
         if f": {todo}" in line
     ]
+    if not left:
+        return
     print(
         f"write {len(left)} values where it says {todo}: lines {', '.join(map(str, left))}"
     )

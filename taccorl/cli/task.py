@@ -7,10 +7,9 @@ installed, collect, augment, post-train and evaluate know the task.
 from dataclasses import dataclass
 from pathlib import Path
 
-from taccorl.cli.effects import NewConfig, check_new
+from taccorl.cli.effects import NewConfig, check_new, write_package
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
-from taccorl.lineage.destinations import write_new
 
 
 @dataclass(kw_only=True)
@@ -31,20 +30,9 @@ def main(argv: list[str]) -> int:
     from taccorl.sim.task import tasks
 
     check_new("task", config.name, tasks)
-    out = config.out or Path(config.name)
-    package = out / config.name
-    if package.exists():
-        raise TaccorlError(
-            f"{package}: is there already; nothing was changed: give another --out, or remove it"
-        )
-    package.mkdir(parents=True)
-    for path in sorted((Path(__file__).parents[1] / "tasks" / "example").glob("*.txt")):
-        text = path.read_text(encoding="utf-8").replace("lift_block", config.name)
-        place = out if path.stem == "pyproject.toml" else package
-        write_new(
-            place / path.stem,
-            text.replace("LiftBlock", config.name.title().replace("_", "")),
-        )
+    texts = Path(__file__).parents[1] / "tasks" / "example"
+    package = write_package(config, "lift_block", [texts])
+    out = package.parent
     print(
         f"wrote {package / '__init__.py'}: change the scene, the goal and the expert there"
     )

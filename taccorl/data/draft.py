@@ -41,11 +41,9 @@ PICTURE_SHAPE = (
 FPS = 30  # Greatest row rate of a draft with pictures [Hz], and that of one with neither pictures nor positions
 # Of rows without times: their drafts state ``lead_frames``, the row of a command
 ROW_CLOCK_READERS = ("hdf5", "lerobot")
-ACTION_TIME = (
-    "action_time: next_row   # action of row t: the last command sent before row t + 1"
-)
+ACTION_TIME = "action_time: next_row   # a guess: action of row t: the last command sent before row t + 1"
 ROW_ACTION_TIME = (
-    "action_time: this_row   # action of row t: sent right after the observation of row t, as by LeRobot's record loop; "
+    "action_time: this_row   # a guess: action of row t: sent right after the observation of row t, as by LeRobot's record loop; "
     "next_row: reached at row t + 1"
 )
 COUNT_UNIT = "adc_count"
@@ -195,7 +193,7 @@ class _Draft:
             if t not in self.used and t not in self.spare and t not in texts
         ]
         markers = (
-            f"   # or {{by: markers, topic: {_yaml(texts[0].topic)}, min_s: 1.0}}"
+            f"; or {{by: markers, topic: {_yaml(texts[0].topic)}, min_s: 1.0}}"
             if texts
             else ""
         )
@@ -205,11 +203,11 @@ class _Draft:
             f"dataset: {_yaml(_beside(self.path, 'dataset').name)}   # what the dataset shall hold, drafted beside this file",
             f"reader: {inventory.reader}",
             f"clock: {clock}",
-            f"episodes: {{by: whole_file, min_s: 1.0}}{markers}",
+            f"episodes: {{by: whole_file, min_s: 1.0}}   # min_s is a guess{markers}",
             "instruction: {from: topic, topic: task}"
             if inventory.reader == "lerobot"
             else said,
-            f"channels:   # each must be used by a feature below{rate}",
+            f"channels:   # each must be used by a feature below; max_age_s is a guess{rate}",
             *(
                 f"  {self.names[t.key]}: {self.channel(t, clock, self.row_clock and t in self.commands)}"
                 for t in self.used
@@ -455,14 +453,14 @@ class _Draft:
             f"wire: {{rows: {rows}, columns: {columns}, dtype: {dtype}, transpose: false}}   "
             "# as it is sent, row after row; transpose: true if its rows are the pad's columns",
             f"adc_bits: {bits.get(dtype, 'TODO   # of the converter, at most 15: 10, 12')}",
-            "wire_shift_bits: 0",
+            "wire_shift_bits: 0   # a guess",
             f"rate_hz: {f'{known:.3g}' if known else 'TODO   # readings a second'}",
-            f"scan_time_s: {f'{1 / known:.3g}' if known else 'TODO'}   # time of one scan of the pad, at most 1 / rate_hz",
+            f"scan_time_s: {f'{1 / known:.3g}' if known else 'TODO'}   # a guess: time of one scan, at most 1 / rate_hz",
             f"unit: {COUNT_UNIT}",
             "baseline: {rule: median_of_first, frames: 30, max_spread_count: TODO}   "
-            "# a pad whose first 30 frames spread more, in counts, is not at rest: 12",
+            "# 30 is a guess; a pad whose first 30 frames spread more, in counts, is not at rest: 12",
             "noise_count: TODO   # counts above the baseline that an untouched taxel may show: 15",
-            "scheme: fixed_scale",
+            "scheme: fixed_scale   # a guess",
             "gain_per_count: TODO   # the policy reads counts × gain and calls a taxel above 0.4 touched: 0.0133 for 30 counts",
         ]
 

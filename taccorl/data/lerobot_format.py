@@ -414,7 +414,8 @@ def _pixels_counted() -> Iterator[None]:
                 return
             pixels = np.ascontiguousarray(batch.reshape(-1, 1, batch.shape[-1]))
             new = [
-                cv2.calcHist([pixels], [c], None, [256], [0, 256])[:, 0]
+                # (256, 1) of OpenCV 4, (256,) of OpenCV 5
+                cv2.calcHist([pixels], [c], None, [256], [0, 256]).reshape(256)
                 for c in range(batch.shape[-1])
             ]
             self.counts = np.array(new, np.int64) + (

@@ -10,7 +10,9 @@ import taccorl.robot_plugin.config_robots
 import taccorl.robot_plugin.lerobot_hooks
 import taccorl.training.reading
 from taccorl.extras import quick_columns
+from taccorl.lerobot_plugin import compat
 
+compat.follow()
 taccorl.training.reading.install()
 taccorl.robot_plugin.lerobot_hooks.install()
 quick_columns()

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.common.wandb_utils import get_wandb_run_id_from_filesystem
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 
 from taccorl.data.episode import Episode
@@ -510,7 +509,7 @@ def _logger(settings: PostTrainSettings) -> Callable[[dict[str, Any]], None]:
     import wandb
 
     run = wandb.init(
-        id=get_wandb_run_id_from_filesystem(out) if (out / "wandb").is_dir() else None,
+        id=_last_run(out),
         resume="allow", project=asked.project, entity=asked.entity, mode=asked.mode,  # type: ignore[arg-type]
         name=out.name, dir=out, job_type="post-train", config=run_settings.to_json(settings),
     )  # fmt: skip
@@ -518,6 +517,20 @@ def _logger(settings: PostTrainSettings) -> Callable[[dict[str, Any]], None]:
         {name: value for name, value in row.items() if value is not None},
         step=row["iteration"],
     )
+
+
+def _last_run(out: Path) -> str | None:
+    """Name of the run of Weights & Biases in ``out/wandb/latest-run``; None: there is no
+    run. Raises TaccorlError: there are several files of runs, or none."""
+    if not (out / "wandb").is_dir():
+        return None
+    found = [*out.glob("wandb/latest-run/run-*.wandb")]
+    if len(found) != 1:
+        raise TaccorlError(
+            f"{out / 'wandb' / 'latest-run'}: has {len(found)} files run-*.wandb, where one "
+            "names the run that goes on; remove the folder wandb to begin another one"
+        )
+    return found[0].stem.removeprefix("run-")
 
 
 def _line(row: dict[str, Any]) -> str:

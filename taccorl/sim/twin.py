@@ -85,6 +85,9 @@ def empty_bench(config: TwinConfig) -> mujoco.MjSpec:
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # MuJoCo 4.0.0's Newton solver gives wrong accelerations with sparse Jacobians, which
+    # it takes by itself where a scene has 60 degrees of freedom or more; 4.0.1 does not.
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.impratio = config.physics.impratio
     option.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -86,63 +86,61 @@ def test_a_wrong_kind_or_name_is_said_with_the_nearest(said) -> None:
 @pytest.mark.parametrize(
     "kind", [pytest.param("joint", marks=pytest.mark.slow), "cells"]
 )
-def test_a_written_example_passes_its_own_test_and_fails_it_once_its_law_is_broken(
+def test_a_written_package_passes_its_own_test_and_fails_it_once_its_law_is_broken(
     said, tmp_path, kind
 ):
-    code, shown = said("effects", "new", "my_effect", "--out=mine.py", f"--for={kind}")
+    code, shown = said("effects", "new", "stiffer", "--out=mine", f"--for={kind}")
     assert code == 0
-    assert 'my_effect = "mine"' in shown
-    pytest_words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "mine.py")
-    done = fresh_python(*pytest_words, cwd=tmp_path, path=tmp_path)
+    assert "pip install --editable mine" in shown
+    module = tmp_path / "mine" / "stiffer" / "__init__.py"
+    assert "my_effect" not in module.read_text()
+    pytest_words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "mine")
+    path = tmp_path / "mine"
+    done = fresh_python(*pytest_words, cwd=tmp_path, path=path)
     assert done.returncode == 0, done.stdout
     assert "2 passed" in done.stdout
-    text = (tmp_path / "mine.py").read_text()
+    text = module.read_text()
     law = {"joint": "self.stiffness_nm_per_rad, ", "cells": "self.curvature)"}[kind]
     assert law in text
-    (tmp_path / "mine.py").write_text(
-        text.replace(
-            law,
-            law.replace("self.stiffness_nm_per_rad", "1.0").replace(
-                "self.curvature", "0.3"
-            ),
-        )
-    )
-    broken = fresh_python(*pytest_words, cwd=tmp_path, path=tmp_path)
+    broken_law = {"joint": "1.0, ", "cells": "0.3)"}[kind]
+    module.write_text(text.replace(law, broken_law))
+    broken = fresh_python(*pytest_words, cwd=tmp_path, path=path)
     assert broken.returncode == 1
     assert (
-        "my_effect: its absent numbers do something" in broken.stdout
+        "stiffer: its absent numbers do something" in broken.stdout
         or "near its absent values" in broken.stdout
     )
 
 
-def test_a_written_example_joins_the_registry_by_its_entry_point(
-    said, tmp_path: Path
-) -> None:
-    said("effects", "new", "my_effect")
-    info = tmp_path / "mine-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[taccorl.plugins]\nmy_effect = my_effect\n")
+@pytest.mark.slow
+def test_a_written_package_is_installed_and_then_known(said, tmp_path: Path) -> None:
+    """pip builds the package into a folder of its own; no index is asked."""
+    assert said("effects", "new", "my_effect")[0] == 0
+    site = tmp_path / "site"
+    words = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation"]
+    words += ["--no-index", f"--target={site}", "./my_effect"]
+    built = fresh_python(*words, cwd=tmp_path)
+    assert built.returncode == 0, built.stderr
     done = fresh_python(
-        "-m", "taccorl.cli.main", "effects", "my_effect", cwd=tmp_path, path=tmp_path
+        "-m", "taccorl.cli.main", "effects", "my_effect", cwd=tmp_path, path=site
     )
     assert done.returncode == 0, done.stderr
     assert "stiffness_nm_per_rad [N·m/rad]" in done.stdout
 
 
 def test_nothing_is_overwritten_and_no_name_taken_twice(said, tmp_path: Path) -> None:
-    (tmp_path / "my_effect.py").write_text("precious")
+    (tmp_path / "my_effect").mkdir()
+    (tmp_path / "my_effect" / "pyproject.toml").write_text("precious")
     code, shown = said("effects", "new", "my_effect")
     assert code == 2
-    assert "my_effect.py: already exists" in shown
-    assert (tmp_path / "my_effect.py").read_text() == "precious"
+    assert "pyproject.toml: is there already" in shown
+    assert (tmp_path / "my_effect" / "pyproject.toml").read_text() == "precious"
+    assert not (tmp_path / "my_effect" / "my_effect").exists()
     assert (
         "the effect taxel_creep exists already"
         in said("effects", "new", "taxel_creep")[1]
     )
     for name in ("My-Effect", "class", "2nd"):
         assert "is not a valid name of an effect" in said("effects", "new", name)[1]
-    assert (
-        "must be a Python module"
-        in said("effects", "new", "other", "--out=other.txt")[1]
-    )
+    (tmp_path / "file").touch()
+    assert "cannot be made" in said("effects", "new", "other", "--out=file")[1]

@@ -309,3 +309,15 @@ def test_an_arm_may_have_gains_of_its_own():
 def test_wrong_gains_are_refused_by_name(settings, said):
     with pytest.raises(TaccorlError, match=said):
         ControllerConfig(**settings)
+
+
+def test_a_twin_with_many_parts_keeps_dense_jacobians():
+    """MuJoCo takes sparse ones by itself from 60 degrees of freedom on."""
+    spec = empty_bench(TwinConfig())
+    for k in range(10):  # 6 degrees of freedom each, beside those of the arms
+        body = spec.worldbody.add_body(name=f"part {k}", pos=[0.0, 0.0, 1.0 + k])
+        body.add_freejoint()
+        body.add_geom(size=[0.01, 0.0, 0.0])
+    model = spec.compile()
+    assert model.nv >= 60
+    assert not mujoco.mj_isSparse(model)

@@ -189,7 +189,9 @@ class TactilePI05Pytorch(PI05Pytorch):
         image_masks: list[Tensor],
         tokens: Tensor,
         token_mask: Tensor,
+        *memory: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """``memory``: what versions of LeRobot after 0.6.1 pass on to their π0.5 besides."""
         backbone = self.paligemma_with_expert
         are_tokens = not images or images[0].ndim == 3  # none: a policy without cameras
         if not are_tokens and (
@@ -199,7 +201,7 @@ class TactilePI05Pytorch(PI05Pytorch):
         if self.fusion is not None and self._state_B1D is not None:
             self._fuse(self.fusion, images, self._state_B1D)
         context_BTD, valid_BT, starts_block_BT = super().embed_prefix(
-            images, image_masks, tokens, token_mask
+            images, image_masks, tokens, token_mask, *memory
         )
         if self._touch is None:
             return context_BTD, valid_BT, starts_block_BT

@@ -7,6 +7,7 @@ trained from scratch has to learn first what digits mean, and reads three times 
 import math
 import re
 import zlib
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -45,6 +46,11 @@ class ByteTokenizer:
             [[1] * len(row) + [0] * (longest - len(row)) for row in rows]
         )
         return {"input_ids": ids, "attention_mask": mask}
+
+    def save_pretrained(self, save_directory: str | Path, **_: Any) -> tuple[str, ...]:
+        """Files written into a checkpoint, as a tokenizer of transformers returns them:
+        none. The step's ``tokenizer_name`` says all."""
+        return ()
 
 
 class WordTokenizer(ByteTokenizer):

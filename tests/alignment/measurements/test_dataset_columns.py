@@ -216,3 +216,23 @@ def test_a_drafted_ingest_and_a_columns_file_pair_action_and_state_alike(
     assert rows >= ROWS - 1
     np.testing.assert_allclose(m.target[:, 0], direct.target[:rows, 0], atol=1e-6)
     np.testing.assert_allclose(m.measured[:, 0], direct.measured[:rows, 0], atol=1e-6)
+
+
+def test_a_draft_of_an_so101_states_units_as_lerobot_records_them(
+    dataset: Path,
+) -> None:
+    info, model = dataset / "meta" / "info.json", dataset.parent / "arm.xml"
+    info.write_text(info.read_text().replace("grip.pos", "gripper.pos"))
+    model.write_text(ARM.replace('"grip"', '"gripper"'))
+    out = dataset.parent / "arm.yaml"
+    words = [str(model), f"--out={out}", f"--dataset={dataset}", "--servo=so101"]
+    assert init_robot.main(words) == 0
+    columns = dataset.parent / "columns.yaml"
+    assert columns.read_text().count("# a guess: ") == 4
+    two = read_measurements(dataset, columns=columns).all[1]
+    state, _ = numbers(1)
+    np.testing.assert_allclose(two.measured[:, 0], np.radians(state[:, 0]), atol=1e-6)
+    # 0 is -0.2 rad, 100 is 1.8 rad
+    np.testing.assert_allclose(
+        two.measured[:, 1], -0.2 + 2.0 * state[:, 1] / 100, atol=1e-5
+    )
