@@ -7,6 +7,7 @@ people's datasets it stays unknown.
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
@@ -193,9 +195,7 @@ class Dataset:
                 f"{self.root}/meta/info.json: has no feature {absent[0]}: copy the dataset again"
             )
         with plainly(path, PARQUET):
-            table = pq.read_table(
-                path, columns=columns, filters=[("episode_index", "==", index)]
-            )
+            table = _rows_of_episode(path, index, columns)
         if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(
             range(num_rows)
         ):
@@ -523,10 +523,9 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         with plainly(path, PARQUET):
-            names = [
-                n for n in pq.read_schema(path).names if not n.startswith("stats/")
-            ]
-            rows += pq.read_table(path, columns=names).to_pylist()
+            every = pq.read_schema(path).names
+        names = [name for name in every if not name.startswith("stats/")]
+        rows += read_columns(path, names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
     listed, told = [r["episode_index"] for r in rows], info["total_episodes"]
     if len(listed) != told or listed != list(range(told)):
@@ -551,8 +550,7 @@ def _read_tasks(root: Path) -> dict[int, str]:
         raise DatasetError(
             f"{root}: there is no meta/tasks.parquet: copy it whole, or remove a failed recording"
         )
-    with plainly(path, PARQUET):
-        table = pq.read_table(path)
+    table = read_columns(path)
     # LeRobot up to 0.4 kept the text as pandas' index.
     text = next(
         (n for n in ("task", "__index_level_0__") if n in table.column_names), None
@@ -740,17 +738,60 @@ def numbers_of(column: pa.ChunkedArray, where: str) -> np.ndarray:
     return values.to_numpy()
 
 
+def read_columns(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """A parquet file, or these columns of it. (``pq.read_table`` does the same and imports pandas, which takes 0.6 CPU-s.)
+    Raises DatasetError: not a whole parquet file, or it lacks a column."""
+    with plainly(path, PARQUET), pq.ParquetFile(path) as file:
+        _require_columns(path, file, columns or ())
+        return file.read(columns)
+
+
+def _require_columns(path: Path, file: pq.ParquetFile, columns: Sequence[str]) -> None:
+    """Raise a DatasetError if a file lacks a column, which pyarrow would leave out of the table without a word."""
+    present = set(file.schema_arrow.names)
+    if absent := [key for key in columns if key not in present]:
+        raise DatasetError(f"{path}: lacks the column {absent[0]}: copy it again")
+
+
 def data_files(root: Path) -> list[Path]:
     """Parquet files of rows in the order in which LeRobot joins them."""
     return sorted((root / "data").glob("*/*.parquet"))
+
+
+@functools.lru_cache(maxsize=2)
+def _row_groups(
+    path: Path, changed_ns: int
+) -> tuple[pq.FileMetaData, np.ndarray, np.ndarray]:
+    """Footer of a parquet file, and (G,) first and last episode that each of its row groups may hold. LeRobot writes a row group
+    for each episode, so that reading the footer takes longer than reading an episode. ``changed_ns``: time of the last change."""
+    del changed_ns  # part of the key: a file that was written again is read again
+    footer, bounds = pq.read_metadata(path), []
+    columns = [footer.schema.column(k).path for k in range(footer.num_columns)]
+    column = columns.index("episode_index")
+    for k in range(footer.num_row_groups):
+        known = footer.row_group(k).column(column).statistics
+        stated = known is not None and known.has_min_max
+        bounds.append((known.min, known.max) if stated else (-math.inf, math.inf))
+    first, last = np.array(bounds, dtype=float).reshape(-1, 2).T
+    return footer, first, last
+
+
+def _rows_of_episode(path: Path, index: int, columns: Sequence[str]) -> pa.Table:
+    """The ``columns`` of the rows of one episode, read from the row groups that may hold it."""
+    footer, first, last = _row_groups(path, path.stat().st_mtime_ns)
+    with pq.ParquetFile(path, metadata=footer) as file:
+        _require_columns(path, file, columns)
+        groups = np.flatnonzero((first <= index) & (index <= last)).tolist()
+        table = file.read_row_groups(groups, [*columns, "episode_index"])
+    own = pc.equal(table["episode_index"], index)  # pyright: ignore[reportAttributeAccessIssue]
+    return table.filter(own).select(list(columns))
 
 
 def feature_rows(root: Path, key: str) -> np.ndarray:
     """(N, size) values of a feature of numbers in all rows of the dataset."""
     parts = []
     for path in data_files(root):
-        with plainly(path, PARQUET):
-            column = pq.read_table(path, columns=[key])[key]
+        column = read_columns(path, [key])[key]
         parts += (
             [numbers_of(column, f"{path}, {key}").reshape(len(column), -1)]
             if len(column)
