@@ -7,7 +7,6 @@ people's datasets it stays unknown.
 
 import contextlib
 import dataclasses
-import functools
 import json
 import math
 import os
@@ -108,6 +107,8 @@ class Dataset:
             why = "not stored as video; frames are in training's cache (lerobot-train --dataset.cache=gpu|host|disk)"
             self.skipped |= dict.fromkeys(self.unstored, why)
         self._records = _read_records(self.root, self._table, self.info["features"])
+        self._rows: _Rows | None = None
+        """File of the episode that was read last."""
         manifest = self.root / PROVENANCE / "manifest.json"
         self.provenance: dict[str, Any] | None = (
             _read_json(manifest) if manifest.is_file() else None
@@ -195,7 +196,9 @@ class Dataset:
                 f"{self.root}/meta/info.json: has no feature {absent[0]}: copy the dataset again"
             )
         with plainly(path, PARQUET):
-            table = _rows_of_episode(path, index, columns)
+            if self._rows is None or self._rows.path != path:
+                self._rows = _Rows(path)
+            table = self._rows.of_episode(index, columns)
         if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(
             range(num_rows)
         ):
@@ -758,33 +761,33 @@ def data_files(root: Path) -> list[Path]:
     return sorted((root / "data").glob("*/*.parquet"))
 
 
-@functools.lru_cache(maxsize=2)
-def _row_groups(
-    path: Path, changed_ns: int
-) -> tuple[pq.FileMetaData, np.ndarray, np.ndarray]:
-    """Footer of a parquet file, and (G,) first and last episode that each of its row groups may hold. LeRobot writes a row group
-    for each episode, so that reading the footer takes longer than reading an episode. ``changed_ns``: time of the last change."""
-    del changed_ns  # part of the key: a file that was written again is read again
-    footer, bounds = pq.read_metadata(path), []
-    columns = [footer.schema.column(k).path for k in range(footer.num_columns)]
-    column = columns.index("episode_index")
-    for k in range(footer.num_row_groups):
-        known = footer.row_group(k).column(column).statistics
-        stated = known is not None and known.has_min_max
-        bounds.append((known.min, known.max) if stated else (-math.inf, math.inf))
-    first, last = np.array(bounds, dtype=float).reshape(-1, 2).T
-    return footer, first, last
+class _Rows:
+    """A file of rows, of which single episodes are read. Its footer is read once: LeRobot writes a row group for each episode, so
+    that reading the footer takes longer than reading an episode."""
 
+    def __init__(self, path: Path) -> None:
+        """Raises ValueError, OSError: not a whole parquet file, or it has no ``episode_index``."""
+        self.path = path
+        self._footer = pq.read_metadata(path)
+        schema = self._footer.schema
+        columns = [schema.column(k).path for k in range(self._footer.num_columns)]
+        column, bounds = columns.index("episode_index"), []
+        for k in range(self._footer.num_row_groups):
+            known = self._footer.row_group(k).column(column).statistics
+            stated = known is not None and known.has_min_max
+            bounds.append((known.min, known.max) if stated else (-math.inf, math.inf))
+        self._first, self._last = np.array(bounds, dtype=float).reshape(-1, 2).T
+        """(G,) first and last episode that each row group may hold."""
 
-def _rows_of_episode(path: Path, index: int, columns: Sequence[str]) -> pa.Table:
-    """The ``columns`` of the rows of one episode, read from the row groups that may hold it."""
-    footer, first, last = _row_groups(path, path.stat().st_mtime_ns)
-    with pq.ParquetFile(path, metadata=footer) as file:
-        _require_columns(path, file, columns)
-        groups = np.flatnonzero((first <= index) & (index <= last)).tolist()
-        table = file.read_row_groups(groups, [*columns, "episode_index"])
-    own = pc.equal(table["episode_index"], index)  # pyright: ignore[reportAttributeAccessIssue]
-    return table.filter(own).select(list(columns))
+    def of_episode(self, index: int, columns: Sequence[str]) -> pa.Table:
+        """The ``columns`` of the rows of one episode. Raises DatasetError: the file lacks a column."""
+        groups = np.flatnonzero((self._first <= index) & (index <= self._last))
+        with pq.ParquetFile(self.path, metadata=self._footer) as file:
+            _require_columns(self.path, file, columns)
+            named = [*columns, "episode_index"]
+            table = file.read_row_groups(groups.tolist(), named)
+        own = pc.equal(table["episode_index"], index)  # pyright: ignore[reportAttributeAccessIssue]
+        return table.filter(own).select(list(columns))
 
 
 def feature_rows(root: Path, key: str) -> np.ndarray:

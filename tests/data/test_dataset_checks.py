@@ -443,9 +443,9 @@ def test_an_episode_is_read_from_its_own_row_groups_and_after_a_change(faulty):
     for size in (1, ROWS + 1, len(table)):  # rows of two episodes in a group, too
         pq.write_table(table, path, row_group_size=size)
         number = Dataset(faulty).values(1, ["index"])["index"].ravel()
-        assert number.tolist() == [*range(ROWS, 2 * ROWS)]
+        assert number.tolist() == [*range(ROWS, 2 * ROWS + 1)]
     pq.write_table(table, path, write_statistics=False)
-    assert Dataset(faulty).values(2, ["index"])["index"][0] == 2 * ROWS
+    assert Dataset(faulty).values(2, ["index"])["index"][0] == 2 * ROWS + 1
     pq.write_table(table.drop_columns(["action"]), path)
     with pytest.raises(DatasetError, match="lacks the column action"):
         Dataset(faulty).values(0, ["action"])
