@@ -774,8 +774,10 @@ class _Rows:
         column, bounds = columns.index("episode_index"), []
         for k in range(self._footer.num_row_groups):
             known = self._footer.row_group(k).column(column).statistics
-            stated = known is not None and known.has_min_max
-            bounds.append((known.min, known.max) if stated else (-math.inf, math.inf))
+            if known is not None and known.has_min_max:
+                bounds.append((known.min, known.max))
+            else:
+                bounds.append((-math.inf, math.inf))
         self._first, self._last = np.array(bounds, dtype=float).reshape(-1, 2).T
         """(G,) first and last episode that each row group may hold."""
 
