@@ -1,5 +1,7 @@
-"""Figures of reading and writing recordings: ``make bench ONLY=ingest``, ``memory``, ``corruption``, ``start_up``."""
+"""Figures of reading and writing recordings: ``make bench ONLY=ingest``, ``check``, ``memory``, ``corruption``, ``start_up``."""
 
+import itertools
+import multiprocessing
 import os
 import resource
 import subprocess
@@ -8,13 +10,17 @@ import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from pipelines.benchmarks.rows import Row, benchmark
 from pipelines.benchmarks.run import ROOT
+from taccorl.data.lerobot_format import merge, quiet_lerobot
 from taccorl.data.spec import data_specs_folder, load_recording_spec
 from taccorl.lineage.processes import cpu_s
 
@@ -24,6 +30,8 @@ RIVAL_ROWS = 150
 """Number of rows for the reference writer. LeRobot's default writer takes 0.17 CPU-s per row, so that a part of the recording is
 measured."""
 REPEATS = 3
+EPISODE_ROWS, FEW_EPISODES, MANY_EPISODES = 20, 5, 2000
+"""Rows of an episode and numbers of episodes of the datasets that the benchmark ``check`` reads."""
 NATIVE = [480, 640, 3]
 CORRUPTION, DAMAGE = (
     ("tests/end_to_end/test_corruption.py",),
@@ -75,8 +83,6 @@ def _stand_in(path: Path, duration_s: float) -> Path:
 def ingest_speed() -> Iterator[Row]:
     """Benchmark of ingest: rows per second relative to LeRobot's own default writer and to real time, and the share of
     parsing."""
-    from taccorl.data.lerobot_format import quiet_lerobot
-
     with quiet_lerobot():
         import lerobot.datasets.lerobot_dataset  # noqa: F401  (its import, 11 CPU-s, is not what is measured)
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
@@ -148,7 +154,7 @@ def _default_writer(path: Path, spec: Any, root: Path) -> Cost:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from taccorl.data.cutting import open_episodes
-    from taccorl.data.lerobot_format import _rows, lerobot_features, quiet_lerobot
+    from taccorl.data.lerobot_format import _rows, lerobot_features
 
     with open_episodes(path, spec) as episodes, quiet_lerobot():
         episode = episodes[0]
@@ -230,6 +236,50 @@ def ingest_memory() -> Iterator[Row]:
             rival=rival,
             rival_value=importing,
         )
+
+
+@benchmark("check")
+def check_dataset() -> Iterator[Row]:
+    """Benchmark of ``taccorl check`` on a dataset of numbers with few and with many episodes of 20 rows: CPU time of the
+    command, and its peak resident memory."""
+    with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
+        folder = Path(name)
+        one, many = folder / "one", folder / "many"
+        # By another process: a command's peak memory is at least that of the process which starts it.
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            pool.submit(_numbers, one, FEW_EPISODES).result()
+            copies = [one] * (MANY_EPISODES // FEW_EPISODES)
+            pool.submit(merge, copies, many).result()
+        for root, number in ((one, FEW_EPISODES), (many, MANY_EPISODES)):
+            command = [sys.executable, "-m", "taccorl.cli.main", "check", str(root)]
+            _used(command, subprocess.DEVNULL)  # compiles what is imported
+            found = [_used(command, subprocess.DEVNULL)[1] for _ in range(REPEATS)]
+            cpu = [usage.ru_utime + usage.ru_stime for usage in found]
+            label = f"taccorl check, {number} episodes of {EPISODE_ROWS} rows"
+            goal = f"≤ {1.5 if number == FEW_EPISODES else 0.02 * number:g}"
+            yield Row.of(cpu, name=label, unit="CPU-s", goal=goal, by=mean)
+            peak = [usage.ru_maxrss / 1000 for usage in found]
+            yield Row.of(
+                peak, name=f"{label}: peak memory", unit="MB", goal="≤ 300", by=mean
+            )
+
+
+def _numbers(root: Path, num_episodes: int) -> None:
+    """A dataset of six joints that follow their commands, written by LeRobot."""
+    with quiet_lerobot():
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        joints = {"dtype": "float32", "shape": (6,), "names": None}
+        features = {"observation.state": joints, "action": joints}
+        made = LeRobotDataset.create("local/numbers", 30, features, root=root)
+        for phase, k in itertools.product(range(num_episodes), range(EPISODE_ROWS)):
+            target = np.sin(phase + 0.1 * k + np.arange(6)).astype(np.float32)
+            state = np.sin(phase + 0.1 * (k - 2) + np.arange(6)).astype(np.float32)
+            row = {"observation.state": state, "action": target, "task": "wave"}
+            made.add_frame(row)
+            if k == EPISODE_ROWS - 1:
+                made.save_episode()
+        made.finalize()
 
 
 def _used(

@@ -6,8 +6,8 @@ that spec.
 """
 
 import dataclasses
-import itertools
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,9 +24,10 @@ from taccorl.report.section import Section
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
     from taccorl.data.dataset import Dataset
+    from taccorl.data.episode import Episode
 
 MOST_PROBED = 12
-"""Most episodes of which LeRobot reads the first and last row."""
+"""Most episodes of which the first and last row are read as in training."""
 
 
 @dataclass(kw_only=True)
@@ -41,7 +42,10 @@ class CheckConfig:
     pictures: bool = True
     """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
     quick: bool = False
-    """Of a dataset, neither read all files to compare them with the digests in its manifest nor load it with LeRobot."""
+    """Of a dataset, do not read all files to compare them with the digests in its manifest."""
+    lerobot: bool = False
+    """Of a dataset, also load it with LeRobot, as training does: at least 10 CPU-s and 1 GB. Without, its tables and some of its
+    pictures are compared with what LeRobot requires."""
     repair: Path | None = None
     """Write a copy of a dataset to this new folder, with the time stamps, indices, totals and statistics that its rows must
     have. The dataset itself is not changed."""
@@ -82,33 +86,16 @@ def _why(error: TaccorlError | MemoryError) -> str:
     )
 
 
-def _probes(dataset: "Dataset") -> list[int]:
-    """First and last row of the first, the last and some episodes between them."""
-    number = dataset.num_episodes
-    some = (
-        sorted(
-            {round(k * (number - 1) / (MOST_PROBED - 1)) for k in range(MOST_PROBED)}
-        )
-        if number
-        else []
-    )
-    first = list(
-        itertools.accumulate((dataset.num_rows(i) for i in range(number)), initial=0)
-    )
-    return sorted(
-        {
-            row
-            for i in some
-            if dataset.num_rows(i)
-            for row in (first[i], first[i + 1] - 1)
-        }
-    )
+def _probed(dataset: "Dataset") -> list[int]:
+    """The first, the last and some episodes between them, of those that have rows."""
+    last, steps = max(dataset.num_episodes - 1, 0), MOST_PROBED - 1
+    some = sorted({round(k * last / steps) for k in range(MOST_PROBED)})
+    return [i for i in some if i < dataset.num_episodes and dataset.num_rows(i)]
 
 
-def _bookkeeping(dataset: "Dataset", quick: bool) -> list[Finding]:
+def _bookkeeping(dataset: "Dataset", config: CheckConfig) -> list[Finding]:
     """On what LeRobot reads beside the features, and whether it can."""
     from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
-    from taccorl.data.lerobot_format import read_as_lerobot
 
     findings = []
     for check in (check_bookkeeping, check_statistics):
@@ -116,26 +103,38 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> list[Finding]:
             findings += check(dataset)
         except (TaccorlError, MemoryError) as error:  # LeRobot reads all rows, too
             return [*findings, Finding("unreadable", "error", "rows", _why(error))]
-    why = (
-        "--quick=true"
-        if quick
-        else "its pictures are only in the cache of training" * bool(dataset.unstored)
-    )
-    if why := why or missing("lerobot"):
-        return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
-    problems = read_as_lerobot(dataset.root, _probes(dataset))
-    text = "; ".join(problems[:1]) + (
-        f" ({len(problems)} such rows)" if len(problems) > 1 else ""
-    )
-    return [
-        *findings,
-        *([Finding("lerobot", "error", "dataset", text)] if problems else []),
-    ]
+    return findings + _loading(dataset, config)
+
+
+def _loading(dataset: "Dataset", config: CheckConfig) -> list[Finding]:
+    """On whether LeRobot can load a dataset: by LeRobot itself where that is asked for."""
+    from taccorl.data.lerobot_format import loading_problems, read_as_lerobot
+
+    probed, findings = _probed(dataset), list[Finding]()
+    if config.lerobot and dataset.unstored:
+        why = "its pictures are only in the cache of training"
+        findings = [not_judged("dataset", "whether LeRobot loads it", why)]
+    elif config.lerobot and (why := missing("lerobot")):
+        findings = [not_judged("dataset", "whether LeRobot loads it", why)]
+    elif config.lerobot:
+        ends = [(dataset.first_row(i), dataset.num_rows(i)) for i in probed]
+        rows = {row for first, n in ends for row in (first, first + n - 1)}
+        problems = read_as_lerobot(dataset.root, sorted(rows))
+        return _of_loading(problems, "such rows")
+    problems = loading_problems(dataset, () if config.pictures else probed)
+    return findings + _of_loading(problems, "such problems")
+
+
+def _of_loading(problems: list[str], kind: str) -> list[Finding]:
+    if not problems:
+        return []
+    more = f" ({len(problems)} {kind})" if len(problems) > 1 else ""
+    return [Finding("lerobot", "error", "dataset", problems[0] + more)]
 
 
 def _check_dataset(config: CheckConfig) -> int:
     from taccorl.cli.progress import Bars
-    from taccorl.data.checks import check_episode, check_recording_episodes
+    from taccorl.data.checks import check_recording_episodes
     from taccorl.data.dataset import Dataset
     from taccorl.data.episode import Episode
     from taccorl.report.terminal import show
@@ -152,7 +151,7 @@ def _check_dataset(config: CheckConfig) -> int:
         show(found_in(f"{config.path}: files", stored))
     dataset = Dataset(config.path)
     findings = [] if worst else stored
-    findings += _bookkeeping(dataset, config.quick)
+    findings += _bookkeeping(dataset, config)
     findings += [
         Finding("video_count", "error", "video", text)
         for text in dataset.video_problems()
@@ -161,35 +160,43 @@ def _check_dataset(config: CheckConfig) -> int:
         Finding("skipped_feature", "note", key, f"{key}: {why}")
         for key, why in dataset.skipped.items()
     ]
-    episodes: dict[int, Episode] = {}
-    for index in range(dataset.num_episodes):
-        try:
-            episodes[index] = dataset.episode(index)
-        except (TaccorlError, MemoryError) as error:
-            findings.append(Finding("unreadable", "error", "rows", _why(error)))
-    findings += check_recording_episodes([*episodes.values()])
-    show(found_in(str(config.path), findings))
-    worst = max(worst, _worst(findings))
-    checked = []
-    with Bars(len(episodes), f"checking {len(episodes)} episodes") as bars:
-        for done, (number, episode) in enumerate(episodes.items()):
-            bars.update(f"episode {number}", done, len(episodes))
-            try:
-                found = check_episode(episode, pictures=config.pictures)
-            except (
-                TaccorlError,
-                MemoryError,
-            ) as error:  # a video without its rows: the other episodes may be sound
-                found = [Finding("unreadable", "error", "video", _why(error))]
-            for k, f in enumerate(found):
-                if LEAVE_OUT in f.text:
-                    text = f.text.replace(
-                        LEAVE_OUT, leave_out(config.path.resolve(), number)
-                    )
-                    found[k] = dataclasses.replace(f, text=text)
-            checked.append((f"  episode {number}: {episode.num_rows} rows", found))
+    checked: list[tuple[str, list[Finding]]] = []
+
+    def one_by_one() -> Iterator[Episode]:
+        """Check each episode, and hold it no longer than until the next one is read."""
+        with Bars(dataset.num_episodes, f"checking {dataset.num_episodes}") as bars:
+            for index in range(dataset.num_episodes):
+                bars.update(f"episode {index}", index, dataset.num_episodes)
+                try:
+                    episode = dataset.episode(index)
+                except (TaccorlError, MemoryError) as error:
+                    unread = Finding("unreadable", "error", "rows", _why(error))
+                    findings.append(unread)
+                    continue
+                label = f"  episode {index}: {episode.num_rows} rows"
+                checked.append((label, _of_episode(episode, index, config)))
+                yield episode
+
+    across = check_recording_episodes(one_by_one())
+    show(found_in(str(config.path), findings + across))
     show(*(found_in(label, found) for label, found in checked))
-    return max(worst, *(_worst(found) for _, found in checked), 0)
+    severe = [_worst(found) for _, found in checked]
+    return max(worst, _worst(findings + across), *severe)
+
+
+def _of_episode(episode: "Episode", index: int, config: CheckConfig) -> list[Finding]:
+    """Findings on one episode of a dataset; those whose remedy is to leave it out name the command that does."""
+    from taccorl.data.checks import check_episode
+
+    try:
+        found = check_episode(episode, pictures=config.pictures)
+    except (TaccorlError, MemoryError) as error:
+        # a video without its rows: the other episodes may be sound
+        return [Finding("unreadable", "error", "video", _why(error))]
+    command = leave_out(config.path.resolve(), index)
+    return [
+        dataclasses.replace(f, text=f.text.replace(LEAVE_OUT, command)) for f in found
+    ]
 
 
 def _stored_findings(folder: Path) -> list[Finding]:

@@ -31,7 +31,7 @@ SHOWN = {
     "serve-surrogate": "task secret faults port",
     "ingest": "spec out dry_run domain replace",
     "ingest inspect": "draft",
-    "check": "spec quick repair",
+    "check": "spec quick lerobot repair",
     "merge": "real sim pictures resolution out",
     "view": "episode spec against align serve save screenshot sheet",
     "lineage explain": "store",

@@ -5,7 +5,7 @@ information; a check that could not be made is a note. ``finding.CHECKS`` lists 
 commands), ``picture_checks``, ``touch_checks`` (a pad by itself) and ``grip_checks`` (pads against grippers).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -134,33 +134,64 @@ EPISODE_LAG_S = 0.05  # Largest difference of an episode's lag from its recordin
 COMPARED_EPISODES = 3  # Least number of episodes for deciding which one differs
 
 
-def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
-    """Compare the episodes of one recording; each finding names the episode that differs."""
-    if len(episodes) < 2:
-        return []
-    good = [
-        e for e in episodes if e.arrays and e.num_rows >= 2 and not any(check_values(e))
-    ]
-    touch: list[tuple[Episode, str, list[Pad], Grippers]] = []
-    for e in good:
-        if (grippers := read_grippers(e)) is not None:
-            touch += [
-                (
-                    e,
-                    k,
-                    [p for p in read_pads(e, k) if p.arm in grippers.opening],
-                    grippers,
-                )
-                for k in tactile_keys(e)
-            ]
-    return [*_odd_arms(good), *_odd_touch(touch), *_resting_levels(touch)]
-
-
-def _odd_arms(episodes: list[Episode]) -> Iterator[Finding]:
-    lags: dict[str, dict[str, float]] = {}
+def check_recording_episodes(episodes: Iterable[Episode]) -> list[Finding]:
+    """Compare the episodes of one recording; each finding names the episode that differs. Of an episode only what is compared is
+    kept, so that ``episodes`` may be read one by one."""
+    across = _Across()
     for episode in episodes:
+        across.add(episode)
+    return across.findings()
+
+
+class _Across:
+    """What is compared between episodes: lags of arms and pads, and levels of untouched pads. All by name of feature, pad or
+    arm, and of episode."""
+
+    def __init__(self) -> None:
+        self.num_episodes = 0
+        self.arm_lags: dict[str, dict[str, float]] = {}
+        self.pad_lags: dict[str, dict[str, list[float]]] = {}
+        self.levels: dict[str, dict[str, dict[float, str]]] = {}
+        self.limits: dict[str, float] = {}
+        """Key of touch → largest difference between levels of rest [counts]."""
+
+    def add(self, episode: Episode) -> None:
+        """Add an episode, unless its values are wrong."""
+        self.num_episodes += 1
+        if not episode.arrays or episode.num_rows < 2 or any(check_values(episode)):
+            return
         for arm, lag in arm_lags(episode).items():
-            lags.setdefault(arm, {})[episode.name] = lag.lag_s
+            self.arm_lags.setdefault(arm, {})[episode.name] = lag.lag_s
+        if (grippers := read_grippers(episode)) is None:
+            return
+        for key in tactile_keys(episode):
+            self.limits[key] = DRIFT_SHARE * episode.spec.sensors[key].noise_count
+            for pad in read_pads(episode, key):
+                if pad.arm in grippers.opening:
+                    self._add_pad(episode, key, pad, grippers)
+
+    def _add_pad(
+        self, episode: Episode, key: str, pad: Pad, grippers: Grippers
+    ) -> None:
+        lags = self.pad_lags.setdefault(key, {}).setdefault(pad.name, [])
+        lags += lags_of_pad(pad, grippers, episode.spec.fps)
+        level = rest_level(pad.counts, grippers.rest(pad.arm, pad.fps), pad.fps)
+        levels = self.levels.setdefault(key, {}).setdefault(pad.name, {})
+        if level is not None:
+            levels.setdefault(level, episode.name)
+
+    def findings(self) -> list[Finding]:
+        """Findings of all episodes together; none of a single one."""
+        if self.num_episodes < 2:
+            return []
+        return [
+            *_odd_arms(self.arm_lags),
+            *_odd_touch(self.pad_lags),
+            *_resting_levels(self.levels, self.limits),
+        ]
+
+
+def _odd_arms(lags: dict[str, dict[str, float]]) -> Iterator[Finding]:
     for arm, of_arm in lags.items():
         for name, lag_s in of_arm.items() if len(of_arm) >= COMPARED_EPISODES else ():
             others = float(np.median([x for n, x in of_arm.items() if n != name]))
@@ -170,16 +201,8 @@ def _odd_arms(episodes: list[Episode]) -> Iterator[Finding]:
                 yield finding("action_lag", ACTION, text)
 
 
-def _odd_touch(
-    touch: list[tuple[Episode, str, list[Pad], Grippers]],
-) -> Iterator[Finding]:
+def _odd_touch(lags: dict[str, dict[str, list[float]]]) -> Iterator[Finding]:
     """Many holds average out the resolution of one row, so the accepted interval is not widened by it."""
-    lags: dict[str, dict[str, list[float]]] = {}
-    for episode, key, pads, grippers in touch:
-        for pad in pads:
-            lags.setdefault(key, {}).setdefault(pad.name, []).extend(
-                lags_of_pad(pad, grippers, episode.spec.fps)
-            )
     for key, of_pads in sorted(lags.items()):
         odd, text = odd_lags(of_pads, least=2)
         if odd:
@@ -188,24 +211,14 @@ def _odd_touch(
 
 
 def _resting_levels(
-    touch: list[tuple[Episode, str, list[Pad], Grippers]],
+    levels: dict[str, dict[str, dict[float, str]]], limits: dict[str, float]
 ) -> Iterator[Finding]:
     """Pads that rest at another level in a later episode: one baseline for the whole recording no longer holds."""
-    levels: dict[str, dict[str, dict[float, str]]] = {}
-    limits = {
-        key: DRIFT_SHARE * episode.spec.sensors[key].noise_count
-        for episode, key, _, _ in touch
-    }
-    for episode, key, pads, grippers in touch:
-        for pad in pads:
-            level = rest_level(pad.counts, grippers.rest(pad.arm, pad.fps), pad.fps)
-            if level is not None:
-                levels.setdefault(key, {}).setdefault(pad.name, {}).setdefault(
-                    level, episode.name
-                )
     for key, of_pads in levels.items():
         ends = {
-            pad: (min(of_pad), max(of_pad), of_pad) for pad, of_pad in of_pads.items()
+            pad: (min(of_pad), max(of_pad), of_pad)
+            for pad, of_pad in of_pads.items()
+            if of_pad
         }
         drifting = [
             f"{pad} {low:+.1f} counts in {of_pad[low]}, {high:+.1f} in {of_pad[high]}"

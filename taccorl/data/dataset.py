@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
@@ -106,6 +107,8 @@ class Dataset:
             why = "not stored as video; frames are in training's cache (lerobot-train --dataset.cache=gpu|host|disk)"
             self.skipped |= dict.fromkeys(self.unstored, why)
         self._records = _read_records(self.root, self._table, self.info["features"])
+        self._rows: _Rows | None = None
+        """File of the episode that was read last."""
         manifest = self.root / PROVENANCE / "manifest.json"
         self.provenance: dict[str, Any] | None = (
             _read_json(manifest) if manifest.is_file() else None
@@ -193,9 +196,9 @@ class Dataset:
                 f"{self.root}/meta/info.json: has no feature {absent[0]}: copy the dataset again"
             )
         with plainly(path, PARQUET):
-            table = pq.read_table(
-                path, columns=columns, filters=[("episode_index", "==", index)]
-            )
+            if self._rows is None or self._rows.path != path:
+                self._rows = _Rows(path)
+            table = self._rows.of_episode(index, columns)
         if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(
             range(num_rows)
         ):
@@ -523,10 +526,9 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         with plainly(path, PARQUET):
-            names = [
-                n for n in pq.read_schema(path).names if not n.startswith("stats/")
-            ]
-            rows += pq.read_table(path, columns=names).to_pylist()
+            every = pq.read_schema(path).names
+        names = [name for name in every if not name.startswith("stats/")]
+        rows += read_columns(path, names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
     listed, told = [r["episode_index"] for r in rows], info["total_episodes"]
     if len(listed) != told or listed != list(range(told)):
@@ -551,8 +553,7 @@ def _read_tasks(root: Path) -> dict[int, str]:
         raise DatasetError(
             f"{root}: there is no meta/tasks.parquet: copy it whole, or remove a failed recording"
         )
-    with plainly(path, PARQUET):
-        table = pq.read_table(path)
+    table = read_columns(path)
     # LeRobot up to 0.4 kept the text as pandas' index.
     text = next(
         (n for n in ("task", "__index_level_0__") if n in table.column_names), None
@@ -740,17 +741,62 @@ def numbers_of(column: pa.ChunkedArray, where: str) -> np.ndarray:
     return values.to_numpy()
 
 
+def read_columns(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """A parquet file, or these columns of it. (``pq.read_table`` does the same and imports pandas, which takes 0.6 CPU-s.)
+    Raises DatasetError: not a whole parquet file, or it lacks a column."""
+    with plainly(path, PARQUET), pq.ParquetFile(path) as file:
+        _require_columns(path, file, columns or ())
+        return file.read(columns)
+
+
+def _require_columns(path: Path, file: pq.ParquetFile, columns: Sequence[str]) -> None:
+    """Raise a DatasetError if a file lacks a column, which pyarrow would leave out of the table without a word."""
+    present = set(file.schema_arrow.names)
+    if absent := [key for key in columns if key not in present]:
+        raise DatasetError(f"{path}: lacks the column {absent[0]}: copy it again")
+
+
 def data_files(root: Path) -> list[Path]:
     """Parquet files of rows in the order in which LeRobot joins them."""
     return sorted((root / "data").glob("*/*.parquet"))
+
+
+class _Rows:
+    """A file of rows, of which single episodes are read. Its footer is read once: LeRobot writes a row group for each episode, so
+    that reading the footer takes longer than reading an episode."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises ValueError, OSError: not a whole parquet file, or it has no ``episode_index``."""
+        self.path = path
+        self._footer = pq.read_metadata(path)
+        schema = self._footer.schema
+        columns = [schema.column(k).path for k in range(self._footer.num_columns)]
+        column, bounds = columns.index("episode_index"), []
+        for k in range(self._footer.num_row_groups):
+            known = self._footer.row_group(k).column(column).statistics
+            if known is not None and known.has_min_max:
+                bounds.append((known.min, known.max))
+            else:
+                bounds.append((-math.inf, math.inf))
+        self._first, self._last = np.array(bounds, dtype=float).reshape(-1, 2).T
+        """(G,) first and last episode that each row group may hold."""
+
+    def of_episode(self, index: int, columns: Sequence[str]) -> pa.Table:
+        """The ``columns`` of the rows of one episode. Raises DatasetError: the file lacks a column."""
+        groups = np.flatnonzero((self._first <= index) & (index <= self._last))
+        with pq.ParquetFile(self.path, metadata=self._footer) as file:
+            _require_columns(self.path, file, columns)
+            named = [*columns, "episode_index"]
+            table = file.read_row_groups(groups.tolist(), named)
+        own = pc.equal(table["episode_index"], index)  # pyright: ignore[reportAttributeAccessIssue]
+        return table.filter(own).select(list(columns))
 
 
 def feature_rows(root: Path, key: str) -> np.ndarray:
     """(N, size) values of a feature of numbers in all rows of the dataset."""
     parts = []
     for path in data_files(root):
-        with plainly(path, PARQUET):
-            column = pq.read_table(path, columns=[key])[key]
+        column = read_columns(path, [key])[key]
         parts += (
             [numbers_of(column, f"{path}, {key}").reshape(len(column), -1)]
             if len(column)

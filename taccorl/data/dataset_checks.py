@@ -30,6 +30,7 @@ from taccorl.data.dataset import (
     data_files,
     feature_rows,
     numbers_of,
+    read_columns,
     write_info,
 )
 from taccorl.data.exact_statistics import (
@@ -97,7 +98,7 @@ def read_rows(dataset: Dataset) -> Rows:
                 raise DatasetError(
                     f"{path}: lacks the column {absent[0]}, which every LeRobot dataset has"
                 )
-            table = pq.read_table(path, columns=list(BOOKKEEPING))
+            table = read_columns(path, BOOKKEEPING)
         tables.append(
             {key: numbers_of(table[key], f"{path}, {key}") for key in BOOKKEEPING}
         )
@@ -171,6 +172,7 @@ def _check_tasks(
     dataset: Dataset, rows: Rows, of_episode: np.ndarray
 ) -> Iterator[Finding]:
     known, total = dataset.task_names, dataset.info.get("total_tasks")
+    ends = np.searchsorted(of_episode, np.arange(dataset.num_episodes + 1))
     unknown, text = sorted(set(rows.task_index.tolist()) - set(known)), ""
     if long := next(
         (text for text in known.values() if len(text) > MOST_INSTRUCTION), None
@@ -183,7 +185,8 @@ def _check_tasks(
         yield finding("totals", "task", told, severity="warning")
     for i in range(dataset.num_episodes) if not text else ():
         stated = dataset.entry(i).get("tasks")
-        found = {known[t] for t in set(rows.task_index[of_episode == i].tolist())}
+        own = rows.task_index[ends[i] : ends[i + 1]]
+        found = {known[t] for t in np.unique(own).tolist()}
         if stated is not None and set(stated) != found:
             text = f"episode {i}: meta/episodes states {sorted(stated)}, its rows have {sorted(found)}"
             break
@@ -470,7 +473,7 @@ def repair(dataset: Dataset, copy: Path) -> None:
     first = np.cumsum([0, *(dataset.num_rows(i) for i in range(dataset.num_episodes))])
     at = 0
     for path in data_files(copy):
-        table = pq.read_table(path)
+        table = read_columns(path)
         table = _with(
             table, "timestamp", table["frame_index"].to_numpy() / dataset.spec.fps
         )
@@ -481,7 +484,7 @@ def repair(dataset: Dataset, copy: Path) -> None:
         k: feature_rows(copy, k) for k, f in features.items() if f["dtype"] in STATED
     }
     for path in sorted((copy / "meta" / "episodes").glob("*/*.parquet")):
-        table = pq.read_table(path)
+        table = read_columns(path)
         numbers = table["episode_index"].to_numpy()
         for key, to in (
             ("dataset_from_index", first[numbers]),

@@ -7,6 +7,7 @@ one frame per row at its time; a dataset that fails is written again the slow wa
 
 import contextlib
 import functools
+import itertools
 import json
 import logging
 import math
@@ -29,7 +30,9 @@ from taccorl.data.dataset import (
     PROVENANCE,
     ROWS_PER_PICTURE,
     Dataset,
+    data_files,
     feature_rows,
+    read_columns,
     read_info,
     write_info,
 )
@@ -42,7 +45,7 @@ from taccorl.data.exact_statistics import (
 )
 from taccorl.data.joining import JOINED_TOGETHER, Run, in_threads, join, require_videos
 from taccorl.data.spec import DatasetSpec
-from taccorl.errors import DatasetError
+from taccorl.errors import DatasetError, TaccorlError
 from taccorl.extras import OnUse, quick_columns
 
 av, cv2 = OnUse("av"), OnUse("cv2")
@@ -170,8 +173,8 @@ def change_features(
     }
     schema = get_hf_features_from_features(shaped).arrow_schema
     for source in sorted((root / "data").glob("*/*.parquet")):
-        table = pq.read_table(
-            source, columns=[name for name in schema.names if name not in added]
+        table = read_columns(
+            source, [name for name in schema.names if name not in added]
         )
         for key, (value, _) in added.items():
             kind = schema.field(key).type
@@ -191,7 +194,7 @@ def change_features(
 
     gone = tuple(f"{kind}/{key}/" for kind in ("videos", "stats") for key in lost)
     for file in (copy / "meta/episodes").rglob("*.parquet"):
-        table = pq.read_table(file)
+        table = read_columns(file)
         pq.write_table(
             table.select(
                 [name for name in table.column_names if not name.startswith(gone)]
@@ -546,7 +549,7 @@ def picture_statistics(
         from lerobot.datasets.compute_stats import aggregate_stats
 
         tables = [
-            pq.read_table(path)
+            read_columns(path)
             for path in sorted((root / "meta/episodes").glob("*/*.parquet"))
         ]
         for key in keys:
@@ -566,6 +569,32 @@ def picture_statistics(
             if episodes and episodes[0]:
                 stats |= aggregate_stats([{key: episode} for episode in episodes])
     return stats
+
+
+def loading_problems(dataset: Dataset, probed: Sequence[int]) -> list[str]:
+    """What would stop LeRobot, or ``datasets``, from loading a dataset: tables with columns that are not stated, or that not
+    all files have. Of the episodes ``probed`` also pictures of the first and last row that do not decode. One text for each."""
+    problems, features = [], dataset.info["features"]
+    stated = {key for key, f in features.items() if f["dtype"] != "video"}
+    for path in data_files(dataset.root):
+        if odd := sorted(set(pq.read_schema(path).names) - stated):
+            text = f"has the column {odd[0]}, which meta/info.json does not state"
+            problems.append(f"LeRobot cannot load it: {path}: {text}")
+    first: set[str] | None = None
+    for path in sorted((dataset.root / "meta" / "episodes").glob("*/*.parquet")):
+        names = set(pq.read_schema(path).names)
+        first = names if first is None else first
+        if odd := sorted(names - first):
+            text = f"has the column {odd[0]}, which the first file there lacks"
+            problems.append(f"LeRobot cannot load it: {path}: {text}")
+    for index, key in itertools.product(probed, dataset.cameras):
+        for row in {0, dataset.num_rows(index) - 1}:
+            try:
+                next(dataset.frames(index, key, row, row + 1))
+            except TaccorlError as error:
+                text = f"row {dataset.first_row(index) + row}: {error}"
+                problems.append(f"LeRobot cannot read {text}")
+    return problems
 
 
 def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:

@@ -22,9 +22,9 @@ from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics, repair
 from taccorl.data.exact_statistics import QUANTILE_NAMES
 from taccorl.data.finding import leave_out, recompute_statistics
-from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
+from taccorl.data.lerobot_format import loading_problems, quiet_lerobot, read_as_lerobot
 from taccorl.data.recording import Source, find_sources, readers
-from taccorl.errors import RecordingError
+from taccorl.errors import DatasetError, RecordingError
 
 ROWS, FPS, EPISODES = 12, 30, 3
 SHAPE = (64, 96, 3)
@@ -402,14 +402,53 @@ def test_a_stamp_that_is_no_time_refuses_the_episode_that_has_it(faulty, value):
 @pytest.mark.parametrize(
     "name", ["stamps run on over the episodes", "wrong number of tasks"]
 )
-def test_lerobots_own_reading_is_part_of_the_check(faulty, name, capsys):
+def test_lerobots_own_reading_is_part_of_the_check_where_asked_for(
+    faulty, name, capsys
+):
     FAULTS[name][0](faulty)
-    assert main(["check", str(faulty), "--pictures=false"]) == 1
+    assert main(["check", str(faulty), "--pictures=false", "--lerobot=true"]) == 1
     out = capsys.readouterr().out
     assert ("lerobot: LeRobot cannot read row" in out) == (
         name == "stamps run on over the episodes"
     )
     assert FAULTS[name][1] in out
+
+
+def test_what_lerobot_requires_is_checked_without_it(faulty):
+    dataset = Dataset(faulty)
+    assert loading_problems(dataset, [0, 2]) == []
+    path = next((faulty / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.append_column("extra", table["index"]), path)
+    [said] = loading_problems(dataset, [])
+    assert "the column extra" in said
+    [by_lerobot] = read_as_lerobot(faulty, [])
+    assert "LeRobot cannot load it" in by_lerobot
+
+
+def test_a_picture_of_a_probed_row_that_does_not_decode_is_named(faulty):
+    dataset = Dataset(faulty)
+    video = dataset.video(1, dataset.cameras[0]).path
+    video.write_bytes(video.read_bytes()[:400])
+    problems = loading_problems(dataset, [1])
+    rows = (dataset.first_row(1), dataset.first_row(2) - 1)
+    assert {p.split(":")[0] for p in problems} == {
+        f"LeRobot cannot read row {row}" for row in rows
+    }
+
+
+def test_an_episode_is_read_from_its_own_row_groups_and_after_a_change(faulty):
+    path = next((faulty / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    for size in (1, ROWS + 1, len(table)):  # rows of two episodes in a group, too
+        pq.write_table(table, path, row_group_size=size)
+        number = Dataset(faulty).values(1, ["index"])["index"].ravel()
+        assert number.tolist() == [*range(ROWS, 2 * ROWS + 1)]
+    pq.write_table(table, path, write_statistics=False)
+    assert Dataset(faulty).values(2, ["index"])["index"][0] == 2 * ROWS + 1
+    pq.write_table(table.drop_columns(["action"]), path)
+    with pytest.raises(DatasetError, match="lacks the column action"):
+        Dataset(faulty).values(0, ["action"])
 
 
 @pytest.mark.parametrize("from_within", [False, True])
