@@ -10,11 +10,13 @@ import dataclasses
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.measured import MeasuredConfig, Show, far_off, replayed
 from taccorl.cli.parse import command, verb
+from taccorl.cli.printed import give
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Section
 
@@ -74,7 +76,7 @@ def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.report.report import check_folder, write_report
+    from taccorl.report.report import as_json, check_folder, write_report
     from taccorl.report.terminal import show
 
     if config.out is not None:  # before any work is done
@@ -97,6 +99,7 @@ def run(config: CompareConfig) -> int:
     )
     if report is None:
         return 1
+    give(partial(as_json, report))
     if config.out is not None:
         words = shlex.join(command("compare", config, "measurements"))
         provenance = {"command": words, **report.provenance}

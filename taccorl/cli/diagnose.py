@@ -29,6 +29,7 @@ from taccorl.cli.measured import (
     replayed,
 )
 from taccorl.cli.parse import command, verb
+from taccorl.cli.printed import give
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def run(config: DiagnoseConfig) -> int:
     or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM
     ended the search, and what it had found was written."""
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.report.report import check_folder
+    from taccorl.report.report import as_json, check_folder
     from taccorl.report.terminal import show
 
     replaced = check_folder(config.out, config.measurements)
@@ -114,6 +115,7 @@ def run(config: DiagnoseConfig) -> int:
     file = config.out / machine.file_name if config.until == "noise_floor" else None
     step = _next(report, machine, words, config.twin, file)
     report = dataclasses.replace(report, next=step)
+    give(partial(as_json, report))
     lines = _saved(report, config.out, replaced, mended, file)
     lines += [disagree] if disagree else []
     show(

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 from taccorl.cli.card import add_card
 from taccorl.cli.output_lock import check_apart
 from taccorl.cli.parse import parse
+from taccorl.cli.printed import give
 from taccorl.data.origin import DOMAINS, Domain, Origin
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError, nearest, printable
 from taccorl.lineage.destinations import check_writable, is_free, write_new
@@ -102,6 +103,7 @@ def run(config: IngestConfig) -> int:
 
     moved: list[Path] = []
     report = ingested_as(config, print, moved.append)
+    give(lambda: report)
     show(ingested(report))
     for aside in moved:
         print(f"what was at {config.out} is now at {aside}")
