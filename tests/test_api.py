@@ -57,6 +57,7 @@ def test_nothing_imports_torch_and_the_import_is_quick() -> None:
     assert float(used_s) <= 0.5
 
 
+@pytest.mark.slow
 def test_compare_gives_the_numbers_of_the_verb(
     recorded: Path, robot: Machine, measurements: Measurements, tmp_path: Path
 ) -> None:
@@ -112,6 +113,7 @@ def test_a_notebook_shows_the_verdict(diagnosis: Report) -> None:
     assert "<style>.taccorl{" in html and "body{" not in html
 
 
+@pytest.mark.slow
 def test_plot_draws_the_largest_error(
     robot: Machine, measurements: Measurements
 ) -> None:
@@ -128,6 +130,7 @@ def test_plot_draws_the_largest_error(
         taccorl.plot(report, recording="nothing_such")
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_verbs(
     recorded: Path,
     robot: Machine,
@@ -143,7 +146,8 @@ def test_errors_are_those_of_the_verbs(
     assert capsys.readouterr().err == f"taccorl compare: {error.value}\n"
 
 
-def test_values_by_hand_need_no_diagnosis(robot: Machine) -> None:
+def test_values_by_hand_need_no_diagnosis() -> None:
+    robot = taccorl.load_robot()  # the nominal twin
     part, values = "left_joint5", {"torque_nm": 0.25}
     new = taccorl.add_effect(robot, "coulomb_friction", values=values, joints=[part])
     assert new.numbers(part)["coulomb_friction.torque_nm"] == (0.25, "N·m")
@@ -152,6 +156,7 @@ def test_values_by_hand_need_no_diagnosis(robot: Machine) -> None:
         taccorl.add_effect(robot, "coulomb_friction")
 
 
+@pytest.mark.slow
 def test_measurements_with_errors_are_refused_with_the_findings(
     recorded: Path, robot: Machine, measurements: Measurements
 ) -> None:
@@ -192,7 +197,7 @@ def test_ingest_and_load_episode(
 
 def test_the_types_name_what_there_is() -> None:
     stub = (Path(taccorl.__file__).parent / "__init__.pyi").read_text()
-    for name in taccorl._LAZY:
+    for name in vars(taccorl)["_LAZY"]:
         assert f"import {name} as {name}" in stub
         assert getattr(taccorl, name) is not None
     with pytest.raises(AttributeError, match="comparee"):
