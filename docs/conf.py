@@ -4,11 +4,15 @@
 """
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 project = "TacCoRL"
-extensions = ["myst_parser"]
+sys.path.insert(0, str(Path(__file__).parents[1]))  # docs/api.md imports taccorl.api
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
 source_suffix = {".md": "markdown", ".ipynb": "markdown"}
 include_patterns = [
     "README.md",
@@ -31,7 +35,7 @@ suppress_warnings = [
 
 NAVIGATION = {
     "Use": ["data", "training", "demonstrations", "twin", "effects", "robot"],
-    "Diagnose": ["your_robot", "diagnosis"],
+    "Diagnose": ["your_robot", "diagnosis", "api"],
     "Results": ["results", "learning", "benchmarks", "decisions", "limits"],
 }
 """Caption → pages of docs/, in reading order; notebooks and the pages for developers follow."""

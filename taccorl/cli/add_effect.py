@@ -10,9 +10,10 @@ Writes a copy, ``twin+coulomb_friction.yaml``, which collection, generation and 
 
 import json
 import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import verb
@@ -57,32 +58,27 @@ def run(config: AddEffectConfig) -> int:
     out = _place(config)
     hold(out)
     from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.report.report import numbers_of
     from taccorl.report.terminal import show
 
-    machine, hand, made_by, said = load_machine(config.twin), config.values, [], {}
-    if key := next((key for key in hand if {*":="} & {*key}), ""):
-        raise TaccorlError(
-            f"--values: {key!r} is one word; YAML needs a colon and a space: '{{torque_nm: 0.4}}'"
-        )
+    machine = load_machine(config.twin)
     names = list(dict.fromkeys(config.effect.split(",")))
-    if hand and len(names) > 1:
-        raise TaccorlError(
-            f"--values={hand}: of which effect? Add one of {', '.join(names)} at a time"
-        )
-    if hand:
-        added = machine.by_hand(names[0], config.joints, config.pads, hand)
+    request = Request(names, config.joints, config.pads)
+    if config.values:
+        new = by_hand(machine, request, config.values, "--values=")
     else:
-        added, made_by, said = _diagnosed(config, machine, names)
-    mended = machine.with_additions(added)
-    for a in added:
-        words = Section(text=[f"  {said.get(a.part, 'by hand')}"])
+        path = numbers_of(config.diagnosis)
+        new = diagnosed(machine, request, stored(path, machine, names), path, print)
+    mended = machine.with_additions(new.additions)
+    for a in new.additions:
+        words = Section(text=[f"  {new.reasons.get(a.part, 'by hand')}"])
         show(_changes(a.part, machine.numbers(a.part), mended.numbers(a.part)), words)
     mended.save(out)
     against = None if config.in_place else out
     show(
         Section(
             text=[
-                f"wrote {out}; next: {compare_words(made_by, [a.part for a in added], config.twin, against)}"
+                f"wrote {out}; next: {compare_words(new.made_by, [a.part for a in new.additions], config.twin, against)}"
             ]
         )
     )
@@ -125,30 +121,86 @@ def _place(config: AddEffectConfig) -> Path:
     return out
 
 
-def _diagnosed(
-    config: AddEffectConfig, machine: "Machine", names: list[str]
-) -> tuple[list["Addition"], list[str], dict[str, str]]:
-    """What the diagnosis of this machine says of these effects and numbers, part by part: the numbers of the fit with exactly
-    those of them that it found there; the words of its command; and part → its verdict, or evidence of a part of it. Raises
-    TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects."""
-    from taccorl.report.report import numbers_of
+class Request(NamedTuple):
+    """Effects and numbers to be added, and where."""
+
+    names: list[str]
+    joints: Sequence[str] = ()
+    """Empty, as ``pads``: all parts for which the diagnosis found them."""
+    pads: Sequence[str] = ()
+
+
+class Change(NamedTuple):
+    """Changes of a machine's file."""
+
+    additions: "list[Addition]"
+    made_by: list[str]
+    """Words of the command that diagnosed; none for values by hand."""
+    reasons: Mapping[str, str]
+    """Part → verdict of the diagnosis, or evidence of a part of it."""
+
+
+def by_hand(
+    machine: "Machine", request: Request, values: Mapping[str, float], option: str
+) -> Change:
+    """One effect with values by hand; ``option``: begin of messages, ``--values=``.
+
+    Raises:
+        TaccorlError: several effects are asked for, or one cannot have these values.
+    """
+    if key := next((key for key in values if {*":="} & {*key}), ""):
+        raise TaccorlError(
+            f"--values: {key!r} is one word; YAML needs a colon and a space: '{{torque_nm: 0.4}}'"
+        )
+    if len(request.names) > 1:
+        raise TaccorlError(
+            f"{option}{values}: of which effect? Add one of {', '.join(request.names)} at a time"
+        )
+    [name] = request.names
+    additions = machine.by_hand(name, request.joints, request.pads, values)
+    return Change(additions, [], {})
+
+
+def stored(path: Path, machine: "Machine", names: list[str]) -> dict[str, Any]:
+    """Content of the report.json ``path``. Raises TaccorlError: there is none."""
     from taccorl.sim.effects import effects
 
-    path = numbers_of(config.diagnosis)
-    if not path.is_file():
-        own = effects.get(names[0]).parameters()[:1] if names[0] in effects else ()
-        by_hand = [
-            f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
-            for number in own
-        ]
-        unknown = [n for n in names if n not in effects and n not in _numbers(machine)]
-        if unknown:
-            text = f"{unknown[0]}: no such effect; {nearest(unknown[0], effects)}"
-            raise TaccorlError(f"{text}; and {path} has no diagnosis")
-        raise TaccorlError(
-            f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(by_hand)}"
-        )
-    report = json.loads(path.read_text(encoding="utf-8"))
+    if path.is_file():
+        return json.loads(path.read_text(encoding="utf-8"))
+    own = effects.get(names[0]).parameters()[:1] if names[0] in effects else ()
+    hand = [
+        f", or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
+        for number in own
+    ]
+    unknown = [n for n in names if n not in effects and n not in _numbers(machine)]
+    if unknown:
+        text = f"{unknown[0]}: no such effect; {nearest(unknown[0], effects)}"
+        raise TaccorlError(f"{text}; and {path} has no diagnosis")
+    raise TaccorlError(
+        f"{path}: no diagnosis there; run `taccorl diagnose` first{''.join(hand)}"
+    )
+
+
+def diagnosed(
+    machine: "Machine",
+    request: Request,
+    report: Mapping[str, Any],
+    path: Path,
+    warn: Callable[[str], None],
+) -> Change:
+    """Numbers of the fit with exactly these effects and numbers, part by part.
+
+    Args:
+        report: content of the diagnosis' report.json.
+        path: its place, for messages.
+        warn: function that gets what makes the numbers doubtful.
+
+    Raises:
+        TaccorlError: the diagnosis is of another machine, or did not fit an effect.
+    """
+    from taccorl.sim.effects import effects
+
+    names = request.names
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
         made_with = report.get("provenance", {}).get("twin", "another twin")
         raise TaccorlError(
@@ -156,11 +208,11 @@ def _diagnosed(
             "found are added together: taccorl add-effect NAME,NAME"
         )
     if not report.get("finished", True):
-        print(
+        warn(
             f"warning: {path}: is of a diagnosis that is not finished; what was not tried may be missing instead"
         )
     diagnoses = report["diagnoses"]
-    parts = machine.select(list(diagnoses), config.joints, config.pads)
+    parts = machine.select(list(diagnoses), request.joints, request.pads)
     told = {
         part: {*_found(diagnoses[part]), *_changed(diagnoses[part])} for part in parts
     }
@@ -189,7 +241,7 @@ def _diagnosed(
             continue
         if fit is None:
             continue
-        additions.append(_addition(machine, part, fit))
+        additions.append(_addition(machine, part, fit, warn))
         written |= {*(e["effect"] for e in fit["effects"]), *_off(diagnoses[part])}
         said[part] = (
             report["verdicts"][part]["title"]
@@ -197,12 +249,12 @@ def _diagnosed(
             else fit["effects"][-1]["evidence"]
         )
     left = [name for name in names if name not in written]
-    if refused and (config.joints or config.pads or not additions):
+    if refused and (request.joints or request.pads or not additions):
         raise refused[0]
     if left_out and left:
         raise left_out[0]
     for error in left_out:
-        print(f"not written: {error}")
+        warn(f"not written: {error}")
     if left:
         tried = sorted(
             {
@@ -216,7 +268,7 @@ def _diagnosed(
         raise TaccorlError(
             f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}"
         )
-    return additions, shlex.split(report["provenance"].get("command", "")), said
+    return Change(additions, shlex.split(report["provenance"].get("command", "")), said)
 
 
 def _numbers(machine: "Machine") -> set[str]:
@@ -304,17 +356,20 @@ def _fit_of(
     )
 
 
-def _addition(machine: "Machine", part: str, fit: dict[str, Any]) -> "Addition":
-    """The change of the machine's file that a fit of one part says, with warnings of numbers that it does not determine."""
+def _addition(
+    machine: "Machine", part: str, fit: dict[str, Any], warn: Callable[[str], None]
+) -> "Addition":
+    """The change of the machine's file that a fit of one part says. ``warn`` gets which
+    numbers it does not determine."""
     from taccorl.diagnosis.machines.machine import Addition
 
     if unknown := fit.get("undetermined"):
-        print(
+        warn(
             f"warning: {part}: its recordings do not determine {', '.join(unknown)}; what is written is one of many values "
             "that fit, near where they began. Other motions may need other values: record them, then diagnose again"
         )
     if ends := fit["at_bound"]:
-        print(
+        warn(
             f"warning: {part}: the fit ended with {', '.join(ends)} at the end of its range, so the other numbers may be "
             "wrong, too: check units, gains and time stamps, or look for more effects (--until=noise_floor)"
         )

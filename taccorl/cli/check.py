@@ -7,13 +7,14 @@ that spec.
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.ingest import chosen_spec
 from taccorl.cli.parse import verb
+from taccorl.cli.printed import give
 from taccorl.data.file_kinds import no_recording
 from taccorl.data.finding import LEAVE_OUT, Finding, leave_out, listed, not_judged
 from taccorl.errors import TaccorlError, no_such_path
@@ -180,6 +181,8 @@ def _check_dataset(config: CheckConfig) -> int:
     across = check_recording_episodes(one_by_one())
     show(found_in(str(config.path), findings + across))
     show(*(found_in(label, found) for label, found in checked))
+    every = dict.fromkeys([*stored, *findings, *across])
+    _give([(str(config.path), [*every]), *checked])
     severe = [_worst(found) for _, found in checked]
     return max(worst, _worst(findings + across), *severe)
 
@@ -302,6 +305,7 @@ def _check_recordings(config: CheckConfig) -> int:
                     (source.name, [Finding("unreadable", "error", "file", _why(error))])
                 )
     show(*(found_in(label, findings) for label, findings in checked))
+    _give(checked)
     return max((_worst(findings) for _, findings in checked), default=0)
 
 
@@ -337,6 +341,18 @@ def _recording_findings(
         found.append((label, check_episode(episode, pictures=pictures)))
     findings += cutter.size_findings()
     return found
+
+
+def _give(checked: Sequence[tuple[str, list[Finding]]]) -> None:
+    """Findings as the report of ``--json``."""
+
+    def as_json() -> list[dict[str, Any]]:
+        return [
+            {"name": label.strip(), "findings": [*map(dataclasses.asdict, found)]}
+            for label, found in checked
+        ]
+
+    give(as_json)
 
 
 def _worst(findings: list) -> int:

@@ -6,14 +6,17 @@ are for validation, which repeat one another, and which object the pads pressed:
 of every recording are simulated in the twin. Faults of the data are printed first; with errors nothing is compared.
 """
 
+import dataclasses
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from taccorl.cli.measured import MeasuredConfig, far_off, replayed
+from taccorl.cli.measured import MeasuredConfig, Show, far_off, replayed
 from taccorl.cli.parse import command, verb
+from taccorl.cli.printed import give
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Section
 
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurements.pressed import PressedObject
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Machine
+    from taccorl.report.report import Report
 
 
 @dataclass(kw_only=True)
@@ -71,10 +75,8 @@ class CompareConfig(MeasuredConfig):
 def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""
-    from taccorl.diagnosis.comparison.result import only, origin_words
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.report import compared
-    from taccorl.report.report import Report, check_folder, write_report
+    from taccorl.report.report import as_json, check_folder, write_report
     from taccorl.report.terminal import show
 
     if config.out is not None:  # before any work is done
@@ -84,62 +86,103 @@ def run(config: CompareConfig) -> int:
     paths = [config.twin, *([] if config.against is None else [config.against])]
     twins = [load_machine(path) for path in paths]
     measurements = config.read(twins[0], fit_needed=False)
-    measurements = _of_joints(measurements, config.joints)
-    _check_same_machine(twins, paths, measurements)
-    words, labels = command("compare", config, "measurements"), _labels(twins, paths)
-    solid = config.pressed.made()
-    comparisons: list[Comparison] = []
-
-    def replay() -> "Comparison":
-        for twin, label in zip(twins, labels, strict=True):
-            comparisons.append(_replayed(twin, label, measurements, solid))
-        if config.joints:
-            comparisons[:] = [only(c, config.joints) for c in comparisons]
-        return comparisons[0]
-
-    beside = replayed(
-        twins[0],
+    report = compared(
+        twins,
         measurements,
-        "not compared",
-        config.accept,
-        replay,
-        only=config.joints,
+        names=_labels(twins, paths),
+        joints=config.joints,
+        accept=config.accept,
+        pressed=config.pressed.made(),
+        second=f"--against={config.against}",
+        title=config.measurements.name,
+        show=show,
     )
-    if beside is None:
+    if report is None:
         return 1
-    first, *rest = comparisons
-    show(
-        compared.how_far(*comparisons),
-        *compared.pad_matches(*comparisons),
-        compared.where(first, ()),
-        compared.cell_numbers(comparisons[-1]),
-        compared.not_compared(first),
-    )
-    off = far_off(comparisons[-1], twins[-1].fitted_gains, beside.findings)
-    show(Section(text=[origin_words(first.origins), *off]))
-    after = rest[0] if rest else None
+    give(partial(as_json, report))
     if config.out is not None:
-        digests = {
-            f"{name}, SHA-256": t.digest()
-            for name, t in zip(labels, twins, strict=True)
-        }
-        report = Report(
-            title=", and ".join(
-                [f"{labels[0]} beside {config.measurements.name}", *labels[1:]]
-            ),
-            comparison=first,
-            after=after,
-            findings=beside.findings,
-            provenance={"command": shlex.join(words), **digests},
-        )
+        words = shlex.join(command("compare", config, "measurements"))
+        provenance = {"command": words, **report.provenance}
+        report = dataclasses.replace(report, provenance=provenance)
         show(write_report(report, config.out))
     if config.rerun is not None:
         from taccorl.views.compare_view import save_comparison
 
-        save_comparison(first, config.rerun, after)
+        save_comparison(report.comparison, config.rerun, report.after)
         look = f"look at it with rerun {shlex.quote(str(config.rerun))}"
         show(Section(text=[f"wrote {config.rerun}: {look}"]))
     return 0
+
+
+def compared(
+    twins: "Sequence[Machine]",
+    measurements: "Measurements",
+    *,
+    names: Sequence[str],
+    joints: Sequence[str],
+    accept: Sequence[str],
+    pressed: "PressedObject | None",
+    second: str,
+    title: str,
+    show: Show,
+) -> "Report | None":
+    """Compare one machine with measurements, or two beside each other.
+
+    Args:
+        names: name of each machine in tables and titles.
+        joints: only these; all that move if there are none.
+        accept: checks whose errors become warnings.
+        pressed: object between the fingers in recordings that do not state one.
+        second: the second machine, for messages.
+        title: name of the measurements.
+        show: function that gets the findings and the result.
+
+    Returns: the content of the report; None if the measurements have errors, which were
+        shown.
+
+    Raises:
+        TaccorlError: no recording has one of the joints, or the second machine lacks a
+            signal that the first one has.
+    """
+    from taccorl.diagnosis.comparison.result import only, origin_words
+    from taccorl.report import compared as sections
+    from taccorl.report.report import Report
+
+    measurements = _of_joints(measurements, joints)
+    _check_same_machine(twins, names[0], second, measurements)
+    comparisons: list[Comparison] = []
+
+    def replay() -> "Comparison":
+        for twin, name in zip(twins, names, strict=True):
+            comparisons.append(_replayed(twin, name, measurements, pressed))
+        if joints:
+            comparisons[:] = [only(c, joints) for c in comparisons]
+        return comparisons[0]
+
+    beside = replayed(
+        twins[0], measurements, "not compared", accept, replay, only=joints, show=show
+    )
+    if beside is None:
+        return None
+    first, *rest = comparisons
+    off = far_off(comparisons[-1], twins[-1].fitted_gains, beside.findings)
+    show(
+        sections.how_far(*comparisons),
+        *sections.pad_matches(*comparisons),
+        sections.where(first, ()),
+        sections.cell_numbers(comparisons[-1]),
+        sections.not_compared(first),
+        Section(text=[origin_words(first.origins), *off]),
+    )
+    return Report(
+        title=", and ".join([f"{names[0]} beside {title}", *names[1:]]),
+        comparison=first,
+        after=rest[0] if rest else None,
+        findings=beside.findings,
+        provenance={
+            f"{name}, SHA-256": t.digest() for name, t in zip(names, twins, strict=True)
+        },
+    )
 
 
 def _check_rerun(path: Path) -> None:
@@ -169,19 +212,16 @@ def _of_joints(measurements: "Measurements", joints: Sequence[str]) -> "Measurem
 
 
 def _check_same_machine(
-    twins: "Sequence[Machine]",
-    paths: Sequence[Path | None],
-    measurements: "Measurements",
+    twins: "Sequence[Machine]", name: str, second: str, measurements: "Measurements"
 ) -> None:
     """Raises TaccorlError: the second machine lacks a signal that the first one has."""
     first, last = twins[0], twins[-1]
     kin = first.of_joints == last.of_joints
-    for name in sorted({signal for m in measurements.all for signal in m.signals}):
-        if not kin or (name in first.units and name not in last.units):
+    for signal in sorted({signal for m in measurements.all for signal in m.signals}):
+        if not kin or (signal in first.units and signal not in last.units):
             raise TaccorlError(
-                f"--against={paths[-1]}: is of another machine: it has no {name!r}, which "
-                f"{paths[0] or 'the nominal twin'} has and recordings move; give a file of "
-                "the same machine"
+                f"{second}: is of another machine: it has no {signal!r}, which {name} has "
+                "and recordings move; give a file of the same machine"
             )
 
 

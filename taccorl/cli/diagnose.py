@@ -17,33 +17,38 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from taccorl.cli.add_effect import compare_words
 from taccorl.cli.measured import (
     OTHER_GAINS,
     PartsConfig,
+    Show,
     far_off,
     refuse_long,
     replayed,
 )
 from taccorl.cli.parse import command, verb
+from taccorl.cli.printed import give
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.cli.measured import Replayed
     from taccorl.diagnosis.comparison.result import Comparison
-    from taccorl.diagnosis.machines.machine import Finding, Machine
+    from taccorl.diagnosis.machines.machine import Finding, GainsAre, Machine
     from taccorl.report.fact import Fact
     from taccorl.report.report import Report
+
+
+Until = Literal["one", "noise_floor"]
 
 
 @dataclass(kw_only=True)
 class DiagnoseConfig(PartsConfig):
     """Find the physical effect that a twin lacks, with the evidence."""
 
-    until: Literal["one", "noise_floor"] = "one"
+    until: Until = "one"
     """``one``: find the most likely missing effect of each joint. ``noise_floor``: add effects until the error is at the noise
     floor, and write the corrected twin."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
@@ -63,57 +68,34 @@ def run(config: DiagnoseConfig) -> int:
     or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM
     ended the search, and what it had found was written."""
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.diagnosis.machines.machine import diagnose_parts
-    from taccorl.diagnosis.search.result import SearchConfig
-    from taccorl.report.compared import not_compared
-    from taccorl.report.report import Report, check_folder
+    from taccorl.report.report import as_json, check_folder
     from taccorl.report.terminal import show
-    from taccorl.sim.effects import effects
 
     replaced = check_folder(config.out, config.measurements)
     machine = load_machine(config.twin)
-    for name in config.without:
-        effects.get(name)
-    measurements = config.read(machine)
-    if machine.of_joints:
-        refuse_long(measurements)
-    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
-    beside = replayed(
+    ready = to_diagnose(
         machine,
-        measurements,
-        "not diagnosed",
-        config.accept,
-        partial(machine.compare, measurements),
-        clocks=False,
-        only=selected if config.joints and not config.pads else (),
+        config.read(machine),
+        joints=config.joints,
+        pads=config.pads,
+        without=config.without,
+        accept=config.accept,
+        show=show,
     )
-    if beside is None:
+    if ready is None or not ready.parts:
         return 1
-    off = {} if OTHER_GAINS in config.accept else _other_gains(beside)
-    refused = [f"{part}: {off[part]}" for part in selected if part in off]
-    far = far_off(beside.comparison, machine.fitted_gains, beside.findings)
-    show(Section(text=[*far, *refused]), not_compared(beside.comparison))
-    if not (parts := [part for part in selected if part not in off]):
-        return 1
+    measurements, parts, refused = ready.measurements, ready.parts, ready.refused
     words = command("diagnose", config, "measurements")
-    report = Report(
-        title=_title(config.twin, config.measurements, machine.name),
-        comparison=beside.comparison,
+    report = ready.report(
+        _title(config.twin, config.measurements, machine.name),
+        command=shlex.join(words),
+        twin=str(config.twin) if config.twin else "nominal twin",
         options=_options(config.twin, config.out, config.measurements),
-        findings=beside.findings,
-        provenance={
-            "command": shlex.join(words),
-            "twin": str(config.twin) if config.twin else "nominal twin",
-            "twin, SHA-256": machine.digest(),
-        },
     )
     search = partial(
-        diagnose_parts,
-        machine,
-        parts,
-        measurements,
+        ready.search,
+        until=config.until,
         gains=config.gains,
-        search=SearchConfig(max_effects=1) if config.until == "one" else SearchConfig(),
         without=config.without,
         workers=config.workers,
     )
@@ -126,19 +108,128 @@ def run(config: DiagnoseConfig) -> int:
     if not found:
         raise KeyboardInterrupt
     mended, disagree = machine.mended(found)
-    report = _with_results(report, machine, found, measurements, mended)
+    report = with_results(report, machine, found, measurements, mended)
     if stopped_by:
         stopped = "This diagnosis is not finished: it was stopped."
         report = dataclasses.replace(report, stopped=" ".join([stopped, *refused]))
     file = config.out / machine.file_name if config.until == "noise_floor" else None
     step = _next(report, machine, words, config.twin, file)
     report = dataclasses.replace(report, next=step)
+    give(partial(as_json, report))
     lines = _saved(report, config.out, replaced, mended, file)
     lines += [disagree] if disagree else []
-    show(Section(text=[*refused, *_open_clocks(beside, found)]), Section(text=lines))
+    show(
+        Section(text=[*refused, *_open_clocks(ready.beside, found)]),
+        Section(text=lines),
+    )
     if stopped_by == signal.SIGTERM:
         return 128 + stopped_by
     return int(not _is_explained(report) or bool(disagree or refused))
+
+
+class Ready(NamedTuple):
+    """Measurements that passed the checks, and the parts that can be diagnosed."""
+
+    machine: "Machine"
+    measurements: "Measurements"
+    beside: "Replayed"
+    """The replays of the machine, and findings."""
+    parts: list[str]
+    refused: list[str]
+    """Lines: a part, and why it is not diagnosed."""
+
+    def report(
+        self, title: str, twin: str, command: str = "", options: Sequence[str] = ()
+    ) -> "Report":
+        """Report without a diagnosis.
+
+        Args:
+            twin: the machine's file, or its name.
+            command: words of the verb; empty if none was typed.
+            options: options of suggested commands.
+        """
+        from taccorl.report.report import Report
+
+        return Report(
+            title=title,
+            comparison=self.beside.comparison,
+            options=options,
+            findings=self.beside.findings,
+            provenance={
+                "command": command,
+                "twin": twin,
+                "twin, SHA-256": self.machine.digest(),
+            },
+        )
+
+    def search(
+        self,
+        *,
+        until: Until,
+        gains: "GainsAre",
+        without: Sequence[str],
+        workers: int,
+        **progress: Any,
+    ) -> "list[Finding]":
+        """Findings of the parts. ``progress``: ``done`` and ``progress`` of
+        ``diagnose_parts``; the other arguments are options of the verb."""
+        from taccorl.diagnosis.machines.machine import diagnose_parts
+        from taccorl.diagnosis.search.result import SearchConfig
+
+        return diagnose_parts(
+            self.machine,
+            self.parts,
+            self.measurements,
+            gains=gains,
+            search=SearchConfig(max_effects=1) if until == "one" else SearchConfig(),
+            without=without,
+            workers=workers,
+            **progress,
+        )
+
+
+def to_diagnose(
+    machine: "Machine",
+    measurements: "Measurements",
+    *,
+    joints: Sequence[str],
+    pads: Sequence[str],
+    without: Sequence[str],
+    accept: Sequence[str],
+    show: Show,
+) -> Ready | None:
+    """Check measurements, and choose the parts that can be diagnosed; None if there are
+    errors, which were shown. Arguments are options of the verb.
+
+    Raises:
+        TaccorlError: a joint, a pad or an effect is unknown, or a recording is too long.
+    """
+    from taccorl.report.compared import not_compared
+    from taccorl.sim.effects import effects
+
+    for name in without:
+        effects.get(name)
+    if machine.of_joints:
+        refuse_long(measurements)
+    selected = machine.select(machine.parts(measurements), joints, pads)
+    beside = replayed(
+        machine,
+        measurements,
+        "not diagnosed",
+        accept,
+        partial(machine.compare, measurements),
+        clocks=False,
+        only=selected if joints and not pads else (),
+        show=show,
+    )
+    if beside is None:
+        return None
+    off = {} if OTHER_GAINS in accept else _other_gains(beside)
+    refused = [f"{part}: {off[part]}" for part in selected if part in off]
+    far = far_off(beside.comparison, machine.fitted_gains, beside.findings)
+    show(Section(text=[*far, *refused]), not_compared(beside.comparison))
+    parts = [part for part in selected if part not in off]
+    return Ready(machine, measurements, beside, parts, refused)
 
 
 def _other_gains(beside: "Replayed") -> dict[str, str]:
@@ -207,7 +298,7 @@ def _options(
     return [shlex.quote(word) for word in words]
 
 
-def _with_results(
+def with_results(
     report: "Report",
     machine: "Machine",
     found: "Sequence[Finding]",

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import given_names, joined, parse, shared_fields
+from taccorl.cli.printed import give
 from taccorl.cli.progress import Steps
 from taccorl.errors import TaccorlError, nearest
 from taccorl.extras import require
@@ -276,6 +277,7 @@ def run(config: EvaluateConfig) -> int:
             + "\n"
         }
     )
+    give(found.to_json)
     show(found.lines())
     show(_write_page(config, found, rollouts[0]))
     return 0

@@ -5,12 +5,11 @@ Turn recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one Le
 """
 
 import ctypes
-import dataclasses
 import json
 import os
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 from taccorl.cli.card import add_card
 from taccorl.cli.output_lock import check_apart
 from taccorl.cli.parse import parse
+from taccorl.cli.printed import give
 from taccorl.data.origin import DOMAINS, Domain, Origin
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError, nearest, printable
 from taccorl.lineage.destinations import check_writable, is_free, write_new
@@ -98,51 +98,16 @@ def run(config: IngestConfig) -> int:
     """Ingest the recordings. Returns the exit status, 0: all recordings were written or split, 1: some were quarantined or
     refused."""
     _save_memory()
-    from taccorl.cli.progress import Bars
-    from taccorl.data.ingest import find_jobs, ingest
-    from taccorl.data.spec import load_recording_spec
-    from taccorl.lineage.store import Store
     from taccorl.report.ingested import ingested
     from taccorl.report.terminal import show
 
-    if config.domain not in (None, *DOMAINS):
-        raise TaccorlError(
-            f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}"
-        )
-    if config.spec is None:
-        config = dataclasses.replace(config, spec=chosen_spec(config.paths))
-    assert config.spec is not None
-    spec = load_recording_spec(config.spec)
-    skipped: list[str] = []
-    domain = cast("Domain | None", config.domain)
-    jobs = find_jobs(
-        config.paths, spec, config.spec, config.store, config.dry_run, skipped, domain
-    )
-    for line in skipped:
-        print(f"not read: {printable(line)}")
-    _check_out(config, jobs)
-    store = None if config.dry_run else Store(config.store)
-    if store is not None:
-        store.make()  # each recording's errors are its own: a store that cannot be written would be an error of all
     moved: list[Path] = []
-    replace = moved.append if config.replace else None
-    with Bars(len(jobs)) as bars:
-        try:
-            report = ingest(
-                jobs,
-                config.out,
-                store,
-                engine=config.engine,
-                progress=bars.update,
-                replace=replace,
-            )
-        except InTheWayError as error:
-            raise InTheWayError(f"{error} --replace=true moves it aside.") from error
-    path = _write_report(report, config)
+    report = ingested_as(config, print, moved.append)
+    give(lambda: report)
     show(ingested(report))
     for aside in moved:
         print(f"what was at {config.out} is now at {aside}")
-    _say_where(report, config, path)
+    _say_where(report, config)
     bad = (
         report["episodes_quarantined"]
         + report["outcomes"]["quarantined"]
@@ -151,13 +116,65 @@ def run(config: IngestConfig) -> int:
     return 1 if bad else 0
 
 
-def chosen_spec(paths: Sequence[Path]) -> str:
-    """Name of the shipped spec that fits recordings for which the user gave none, which is printed. Raises TaccorlError: none
+def ingested_as(
+    config: IngestConfig, say: Callable[[str], None], moved: Callable[[Path], None]
+) -> dict[str, Any]:
+    """Ingest the recordings, and write the dataset and its report.
+
+    Args:
+        say: function that gets what was chosen, and what was not read.
+        moved: function that gets the path to which an earlier dataset was moved.
+
+    Returns: the content of ingest_report.json.
+
+    Raises:
+        TaccorlError: an option is wrong, or the output cannot be written.
+    """
+    from taccorl.cli.progress import Bars
+    from taccorl.data.ingest import find_jobs, ingest
+    from taccorl.data.spec import load_recording_spec
+    from taccorl.lineage.store import Store
+
+    if config.domain not in (None, *DOMAINS):
+        raise TaccorlError(
+            f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}"
+        )
+    name = config.spec or chosen_spec(config.paths, say)
+    spec = load_recording_spec(name)
+    skipped: list[str] = []
+    domain = cast("Domain | None", config.domain)
+    jobs = find_jobs(
+        config.paths, spec, name, config.store, config.dry_run, skipped, domain
+    )
+    for line in skipped:
+        say(f"not read: {printable(line)}")
+    _check_out(config, jobs)
+    store = None if config.dry_run else Store(config.store)
+    if store is not None:
+        store.make()  # each recording's errors are its own: a store that cannot be written would be an error of all
+    with Bars(len(jobs)) as bars:
+        try:
+            report = ingest(
+                jobs,
+                config.out,
+                store,
+                engine=config.engine,
+                progress=bars.update,
+                replace=moved if config.replace else None,
+            )
+        except InTheWayError as error:
+            raise InTheWayError(f"{error} --replace=true moves it aside.") from error
+    _write_report(report, config)
+    return report
+
+
+def chosen_spec(paths: Sequence[Path], say: Callable[[str], None] = print) -> str:
+    """Name of the shipped spec that fits recordings for which the user gave none; ``say`` gets it. Raises TaccorlError: none
     fits, or several do."""
     from taccorl.data.inspection import choose_spec
 
     name = choose_spec(paths)
-    print(f"spec:    {name}, whose topics these are (--spec={name})")
+    say(f"spec:    {name}, whose topics these are (--spec={name})")
     return name
 
 
@@ -221,9 +238,13 @@ def _check_same(out: Path, jobs: "list[Job]") -> None:
         )
 
 
-def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
+def _report_path(config: IngestConfig) -> Path:
+    return config.out.with_name(f"{config.out.name}.ingest_report.json")
+
+
+def _write_report(report: dict[str, Any], config: IngestConfig) -> None:
     """Beside the dataset, before anything is printed: a closed pipe must not cost it."""
-    path = config.out.with_name(f"{config.out.name}.ingest_report.json")
+    path = _report_path(config)
     if not config.dry_run:
         path.parent.mkdir(parents=True, exist_ok=True)
         temp = path.with_name(f".{path.name}.{os.getpid()}")
@@ -231,14 +252,13 @@ def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
             json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
         )
         temp.replace(path)
-    return path
 
 
-def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None:
+def _say_where(report: dict[str, Any], config: IngestConfig) -> None:
     if config.dry_run:
         print("dry run: nothing was written")
         return
-    print(f"report:  {path}")
+    print(f"report:  {_report_path(config)}")
     if report["episodes"]:
         print(
             f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows)"

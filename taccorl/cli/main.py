@@ -9,6 +9,7 @@ import sys
 import warnings
 
 from taccorl.cli.output_lock import released_at_the_end
+from taccorl.cli.printed import form_of, printed
 from taccorl.errors import TaccorlError, nearest, printable
 
 VERBS = {
@@ -75,12 +76,14 @@ def main(argv: list[str] | None = None) -> int:
         ):  # before NumPy is imported
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     words = argv
-    if words == ["--version"]:
+    if words in (["--version"], ["-V"]):
         from taccorl import __version__
 
         print(f"taccorl {__version__}")
         return 0
     known = [verb for group in VERBS.values() for verb in group]
+    if words[:1] == ["help"]:  # taccorl help ingest inspect
+        words = [*words[1:], "--help"]
     listing = not words or words[0] in ("-h", "--help")
     if not listing and words[0] not in known:
         print(
@@ -96,7 +99,8 @@ def main(argv: list[str] | None = None) -> int:
         ]
     )
     try:
-        with released_at_the_end():
+        words, form = form_of(words)
+        with released_at_the_end(), printed(form):
             module = "" if listing else words[0].replace("-", "_")
             code = (
                 _list_verbs()
@@ -165,7 +169,8 @@ def _list_verbs() -> int:
         for verb, line in verbs.items():
             print(f"  {verb:16s}{line}")
     print(
-        "\ntraining is LeRobot's own command: lerobot-train; lerobot-eval scores as taccorl evaluate does"
+        "\nevery verb: --quiet prints no result; --json, of those with a report, prints it as JSON\n"
+        "training is LeRobot's own command: lerobot-train; lerobot-eval scores as taccorl evaluate does"
     )
     return 0
 

@@ -42,6 +42,17 @@ FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
 
+Show = Callable[..., None]
+"""Function that is called with the sections of what is to be said."""
+
+
+def in_terminal(*sections: Section) -> None:
+    """Print sections in the terminal."""
+    from taccorl.report.terminal import show
+
+    show(*sections)
+
+
 @dataclass(kw_only=True)
 class MeasuredConfig:
     """Options of the verbs that read measurements of joints, axes, pads and cells."""
@@ -123,15 +134,14 @@ def replayed(
     why: str = "looks like missing physics",
     clocks: bool = True,
     only: Collection[str] = (),
+    show: Show = in_terminal,
 ) -> Replayed | None:
     """Check measurements before and after their replay, and show the findings. ``verdict``: text with which the message begins
     if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
     with the measurements. ``why``: what an offset of one row does.
     ``clocks``: whether to show which clocks nothing judged. ``only``: parts that are asked for; errors of others are
-    warnings. Returns None if there are errors, or most clocks are off."""
-    from taccorl.report.terminal import show
-
-    findings = checked(machine, measurements, accept, only)
+    warnings. ``show``: function that gets what is to be said. Returns None if there are errors, or most clocks are off."""
+    findings = checked(machine, measurements, accept, only, show)
     if wrong := recordings_with_errors(findings):
         with contextlib.suppress(TaccorlError):  # what a replay would refuse as well
             late = of_replays(replay(), findings, accept, only)
@@ -207,9 +217,10 @@ def checked(
     measurements: "Measurements",
     accept: Sequence[str] = (),
     only: Collection[str] = (),
+    show: Show = in_terminal,
 ) -> dict[str, list["Finding"]]:
-    """Run the checks of telemetry and of the machine, and print their findings. ``accept``: checks whose errors become
-    warnings. ``only``: as of ``replayed``. Returns: name of a recording → its findings."""
+    """Run the checks of telemetry and of the machine, and show their findings. ``accept``: checks whose errors become
+    warnings. ``only``, ``show``: as of ``replayed``. Returns: name of a recording → its findings."""
     from taccorl.alignment.checks.telemetry import (
         accepted,
         check_copies,
@@ -218,7 +229,6 @@ def checked(
     )
     from taccorl.alignment.checks.unsigned import without_unsigned
     from taccorl.cli.progress import LINE_EVERY_S, Steps
-    from taccorl.report.terminal import show
 
     rows, seconds = (
         sum(each)
@@ -227,10 +237,11 @@ def checked(
         )
     )
     if rows > MANY_ROWS:
-        print(
-            f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take minutes; 10 s of each motion are enough",
-            flush=True,
+        text = (
+            f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take "
+            "minutes; 10 s of each motion are enough"
         )
+        show(Section(text=[text]))
     steps = Steps(every_s=0.0 if rows > MANY_ROWS else LINE_EVERY_S)
     found = check_copies(measurements.all)
     if machine.of_joints:

@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -204,17 +204,28 @@ def _check_outputs(config: ViewConfig) -> None:
 
 @contextlib.contextmanager
 def opened_episode(
-    path: Path, number: int, spec: str | None, option: str
+    path: Path,
+    number: int,
+    spec: str | None,
+    option: str,
+    say: Callable[[str], None] = print,
 ) -> Iterator["Episode"]:
-    """Context manager that opens one episode of a dataset, a recording or an attempt, and closes its files. ``option``: name
-    of the option for the recording's spec, for messages. Raises TaccorlError: there is no such file or episode, or a
-    recording's spec is missing."""
+    """Context manager that opens one episode of a dataset, a recording or an attempt,
+    and closes its files.
+
+    Args:
+        option: name of the option for the recording's spec, for messages.
+        say: function that gets what was chosen, and what is not shown.
+
+    Raises:
+        TaccorlError: there is no such file or episode, or a recording's spec is missing.
+    """
     if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
 
         dataset = Dataset(path)
         for key, why in dataset.skipped.items():
-            print(f"not shown: {key}: {why}")
+            say(f"not shown: {key}: {why}")
         yield dataset.episode(number)
         return
     if not path.exists():
@@ -237,7 +248,7 @@ def opened_episode(
         if what := no_recording(path):
             raise TaccorlError(f"{path}: {what}")
         try:
-            spec = chosen_spec([path])
+            spec = chosen_spec([path], say)
         except TaccorlError as error:
             raise TaccorlError(str(error).replace("--spec=", f"{option}=")) from error
     from taccorl.data.cutting import open_episodes

@@ -20,6 +20,16 @@ HEAD_BYTES = 2048
 
 def html(title: str, sections: Iterable[Section], generator: str) -> str:
     """Text of the page; ``generator`` is the text by which the file is recognised."""
+    made_by = f"{generator}, taccorl {taccorl.__version__}"
+    return _rendered(sections, whole=True, title=title, generator=made_by)
+
+
+def fragment(sections: Iterable[Section]) -> str:
+    """Sections as one HTML element with its own style, for a cell of a notebook."""
+    return _rendered(sections, whole=False)
+
+
+def _rendered(sections: Iterable[Section], **values: object) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     made = Environment(
@@ -28,12 +38,8 @@ def html(title: str, sections: Iterable[Section], generator: str) -> str:
         undefined=StrictUndefined,
     )
     made.filters |= {"cell": cell, "uri": _uri}
-    words = {
-        "title": title,
-        "sections": list(sections),
-        "generator": f"{generator}, taccorl {taccorl.__version__}",
-    }
-    return made.get_template("page.html.j2").render(words)
+    template = made.get_template("page.html.j2")
+    return template.render(sections=list(sections), **values)
 
 
 def _uri(draw: Callable[[], Any]) -> str:

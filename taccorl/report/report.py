@@ -32,6 +32,7 @@ from taccorl.report.diagnosed import account_section, diagnosed, next_section
 from taccorl.report.evidence import Seen, added
 from taccorl.report.fact import Account, Fact
 from taccorl.report.section import Section
+from taccorl.report.terminal import as_text
 from taccorl.sim.effects.effect import Effect
 
 PAGE, NUMBERS = "report.html", "report.json"
@@ -40,7 +41,7 @@ GENERATOR = "taccorl report"
 """Text by which a file is recognised as a report."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Report:
     """The content of a report: comparisons, diagnoses and findings of checks."""
 
@@ -204,19 +205,47 @@ class Report:
             if f.severity == "error" and (not moved or name in moved)
         ]
 
-    def sections(self) -> list[Section]:
-        """The page."""
-        c, accounts, regimes = self.comparison, self.accounts(), self.regimes()
-        twins = [one for one in (c, self.refitted, self.after) if one is not None]
+    def verdict(self) -> list[Section]:
+        """What the result is: origin of the data, and the verdict on every part."""
+        accounts = self.accounts()
         return [
             Section(text=[origin_words(self.origins)], style="data"),
             *([Section(text=[self.stopped])] if self.stopped else []),
             *(
                 map(account_section, accounts.values())
                 if accounts
-                else [compared.verdict(c, self.after)]
+                else [compared.verdict(self.comparison, self.after)]
             ),
             *([next_section(self.next)] if len(accounts) > 1 else []),
+        ]
+
+    def twins(self) -> list[Comparison]:
+        """The comparisons that there are: original, refitted, corrected or other."""
+        every = (self.comparison, self.refitted, self.after)
+        return [one for one in every if one is not None]
+
+    def __repr__(self) -> str:
+        """The verdict and the errors of every signal, as a terminal shows them."""
+        return as_text(*self.verdict(), compared.how_far(*self.twins()))
+
+    def _repr_html_(self) -> str:
+        """The verdict and the errors of every signal, for notebooks."""
+        return page.fragment([*self.verdict(), compared.how_far(*self.twins())])
+
+    def save(self, folder: Path | str) -> None:
+        """Write ``report.html`` and ``report.json`` into ``folder``; an earlier report
+        there is replaced.
+
+        Raises:
+            TaccorlError: other files have these names, or the folder cannot be written.
+        """
+        write_report(self, Path(folder))
+
+    def sections(self) -> list[Section]:
+        """The page."""
+        c, regimes, twins = self.comparison, self.regimes(), self.twins()
+        return [
+            *self.verdict(),
             *(
                 [compared.signals(self.without_effects, self.after)]
                 if c.signals

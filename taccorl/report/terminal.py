@@ -1,5 +1,7 @@
 """Sections in a terminal, readable in a narrow one and in a log file."""
 
+import io
+
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text as RichText
@@ -37,9 +39,17 @@ def console() -> Console:
     return found if found.is_terminal else _Console(width=WIDE)
 
 
-def show(*sections: Section, indent: str = "") -> None:
-    """Print sections: lines whole, never cut or folded, so that they can be copied; cells of tables folded."""
-    out = console()
+def as_text(*sections: Section) -> str:
+    """What ``show`` prints into a log file."""
+    file = io.StringIO()
+    show(*sections, out=_Console(file=file, width=WIDE, color_system=None))
+    return file.getvalue().strip("\n")
+
+
+def show(*sections: Section, indent: str = "", out: Console | None = None) -> None:
+    """Print sections: lines whole, never cut or folded, so that they can be copied; cells of tables folded. ``out``: where;
+    stdout if not given."""
+    out = out or console()
     for s in sections:
         if s.only == "page":
             continue
@@ -67,7 +77,7 @@ def show(*sections: Section, indent: str = "") -> None:
             out.print(_line(value, indent, "note"), soft_wrap=True)
         if s.command:
             out.print(Text(f"{indent}{s.command}"), soft_wrap=True)
-        show(*s.parts, indent=f"{indent}  " if s.title else indent)
+        show(*s.parts, indent=f"{indent}  " if s.title else indent, out=out)
 
 
 def _line(value: Value, indent: str, style: str = "") -> RichText:

@@ -35,6 +35,8 @@ GONE_S = 1.0
 """Time without a message, of which it sends one every 50 ms, after which a client counts as dead, and another is accepted [s]."""
 _FRAMES_PER_TICK = 64
 """Frames that are received in a tick whose time is used up; more while time remains."""
+_PACE_TICKS = 50
+"""Ticks by which the pace is measured before the surrogate is served: half a second."""
 _SLIPPED_S = 0.25  # further behind than this, the surrogate's time stands still instead of hurrying
 
 
@@ -254,6 +256,33 @@ class SurrogateServer:
         return found
 
 
+def pace(
+    body: SurrogateBody, behind: int, clock: Callable[[], float] = time.monotonic
+) -> float:
+    """Time that the surrogate needs for a second of its own time [s/s]; above 1 it is too
+    slow.
+
+    Args:
+        behind: 0 with pictures, 1 without them, as for ``SurrogateBody.tick``.
+        clock: the time [s].
+    """
+    begun_s = clock()
+    for _ in range(_PACE_TICKS):
+        body.tick(behind)
+    return (clock() - begun_s) / (_PACE_TICKS * body.TICK_S)
+
+
+def slow_words(with_pictures: float, without: float, camera_px: int) -> str:
+    """Text on a surrogate that is too slow, with the option that helps; empty if it is
+    not. Both paces are those of ``pace``."""
+    if with_pictures <= 1.0:
+        return ""
+    text = f"too slow: it needs {with_pictures:.1f} s of this machine for each of its seconds"
+    if without <= 1.0 and camera_px:
+        return f"{text}, {without:.1f} s without pictures: --camera_px={camera_px // 2} (0: no cameras)"
+    return f"{text}, also without pictures: end what else runs here, or take a faster machine"
+
+
 def serve(config: ServeConfig) -> int:
     """Run ``taccorl serve-surrogate``; returns the exit status: 143 after SIGTERM, else 0."""
     signals: list[int] = []
@@ -268,6 +297,7 @@ def serve(config: ServeConfig) -> int:
         12
     ):  # what is compiled and allocated at first use, such as each camera's renderer, must not be late
         body.tick()
+    with_pictures, without = (pace(body, behind) for behind in (0, 1))
     if body.sim.task.expert:
         body.lead_on()
     body.reset(config.seed)
@@ -278,6 +308,8 @@ def serve(config: ServeConfig) -> int:
         else "no cameras"
     )
     print(f"{config.task}, scene {body.scene_seed}, {shown}", flush=True)
+    if slow := slow_words(with_pictures, without, config.camera_px):
+        print(slow, flush=True)
     if config.secret is not None and config.effects is None:
         print("hidden effects: drawn from the secret, not shown", flush=True)
     print(

@@ -23,6 +23,7 @@ from taccorl.cli.help import SHOWN
 from taccorl.cli.ingest import IngestConfig, InspectConfig
 from taccorl.cli.lineage import ExplainConfig, PruneConfig
 from taccorl.cli.main import SECOND_WORDS, VERBS, main
+from taccorl.cli.printed import give
 from taccorl.cli.view import ViewConfig
 from taccorl.errors import TaccorlError, printable
 from tests.fresh_python import fresh_python
@@ -371,3 +372,44 @@ def test_notes_of_numpy_do_not_reach_the_terminal_unless_python_is_asked_for_the
     )
     done = fresh_python(*options, "-c", code)
     assert done.returncode == 0 and ("empty mean" in done.stderr) == shown
+
+
+@pytest.mark.parametrize("words", [["-V"], ["--version"]])
+def test_the_version_is_one_line(words, capsys):
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"taccorl {taccorl.__version__}\n"
+
+
+def test_help_of_a_verb_is_its_help(capsys):
+    with pytest.raises(SystemExit):
+        main(["help", "ingest", "inspect"])
+    shown = capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["ingest", "inspect", "--help"])
+    assert shown == capsys.readouterr().out and "--draft" in shown
+    assert main(["help"]) == 0 and "usage: taccorl <verb>" in capsys.readouterr().out
+    assert main(["help", "colect"]) == 2 and "'collect'" in capsys.readouterr().err
+
+
+def test_json_is_the_report_and_nothing_else(capfd, monkeypatch):
+    monkeypatch.setattr("taccorl.cli.ingest.main", _reporting)
+    assert main(["ingest", "x", "--json"]) == 1
+    shown = capfd.readouterr()
+    assert json.loads(shown.out) == {"rows": 3} and "a table" in shown.err
+    assert main(["ingest", "x", "--quiet"]) == 1
+    assert capfd.readouterr() == ("", "")
+    assert main(["ingest", "x"]) == 1 and capfd.readouterr().out == "a table ['x']\n"
+
+
+def _reporting(words: list[str]) -> int:
+    print("a table", words)
+    give(lambda: {"rows": 3})
+    return 1
+
+
+@pytest.mark.parametrize(
+    "words", [["collect", "--json"], ["ingest", "inspect", "x", "--json"]]
+)
+def test_a_verb_without_a_report_refuses_json(words, capsys):
+    assert main(words) == 2
+    assert "ingest" in capsys.readouterr().err.partition("verbs with one:")[2]

@@ -30,7 +30,7 @@ from taccorl.robot_plugin.surrogate_body import (
 )
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
 from taccorl.robot_plugin.surrogate_messages import MOST_REQUEST_BYTES
-from taccorl.robot_plugin.surrogate_server import SurrogateServer
+from taccorl.robot_plugin.surrogate_server import SurrogateServer, pace, slow_words
 from taccorl.robots import ROBOT
 from taccorl.sim.seen_scene import SeenScene
 
@@ -603,3 +603,22 @@ def test_pads_are_checked_when_they_are_connected(
     with pytest.raises(TaccorlError, match=said):
         second.connect()
     assert not second.pads or not second.pads._threads
+
+
+def test_a_surrogate_that_is_too_slow_names_the_option_that_helps():
+    assert slow_words(0.99, 0.3, 224) == ""
+    # 2.5 s of the machine for each second, of which pictures take 1.7 s: halve them.
+    assert "--camera_px=112" in slow_words(2.5, 0.8, 224)
+    assert "2.5" in slow_words(2.5, 0.8, 224)
+    for without, camera_px in ((1.4, 224), (2.5, 0)):
+        assert "--camera_px" not in slow_words(2.5, without, camera_px) != ""
+
+
+def test_the_pace_is_time_over_simulated_time():
+    body = SurrogateBody(SurrogateConfig(task="bench", camera_px=0))
+    begun = body.ticks
+    times_s = iter((10.0, 11.5))
+    # 50 ticks of 10 ms are 0.5 s; the clock moves by 1.5 s.
+    assert pace(body, 1, lambda: next(times_s)) == pytest.approx(3.0)
+    assert body.ticks == begun + 50
+    body.close()
