@@ -382,12 +382,13 @@ def check_frozen_targets(t: Trial) -> Iterator[Finding]:
         name, least = m.signals[j], FROZEN_MOVE / scale(m, j)
         least = max(least, REST_SHARE * float(np.ptp(m.target[:, j])))
         holds = runs(np.diff(m.target[:, j]) == 0)
-        inner = [r for r in holds if r[0] > 0 and r[1] < m.num_rows - 1]
-        inner.sort(key=lambda r: r[0] - r[1])
-        if not inner:
+        later = sorted(
+            (r for r in holds if r[0] > 0), key=lambda r: r[0] - r[1]
+        )  # the longest first; the last one may reach the end
+        if not later:
             continue
-        first, end = inner[0]
-        others = max((stop - start for start, stop in inner[1:]), default=0)
+        first, end = later[0]
+        others = max((stop - start for start, stop in later[1:]), default=0)
         if (end - first) * m.period_s < FROZEN_S or 3 * others > end - first:
             continue
         if _to_and_fro(m.measured[first + answer : end, j]) > least:

@@ -77,9 +77,15 @@ def overlay(
         loop = "; torques of an outer loop never repeat: then remove it" * (
             "torque" in first.target_kinds
         )
+        squares = (target[moving] ** 2).sum(axis=0)
+        most = int(np.argmax(squares))
+        where = ""
+        if len(squares) > 1 and squares[most] > 0.0:
+            where = f", {squares[most] / squares.sum():.0%} of their squares in the target of {first.signals[most]},"
         raise TaccorlError(
-            f"{no_repeat}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
-            f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice{loop}"
+            f"{no_repeat}: their commands differ by {rms:.4f} (RMS) of {motion:.4f}{where} "
+            f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or that column if it is not "
+            f"what was sent, or record the same command file twice{loop}"
         )
     weights = _weights(share)
     columns = {"position": "measured", "velocity": "velocity", "effort": "effort"}

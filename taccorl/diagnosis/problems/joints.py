@@ -42,6 +42,9 @@ from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffect
 from taccorl.sim.twin import TwinConfig
 
+OTHER_GAIN = 0.1
+"""Share by which a gain of the plain fit must differ from the stated one before a search
+with fitted gains is tried. A choice."""
 MOVES_RAD = 2e-3
 """Least commanded (or, without position commands, measured) range of a joint that is diagnosed [rad]."""
 SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
@@ -125,12 +128,17 @@ def diagnose_joint(
     own = apart(own, drifted)
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
     found = solved(signal, problem, search, without, progress)
-    if gains == "auto" and problem.commanded and _other_gains_do(found.diagnosis):
+    if gains == "auto" and problem.commanded and _gains_do_more(problem, found):
         progress("the gains are not those of the file: search again, with gains fitted")
         freed = JointProblem(machine, signal, own, gains="fitted", held=without)
         again = solved(signal, freed, search, without, progress)
         if _removes_more(_left(again.diagnosis), _left(found.diagnosis)):
             problem, found = freed, again
+    most = SearchConfig().max_effects
+    if search and search.max_effects < most and _plain_does_more(found.diagnosis):
+        progress("usual numbers together explain more: search for several effects")
+        more = dataclasses.replace(search, max_effects=most)
+        found = solved(signal, problem, more, without, progress)
     if problem.axis is not None:
         return JointFinding(**vars(found), floors=tuple(problem.floors))
     known = known_numbers(problem, found.diagnosis)
@@ -154,12 +162,22 @@ def _removes_more(error: float, other: float) -> bool:
     return error < other and not gains_nothing(other, error)
 
 
-def _other_gains_do(found: Diagnosis) -> bool:
-    """Whether the plain fit, in which gains are free, leaves much less than the answer."""
+def _plain_does_more(found: Diagnosis) -> bool:
+    """Whether the plain fit, of gains, friction and a delay, leaves much less than the
+    answer."""
     plain = found.plain
     return plain is not None and _removes_more(
         plain.errors["validation"], _left(found)
     )
+
+
+def _gains_do_more(problem: JointProblem, found: PartFinding) -> bool:
+    """Whether the plain fit leaves much less than the answer, with other gains."""
+    if not _plain_does_more(found.diagnosis):
+        return False
+    plain = found.diagnosis.plain.values if found.diagnosis.plain else {}
+    stated = {n: problem.start[n] for n in ("kp", "kd") if problem.start.get(n)}
+    return any(abs(plain.get(n, v) / v - 1.0) > OTHER_GAIN for n, v in stated.items())
 
 
 def drifts_of(
