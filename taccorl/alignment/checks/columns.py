@@ -50,7 +50,12 @@ NO_WEIGHT = 0.2
 less so much. A choice."""
 COLUMNS = ("measured", "target", "velocity", "effort")
 """Arrays (T, J) of a measurement that hold a joint's columns."""
-EXCHANGES = (COLUMNS, COLUMNS[:-1], ("effort",))
+EXCHANGES = (
+    COLUMNS,
+    COLUMNS[:-1],
+    tuple(name for name in COLUMNS if name != "target"),
+    ("effort",),
+)
 """Columns that may be exchanged together."""
 PAIRS = (("effort", "drive"), ("effort", "links"), ("drive", "links"))
 """Torques that are compared."""
@@ -172,7 +177,7 @@ def _exchanged(
         return None
     own = [m for m in known if m.name in names]
     old = np.array([_disagreements(own, [as_is[m.name] for m in own], n) for n in pair])
-    best: _Exchange | None = None
+    best, least_of_all = None, np.inf
     for columns in EXCHANGES:
         swapped = [_swapped(m, *pair, columns) for m in own]
         torques = [_torques(robot, m) for m in swapped]
@@ -180,12 +185,17 @@ def _exchanged(
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios = new / old
             means = np.sqrt(ratios.prod(axis=0))  # NaN: a torque is not known
-        for compared, mean, largest in zip(
-            PAIRS, means.tolist(), ratios.max(axis=0).tolist(), strict=True
-        ):
-            least = BETTER if best is None else best.ratio
-            if mean < least and largest < 1.0:
-                best = _Exchange(pair, own, columns, compared, mean)
+        shown = [
+            _Exchange(pair, own, columns, compared, mean)
+            for compared, mean, largest in zip(
+                PAIRS, means.tolist(), ratios.max(axis=0).tolist(), strict=True
+            )
+            if mean < BETTER and largest < 1.0
+        ]
+        # Several may explain one pair of torques; all pairs together tell which it is.
+        of_all = float(np.nanprod(means))
+        if shown and of_all < least_of_all:
+            best, least_of_all = min(shown, key=lambda one: one.ratio), of_all
     return best
 
 

@@ -35,7 +35,7 @@ AT_FLOOR = SearchConfig().floor
 """An error up to so many noise floors counts as at the floor, as in the search."""
 DISAGREE = 1.3
 """Ratio of two errors from which on a remark is made."""
-COVERED = 0.75
+COVERED = 0.5
 """Least share of a range that recordings of the other use must cover; below it a remark is made."""
 INNER = (0.005, 0.995)
 """Quantiles that count as the ends of a range, so that single noisy rows are ignored."""
