@@ -308,8 +308,9 @@ def _side_by_side(
         drive["gravity_sin"] += weight * case.lever.sin_m
         drive["gravity_cos"] += weight * case.lever.cos_m
         # A target that acts before its row does so by a delay below 0, a later one by ``_sent``.
-        drive["command_delay__delay_s"] += case.waits_s + min(late_s, 0.0)
-        drive["effort_age"] -= case.waits_s
+        waits_s = case.waits_s + min(late_s, 0.0)
+        drive["command_delay__delay_s"] += waits_s
+        drive["effort_age"] -= waits_s
         # An integral holds what acts on a joint at rest with any effort within the dry
         # friction.
         if any(
