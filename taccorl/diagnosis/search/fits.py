@@ -403,7 +403,26 @@ class Fits:
         if model.error <= self.config.floor:
             return model
         afresh = self.fitted(names, [starts[0] | self.given])
-        return min(model, afresh, key=lambda m: m.error)
+        return self._in_best_row(min(model, afresh, key=lambda m: m.error), name)
+
+    def _in_best_row(self, model: Fit, name: str) -> Fit:
+        """``model``, or a better one in which ``name`` makes the motion a row later or
+        earlier: efforts jump where a delay reaches the next row, so that between any two
+        rows the error has a minimum of its own."""
+        late = [f for f in model.frees if f.name == f"{name}.delay_s"]
+        if not late or model.error <= self.config.floor:
+            return model
+        row_s = float(np.median(np.diff(self.fit_to[0].time_s)))
+        value = model.values[late[0].name]
+        others = [late[0].within(value + by * row_s) for by in (-1.0, 1.0)]
+        found = [
+            self.fitted(model.names, [model.values | {late[0].name: other}], FIRST_STEPS)
+            for other in others
+        ]
+        best_one = min(found, key=lambda f: f.error)
+        if best_one.error >= model.error:
+            return model
+        return self.fitted(model.names, [best_one.values])
 
     def with_optional(self, model: Model) -> Model:
         """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles. Also of a
