@@ -436,7 +436,10 @@ def _in_time(
         else motion.command_s * (rows - 1) / motion.time_s[-1]
     ) + late
     edges = np.arange(rows * parts + 1) / parts
-    last = np.maximum(np.searchsorted(came, edges, side="right") - 1, 0)
+    if motion.command_s is None:  # a fifth of the time of a search in ``came``
+        last = np.clip(np.floor(edges - late).astype(int), 0, rows - 1)
+    else:
+        last = np.maximum(np.searchsorted(came, edges, side="right") - 1, 0)
     whole, since = np.diff(came), edges - came[last]
 
     def mean(values: np.ndarray) -> np.ndarray:
