@@ -400,17 +400,17 @@ class Fits:
         file: those of ``parent`` may have gone far to make up for the effect."""
         names = (*parent.names, name)
         model = self.fitted(names, starts)
-        if model.error <= self.config.floor:
-            return model
-        afresh = self.fitted(names, [starts[0] | self.given])
-        return self._in_best_row(min(model, afresh, key=lambda m: m.error), name)
+        if model.error > self.config.floor:
+            afresh = self.fitted(names, [starts[0] | self.given])
+            model = min(model, afresh, key=lambda m: m.error)
+        return self._in_best_row(model, name)
 
     def _in_best_row(self, model: Fit, name: str) -> Fit:
         """``model``, or a better one in which ``name`` makes the motion a row later or
         earlier: efforts jump where a delay reaches the next row, so that between any two
         rows the error has a minimum of its own."""
         late = [f for f in model.frees if f.name == f"{name}.delay_s"]
-        if not late or model.error <= self.config.floor:
+        if not late or self.error(model) <= self.config.floor:
             return model
         row_s = float(np.median(np.diff(self.fit_to[0].time_s)))
         value = model.values[late[0].name]
