@@ -169,14 +169,7 @@ def main(argv: list[str]) -> int:
     else:
         given.append(f"--twin={config.out / TWIN}")
     words = shlex.join(["taccorl", "diagnose", str(config.measurements), *given])
-    show(
-        Section(
-            text=[
-                f"wrote {what} and {REPORT}",
-                f"next: {words}",
-            ]
-        )
-    )
+    show(Section(text=[f"wrote {what} and {REPORT}", f"next: {words}"]))
     return int(len(good) < len(found) or bool(disagree))
 
 

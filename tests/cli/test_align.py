@@ -240,7 +240,9 @@ def test_gains_whose_replay_is_worse_are_not_written_and_other_larger_errors_are
     alone = dataclasses.replace(made, validation=())
     (judged,) = _beside_fitted(machine, [one], alone, machine.compare(alone), ())
     assert "position error of fit" in judged.trouble
-    (same,) = _beside_fitted(machine, [dataclasses.replace(one, numbers=())], made, before, ())
+    (same,) = _beside_fitted(
+        machine, [dataclasses.replace(one, numbers=())], made, before, ()
+    )
     assert not same.trouble and not same.remarks
     # The recordings of another twin agree on validation, and not in the others.
     other = sweeps(other_gains(), seconds=3.0)

@@ -249,10 +249,7 @@ def shared_fit(
 
 
 def _last_fit(
-    whole: Problem,
-    model: Fit,
-    fit_to: Sequence[Recording],
-    others: Sequence[Recording],
+    whole: Problem, model: Fit, fit_to: Sequence[Recording], others: Sequence[Recording]
 ) -> Fit:
     """Fit from ``model`` with fine derivatives, and with all that its intervals need."""
     found = fit(whole, fit_to, model.names, model.values, LAST_STEPS, FINE)

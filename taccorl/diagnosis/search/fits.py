@@ -416,7 +416,9 @@ class Fits:
         value = model.values[late[0].name]
         others = [late[0].within(value + by * row_s) for by in (-1.0, 1.0)]
         found = [
-            self.fitted(model.names, [model.values | {late[0].name: other}], FIRST_STEPS)
+            self.fitted(
+                model.names, [model.values | {late[0].name: other}], FIRST_STEPS
+            )
             for other in others
         ]
         best_one = min(found, key=lambda f: f.error)

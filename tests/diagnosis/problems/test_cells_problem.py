@@ -502,7 +502,9 @@ def test_a_few_rows_of_the_hardest_press_are_no_plateau():
     assert not list(plateaus(CellSet(CONFIG, [pressed])))
 
 
-def test_compare_states_the_error_of_the_diagnosis_where_readings_reach_an_end() -> None:
+def test_compare_states_the_error_of_the_diagnosis_where_readings_reach_an_end() -> (
+    None
+):
     """A tenth of the rows reads 0, as the converter does below it: a replay that is cut
     off there as well would make the error smaller."""
     case = draw_cells("taxel_creep", 50026)

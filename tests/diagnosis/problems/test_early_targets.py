@@ -76,7 +76,9 @@ def servo(
     return load_machine(path), Measurements(tuple(sides), (held,))
 
 
-def test_a_delay_is_the_one_that_acts_less_half_a_step_of_mujoco(tmp_path: Path) -> None:
+def test_a_delay_is_the_one_that_acts_less_half_a_step_of_mujoco(
+    tmp_path: Path,
+) -> None:
     """12 steps are 24 ms, which the model's own steps need not divide: 23 ms are found."""
     robot, made = servo(tmp_path, f"kp: {KP}, kd: {KD}", late_steps=12)
     problem = robot.motion_problem("hinge", made, "auto")
