@@ -291,7 +291,7 @@ def _of_rows(after: Comparison, part: str, use: str) -> float:
         for t in after.traces
         if t.signal == part and t.use == use
     ]
-    rows += [(t.residual / t.floor).ravel() for t in after.touches if t.use == use]
+    rows += [t.over_floor for t in after.touches if t.use == use]
     return float(np.sqrt(np.nanmean(np.concatenate(rows) ** 2)))
 
 

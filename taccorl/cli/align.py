@@ -39,6 +39,8 @@ NO_JOINT = (
 LATE_S = 0.01
 """Delay of a joint's measurement after the twin's replay [s] from which on its gains are not fitted: a tenth of K_d / K_p of the
 PiPER's joints (0.084 … 0.12 s), by which fitted gains would be wrong."""
+SAME = 1e-3
+"""Share by which an error may rise and still counts as the same (a choice)."""
 FAR_ABOVE_FLOOR = 2.0
 """Noise floors of error left on validation recordings from which on a missing effect is named as the reason."""
 
@@ -150,6 +152,10 @@ def main(argv: list[str]) -> int:
         )
         return 1
     save_twin(twin, config.out / TWIN)
+    changed = [one.part for one in found if not (one.trouble or one.unchanged)]
+    what = f"{config.out / TWIN} ({', '.join(changed)})"
+    if not changed:
+        what = f"{config.out / TWIN}, in which nothing changed,"
     options = {
         name: getattr(config, name) for name in ("spec", "columns", "validation_every")
     }
@@ -163,14 +169,7 @@ def main(argv: list[str]) -> int:
     else:
         given.append(f"--twin={config.out / TWIN}")
     words = shlex.join(["taccorl", "diagnose", str(config.measurements), *given])
-    show(
-        Section(
-            text=[
-                f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}",
-                f"next: {words}",
-            ]
-        )
-    )
+    show(Section(text=[f"wrote {what} and {REPORT}", f"next: {words}"]))
     return int(len(good) < len(found) or bool(disagree))
 
 
@@ -216,8 +215,11 @@ def _joints_and_pads(
     with Bars(len(selected), f"fitting {len(selected)} parts") as bars:
         count = itertools.count(1)
         found = fit(done=lambda part: bars.update(part, next(count), len(selected)))
-    if shifted:
-        found = _beside_fitted(machine, found, of_joints(measurements, shifted))
+    changed = [one.part for one in found if not (one.trouble or one.unchanged)]
+    joints = [s for s in changed if before.of(s)]
+    if joints or shifted:
+        own = of_joints(measurements, [*joints, *shifted], touch=False)
+        found = _beside_fitted(machine, found, own, before, shifted)
     floors = {
         (s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"
     }
@@ -254,10 +256,21 @@ def _of_gains(f: Finding) -> Finding:
 
 
 def _beside_fitted(
-    machine: "PiperTwin", found: "list[Alignment]", measurements: "Measurements"
+    machine: "PiperTwin",
+    found: "list[Alignment]",
+    measurements: "Measurements",
+    before: "Comparison",
+    shifted: Sequence[str],
 ) -> "list[Alignment]":
-    """``found``, in which joints that are shifted from the replay with the fitted gains as
-    well are not aligned. ``measurements``: of the joints that were shifted before."""
+    """``found``, judged by replays with the fitted gains. Joints whose angles are further
+    off in the recordings that judge them, or that are shifted with these gains as well,
+    are not aligned; other errors that rise are remarks.
+
+    Args:
+        measurements: of the joints that were changed.
+        before: replays with the twin's own gains.
+        shifted: joints that were shifted in these.
+    """
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.diagnosis.align import aligned
 
@@ -265,13 +278,37 @@ def _beside_fitted(
     again = dataclasses.replace(machine, config=twin).compare(measurements)
     result = []
     for one in found:
-        trouble = one.trouble
-        if not trouble and _is_shifted(again, one.part, "error"):
-            every = [f for own in again.clock.values() for f in _shifts(own, one.part)]
-            trouble = f"{every[0].text}; --accept={SHIFTED} aligns nevertheless"
-        trouble = trouble or _late(again, one.part)
-        result.append(dataclasses.replace(one, trouble=trouble))
+        trouble, remarks = one.trouble, one.remarks
+        larger = _larger(before, again, one.part)
+        judge = "validation" if measurements.validation else "fit"
+        if ("position", judge) in larger:
+            trouble = trouble or larger.pop(("position", judge))
+        if one.part in shifted:
+            if not trouble and _is_shifted(again, one.part, "error"):
+                own = [f for c in again.clock.values() for f in _shifts(c, one.part)]
+                trouble = f"{own[0].text}; --accept={SHIFTED} aligns nevertheless"
+            trouble = trouble or _late(again, one.part)
+        if not (trouble or one.unchanged):
+            remarks = (*larger.values(), *remarks)
+        result.append(dataclasses.replace(one, trouble=trouble, remarks=remarks))
     return result
+
+
+def _larger(
+    before: "Comparison", after: "Comparison", part: str
+) -> dict[tuple[str, str], str]:
+    """(kind, use) of each error of a joint that rises by more than ``SAME``, with the
+    sentence that says so."""
+    found = {}
+    for new in (s for s in after.scores() if s.signal == part):
+        old = before.score(part, new.kind, new.use) if new.kind != "touch" else None
+        if old is None or new.rmse <= (1.0 + SAME) * old.rmse:
+            continue
+        found[new.kind, new.use] = (
+            f"the {new.kind} error of {new.use} recordings is larger with the fitted "
+            f"gains: {old.ratio:.4g} → {new.ratio:.4g} noise floors"
+        )
+    return found
 
 
 def _late(comparison: "Comparison", part: str) -> str:
@@ -383,8 +420,10 @@ def _section(one: "Alignment") -> Section:
         from taccorl.report.touch_match import touch_match_section
 
         parts.append(touch_match_section(("before", "fitted"), one.touch_matches))
+    is_kept = one.unchanged or bool(one.trouble)
     remarks = [
-        f"{one.error_name}: {one.before:.3g} → {one.after:.3g}",
+        f"{one.error_name}: {one.before:.3g} → {one.after:.3g}"
+        + ", with fitted numbers that are not written" * is_kept,
         *(f"Remark: {remark}" for remark in one.remarks),
     ]
     return Section(

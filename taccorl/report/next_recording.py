@@ -19,6 +19,9 @@ from taccorl.report.fact import Fact, fact, when
 NEAR_GAIN = 0.05
 """Least gain of an effect from which a recording for it is worth while."""
 
+TOLD_APART = 2.0
+"""Factor on the error from which recordings tell two effects apart (a choice)."""
+
 
 @dataclass(frozen=True)
 class Advice:
@@ -152,13 +155,26 @@ def _other_pose(of: Advice) -> list[Fact]:
     return [shown, *of.plan(name, *open_[:1])]
 
 
+def _told_apart(d: Diagnosis, name: str) -> set[str]:
+    """Effects that leave ``TOLD_APART`` times the error of the effect ``name``, which was
+    added in their place, so that no other recording need separate them."""
+    return {
+        e.name
+        for r in d.rounds
+        for e in r.evidence
+        if r.added == name
+        and e.validation_error > TOLD_APART * max(r.validation_error, 1.0)
+    }
+
+
 def _check(of: Advice) -> list[Fact]:
     """Of what was named: a recording that tells it from its near-twin, and what fixes the
     scale of the torques."""
     d, known = of.d, of.seen.known
     name = [*added(d), *(n.rpartition(".")[0] or n for n in of.numbers)][0]
     near = d.twins.get(name) or getattr(effect_class(name), "near_twins", ())
-    other = plannable(d, name, near)[:1]
+    told_apart = _told_apart(d, name)
+    other = plannable(d, name, [n for n in near if n not in told_apart])[:1]
     plan, motion = of.plan(name, *other), of.motion(name)
     absolute = known.absolute if known is not None and not known.pinned_by else ()
     checked = [

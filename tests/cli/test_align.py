@@ -18,10 +18,11 @@ from taccorl.alignment.checks.registry import find
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.touch.match import MATCH_NUMBERS
-from taccorl.cli.align import _section
+from taccorl.cli.align import _beside_fitted, _section
 from taccorl.data.finding import Finding
-from taccorl.diagnosis.align import Alignment, align_part, aligned
+from taccorl.diagnosis.align import Alignment, FittedNumber, align_part, aligned
 from taccorl.diagnosis.comparison import compare
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.twin import TwinConfig
@@ -222,6 +223,36 @@ def test_gains_that_stand_in_for_a_missing_effect_are_said_to_do_so(
     assert "alignment/twin.yaml" not in text.split("next:")[-1], (
         "the effect is looked for in the twin that was given"
     )
+
+
+def test_gains_whose_replay_is_worse_are_not_written_and_other_larger_errors_are_said():
+    """K_d 1.5 times that of the recordings, as if a fit had found it."""
+    made = sweeps(TwinConfig(), seconds=3.0)
+    machine = PiperTwin(TwinConfig(), "twin")
+    had = machine.config.controller_of("left").kd_nms_per_rad[J]
+    kd = FittedNumber("kd", "N·m·s/rad", had, 1.5 * had, had, 2.0 * had)
+    one = Alignment(part=SIGNAL, numbers=(kd,), before=2.0, after=1.0)
+    before = machine.compare(made)
+    (judged,) = _beside_fitted(machine, [one], made, before, ())
+    assert "position error of validation" in judged.trouble
+    assert aligned(TwinConfig(), [judged]) == (TwinConfig(), "")
+    # Without validation recordings it is the error of the fit's that judges.
+    alone = dataclasses.replace(made, validation=())
+    (judged,) = _beside_fitted(machine, [one], alone, machine.compare(alone), ())
+    assert "position error of fit" in judged.trouble
+    (same,) = _beside_fitted(
+        machine, [dataclasses.replace(one, numbers=())], made, before, ()
+    )
+    assert not same.trouble and not same.remarks
+    # The recordings of another twin agree on validation, and not in the others.
+    other = sweeps(other_gains(), seconds=3.0)
+    mixed = dataclasses.replace(other, validation=made.validation)
+    turned = PiperTwin(other_gains(), "twin")
+    back = dataclasses.replace(kd, value=had)
+    zero = FittedNumber("torque_ff", "N·m", 0.8, 0.0, -1.0, 1.0)
+    one = dataclasses.replace(one, numbers=(back, zero))
+    (judged,) = _beside_fitted(turned, [one], mixed, turned.compare(mixed), ())
+    assert not judged.trouble and "position error of fit" in judged.remarks[0]
 
 
 def test_right_gains_stay_as_they_are():

@@ -44,10 +44,14 @@ def _uniform(seed: float, count: int) -> float:
 @compiled
 def arriving(
     p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """(S hold, LANES) what the controller works on in each physics step, of targets (S,)
     held for ``hold`` steps each. In MuJoCo's twin, lag and slew limit act once per target;
-    with ``Drive.midpoint`` they act within the drive: values at the middle of each step."""
+    with ``Drive.midpoint`` they act within the drive: values at the middle of each step.
+
+    Also (S hold, LANES) what its reported effort follows: the same, but no target is early
+    (a delay below 0). Where a target steps, the effort of its row is still the old one's.
+    """
     held_s, count = hold * step_s, sent.size * hold
     lag_s, likely, apart = (
         p.command_lag__time_constant_s,
@@ -86,6 +90,9 @@ def arriving(
                 reach = since * furthest
                 now = min(max(now, at_from - reach), at_from + reach) + lead
             store(commands, k * hold + n, now)
+    punctual = commands
+    if np.any(numbers[_DELAY] < 0.0):
+        punctual = commands.copy()
     for lane in range(LANES):
         late = numbers[_DELAY, lane] / step_s
         if late > 0.0 and numbers[_MIDPOINT, lane] <= 0.0:
@@ -99,7 +106,9 @@ def arriving(
                 newer = own[at] if at >= 0 else sent[0]
                 older = own[at - 1] if at > 0 else sent[0]
                 commands[n, lane] = newer + (older - newer) * (late - whole)
-    return commands
+        if late > 0.0:
+            punctual[:, lane] = commands[:, lane]
+    return commands, punctual
 
 
 @compiled

@@ -320,8 +320,9 @@ def _simulated(
     torque_scale, reverse_gain = p.torque_scale__factor, p.direction_gain__factor
     compliance = p.joint_compliance__compliance_rad_per_nm
     reported, effort = answers = np.empty((2, rows, LANES))
-    command = arriving(p, numbers, sent, hold, h)
+    command, shown_command = arriving(p, numbers, sent, hold, h)
     if kind == VELOCITY:
+        shown_command = command
         for n in range(len(command)):
             store(
                 command,
@@ -530,7 +531,7 @@ def _simulated(
 
         # What can be seen now: the new command has not acted yet.
         now, until_now = load(command, n), load(command, max(n - 1, 0))
-        by = until_now  # also of a delayed one that comes now, which MuJoCo's force has already
+        by = load(shown_command, max(n - 1, 0))
         if not midpoint:
             until_now = where(p.command_delay__delay_s > 0.0, now, until_now)
         given, acts = none, now if midpoint else until_now
@@ -554,7 +555,7 @@ def _simulated(
             given = where(lag_s > 0.0, torque, given)
         if within == 0:
             if effort_after > 0:
-                by = load(command, n + hold * min(effort_after - 1, parts - 1))
+                by = load(shown_command, n + hold * min(effort_after - 1, parts - 1))
             seen = part if effort_after > 0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(
                 p,

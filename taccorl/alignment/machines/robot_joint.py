@@ -733,6 +733,15 @@ class KeptMotions:
             return self._found.setdefault(key, made)
 
 
+def at_times(times: np.ndarray, answer: np.ndarray, rows: int) -> np.ndarray:
+    """(F,) positions at ``times`` [rows] of an ``answer`` (N,) at even times of ``rows``
+    rows. Between its steps a spline: lines would have no acceleration but at their ends."""
+    every, left = divmod(len(answer), len(times))
+    if not left:
+        return answer[::every]
+    return CubicSpline(np.arange(len(answer)) * rows / len(answer), answer)(times)
+
+
 def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
     model, laws = robot.rigid.model, robot.config.joints
     # Soft joints near the base give way to a wrist that swings; less than 1 mrad or 1 mm
@@ -774,9 +783,7 @@ def _moved_together(robot: "Robot", m: Measurement) -> Along | None:
             moved, coupling_nm=coupling, carrying_nm=carrying, positions=None
         )
         answer = one.simulate(moved, one.gains, each_step=True).reported
-        answer = np.interp(
-            times, np.arange(len(answer)) * m.num_rows / len(answer), answer
-        )
+        answer = at_times(times, answer, m.num_rows)
         before = q[:, joint.qposadr[0]].copy()
         q[:, joint.qposadr[0]] = beside_model(m, name, answer)
         more = rates(q[:, joint.qposadr[0]] - before, m.period_s / fine)[1]

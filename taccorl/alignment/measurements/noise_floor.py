@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.stats import chi2
 from scipy.stats import t as student
@@ -399,7 +400,8 @@ def rest_stretches(m: Measurement) -> list[tuple[int, int]]:
 
 def _residue_blocks(m: Measurement, kind: Kind) -> _Blocks:
     """Blocks about the smooth; NaN for signals that move too fast for it."""
-    blocks = _smooth_blocks(_values(m, kind), m.rate_hz)
+    jumps = _jumps(m) if kind == "effort" else None
+    blocks = _smooth_blocks(_values(m, kind), m.rate_hz, jumps)
     half = WINDOW // 2
     reach_hz = (ORDER + 1) / (3.2 * half - 4.6) * m.rate_hz / 2
     fast = motion_hz(m) * BANDWIDTH_FACTOR > reach_hz
@@ -407,14 +409,27 @@ def _residue_blocks(m: Measurement, kind: Kind) -> _Blocks:
     return blocks
 
 
-def _smooth_blocks(values: np.ndarray, rate_hz: float) -> _Blocks:
+def _jumps(m: Measurement) -> np.ndarray:
+    """(T, J) bool: rows of which the smooth takes in a step of the joint's target, as an
+    effort jumps there. None where targets step so often that less than half is left."""
+    steps = np.abs(np.diff(m.target, axis=0, prepend=m.target[:1])) > MOVING
+    near = maximum_filter1d(steps, WINDOW, axis=0)
+    held = np.median(np.abs(np.diff(m.target, axis=0)), axis=0) == 0.0
+    return near & held & (near.mean(axis=0) < 0.5)
+
+
+def _smooth_blocks(
+    values: np.ndarray, rate_hz: float, left_out: np.ndarray | None = None
+) -> _Blocks:
+    """``left_out``: (T, J) bool, rows that do not count."""
     rows = _block_rows(rate_hz)
     half = WINDOW // 2
     if len(values) < WINDOW + rows:
         return _Blocks(np.empty((0, values.shape[1])), rows, 1.0)
-    residue = (values - savgol_filter(values, WINDOW, ORDER, axis=0, mode="nearest"))[
-        half:-half
-    ]
+    residue = values - savgol_filter(values, WINDOW, ORDER, axis=0, mode="nearest")
+    if left_out is not None:
+        residue[left_out] = np.nan
+    residue = residue[half:-half]
     kernel = -savgol_coeffs(WINDOW, ORDER)
     kernel[half] += 1.0
     correlation = np.convolve(kernel, kernel[::-1])

@@ -131,6 +131,15 @@ class TouchTrace:
     """True: ``floor`` includes the variation between repeats of a press. False: it is the noise of each cell, a lower bound."""
     cells: CellNumbers | None = None
     """Gain and offset of each cell; None for pads, whose counts have one gain."""
+    counted: np.ndarray | None = None
+    """(N, P, R, C) bool: readings that count in errors. Those at an end of a converter do
+    not, as in a fit. None: all."""
+
+    @property
+    def over_floor(self) -> np.ndarray:
+        """(n,) residuals of the readings that count [noise floors]."""
+        every = self.residual / self.floor
+        return every.ravel() if self.counted is None else every[self.counted]
 
     @property
     def residual(self) -> np.ndarray:
@@ -361,6 +370,7 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
     for t in traces:
         level = FELT_FLOORS * t.floor
         felt = (np.abs(t.measured) > level) | (np.abs(t.replayed) > level)
+        felt = felt if t.counted is None else felt & t.counted
         if pad is not None:
             felt = felt & (np.arange(len(t.pads)) == t.pads.index(pad))[:, None, None]
         rows = round(BLOCK_S / t.period_s)

@@ -207,6 +207,7 @@ class CellsMachine(Machine):
                         simulated[rows],
                     )
                 shape = (m.num_rows, 1, *config.shape)
+                counted = within_ends(config, m).reshape(shape)
                 loaded = np.asarray(
                     (m.target > LOADED * config.load.rated).any(axis=1, keepdims=True)
                 )
@@ -227,6 +228,7 @@ class CellsMachine(Machine):
                         load_unit=config.load.unit,
                         repeated=bool(repeat_pairs(measurements.all)),
                         cells=cells,
+                        counted=counted,
                     )
                 )
         return Comparison(

@@ -17,15 +17,18 @@ from taccorl.diagnosis.search.evidence import (
     standard_score,
 )
 from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit, moved_by
+from taccorl.diagnosis.search.fits import is_as_good
 from taccorl.diagnosis.search.problem import (
     EFFORT_SCALE,
     Candidate,
     Case,
+    Problem,
     Recording,
     Values,
     WithoutMaps,
     chosen,
     split_rows,
+    with_held,
 )
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import CLEAR, PartFinding
@@ -214,9 +217,19 @@ def shared_fit(
     rough.sort(key=lambda f: f.error)
     near = [f.values for f in rough[:2]]
     model = best_fit(whole, fit_to, effect, near, NEXT_STEPS)
-    model = fit(whole, fit_to, effect, model.values, LAST_STEPS, FINE)
-    steps = np.full(len(model.frees), FINE)
-    model = replace(model, moved=moved_by(whole, model, fit_to, others, steps))
+    model = _last_fit(whole, model, fit_to, others)
+    of_file = {f"{j}/{TORQUE_FF.name}": alone[j].start for j in problems}
+    ends = model.intervals()
+    same = {
+        name: start[TORQUE_FF.name]
+        for name, start in of_file.items()
+        if name in ends and ends[name][0] <= start[TORQUE_FF.name] <= ends[name][1]
+    }
+    if same:
+        # A constant torque would take up a place of a mass that is a little off.
+        simpler = _last_fit(with_held(whole, same), model, fit_to, others)
+        if is_as_good(simpler.error, model.error):
+            model = simpler
     squares, saved = {}, -len(shared.frees)
     for j, problem in problems.items():
         own, head = split[j][1], f"{j}/"
@@ -233,6 +246,15 @@ def shared_fit(
         if name.startswith(head)
     }
     return SharedFit(model, ends, squares, len(shared.frees), saved)
+
+
+def _last_fit(
+    whole: Problem, model: Fit, fit_to: Sequence[Recording], others: Sequence[Recording]
+) -> Fit:
+    """Fit from ``model`` with fine derivatives, and with all that its intervals need."""
+    found = fit(whole, fit_to, model.names, model.values, LAST_STEPS, FINE)
+    steps = np.full(len(found.frees), FINE)
+    return replace(found, moved=moved_by(whole, found, fit_to, others, steps))
 
 
 def _starts(shared: Candidate, alone: Sequence[Diagnosis]) -> list[Values]:

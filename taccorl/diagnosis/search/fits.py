@@ -400,10 +400,31 @@ class Fits:
         file: those of ``parent`` may have gone far to make up for the effect."""
         names = (*parent.names, name)
         model = self.fitted(names, starts)
-        if model.error <= self.config.floor:
+        if model.error > self.config.floor:
+            afresh = self.fitted(names, [starts[0] | self.given])
+            model = min(model, afresh, key=lambda m: m.error)
+        return self._in_best_row(model, name)
+
+    def _in_best_row(self, model: Fit, name: str) -> Fit:
+        """``model``, or a better one in which ``name`` makes the motion a row later or
+        earlier: efforts jump where a delay reaches the next row, so that between any two
+        rows the error has a minimum of its own."""
+        late = [f for f in model.frees if f.name == f"{name}.delay_s"]
+        if not late or self.error(model) <= self.config.floor:
             return model
-        afresh = self.fitted(names, [starts[0] | self.given])
-        return min(model, afresh, key=lambda m: m.error)
+        row_s = float(np.median(np.diff(self.fit_to[0].time_s)))
+        value = model.values[late[0].name]
+        others = [late[0].within(value + by * row_s) for by in (-1.0, 1.0)]
+        found = [
+            self.fitted(
+                model.names, [model.values | {late[0].name: other}], FIRST_STEPS
+            )
+            for other in others
+        ]
+        best_one = min(found, key=lambda f: f.error)
+        if best_one.error >= model.error:
+            return model
+        return self.fitted(model.names, [best_one.values])
 
     def with_optional(self, model: Model) -> Model:
         """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles. Also of a

@@ -150,3 +150,18 @@ def test_a_change_of_an_imported_source_reaches_the_compiled_kernel(
         source.read_text().replace("\nAT_RAD_PER_S = 0.1\n", "\nAT_RAD_PER_S = 0.01\n")
     )
     assert swing() < 0.8 * before  # thirty times the friction
+
+
+def test_a_row_shows_the_effort_before_its_target_however_early_that_acts() -> None:
+    """The target steps by 0.1 rad at row 100 and acts 0.3 ms early: 3 N·m / 0.1 kg·m² for
+    that time make 9 mrad/s, of which K_d makes 0.009 N·m. Its own 0.3 of 3 N·m is not shown."""
+    sent = np.where(np.arange(ROWS) < 100, 0.0, 0.1)
+    early = {"command_delay__delay_s": -3e-4}
+    drives = [Drive(**JOINT, midpoint=1.0, **more) for more in (early, {})]
+    (_, shown), (_, punctual) = simulate_all(drives, sent, [NONE] * 2, *MORE, 0)
+    assert punctual[100] == 0.0 and -0.02 < shown[100] < 0.0
+    assert shown[101] == pytest.approx(punctual[101], rel=0.05)
+    after = [drive._replace(effort_after=1.0) for drive in drives]
+    (_, shown), (_, punctual) = simulate_all(after, sent, [NONE] * 2, *MORE, 0)
+    assert shown[99] == punctual[99] == 0.0
+    assert shown[100] == pytest.approx(punctual[100], abs=0.02) and punctual[100] == 3.0

@@ -10,6 +10,7 @@ from simulated_slide import robot_machine
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import masses_along, rates, torque_along
+from taccorl.alignment.machines.robot_joint import at_times
 from taccorl.alignment.measurements.measurement import Measurement
 
 ARM = """<mujoco><option timestep="0.0001" integrator="implicitfast"/><worldbody>
@@ -74,6 +75,16 @@ def test_a_joint_that_is_later_than_its_file_says_is_a_better_known_load_than_by
     """1.45 with loads by the positions of rows."""
     off = left(tmp_path, steps(late_rows=4), "fore")
     assert np.sqrt(np.mean(off**2)) < 1.25
+
+
+def test_steps_of_a_drive_that_do_not_divide_those_of_the_loads_add_no_acceleration():
+    """2 rad/row² at seven steps a row, seen at five: the second difference is 2 / 5². By
+    lines between the steps it was between 0 and 1.8 times that."""
+    seven, five = np.arange(140) / 7, np.arange(100) / 5
+    seen = at_times(five, seven**2, 20)
+    np.testing.assert_allclose(np.diff(seen, 2), 2.0 / 25, rtol=1e-6)
+    every = at_times(five, (np.arange(200) / 10) ** 2, 20)
+    np.testing.assert_array_equal(every, five**2)
 
 
 def test_torques_and_masses_along_a_motion_are_those_of_mujoco_s_inverse_dynamics():

@@ -19,6 +19,7 @@ from made_sweep import (
 
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, Touch
 from taccorl.alignment.measurements.noise_floor import (
+    floors_by_motion,
     motion_hz,
     noise_floor,
     rest_stretches,
@@ -213,6 +214,22 @@ def test_effort_has_a_floor_where_it_was_recorded(motion):
     assert list(floors) == ["left_joint2"]
     assert floors["left_joint2"].value == pytest.approx(0.02, rel=0.1)
     assert floors["left_joint2"].unit == "N·m"
+
+
+def test_jumps_of_an_effort_with_its_target_are_no_noise():
+    """A target steps by 0.2 rad every 0.6 s, in 30 of 50 rows a second: the effort jumps by
+    12 N·m and decays in 0.16 s. Its noise is 0.05 N·m; with the jumps it would be 2 N·m."""
+    rng = np.random.default_rng(7)
+    since = np.arange(600) % 30
+    target = 0.2 * (np.arange(600) // 30 % 2)
+    way = np.where(target > 0.0, 1.0, -1.0)
+    moved = np.where(np.arange(600) < 30, 0.0, way * np.exp(-since / 8.0))
+    answer, effort = target - 0.2 * moved, 12.0 * moved + 0.05 * rng.normal(size=600)
+    made = {"target": target, "measured": answer, "effort": effort}
+    m = of_signal("steps", 50.0, signal="j", **made)
+    floor = floors_by_motion([m], "effort")["steps"]["j"]
+    assert floor.used.method == "residue"
+    assert floor.value == pytest.approx(0.05, rel=0.25)
 
 
 def test_touch_floor_of_every_taxel():

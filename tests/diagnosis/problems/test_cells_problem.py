@@ -500,3 +500,25 @@ def test_a_few_rows_of_the_hardest_press_are_no_plateau():
         CONFIG.names,
     )
     assert not list(plateaus(CellSet(CONFIG, [pressed])))
+
+
+def test_compare_states_the_error_of_the_diagnosis_where_readings_reach_an_end() -> (
+    None
+):
+    """A tenth of the rows reads 0, as the converter does below it: a replay that is cut
+    off there as well would make the error smaller."""
+    case = draw_cells("taxel_creep", 50026)
+    made, machine = simulated(case), CellsMachine(case.config(), "cells")
+    (part,) = machine.parts(made)
+    found = machine.diagnose(part, made, search=SearchConfig(max_effects=1))
+    written, _ = machine.mended([found])
+    after = written.compare(made)
+    for use, stated in found.diagnosis.errors["after"].items():
+        rows = [t.over_floor for t in after.touches if t.use == use]
+        error = np.sqrt(np.mean(np.concatenate(rows) ** 2))
+        assert error == pytest.approx(stated, rel=1e-6), use
+    ends = [~t.counted for t in after.touches if t.counted is not None]
+    assert 0.05 < np.mean(np.concatenate([e.ravel() for e in ends])) < 0.3
+    every = [t.residual / t.floor for t in after.touches if t.use == "fit"]
+    most = np.sqrt(np.mean(np.concatenate([r.ravel() for r in every]) ** 2))
+    assert most < 0.95 * found.diagnosis.errors["after"]["fit"]

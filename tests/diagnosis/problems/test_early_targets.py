@@ -30,18 +30,25 @@ SERVO = f'<actuator><position joint="hinge" kp="{KP}" kv="{KD}"/></actuator>'
 
 
 def recorded(
-    name: str, high_hz: float, seed: int, repeat_of: str | None = None
+    name: str,
+    high_hz: float,
+    seed: int,
+    repeat_of: str | None = None,
+    late_steps: int = 0,
 ) -> Measurement:
-    """A chirp of 6 s; each row before its target acts."""
+    """A chirp of 6 s; each row before its target acts, which it does so many steps late."""
     model = mujoco.MjModel.from_xml_string(MODEL.format(servo=SERVO))
     data, time_s = mujoco.MjData(model), np.arange(6 * RATE_HZ) / RATE_HZ
     since = np.clip(time_s - 0.5, 0.0, None)
     turns = 0.1 * since + (high_hz - 0.1) * since**2 / 12.0
     target = 0.3 * np.sin(2.0 * np.pi * turns) * np.clip(6.0 - time_s, 0.0, 0.5) / 0.5
     measured = np.empty_like(target)
-    for row, goal in enumerate(target):
-        measured[row], data.ctrl[0] = data.qpos[0], goal
-        mujoco.mj_step(model, data, round(1.0 / (RATE_HZ * STEP_S)))
+    steps = round(1.0 / (RATE_HZ * STEP_S))
+    for step in range(steps * len(target)):
+        if step % steps == 0:
+            measured[step // steps] = data.qpos[0]
+        data.ctrl[0] = target[max(step - late_steps, 0) // steps]
+        mujoco.mj_step(model, data)
     measured += 1e-4 * np.random.default_rng(seed).normal(size=len(target))
     return Measurement(
         name=name,
@@ -55,12 +62,31 @@ def recorded(
     )
 
 
-def servo(folder: Path, drive: str) -> tuple[Machine, Measurements]:
+def servo(
+    folder: Path, drive: str, late_steps: int = 0
+) -> tuple[Machine, Measurements]:
     (folder / "arm.xml").write_text(MODEL.format(servo=""))
     path = folder / "robot.yaml"
     path.write_text(f"kind: robot\nmodel: arm.xml\njoints:\n  hinge: {{{drive}}}\n")
-    sides = [recorded("a", 3.0, 1), recorded("again", 3.0, 2, repeat_of="a")]
-    return load_machine(path), Measurements(tuple(sides), (recorded("b", 2.0, 3),))
+    sides = [
+        recorded("a", 3.0, 1, late_steps=late_steps),
+        recorded("again", 3.0, 2, repeat_of="a", late_steps=late_steps),
+    ]
+    held = recorded("b", 2.0, 3, late_steps=late_steps)
+    return load_machine(path), Measurements(tuple(sides), (held,))
+
+
+def test_a_delay_is_the_one_that_acts_less_half_a_step_of_mujoco(
+    tmp_path: Path,
+) -> None:
+    """12 steps are 24 ms, which the model's own steps need not divide: 23 ms are found."""
+    robot, made = servo(tmp_path, f"kp: {KP}, kd: {KD}", late_steps=12)
+    problem = robot.motion_problem("hinge", made, "auto")
+    start = {**problem.start, "command_delay.delay_s": 0.02}
+    found = fit(problem, problem.fit, ["command_delay"], start)
+    acts_s = 12 * STEP_S - STEP_S / 2
+    assert found.values["command_delay.delay_s"] == pytest.approx(acts_s, abs=1e-4)
+    assert abs(found.values["command_delay.delay_s"] - 12 * STEP_S) > 8e-4
 
 
 def test_timing_of_a_simulated_servo_with_commanded_gains_is_half_a_step(
