@@ -268,6 +268,7 @@ def _changed(of: _Part) -> Iterator[Fact]:
         )
         is_late = c.name == "speed_delay_s"
         yield from when(is_late, "in_effect", effect="speed_delay", name=c.name)
+        yield from when(is_late and c.after < 0.0, "early_speed")
         yield from when(c.name == EFFORT_SCALE, "scale_efforts", factor=1.0 / c.after)
         yield from when(c.name == TORQUE_FF.name, "tie_weight")
 

@@ -418,6 +418,12 @@ def _(one, nothing, short):
     return off(nothing, late, status="numbers_off"), Seen()
 
 
+@case("in_effect", "early_speed")
+def _(one, nothing, short):
+    early = dataclasses.replace(OFF, name="speed_delay_s", after=-3e-4)
+    return off(nothing, early, status="numbers_off"), Seen()
+
+
 @case("scale_efforts", "tie_efforts", "record_load")
 def _(one, nothing, short):
     scale = dataclasses.replace(OFF, name=EFFORT_SCALE, instead=(EFFORT_SCALE,))
