@@ -16,7 +16,7 @@ from xml.parsers import expat
 import mujoco
 import numpy as np
 
-from taccorl.errors import TaccorlError, plain_name
+from taccorl.errors import TaccorlError, no_such_path, plain_name
 
 MOST_BYTES = 1 << 24  # Largest model file that is read
 MOST_DEEP = 200  # Most elements within one another
@@ -109,6 +109,8 @@ def _parsed(path: Path) -> Element:
                 f"{path}: is larger than {MOST_BYTES:,} bytes; is it a model file?"
             )
         content = path.read_bytes()
+    except FileNotFoundError as error:
+        raise TaccorlError(no_such_path(path)) from error
     except OSError as error:
         raise TaccorlError(
             f"{path}: cannot be read: {error.strerror or error}"
