@@ -12,6 +12,7 @@ the argument of that name here. Nothing is printed but progress, on stderr. Pack
 imported by the first call that needs them; none of these functions needs torch.
 """
 
+import dataclasses
 import warnings
 import weakref
 from collections.abc import Mapping, Sequence
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.alignment.measurements.pressed import PressedObject
+    from taccorl.cli.add_effect import Change
     from taccorl.data.episode import Episode
     from taccorl.data.origin import Domain
     from taccorl.diagnosis.machines.machine import Machine
@@ -256,16 +258,23 @@ def add_effect(
         )
     request = verb.Request(list(dict.fromkeys(effect.split(","))), joints, pads)
     if values:
-        return robot.with_additions(
-            verb.by_hand(robot, request, values, "values=").additions
-        )
+        change = verb.by_hand(robot, request, values, "values=")
+        return _named(robot, effect, change)
     if isinstance(diagnosis, Report):
         path, stored = Path("the diagnosis"), as_json(diagnosis)
     else:
         path = numbers_of(Path(diagnosis or ""))
         stored = verb.stored(path, robot, request.names)
     change = verb.diagnosed(robot, request, stored, path, _warn)
-    return robot.with_additions(change.additions)
+    return _named(robot, effect, change)
+
+
+def _named(robot: "Machine", effect: str, change: "Change") -> "Machine":
+    """The changed copy, with a name of its own for tables and pictures."""
+    mended: Any = robot.with_additions(change.additions)
+    if dataclasses.is_dataclass(mended):
+        return dataclasses.replace(mended, name=f"{robot.name}+{effect}")
+    return mended
 
 
 def plot(

@@ -74,7 +74,7 @@ THIRDS = ("first rows", "middle rows", "last rows")
 
 
 @machines.register("cells")
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CellsMachine(Machine):
     """A sensor of cells."""
 

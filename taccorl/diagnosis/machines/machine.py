@@ -85,6 +85,10 @@ class Machine(ABC):
     saved_words: ClassVar[str] = "compare and diagnose load it"
     """Text that completes messages about a file that ``save`` has written: what the file is for."""
 
+    def __repr__(self) -> str:
+        effects = ", ".join(self.effects) or "no effects"
+        return f"{type(self).__name__} {self.name!r}: {effects}"
+
     @property
     def file_name(self) -> str:
         """Name of the file in the report's folder to which ``diagnose --until=noise_floor`` writes the corrected machine."""

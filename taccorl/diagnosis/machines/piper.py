@@ -38,7 +38,7 @@ from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PiperTwin(Machine):
     """A twin of the PiPER. Its parts are joints (``left_joint5``) and pairs of pads (``left pads``)."""
 

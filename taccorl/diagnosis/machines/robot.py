@@ -83,7 +83,7 @@ ONE_POSE = {"rad": 0.3, "m": 0.1}
 
 @machines.register("axis")
 @machines.register("robot")
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RobotMachine(Machine):
     """A robot described by a robot file, and by an MJCF or URDF file if it has a model."""
 
