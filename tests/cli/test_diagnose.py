@@ -405,7 +405,7 @@ def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: P
             "lacks coulomb_friction",
         ),
         (
-            ["check", "dataset", "--pictures=false"],
+            ["check", "dataset", "--pictures=false", "--lerobot=true"],
             0,
             "whether LeRobot loads it could not be checked: needs lerobot",
         ),

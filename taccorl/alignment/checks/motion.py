@@ -30,6 +30,8 @@ TOO_SHORT_S, SHORT_S = 1.0, 3.0
 10 s."""
 DEAD_SHARE = 0.05  # A joint does not answer if its range is below this share of its command's range
 FROZEN_S = 0.3  # Least time of bit-identical readings of a frozen channel [s]
+LATE_S = 2.0
+"""Latest answer to a target [s]: for as long a joint goes on after the last one of a recording that answers late. A choice."""
 FROZEN_MOVE = 0.05  # Least motion of the command in that time [rad; a tenth of it in m]
 FROZEN_EFFORT_S = 1.0
 """Least time of bit-identical efforts of a frozen effort channel [s]; the joint must move to and fro by ``FROZEN_MOVE`` in it,
@@ -377,7 +379,7 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
 def check_frozen_targets(t: Trial) -> Iterator[Finding]:
     """Targets that stand for far longer than elsewhere while the joint goes on to and fro."""
     m = t.m
-    answer = round(SETTLED_S / m.period_s)
+    answer, late = (round(s / m.period_s) for s in (SETTLED_S, LATE_S))
     for j in t.moving:
         name, least = m.signals[j], FROZEN_MOVE / scale(m, j)
         least = max(least, REST_SHARE * float(np.ptp(m.target[:, j])))
@@ -391,7 +393,8 @@ def check_frozen_targets(t: Trial) -> Iterator[Finding]:
         others = max((stop - start for start, stop in later[1:]), default=0)
         if (end - first) * m.period_s < FROZEN_S or 3 * others > end - first:
             continue
-        if _to_and_fro(m.measured[first + answer : end, j]) > least:
+        moving_from = first + (late if end >= m.num_rows - 1 else answer)
+        if _to_and_fro(m.measured[moving_from:end, j]) > least:
             text = (
                 f"{name}: its target stands at {m.target[first, j]:.4g} {m.units[j]} in {place(m, first, end + 1)}, while the "
                 f"joint goes on to and fro: its logger repeated an old target; {without(m, first)}"

@@ -128,7 +128,8 @@ def diagnose_joint(
     own = apart(own, drifted)
     problem = JointProblem(machine, signal, own, gains=gains, held=without)
     found = solved(signal, problem, search, without, progress)
-    if gains == "auto" and problem.commanded and _gains_do_more(problem, found):
+    may_fit = gains == "auto" and problem.commanded and problem.axis is None
+    if may_fit and _gains_do_more(problem, found):
         progress("the gains are not those of the file: search again, with gains fitted")
         freed = JointProblem(machine, signal, own, gains="fitted", held=without)
         again = solved(signal, freed, search, without, progress)

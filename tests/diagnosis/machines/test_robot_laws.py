@@ -171,10 +171,10 @@ def test_a_measured_speed_is_newer_than_a_difference_of_two_samples(
     (off, *more), told = d.changed, account("swing", d)
     assert off.without > 2.0 and d.status == "numbers_off"
     if stated:
-        assert [c.name for c in d.changed] == ["speed_delay_s", "position_age_s"]
-        assert more[0].before == 4e-4 and more[0].after == pytest.approx(
-            0.0, abs=0.05e-3
-        )
+        changed = {c.name: c for c in d.changed}
+        assert {*changed} == {"speed_delay_s", "position_age_s"}
+        age = changed["position_age_s"]
+        assert age.before == 4e-4 and age.after == pytest.approx(0.0, abs=0.05e-3)
         assert {"speed_delay_s"} <= {*told.values("changed", "name")}
         assert told.values("in_effect", "effect") == ["speed_delay"]
     else:
