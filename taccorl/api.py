@@ -271,10 +271,11 @@ def add_effect(
 
 def _named(robot: "Machine", effect: str, change: "Change") -> "Machine":
     """The changed copy, with a name of its own for tables and pictures."""
-    mended: Any = robot.with_additions(change.additions)
-    if dataclasses.is_dataclass(mended):
-        return dataclasses.replace(mended, name=f"{robot.name}+{effect}")
-    return mended
+    mended = robot.with_additions(change.additions)
+    if not dataclasses.is_dataclass(mended):
+        return mended
+    own: Any = mended
+    return dataclasses.replace(own, name=f"{robot.name}+{effect}")
 
 
 def plot(

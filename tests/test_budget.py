@@ -24,7 +24,7 @@ MOST = {
     "taccorl/alignment": Concepts(11_505, 117, 479),
     "taccorl/cli": Concepts(3_776, 41, 44),
     "taccorl/data": Concepts(7_100, 79, 223),
-    "taccorl/diagnosis": Concepts(6_894, 78, 192),
+    "taccorl/diagnosis": Concepts(6_897, 78, 192),
     "taccorl/episodes": Concepts(2_722, 65, 53),
     "taccorl/evaluation": Concepts(1_227, 18, 25),
     "taccorl/lerobot_plugin": Concepts(255, 2, 11),

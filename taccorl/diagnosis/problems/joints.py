@@ -167,9 +167,7 @@ def _plain_does_more(found: Diagnosis) -> bool:
     """Whether the plain fit, of gains, friction and a delay, leaves much less than the
     answer."""
     plain = found.plain
-    return plain is not None and _removes_more(
-        plain.errors["validation"], _left(found)
-    )
+    return plain is not None and _removes_more(plain.errors["validation"], _left(found))
 
 
 def _gains_do_more(problem: JointProblem, found: PartFinding) -> bool:

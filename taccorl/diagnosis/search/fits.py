@@ -504,10 +504,11 @@ class Fits:
                 self.error(other), self.error(model)
             ):
                 of_file = {name: stated(name, other.values) for name in names}
+                moved = _moved_from(model, other)
+                if other.moved is not None:
+                    moved = np.hypot(other.moved, moved)
                 return dataclasses.replace(
-                    other,
-                    values=other.values | of_file,
-                    moved=np.hypot(other.moved, _moved_from(model, other)),
+                    other, values=other.values | of_file, moved=moved
                 )
         return model
 

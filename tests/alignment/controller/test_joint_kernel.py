@@ -104,7 +104,12 @@ COGS = {"cogging__torque_nm": 5.0, "cogging__periods": 30.0}
 
 @pytest.mark.parametrize(
     "effect",
-    [{"torque_saturation__torque_max_nm": 10.0}, {"load_friction__share": 0.2}, {"gear_friction__share": 0.2}, COGS],
+    [
+        {"torque_saturation__torque_max_nm": 10.0},
+        {"load_friction__share": 0.2},
+        {"gear_friction__share": 0.2},
+        COGS,
+    ],
 )
 def test_steps_of_half_a_millisecond_are_nearly_as_good_as_those_of_a_twentieth(
     effect: dict[str, float],

@@ -89,11 +89,7 @@ def test_gains_that_recordings_state_wrongly_are_found_and_no_effect_instead():
         for own in (right.fit, right.validation)
     )
     found = diagnose_joint(
-        TwinConfig(),
-        SIGNAL,
-        Measurements(fit, validation),
-        search=ONE,
-        without=WITHOUT,
+        TwinConfig(), SIGNAL, Measurements(fit, validation), search=ONE, without=WITHOUT
     ).diagnosis
     assert found.names == ()
     assert found.errors["after"]["validation"] < 1.2

@@ -529,7 +529,9 @@ def test_commands_may_be_sent_one_by_one_or_together() -> None:
     np.testing.assert_array_equal(together.arrays["qpos"], apart.arrays["qpos"])
 
 
-@pytest.mark.parametrize("name", ["torque_scale", "torque_lag", "load_friction", "gear_friction"])
+@pytest.mark.parametrize(
+    "name", ["torque_scale", "torque_lag", "load_friction", "gear_friction"]
+)
 def test_the_first_reset_of_a_simulation_is_like_every_other(name: str) -> None:
     """What an effect feels at a reset must not depend on whether the simulation has been reset before."""
     effect = make_effect(name, joints=["joint2"])
