@@ -3,23 +3,31 @@ beside what the pads read (docs/insertion.gif); a joint's twin before and after 
 
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw
 from PIL.ImageFont import load_default as font
 
-from taccorl.diagnosis.comparison.compare import compare
-from taccorl.diagnosis.machines.piper import PiperTwin
-from taccorl.diagnosis.problems.joints import diagnose_joint
+import taccorl
+from pipelines.studies import so101
+from taccorl.alignment.machines.robot_draft import StatedFacts, robot_draft, servo_of
+from taccorl.diagnosis.comparison.result import shown_unit
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.expert import ExpertSource
-from taccorl.report.figures import joint_response
+from taccorl.report.figure_style import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    floor_band,
+    legend,
+    new_figure,
+    tidy,
+)
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
-from taccorl.surrogate.cases import draw_case
-from taccorl.surrogate.recordings import recordings
 from taccorl.tasks.experts import tasks_with_expert
 from taccorl.views.colors import PAD_COLORS, heat
 
@@ -137,30 +145,43 @@ def insertion(
 
 
 def mended_twin() -> None:
-    """Draw the case of ``make demo`` and notebook 3, a surrogate robot with dry friction: the twin before and after."""
-    case = draw_case(
-        ["coulomb_friction"],
-        seed=3,
-        signal="left_joint4",
-        strength=12.0,
-        gains_known=True,
+    """Draw the example of README.md, a simulated arm: what was measured, its model and the
+    model with the effect that ``diagnose`` names; the residuals below. No choice used the
+    recording that is shown."""
+    with TemporaryDirectory() as place:
+        so101.write(Path(place) / "arm")
+        out = Path(place) / "so101.yaml"
+        stated = StatedFacts(servo=servo_of("so101"))
+        out.write_text(robot_draft(Path(place) / "arm/so101.xml", out, stated)[0])
+        robot = taccorl.load_robot(out)
+        sweeps = taccorl.read_measurements(Path(place) / "arm/sweeps", robot)
+        found = taccorl.diagnose(robot, sweeps)
+        mended = taccorl.add_effect(robot, "gear_friction", found)
+        both = taccorl.compare(robot, sweeps, against=mended)
+    assert both.after is not None
+    model, corrected = (
+        next(t for t in side.traces if t.recording == "last.csv")
+        for side in (both.comparison, both.after)
     )
-    measurements = recordings(case, "chirp")
-    found = (
-        PiperTwin(case.twin)
-        .mended([diagnose_joint(case.twin, case.signal, measurements)])[0]
-        .config
-    )
-    both = (
-        compare(twin, measurements, name="twin").traces for twin in (case.twin, found)
-    )
-    before, after = (
-        next(
-            t for t in traces if (t.recording, t.kind) == ("held_triangle", "position")
-        )
-        for traces in both
-    )
-    joint_response(before, after).savefig(OUT / "mended_twin.png", dpi=80)
+    title = "Elbow of a simulated SO-101, a test recording"
+    figure = new_figure(7.2, 5.0, title, [model.origin])
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    above.plot(model.time_s, model.measured, color=MEASURED, lw=2.6, label="measured")
+    floor_band(below, model.floor.value, model.unit)
+    factor, unit = shown_unit(model.unit)
+    for trace, color, name in (
+        (model, BEFORE, "model"),
+        (corrected, AFTER, "model + gear_friction"),
+    ):
+        above.plot(trace.time_s, trace.replayed, color=color, lw=1.2, label=name)
+        rmse = float(np.sqrt(np.mean(trace.residual**2))) * factor
+        label = f"{name}: RMS {rmse:.3g} {unit}"
+        below.plot(trace.time_s, trace.residual * factor, color=color, label=label)
+    tidy(above, y="position [rad]")
+    tidy(below, "time [s]", f"measured − model [{unit}]")
+    for axes, columns in ((above, 3), (below, 3)):
+        legend(axes, columns)
+    figure.savefig(OUT / "mended_twin.png")
 
 
 def main() -> None:
