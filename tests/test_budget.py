@@ -40,7 +40,7 @@ MOST = {
     "taccorl/training": Concepts(1_042, 15, 13),
     "taccorl/views": Concepts(1_535, 8, 73),
     "tests": Concepts(42_227, 138, 1180),
-    "pipelines": Concepts(5_062, 26, 232),
+    "pipelines": Concepts(5_172, 26, 239),
 }
 MOST_LINES_OF_A_FILE = 850  # at 88 columns
 
