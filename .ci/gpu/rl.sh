@@ -1,8 +1,8 @@
 # On a GPU machine, after start.sh and warp.sh: setsid bash .ci/gpu/rl.sh SECOND > /dev/shm/job.log 2>&1 < /dev/null &
-# A policy of $EPISODES demonstrations of $TASK learns; meanwhile modes.py compares the modes of MuJoCo Warp. It is post-trained by
-# configs/post_train/gpu.yaml and $OPTIONS until SECOND of the machine's clock (by MuJoCo C, 128 environments, if the modes differ); beside
-# it, replayed.py compares what the policy does by MuJoCo C and by Warp, and the start is scored by either. Then the result is scored,
-# and, with a build to compare with in /dev/shm/old, an iteration of either build is timed. One GPU, all cores.
+# A policy of $EPISODES demonstrations of $TASK learns; meanwhile modes.py compares the modes of MuJoCo Warp (of $MODES_TASK). It is post-trained by
+# configs/post_train/gpu.yaml and $OPTIONS until SECOND of the machine's clock (by MuJoCo C, 128 environments, if the modes differ);
+# with $ARMS, a line "NAME OPTIONS" each, so many times side by side. Beside it, replayed.py compares what the policy does in $REPLAYED
+# scenes (none: 0) by MuJoCo C and by Warp, and the start is scored by either. Then the results are scored, and, with a build to compare with in /dev/shm/old, an iteration of either build is timed. One GPU, all cores.
 . /dev/shm/env.sh
 end=$1 task=${TASK:-assembly_1} episodes=${EPISODES:-300} steps=${STEPS:-1500} scored=${SCORED:-192} seed=${SEED:-1000}
 threads=$(env -u OMP_NUM_THREADS nproc)
@@ -14,7 +14,7 @@ since start
 modes() {
   while [ ! -e /dev/shm/warp_ready ]; do sleep 1; done
   . /dev/shm/warp_env.sh
-  timeout 240 python3 .ci/gpu/modes.py cuda:0 64 12 "$task" >/dev/shm/modes.log 2>&1
+  timeout 240 python3 .ci/gpu/modes.py cuda:0 64 12 "${MODES_TASK:-$task}" >/dev/shm/modes.log 2>&1
   echo $? >/dev/shm/modes_rc
   since "modes compared: $(cat /dev/shm/modes_rc)"
 }
@@ -29,25 +29,43 @@ twin=/dev/shm/learn_1/$task/twin_of_20_steps.yaml
 out=/dev/shm/learn_ppo/$task/policy_$seed
 mkdir -p "$(dirname "$out")"
 score() { # NAME POLICY OPTIONS
-  OMP_NUM_THREADS=1 timeout 300 python3 -m taccorl.cli.main evaluate --policy.path="$2" --policy.device=cuda --task="$task" --policy.n_action_steps=8 \
+  OMP_NUM_THREADS=1 timeout 400 python3 -m taccorl.cli.main evaluate --policy.path="$2" --policy.device=cuda --task="$task" --policy.n_action_steps=8 \
     --episodes="$scored" --seed=70000 --failures=0 "${@:3}" --out="${out}_score_$1" >"${out}_score_$1.log" 2>&1
   since "$1 scored: $?"
 }
 (
-  python3 .ci/gpu/replayed.py "$start" cuda:0 "${REPLAYED:-24}" 24 "$task" >/dev/shm/replayed.log 2>&1
-  since "replayed: $?"
+  if [ "${REPLAYED:-24}" -gt 0 ]; then
+    python3 .ci/gpu/replayed.py "$start" cuda:0 "${REPLAYED:-24}" 24 "$task" >/dev/shm/replayed.log 2>&1
+    since "replayed: $?"
+  fi
   score start_c "$start" --workers="$((threads - 4))" --batch_size="$((threads - 4))"
   score start_warp "$start" --physics=warp:mode=resident --batch_size="$scored"
 ) &
+scores=$!
 options=()
 if [ "$(cat /dev/shm/modes_rc)" != 0 ]; then options=(--env.physics=c --env.num_envs=128 --ppo.batch_size=512); fi
-timeout -s TERM $((end > $(now) ? end - $(now) : 1)) python3 -m taccorl.cli.main post-train --config_path=configs/post_train/gpu.yaml --policy.path="$start" --env.task="$task" \
-  --env.twin="$twin" --env.threads=4 --rerun=false --keep_checkpoints=1 --save_freq=5 --seed="$seed" "${options[@]}" ${OPTIONS:-} --out="$out" >"$out.log" 2>&1
+arms=() runs=()
+while IFS= read -r arm; do
+  if [ -n "$arm" ]; then arms+=("$arm"); fi
+done <<<"${ARMS:-ppo ${OPTIONS:-}}"
+for arm in "${arms[@]}"; do
+  read -ra words <<<"$arm"
+  run=${out}_${words[0]}
+  timeout -s TERM $((end > $(now) ? end - $(now) : 1)) python3 -m taccorl.cli.main post-train --config_path=configs/post_train/gpu.yaml --policy.path="$start" \
+    --env.task="$task" --env.twin="$twin" --env.threads=4 --rerun=false --keep_checkpoints=1 --save_freq=5 --seed="$seed" "${options[@]}" "${words[@]:1}" \
+    --out="$run" >"$run.log" 2>&1 &
+  runs+=($!)
+done
+wait "${runs[@]}"
 since "post-trained: $?"
-wait
-result=$out/checkpoints/last/pretrained_model
-score result_warp "$result" --physics=warp:mode=resident --batch_size="$scored" &
-score result_c "$result" --workers="$((threads - 2))" --batch_size="$((threads - 2))"
+wait $scores
+result() { echo "${out}_${1%% *}/checkpoints/last/pretrained_model"; }
+for arm in "${arms[@]}"; do
+  score "${arm%% *}_warp" "$(result "$arm")" --physics=warp:mode=resident --batch_size="$scored" &
+done
+for arm in "${arms[@]}"; do
+  score "${arm%% *}_c" "$(result "$arm")" --workers="$((threads - 2))" --batch_size="$((threads - 2))"
+done
 wait
 if [ ! -e /dev/shm/old ]; then exit; fi
 
