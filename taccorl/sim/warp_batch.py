@@ -493,7 +493,10 @@ class _Worlds:
                 model, batch_sizes=dict.fromkeys(varied, num_worlds)
             )
             self._model.opt.warn_overflow = False  # ``overflow`` reads it
-            self._model.opt.contact_sensor_maxmatch = settings.contacts
+            # of one world, where ``contacts`` is a mean over worlds
+            self._model.opt.contact_sensor_maxmatch = max(
+                self._model.opt.contact_sensor_maxmatch, settings.contacts
+            )
             if settings.iterations:
                 self._model.opt.iterations = settings.iterations
             if self._device.is_cuda and not wp.is_conditional_graph_supported():
@@ -643,6 +646,8 @@ class _Worlds:
             self._data.overflow.zero_()
         for name, flag in few.items():
             have = getattr(self._settings, name)
+            if flag & int(kinds.CONTACT_MATCH):
+                have = self._model.opt.contact_sensor_maxmatch
             if flag or needed[name] > have:
                 words = (
                     f"physics=warp: a world needs room for more than {have} {name} ({needed[name]} at the last step; "

@@ -247,6 +247,25 @@ def test_a_world_whose_contact_is_given_up_has_diverged_and_stops_no_other(
     np.testing.assert_array_equal(fell, whole)
 
 
+@pytest.mark.slow
+def test_one_world_may_have_more_contacts_than_worlds_have_room_for_in_the_mean(warp):
+    """Twelve boxes on a table touch it at 48 corners, in the other world at none: 24 in the mean, room for 32."""
+    boxes = "".join(
+        f'<body pos="{0.1 * k} 0 0.01"><freejoint/><geom type="box" size="0.01 0.01 0.01"/></body>'
+        for k in range(12)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom name="floor" type="plane" size="9 9 1"/>{boxes}</worldbody>'
+        '<sensor><contact geom1="floor" data="found"/></sensor></mujoco>'
+    )
+    settings = WarpSettings(device="cpu", contacts=32, constraints=512)
+    batch = WarpBatch(model, 2, 1, settings=settings)
+    found = batch.bind("sensordata")
+    batch.bind("qpos")[1, 2::7] = 1.0
+    batch.step(nstep=2, stage=mujoco.mjtStage.mjSTAGE_ACC)
+    assert found.ravel().tolist() == [48.0, 0.0]
+
+
 # A delay in MuJoCo's history, a friction of the model, further joints, and what is rewritten after each physics step.
 @pytest.mark.slow
 @pytest.mark.parametrize(
