@@ -384,9 +384,12 @@ def _next(
     from taccorl.report.evidence import added
     from taccorl.report.fact import fact
 
-    found = report.found
-    if any(a.kind == "data_first" for a in report.accounts().values()):
+    accounts = report.accounts()
+    found = [f for f in report.found if accounts[f.part].kind != "drifting"]
+    if any(a.kind == "data_first" for a in accounts.values()):
         return [fact("next_data")]
+    if not found:
+        return []
     if file is not None:
         parts = [f.part for f in found]
         return [fact("next", command=compare_words(words, parts, twin, file))]

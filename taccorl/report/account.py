@@ -15,6 +15,7 @@ from taccorl.alignment.least_squares import Free, inverse_of
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS, TORQUE_FF
 from taccorl.diagnosis.remark import Remark
 from taccorl.diagnosis.search import plain as plain_fit
+from taccorl.diagnosis.search.drift import Drift
 from taccorl.diagnosis.search.problem import EFFORT_SCALE
 from taccorl.diagnosis.search.result import (
     Changed,
@@ -59,8 +60,10 @@ def account(part: str, d: Diagnosis, seen: Seen | None = None) -> Account:
     """The facts of one part's diagnosis, and of its recordings ``seen``."""
     of = _Part(part, d, seen or Seen())
     steps = (_title, _error, _remarks, _next)
-    if of.kind not in ("data_first", "not_converged"):
-        steps += (_missing, _changed, _remains, _ties, _doubts)
+    if of.kind == "drifting":
+        steps += (_drifts, _remains)
+    elif of.kind not in ("data_first", "not_converged"):
+        steps += (_missing, _changed, _remains, _ties, _doubts, _drifts)
     return Account.of_facts(part, [found for step in steps for found in step(of)])
 
 
@@ -150,6 +153,7 @@ class _Part:
         kinds = {
             "data_first": self.seen.errors,
             "not_converged": d.status == "not_converged",
+            "drifting": self.is_short and self.seen.drifts and self.only_drifts,
             "something_else": unclear or (self.is_short and not self.named),
             "more": new and self.is_short,
             "ties": tied,
@@ -159,6 +163,12 @@ class _Part:
             "numbers_off": self.numbers,
         }
         return next((kind for kind, is_so in kinds.items() if is_so), "nothing_missing")
+
+    @property
+    def only_drifts(self) -> bool:
+        """Whether each added effect is one of a number that changed with time."""
+        numbers = {n for d in self.seen.drifts for n in (d.number, *d.as_good)}
+        return {*added(self.d)} <= {number.partition(".")[0] for number in numbers}
 
     @property
     def named(self) -> list[str]:
@@ -171,7 +181,9 @@ class _Part:
 
 def _title(of: _Part) -> list[Fact]:
     missing = [_placed(of.d, name) for name in added(of.d)]
-    return [fact(of.kind, part=of.part, missing=missing, numbers=of.numbers)]
+    drifting = list(dict.fromkeys(drift.number for drift in of.seen.drifts))
+    values = {"missing": missing, "numbers": of.numbers, "drifting": drifting}
+    return [fact(of.kind, part=of.part, **values)]
 
 
 def _placed(d: Diagnosis, name: str) -> str:
@@ -383,26 +395,41 @@ def _doubts(of: _Part) -> list[Fact]:
         *when(differ, "fit_differs", fit=fit, validation=validation),
         *when(differ and seen.short is None, "mark_kinds", use=use),
         *when(differ and further, "mark_range", use=use, variables=further),
-        *(
-            fact(
-                "drift",
-                name=drift.number,
-                before=Quantity.of(drift.before, drift.unit, drift.before_interval),
-                after=Quantity.of(drift.after, drift.unit, drift.after_interval),
-                first=drift.first,
-                second=drift.second,
-                share=drift.share,
-            )
-            for drift in seen.drifts
-        ),
         *(fact("one_pose", effect=name) for name in d.one_pose),
         *when(d.at_bound, "at_bound", names=d.at_bound),
         *(fact("undetermined", effect=name) for name in undetermined(d)),
     ]
 
 
+def _drifts(of: _Part) -> Iterator[Fact]:
+    """Each number that changed with time, in the two recordings of one motion that
+    determine it best."""
+    best_first = sorted(of.seen.drifts, key=_open_width)
+    for number in dict.fromkeys(drift.number for drift in best_first):
+        first, *others = (drift for drift in best_first if drift.number == number)
+        yield fact(
+            "drift",
+            name=number,
+            before=Quantity.of(first.before, first.unit, first.before_interval),
+            after=Quantity.of(first.after, first.unit, first.after_interval),
+            first=first.first,
+            second=first.second,
+            share=first.share,
+        )
+        pairs = [f"{drift.first} and {drift.second}" for drift in others]
+        yield from when(pairs, "drift_likewise", pairs=pairs)
+
+
+def _open_width(drift: Drift) -> float:
+    """Sum of the widths of the intervals of the two values; infinite where one is open."""
+    ends = np.array([drift.before_interval, drift.after_interval])
+    width = float(np.diff(ends, axis=1).sum())
+    return width if math.isfinite(width) else math.inf
+
+
 def _remarks(of: _Part) -> list[Fact]:
-    seen, every = of.seen, (*of.d.remarks, *of.seen.remarks)
+    of_fit = () if of.kind == "drifting" else of.d.remarks
+    seen, every = of.seen, (*of_fit, *of.seen.remarks)
     return [
         *(
             Fact(r.id, r.values) if isinstance(r, Remark) else fact("remark", text=r)

@@ -57,6 +57,7 @@ def next_recording(of: Advice) -> Iterator[Fact]:
     is_open = of.kind == "not_converged" or d.status == "something_else"
     cases = [
         (of.kind == "data_first", lambda: [fact("record_data")]),
+        (of.kind == "drifting", lambda: [fact("record_steady")]),
         (of.kind == "gains_moved", lambda: [fact("record_gains")]),
         (is_open, lambda: _deciding(of)),
         (d.status == "too_many", list),  # the search itself may go on

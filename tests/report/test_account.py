@@ -29,7 +29,7 @@ from taccorl.diagnosis.search.search import diagnose
 from taccorl.diagnosis.search.solve import PartFinding
 from taccorl.report.account import account, is_explained, moved, share_gone
 from taccorl.report.diagnosed import account_section
-from taccorl.report.evidence import Seen, grade, simpler_twin
+from taccorl.report.evidence import Seen, added, grade, simpler_twin
 from taccorl.report.fact import (
     MOST_NAMES,
     Account,
@@ -579,20 +579,49 @@ def test_a_plain_fit_of_what_was_added_speaks_not_against_it(one):
     assert "plain_as_good" in better  # with numbers that were not added
 
 
-@case("drift")
-def _(one, nothing, short):
-    drift = SimpleNamespace(
-        number="viscous_friction.damping_nms_per_rad",
+def drift_of(number: str, second: str = "warm.csv") -> SimpleNamespace:
+    return SimpleNamespace(
+        number=number,
+        as_good=(),
         unit="N·m·s/rad",
         before=3.0,
         after=1.0,
         before_interval=(2.9, 3.1),
         after_interval=(0.9, 1.1),
         first="cold.csv",
-        second="warm.csv",
+        second=second,
         share=0.99,
     )
-    return nothing, Seen(drifts=[drift])
+
+
+DAMPING = "viscous_friction.damping_nms_per_rad"
+
+
+@case("drift")
+def _(one, nothing, short):
+    return nothing, Seen(drifts=[drift_of(DAMPING)])
+
+
+@case("drift_likewise")
+def _(one, nothing, short):
+    return nothing, Seen(drifts=[drift_of(DAMPING), drift_of(DAMPING, "hot.csv")])
+
+
+@case("drifting", "record_steady")
+def _(one, nothing, short):
+    return short, Seen(drifts=[drift_of(DAMPING)])
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(DAMPING, "more"), ("{}.strength", "drifting")]
+)
+def test_a_number_that_changed_hides_no_other_effect(number, kind, one):
+    """Only where the added effect is that of the changed number, the change is all."""
+    (name,) = added(one)
+    above = changed(one, status="something_else")
+    a = account(PART, above, Seen(drifts=[drift_of(number.format(name))]))
+    assert a.kind == kind
+    assert "drift" in a.ids
 
 
 ELSEWHERE = {
