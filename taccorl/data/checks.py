@@ -22,6 +22,11 @@ from taccorl.data.grip_checks import (
 from taccorl.data.grip_checks import touch_lags as lags_of_pad
 from taccorl.data.joint_checks import Motion, arm_lags, check_motion, check_values
 from taccorl.data.picture_checks import check_pictures
+from taccorl.data.relative_checks import (
+    RestingLevels,
+    check_relative_motion,
+    check_relative_touch,
+)
 from taccorl.data.spec import ACTION, STATE
 from taccorl.data.touch_checks import (
     Pad,
@@ -51,6 +56,12 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     findings += check_motion(
         Motion(episode, wrong), np.stack(touch, axis=1) if touch else no_touch
     )
+    known = {(f.check, f.feature) for f in findings}
+    findings += [
+        f
+        for f in check_relative_motion(episode)
+        if (f.check, f.feature) not in known and f.feature not in wrong
+    ]
     joints_wrong = wrong & {STATE, ACTION} or any(
         f.check == "swapped_arms" for f in findings
     )
@@ -63,9 +74,9 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
             findings += (
                 [why] if joints_wrong else check_touch_and_grip(episode, key, pads)
             )
-    findings += [
-        f for key in other_touch_keys(episode) for f in check_other_touch(episode, key)
-    ]
+    for key in other_touch_keys(episode):
+        findings += check_other_touch(episode, key)
+        findings += check_relative_touch(episode, key)
     findings += check_pictures(episode, decode=pictures)
     return sorted(
         findings, key=lambda f: ("error", "warning", "note").index(f.severity)
@@ -154,10 +165,14 @@ class _Across:
         self.levels: dict[str, dict[str, dict[float, str]]] = {}
         self.limits: dict[str, float] = {}
         """Key of touch → largest difference between levels of rest [counts]."""
+        self.other_touch: dict[str, RestingLevels] = {}
 
     def add(self, episode: Episode) -> None:
         """Add an episode, unless its values are wrong."""
         self.num_episodes += 1
+        for key in other_touch_keys(episode):
+            levels = self.other_touch.setdefault(key, RestingLevels())
+            levels.add(episode.name, episode.arrays[key], episode.spec.fps)
         if not episode.arrays or episode.num_rows < 2 or any(check_values(episode)):
             return
         for arm, lag in arm_lags(episode).items():
@@ -181,10 +196,16 @@ class _Across:
             levels.setdefault(level, episode.name)
 
     def findings(self) -> list[Finding]:
-        """Findings of all episodes together; none of a single one."""
+        """Findings of all episodes together; of a single one only its levels of rest."""
+        resting = [
+            found
+            for key, levels in self.other_touch.items()
+            for found in levels.finding(key)
+        ]
         if self.num_episodes < 2:
-            return []
+            return resting
         return [
+            *resting,
             *_odd_arms(self.arm_lags),
             *_odd_touch(self.pad_lags),
             *_resting_levels(self.levels, self.limits),
