@@ -74,7 +74,14 @@ def _repair(config: CheckConfig) -> int:
     from taccorl.data.dataset_checks import repair
 
     assert config.repair is not None
-    repair(Dataset(config.path), config.repair)
+    dataset = Dataset(config.path, partial=True)
+    repair(dataset, config.repair)
+    kept, told = dataset.num_episodes, dataset.info["total_episodes"]
+    if kept < told:
+        lost = [str(k) for k in range(kept, told)]
+        print(
+            f"lost:    episodes {', '.join(lost)}, of which meta/episodes says nothing"
+        )
     print(f"dataset: {config.repair}")
     return _check_dataset(dataclasses.replace(config, path=config.repair, repair=None))
 

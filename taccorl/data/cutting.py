@@ -5,7 +5,7 @@ Nothing is invented and no middle row is deleted: what cannot become rows is lis
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from taccorl.data import pictures, timing
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
-from taccorl.data.finding import Finding, finding
+from taccorl.data.finding import Finding, finding, listed
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import RATE_OF, Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened
@@ -287,13 +287,14 @@ class Cutter(TimedRecording):
         if rule.from_ == "spec":
             return _of_usual_length(rule.text or "")
         if rule.from_ == "topic":
-            texts = sorted(
-                {text.strip() for _, text in self.recording.texts[rule.topic or ""]}
-                - {""}
+            said = self.recording.texts[rule.topic or ""]
+            texts = list(
+                dict.fromkeys(text.strip() for _, text in said if text.strip())
             )
             if (n := len(texts)) != 1:
                 raise RecordingError(
-                    f"{rule.topic} has {n} different instructions {texts[:3]}, but needs exactly one"
+                    f"{rule.topic} has {n} different instructions{_when(said)}, but needs exactly one: leave the "
+                    "recording out, or ingest it alone with `instruction: {from: spec, text: …}` in a copy of the spec"
                 )
             return _of_usual_length(texts.pop())
         found = next(
@@ -673,6 +674,20 @@ class Cutter(TimedRecording):
                 broken += 1
         self.clocks = self._read_clocks()
         return broken
+
+
+def _when(said: Sequence[tuple[int, str]]) -> str:
+    """Text of when each instruction begins, such as ``: 'pick it up' from 0.00 s, 'put it down' from 0.67 s``."""
+    changed = [
+        (time_ns, text.strip())
+        for k, (time_ns, text) in enumerate(said)
+        if text.strip() and (k == 0 or text.strip() != said[k - 1][1].strip())
+    ]
+    each = [
+        f"{text[:60]!r} from {(time_ns - said[0][0]) / NS_PER_S:.2f} s"
+        for time_ns, text in changed
+    ]
+    return f": {listed(each)}" if each else ""
 
 
 def _of_usual_length(instruction: str) -> str:

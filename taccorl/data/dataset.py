@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import shlex
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from taccorl.data.origin import NOT_STATED, Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import SPEC_VERSION, Document, check_version
 from taccorl.data.timing import MOST_S
-from taccorl.data.video_files import frame_problems, video_frames
+from taccorl.data.video_files import frame_problems, frame_shift, video_frames
 from taccorl.errors import DatasetError, TaccorlError, no_such_path
 
 PROVENANCE = Path(
@@ -74,11 +75,12 @@ EDITED = "edited by another tool? Remove this file to read the dataset without i
 class Dataset:
     """A LeRobot v3 dataset on disk. Opening it reads ``meta/`` only. Episodes are given by their index from 0."""
 
-    def __init__(self, root: Path) -> None:
-        """Raises DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing."""
+    def __init__(self, root: Path, *, partial: bool = False) -> None:
+        """``partial``: also one whose last episodes are lost, as a writer leaves it that died. Raises DatasetError: no
+        LeRobot v3 dataset, or not a whole one: says what is missing."""
         self.root = Path(root)
         self.info = _checked_info(self.root)
-        self._table = _read_episode_table(self.root, self.info)
+        self._table = _read_episode_table(self.root, self.info, partial)
         self.task_names = _read_tasks(self.root)
         """Number of a task → its text, from ``meta/tasks.parquet``; ``instructions``: the texts."""
         self.instructions = tuple(self.task_names.values())
@@ -308,6 +310,19 @@ class Dataset:
                 ]
         return problems
 
+    def video_shifts(self) -> dict[tuple[int, str], float]:
+        """(episode, camera) → seconds by which its ``from_timestamp`` is before the frame of its first row, where that is
+        less than half a frame and explains why its rows have no frames."""
+        found = {}
+        for key in self.cameras:
+            for index in range(self.num_episodes):
+                video = self.video(index, key)
+                due_s = video.from_s + np.arange(video.num_frames) / self.spec.fps
+                shift_s = frame_shift(video.path, due_s)
+                if shift_s is not None:
+                    found[index, key] = shift_s
+        return found
+
     def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
         entry = self.entry(index)
         try:
@@ -521,8 +536,10 @@ def _no_feature(feature: Any) -> str:
     return ""
 
 
-def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
-    """One dict per episode, in order, without the statistics."""
+def _read_episode_table(
+    root: Path, info: dict[str, Any], partial: bool = False
+) -> list[dict[str, Any]]:
+    """One dict per episode, in order, without the statistics. ``partial``: the last ones may be missing."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         with plainly(path, PARQUET):
@@ -531,7 +548,10 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
         rows += read_columns(path, names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
     listed, told = [r["episode_index"] for r in rows], info["total_episodes"]
-    if len(listed) != told or listed != list(range(told)):
+    are_first = 0 < len(listed) < told and listed == list(range(len(listed)))
+    if (len(listed) != told or listed != list(range(told))) and not (
+        partial and are_first
+    ):
         missing = next(
             (i for i in range(told) if i not in listed), None
         )  # `told` may be any number
@@ -541,9 +561,10 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
             else f"episode {missing} is missing"
         )
         text = f"{root}: info.json states {told} episodes, but meta/episodes lists {len(listed)}, {described}: the "
-        raise DatasetError(
-            f"{text}writer died before finalize(), or the copy is incomplete"
-        )
+        text += "writer died before finalize(), or the copy is incomplete"
+        if are_first:
+            text += f"; `taccorl check {shlex.quote(str(root))} --repair=COPY` writes a copy of the {len(listed)} that are whole"
+        raise DatasetError(text)
     return rows
 
 

@@ -456,8 +456,9 @@ def _without_spread(key: str, known: np.ndarray) -> Iterator[Finding]:
 
 
 def repair(dataset: Dataset, copy: Path) -> None:
-    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have. Raises DatasetError:
-    ``copy`` exists, or rows are missing or exchanged: then which are right is unknown."""
+    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have, and with starts of
+    videos that lie on their frames. Raises DatasetError: ``copy`` exists, or rows are missing or exchanged: then which are
+    right is unknown."""
     root, features = dataset.root, dataset.info["features"]
     if copy.exists():
         raise DatasetError(f"--repair={copy} exists: give a new folder")
@@ -470,6 +471,7 @@ def repair(dataset: Dataset, copy: Path) -> None:
         copy,
         ignore=lambda folder, names: {"manifest.json", ".verified.json"} & set(names),
     )
+    shifts = dataset.video_shifts()
     first = np.cumsum([0, *(dataset.num_rows(i) for i in range(dataset.num_episodes))])
     at = 0
     for path in data_files(copy):
@@ -491,6 +493,11 @@ def repair(dataset: Dataset, copy: Path) -> None:
             ("dataset_to_index", first[numbers + 1]),
         ):
             table = _with(table, key, to)
+        for key in dataset.cameras:
+            shift_s = np.array([shifts.get((int(i), key), 0.0) for i in numbers])
+            for end in ("from", "to") if shift_s.any() else ():
+                column = f"videos/{key}/{end}_timestamp"
+                table = _with(table, column, table[column].to_numpy() + shift_s)
         for key, of_rows in values.items():
             parts = (of_rows[first[i] : first[i + 1]] for i in numbers)
             stats = [statistics_of_rows(part, features[key]["shape"]) for part in parts]

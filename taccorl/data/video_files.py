@@ -87,6 +87,24 @@ def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, Any]]:
         )
 
 
+def _shift(times_s: np.ndarray, due_s: np.ndarray) -> float | None:
+    """Seconds from the times ``due_s`` of an episode's rows to those of its frames, where all of them are off by one time
+    below half a frame; None if they are not, or not off."""
+    if not len(times_s) or len(due_s) < 2:
+        return None
+    off_s = times_s[_nearest(times_s, due_s)] - due_s
+    shift_s = float(np.median(off_s))
+    is_one = np.abs(off_s - shift_s).max() < TOLERANCE_S
+    half_s = (due_s[1] - due_s[0]) / 2
+    return shift_s if is_one and TOLERANCE_S <= abs(shift_s) < half_s else None
+
+
+def frame_shift(path: Path, due_s: np.ndarray) -> float | None:
+    """Seconds by which a video's frames come after the times ``due_s`` (T,) of an episode's rows, if that is one time below
+    half a frame for all rows; else None. Raises DatasetError: the video cannot be read."""
+    return _shift(_packet_times(path)[0], due_s)
+
+
 def frame_problems(path: Path, due: Mapping[int, np.ndarray]) -> list[str]:
     """Compare, without decoding, the packets of a video file with the rows that it shows: every row must have a frame of its own.
     ``due``: episode → (T,) times of its rows [s]. One text for each problem."""
@@ -101,6 +119,12 @@ def frame_problems(path: Path, due: Mapping[int, np.ndarray]) -> list[str]:
     )
     owner: dict[int, int] = {}
     for index, due_s in due.items():
+        if (shift_s := _shift(times_s, due_s)) is not None:
+            side = "before" if shift_s > 0 else "after"
+            text = f"episode {index}: from_timestamp lies {abs(shift_s) * 1000:.1f} ms {side} the frame at "
+            text += f"{due_s[0] + shift_s:.4f} s, so that no row has one; `taccorl check DATASET --repair=COPY` writes a copy "
+            problems.append(f"{text}with the right one")
+            due_s = due_s + shift_s
         nearby = _nearest(times_s, due_s)
         found = (
             np.abs(times_s[nearby] - due_s) < TOLERANCE_S

@@ -573,6 +573,70 @@ def test_statistics_computed_anew_in_place_are_no_changed_file(
     )
 
 
+def shift_videos(root: Path, frames: float) -> None:
+    """Episode k's ``from_timestamp`` and ``to_timestamp``, off by ``frames`` · k / 2."""
+    (path,) = (root / "meta/episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    for end in ("from", "to"):
+        name = f"videos/observation.images.top/{end}_timestamp"
+        moved = table[name].to_numpy() + frames / FPS * np.arange(EPISODES) / 2
+        at = table.column_names.index(name)
+        table = table.set_column(at, table.schema.field(name), pa.array(moved))
+    pq.write_table(table, path)
+
+
+def starts_s(root: Path) -> list[float]:
+    dataset = Dataset(root)
+    return [dataset.video(k, "observation.images.top").from_s for k in range(EPISODES)]
+
+
+@pytest.mark.parametrize("frames", [0.13, -0.3, 0.45])
+def test_starts_of_videos_beside_their_frames_are_named_and_repaired(
+    good, faulty, tmp_path, frames
+):
+    shift_videos(faulty, frames)
+    of = [p for p in Dataset(faulty).video_problems() if "from_timestamp" in p]
+    assert len(of) == EPISODES - 1
+    assert f"{abs(frames) / FPS * 1000:.1f} ms" in of[1]
+    words = ["check", str(faulty), f"--repair={tmp_path / 'copy'}"]
+    assert main([*words, "--pictures=false", "--quick=true"]) == 0
+    assert starts_s(tmp_path / "copy") == pytest.approx(starts_s(good), abs=1e-9)
+    assert Dataset(tmp_path / "copy").video_problems() == []
+
+
+def test_starts_that_are_off_by_more_than_half_a_frame_are_no_guess(faulty, tmp_path):
+    """Which frame is meant is not known: nothing is moved."""
+    shift_videos(faulty, 2.0)  # by 1 and 2 frames
+    before = starts_s(faulty)
+    repair(Dataset(faulty), tmp_path / "copy")
+    assert starts_s(tmp_path / "copy") == before
+    assert Dataset(tmp_path / "copy").video_problems() != []
+
+
+def test_whole_episodes_of_a_writer_that_died_are_kept(good, faulty, tmp_path, capsys):
+    path = faulty / "meta/info.json"
+    info = json.loads(path.read_text(encoding="utf-8"))
+    more = {"total_episodes": EPISODES + 2, "total_frames": info["total_frames"] + 70}
+    path.write_text(json.dumps(info | more), encoding="utf-8")
+    assert main(["check", str(faulty)]) == 2
+    assert "--repair=" in capsys.readouterr().err
+    words = ["check", str(faulty), f"--repair={tmp_path / 'copy'}"]
+    assert main([*words, "--pictures=false", "--quick=true"]) == 0
+    assert f"episodes {EPISODES}, {EPISODES + 1}" in capsys.readouterr().out
+    copy = Dataset(tmp_path / "copy")
+    assert copy.num_episodes == EPISODES
+    assert copy.info["total_frames"] == info["total_frames"]
+    assert [copy.num_rows(k) for k in range(EPISODES)] == [ROWS, ROWS + 1, ROWS + 2]
+
+
+def test_an_episode_that_is_missing_in_the_middle_is_not_repaired(faulty, tmp_path):
+    (path,) = (faulty / "meta/episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    pq.write_table(table.filter(pa.array([True, False, True])), path)
+    with pytest.raises(DatasetError, match="episode 1 is missing"):
+        Dataset(faulty, partial=True)
+
+
 def test_exchanged_rows_are_not_repaired(faulty, tmp_path, capsys):
     swap_rows(faulty)
     assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}"]) != 0
