@@ -86,6 +86,7 @@ def main(argv: list[str]) -> int:
         raise TaccorlError(
             f"--out={config.out}: {held}; nothing was changed: give another folder"
         )
+    config.check_paths()
     from taccorl.diagnosis.align import align_parts, aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin

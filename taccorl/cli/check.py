@@ -7,6 +7,7 @@ that spec.
 
 import dataclasses
 import json
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,12 +61,20 @@ def run(config: CheckConfig) -> int:
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
     if not config.path.exists():
-        raise TaccorlError(no_such_path(config.path))
+        raise TaccorlError(no_such_path(config.path) + _of_hub(config.path))
     if config.spec is None:
         if what := no_recording(config.path):
             raise TaccorlError(f"{config.path}: {what}")
         config = dataclasses.replace(config, spec=chosen_spec([config.path]))
     return _check_recordings(config)
+
+
+def _of_hub(path: Path) -> str:
+    """Words on a path that may be the name of a dataset on Hugging Face's Hub, OWNER/NAME; empty for any other."""
+    if path.is_absolute() or len(path.parts) != 2 or path.parts[0] in (".", ".."):
+        return ""
+    got = f"hf download {shlex.quote(str(path))} --repo-type=dataset --local-dir={shlex.quote(path.name)}"
+    return f". Names on the Hub are not fetched: `{got}`, then `taccorl check {shlex.quote(path.name)}`"
 
 
 def _repair(config: CheckConfig) -> int:

@@ -75,6 +75,7 @@ class CompareConfig(MeasuredConfig):
 def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""
+    config.check_paths()
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.report import as_json, check_folder, write_report
     from taccorl.report.terminal import show

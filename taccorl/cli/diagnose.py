@@ -67,6 +67,7 @@ def run(config: DiagnoseConfig) -> int:
     missing, or at least half of the squared error is gone in each part; 1: little of it is,
     or the measurements have errors, or efforts of other gains than the file's; 143: SIGTERM
     ended the search, and what it had found was written."""
+    config.check_paths()
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.report import as_json, check_folder
     from taccorl.report.terminal import show

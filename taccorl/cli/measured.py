@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, no_such_path
 from taccorl.report.findings import found_in_recordings
 from taccorl.report.section import Section
 
@@ -71,6 +71,14 @@ class MeasuredConfig:
     """Every k-th motion is for validation; as measurements.yaml states if not given."""
     accept: list[str] = field(default_factory=list)
     """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
+
+    def check_paths(self) -> None:
+        """Raises TaccorlError: a path at which there is nothing. Before anything is loaded, which takes seconds."""
+        for path in (self.twin, self.columns):
+            if path is not None and not path.exists():
+                raise TaccorlError(no_such_path(path, "file"))
+        if not self.measurements.exists():
+            raise TaccorlError(no_such_path(self.measurements))
 
     def read(self, machine: "Machine", **how: bool) -> "Measurements":
         """The measurements, as ``machine`` reads them; ``how`` as of ``Machine.read``."""

@@ -218,7 +218,8 @@ def _odd_arms(lags: dict[str, dict[str, float]]) -> Iterator[Finding]:
             others = float(np.median([x for n, x in of_arm.items() if n != name]))
             if abs(lag_s - others) > EPISODE_LAG_S:
                 text = f"{name}: the {arm or 'only'} arm follows its command after {lag_s:.3f} s, in the other "
-                text += f"{len(of_arm) - 1} episodes after {others:.3f} s: a clock stepped in this recording"
+                text += f"{len(of_arm) - 1} episodes after {others:.3f} s. It may be a stepped clock, other gains, or another "
+                text += "kind of motion (a joint follows steps later than slow sweeps)"
                 yield finding("action_lag", ACTION, text)
 
 

@@ -426,10 +426,13 @@ def _own_spec(
                 f"{_expected(known)}"
             )
         if name not in known:
-            whose = "the robot" if units is None else "the machine of the file"
+            whose = "the machine of --twin"
+            if {*known} <= {*ROBOT.action_names}:
+                whose = "without a robot file (--twin=robot.yaml, which `taccorl init-robot` writes) the machine is a "
+                whose += "two-arm PiPER, which"
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). Signals of other "
-                "machines need their own file (--twin) or a columns file, which states their units"
+                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). A columns file gives "
+                "columns of other names"
             )
         parts.setdefault(name, set()).add(key)
     for name, keys in parts.items():

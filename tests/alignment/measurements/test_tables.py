@@ -242,7 +242,7 @@ def test_wrong_columns_files_are_named_by_line(tmp_path, change, message):
         ),
         (
             "t,left_joint7.q,left_joint7.q_target",
-            "the robot has no 'left_joint7' .did you mean 'left_joint",
+            "has no 'left_joint7' .did you mean 'left_joint",
         ),
         ("t", "signal"),
     ],
