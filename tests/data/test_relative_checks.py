@@ -40,7 +40,7 @@ def quantised(values: np.ndarray, scale: float, quantum: float) -> np.ndarray:
 SCALES = {"degrees": (DEGREES, 0.088), "ticks": (TICKS, 1.0), "rad": (1.0, 1e-7)}
 
 
-@pytest.fixture(params=SCALES.values(), ids=SCALES, scope="module")
+@pytest.fixture(params=SCALES.values(), ids=list(SCALES), scope="module")
 def joints(request) -> tuple[Episode, np.ndarray, np.ndarray]:
     episode = make(seed=3)
     state, action, _ = copies(episode)

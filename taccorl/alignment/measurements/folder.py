@@ -30,6 +30,7 @@ import numpy as np
 
 from taccorl.alignment.measurements.dataset_rows import read_dataset
 from taccorl.alignment.measurements.measurement import Measurement, Stated
+from taccorl.alignment.measurements.own_spec import own_spec, taken
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.measurements.recorded import read_recording
 from taccorl.alignment.measurements.table_files import SUFFIXES, EmptyColumns
@@ -206,6 +207,7 @@ def read_measurements(
         lambda one: read_one(one, columns),
         lambda root: read_dataset(root, stated, is_all=root == path),
         skipped,
+        units,
     )
     found = sorted(found, key=lambda m: natural_key(m.name))
     whole, uses, names = (
@@ -515,6 +517,7 @@ def _read(
     table: Callable[[Path], Measurement],
     dataset: Callable[[Path], list[Measurement]],
     skipped: list[str],
+    units: Mapping[str, str] | None,
 ) -> list[Measurement]:
     if not path.exists():
         raise RecordingError(no_such_path(path))
@@ -523,7 +526,7 @@ def _read(
     if path.is_file():
         if path.suffix in SUFFIXES:
             return [table(path)]
-        return _read_recordings(path, spec, skipped)
+        return _read_recordings(path, spec, skipped, units)
     children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
     datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
     tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
@@ -537,7 +540,7 @@ def _read(
     if empty:
         raise EmptyColumns(empty, f"{path}: ")
     left: list[str] = []
-    found += _read_recordings(path, spec, left, is_needed=not found)
+    found += _read_recordings(path, spec, left, units, is_needed=not found)
     read = {p.name for p in (*datasets, *tables)} | {INDEX}
     read |= {
         p.name for p in children if p.suffix in (".yaml", ".yml")
@@ -550,6 +553,7 @@ def _read_recordings(
     path: Path,
     spec: str | Path | RecordingSpec | None,
     skipped: list[str],
+    units: Mapping[str, str] | None,
     is_needed: bool = True,
 ) -> list[Measurement]:
     loaded = (
@@ -574,10 +578,20 @@ def _read_recordings(
             none += f", and there are no tables ({', '.join(SUFFIXES)}) or datasets"
         raise RecordingError(none)
     measurements = []
+    is_own = (
+        loaded is None and units is not None and not {*units} <= {*ROBOT.action_names}
+    )
     for reader, source in found:
-        own = loaded or _only_spec(path, reader)
         try:
-            measurements.append(read_recording(source, own))
+            if is_own and units is not None:
+                own = own_spec(reader, source, units)
+            else:
+                own = loaded or _only_spec(path, reader)
+            measured = read_recording(source, own)
+            if is_own:
+                findings = (*measured.findings, taken(own))
+                measured = dataclasses.replace(measured, findings=findings)
+            measurements.append(measured)
         except TaccorlError as error:
             text = str(error)
             raise RecordingError(

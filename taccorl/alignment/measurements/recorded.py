@@ -103,7 +103,7 @@ def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
             f"{spec.name}: {STATE} and {ACTION} must both be in rad and m, but are in {state.unit}"
         )
     return tuple(
-        re.sub(r"joint_(\d+)$", r"joint\1", name.removesuffix(".pos"))
+        re.sub(r"^(left|right)_joint_(\d+)$", r"\1_joint\2", name.removesuffix(".pos"))
         for name in state.names
     )
 
