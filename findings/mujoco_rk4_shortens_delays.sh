@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Surprise: with MuJoCo 4.0's RK4 integrator the stages within a step look a delayed
 # command up at times of their own, so it acts before its delay is over: a delay of
-# 5 steps moves the joint in the fifth step. A ramp is felt up to half a step sooner.
+# 5 steps moves the joint in the fifth step.
 # Hurts: who fits or states a latency with one integrator and simulates with another,
 # or checks that nothing moves before the delay is over. Without a delay both
 # integrators hold the command for the whole step, and agree.
