@@ -213,15 +213,22 @@ def with_windows(
         deltas = Deltas(resolve(cfg, ds_meta) or {})
         if getattr(cfg, "use_relative_actions", False):
             action = ds_meta.features[ACTION]
-            names = [
-                str(name).lower()
-                for name in action["names"] or [""] * action["shape"][0]
-            ]
+            names, size = action["names"] or (), action["shape"][0]
             absolute = [
                 str(word).lower() for word in cfg.relative_exclude_joints if word
             ]
+            if absolute and isinstance(names, dict):
+                _log.warning(
+                    "dataset %s: its actions have grouped names, %s, in which LeRobot finds no joint: all %d actions are made "
+                    "relative, those of %s too; write the names as a list in meta/info.json",
+                    *(ds_meta.repo_id, names, size, ", ".join(absolute)),
+                )
+            stay = [
+                any(word in str(name).lower() for word in absolute) for name in names
+            ]
+            # Of actions without a name LeRobot makes relative ones; of groups it sees the keys.
             deltas.relative_actions = [
-                not any(word in name for word in absolute) for name in names
+                not (k < len(stay) and stay[k]) for k in range(size)
             ]
         if isinstance(cfg, TactilePI05Config):
             for key, indices in cfg.window_delta_indices(ds_meta.features).items():

@@ -23,6 +23,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.processor import RelativeActionsProcessorStep
 from lerobot.scripts import lerobot_edit_dataset
 from tiny_dataset import (
     CHANGED,
@@ -221,6 +222,32 @@ def test_relative_actions_are_normalised_by_their_own_range_over_the_episodes_tr
     np.testing.assert_array_equal(
         meta.stats["action"]["q01"], stock.meta.stats["action"]["q01"]
     )
+
+
+def test_actions_with_grouped_names_are_all_relative_as_lerobot_has_it(
+    root, monkeypatch, caplog
+):
+    """``{"motors": [...]}``: LeRobot's list of the names is ["motors"]."""
+    config = TactilePI05Config(
+        device="cpu", backbone="tiny", use_relative_actions=True, tactile=False
+    )
+    meta = load(root, dataset_reader.DatasetReader, monkeypatch).meta
+    names = meta.features["action"]["names"]
+    with caplog.at_level(logging.WARNING):
+        kept = with_windows(stock_resolve())(config, meta).relative_actions
+    assert kept == [k not in (6, 13) for k in range(14)] and not caplog.records
+    meta.features["action"]["names"] = {"motors": names}
+    with caplog.at_level(logging.WARNING):
+        deltas = with_windows(stock_resolve())(config, meta)
+    step = RelativeActionsProcessorStep(
+        enabled=True,
+        exclude_joints=config.relative_exclude_joints,
+        action_names=list(meta.features["action"]["names"]),
+    )
+    assert deltas.relative_actions == step._build_mask(14) == [True] * 14
+    assert "motors" in caplog.text and "gripper" in caplog.text
+    found = load(root, FastReader, monkeypatch, delta_timestamps=deltas).meta.stats
+    assert found["action"]["q01"].shape == (14,)
 
 
 def test_only_touch_gets_a_window(root, monkeypatch):

@@ -396,7 +396,13 @@ def _command(draft: JointDraft, main: Actuator) -> None:
     if dyn in _FILTERS or (is_motor and time_s > 0.0):
         name = "torque_lag" if is_motor or not main.has_target else "command_lag"
         draft.add(fields, ("actuator_dynprm[0]",), name, time_constant_s=time_s)
-    if delay_s > 0.0 and main.has_target:
+    held_s = fields.longest_delay_s
+    if delay_s > held_s * (1.0 + _ALIKE):
+        fields.explain(
+            f"MuJoCo delays by {held_s:g} s, which is all that nsample keeps; with a larger "
+            "nsample or this delay in the file, it is command_delay"
+        )
+    elif delay_s > 0.0 and main.has_target:
         draft.add(fields, ("actuator_delay",), "command_delay", delay_s=delay_s)
     elif delay_s > 0.0:
         fields.explain("the delayed control is no target, but a torque or a voltage")

@@ -56,10 +56,13 @@ _TYPES = {
 class StatedFields:
     """Numbers of one joint or actuator of a compiled model that differ from MuJoCo's
     defaults. ``kind``: joint or actuator; ``k``: its id in ``model``; ``place``: its name
-    and line, for remarks."""
+    and line, for remarks. ``longest_delay_s``: as long as an actuator's delay can be, with
+    the samples that it keeps; 0 of a joint."""
 
     def __init__(self, model: mujoco.MjModel, kind: str, k: int, place: str) -> None:
         self.place = place
+        num_samples = model.actuator_history[k, 0] if kind == "actuator" else 0
+        self.longest_delay_s = float(num_samples * model.opt.timestep)
         self._numbers = dict(_numbers(model, kind, k))
         default = _defaults(kind)
         self._left = {

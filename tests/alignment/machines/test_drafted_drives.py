@@ -254,6 +254,11 @@ CASES = {
         remarks=at(ACTUATOR_LINE, "actuator_delay 0.3", "0 … 0.2 s"),
         moves_alike=False,
     ),
+    "delay longer than its samples": Case(  # 40 of 0.1 ms, and 0.02 s are stated
+        actuators='<position joint="j" kp="80" kv="6" delay="0.02" nsample="40"/>',
+        remarks=at(ACTUATOR_LINE, "actuator_delay 0.02", "by 0.004 s", "nsample"),
+        moves_alike=False,
+    ),
     "gain that drives away": Case(
         actuators='<general joint="j" gainprm="8" biastype="affine" biasprm="0 8 -6"/>',
         joint='stiffness="40"',
