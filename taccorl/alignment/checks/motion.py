@@ -242,7 +242,12 @@ def check_motion(t: Trial) -> Iterator[Finding]:
             yield from _stuck(m, int(j))
 
 
-@check("error", "frozen_channel", "saturated_channel")
+@check(
+    "error",
+    "frozen_channel",
+    "saturated_channel",
+    explains=(*FOLLOWS_FROM, "velocity_unit"),
+)
 @check("warning", "sticking_joint", "blocked")
 def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
     """A joint that stands still while its command moves: a driver that repeats old values, the end of its range, or a joint that

@@ -179,7 +179,7 @@ def _copied(m: Measurement, follows: np.ndarray, j: int) -> int | None:
     return next((i for i in alike if (m.target[:, i] == m.target[:, j]).all()), None)
 
 
-@check("error", "turned_midway", needs="position", explains=FOLLOWS_FROM)
+@check("error", "turned_midway", needs="position", explains=(*FOLLOWS_FROM, "reversed"))
 def check_turns(t: Trial) -> Iterator[Finding]:
     """Find targets or positions whose sign is reversed in a part of the recording only. In windows of ``TURN_S`` seconds the
     velocity of the position is correlated with that of the target: about +1 where signs agree, about −1 where one is reversed.
